@@ -62,6 +62,10 @@ GUIDED = (
 #: anomaly [s]. It is also the longest time that the estimator needs to revoke the length offsets
 #: after a jump of lengths.
 REACTION_TIME = 1.0
+#: Time after which a verification is abandoned if its suspect is not isolated any more, although
+#: the anomaly lasts [s]. When a verification ends, the message on the anomaly may come this much
+#: later than the message on the isolated muscles.
+LOST_TIME = 3.0
 #: longest time that a length calibration needs for its first estimate [s]; if messages arrive at
 #: 10 Hz, it needs 3.5 s
 FIRST_ESTIMATE = 5.0
@@ -158,6 +162,7 @@ class Suspicion:
     def __init__(self) -> None:
         self._isolated: tuple[int, float] | None = None  # last isolated muscle, and its time [s]
         self._anomaly_at = math.inf
+        self._lost_at = math.inf  # time since which there is an anomaly, but no suspect [s]
 
     def note_anomaly(self, now: float) -> None:
         """Record that an anomaly was detected."""
@@ -178,6 +183,14 @@ class Suspicion:
             return None
         muscle, at = self._isolated
         return muscle if muscle in isolated and at > self._anomaly_at - REACTION_TIME else None
+
+    def note_lost(self, is_lost: bool, now: float) -> None:
+        """Record whether there is an anomaly without a suspect."""
+        self._lost_at = min(self._lost_at, now) if is_lost else math.inf
+
+    def is_lost(self, now: float) -> bool:
+        """Return whether there has been an anomaly without a suspect for LOST_TIME."""
+        return now - self._lost_at > LOST_TIME
 
 
 class Controller:
@@ -377,6 +390,8 @@ class Controller:
         isolated = self.stream.body.isolated
         suspect = self._suspicion.suspect(self.watchdog.has_anomaly, isolated)
         self.stopping.suspect = suspect
+        is_lost = self.watchdog.has_anomaly and suspect is None
+        self._suspicion.note_lost(is_lost, self.watchdog.age.stepped_at)
         if suspect is not None:
             self.supervisor.on_suspect(True)
 
@@ -546,8 +561,10 @@ class Controller:
         anomaly, the arm is stopped, and the estimator decides whether a jump is due to a repair.
         """
         stream = self.stream
-        if stream.body.offsets.is_suspect:
-            return 'the estimator has revoked the length offsets'
+        if muscles := stream.body.offsets.suspect:
+            names = '' if len(muscles) == self.robot.muscle_count else self.robot.names(muscles)
+            of_muscles = f' of {names}' if names else ''
+            return f'the estimator has revoked the length offsets{of_muscles}'
         if self.watchdog.has_anomaly:
             return ''
         displaced = self.stream.displaced
@@ -572,7 +589,8 @@ class Controller:
             self.activities.entered = None
         present = self.conditions(now)
         stale_estimate = any(c.cause is StopCause.STALE_ESTIMATE for c in present)
-        if stale_estimate:  # the estimator may have restarted, and then no longer has a suspect
+        # If estimates are missing, the estimator may have restarted without the suspect.
+        if stale_estimate or self._suspicion.is_lost(now):
             self.supervisor.on_suspect(False)
         if self.limiter.command is not None or not self.supervisor.is_running:
             # Before the first command, causes do not stop the arm, because it does not move yet.

@@ -54,7 +54,10 @@ def report(core: Controller, now: float) -> Report:
         # An anomaly that has ended needs no repair.
         of_finding = REPAIR if core.watchdog.has_anomaly else ()
         explored = supervisor.awaits_exploration
-        steps = stops.remedy_of(causes, explored, of_finding, core.watchdog.has_anomaly)
+        settled = stops.CONSEQUENCES if supervisor.has_had_anomaly else frozenset()
+        if not core.watchdog.has_anomaly:  # what has outlasted the anomaly needs its own steps
+            settled -= {each.cause for each in present}
+        steps = stops.remedy_of(causes, explored, of_finding, settled)
         values |= {
             'stop cause': condition.cause.identifier,
             stops.STOP_CAUSES: ', '.join(cause.identifier for cause in causes),

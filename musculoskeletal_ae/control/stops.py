@@ -7,7 +7,7 @@ The reference page on stops is generated from this table. Programs compare the s
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from enum import Enum, IntEnum
 from itertools import chain
 from typing import NamedTuple
@@ -223,9 +223,15 @@ class StopCause(Enum):
 
 
 STOP_CAUSES = 'stop causes'  # key of a value in /diagnostics
-#: causes that follow from an anomaly: a faulty muscle makes estimates implausible, and implausible
-#: estimates are rejected
-CONSEQUENCES = frozenset({StopCause.IMPLAUSIBLE_ESTIMATE, StopCause.STALE_ESTIMATE})
+#: causes that follow from an anomaly: a faulty muscle makes estimates implausible, implausible
+#: estimates are rejected, and the repair of the muscle makes its length jump
+CONSEQUENCES = frozenset(
+    {
+        StopCause.IMPLAUSIBLE_MUSCLE_STATES,
+        StopCause.IMPLAUSIBLE_ESTIMATE,
+        StopCause.STALE_ESTIMATE,
+    }
+)
 
 
 class Condition(NamedTuple):
@@ -242,7 +248,7 @@ def remedy_of(
     causes: Iterable[StopCause],
     explored: bool,
     of_finding: Iterable[Step] = REPAIR,
-    has_anomaly: bool = False,
+    settled: Collection[StopCause] = (),
 ) -> list[Step]:
     """Return the steps by which a user ends all the given stop causes, each step once.
 
@@ -254,14 +260,13 @@ def remedy_of(
             exploring when it stopped.
         of_finding: Steps that remedy the faults which the estimator has found. They are the
             remedy of the cause `ANOMALY`, before the reset.
-        has_anomaly: Whether an anomaly is present. If so, the causes in `CONSEQUENCES` need only a
-            reset, because the anomaly has caused them.
+        settled: Causes that need only a reset, for example those in `CONSEQUENCES` while an anomaly
+            is present, because the anomaly has caused them.
     """
     special: dict[StopCause, tuple[Step, ...]] = {
         StopCause.ANOMALY: (*of_finding, Step.RESET_CONTROLLER)
     }
-    if has_anomaly:
-        special |= dict.fromkeys(CONSEQUENCES, (Step.RESET_CONTROLLER,))
+    special |= dict.fromkeys(settled, (Step.RESET_CONTROLLER,))
     remedies = (special.get(cause, cause.steps) for cause in causes)
     steps = sorted(dict.fromkeys(chain.from_iterable(remedies)), key=lambda step: step in LAST)
     return [*steps, Step.EXPLORE] if explored and Step.EXPLORE_GENTLY not in steps else steps

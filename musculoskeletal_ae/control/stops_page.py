@@ -45,9 +45,9 @@ If several causes begin together, the first one in this table is reported.
 ## Steps of remedies
 
 The value `remedy` in `/diagnostics` is a sentence for people. The value \
-`remedy steps` lists the identifiers of its steps, in order. While an anomaly is present, \
-{consequences} need no steps of their own, because they usually follow from it. Their steps are \
-advised if these causes outlast the anomaly.
+`remedy steps` lists the identifiers of its steps, in order. While an anomaly is present, these \
+causes need no steps of their own, because they usually follow from it: {consequences}. Their \
+steps are advised if these causes outlast the anomaly.
 
 {steps}
 """
@@ -62,8 +62,8 @@ def page() -> str:
         states=_listed(states),
         diagram=supervisor.diagram(),
         table=stops.table(),
-        consequences=' and '.join(
-            f'`{cause.identifier}`' for cause in stops.StopCause if cause in stops.CONSEQUENCES
+        consequences=_listed(
+            cause.identifier for cause in stops.StopCause if cause in stops.CONSEQUENCES
         ),
         steps=remedy.table(),
     )

@@ -47,7 +47,7 @@ class Event(Enum):
     CLEARED = 'no cause for 0.2 s'
     RELEASED = 'hold_time is over and the arm is released'
     SUSPECT = 'the estimator has isolated a suspect muscle'
-    SUSPECT_LOST = 'the estimator has stopped during the verification'
+    SUSPECT_LOST = 'the estimator has stopped, or has no suspect any more'
     VERIFIED = 'verification ended the anomaly, and no cause needs a reset'
     VERIFIED_IN_VAIN = 'verification ended the anomaly, but another cause needs a reset'
     NOTHING_PRESENT = 'no cause is present'
@@ -124,6 +124,11 @@ class Supervisor:
         return self.state is StopState.VERIFYING and StopCause.OPERATOR not in self._causes
 
     @property
+    def has_had_anomaly(self) -> bool:
+        """Whether an anomaly is or was a cause of the present stop."""
+        return StopCause.ANOMALY in self._causes
+
+    @property
     def action(self) -> Action:
         """The action of the present stop: the most severe one of all its causes."""
         reported = () if self.condition is None else (self.condition.cause,)
@@ -198,8 +203,9 @@ class Supervisor:
         `on_verified` ends a verification that is complete.
 
         Args:
-            is_isolated: True if the estimator has isolated a suspect. False if estimates are
-                missing: the estimator may then have restarted, and would no longer have a suspect.
+            is_isolated: True if the estimator has isolated a suspect. False if it has no suspect
+                any more although the anomaly lasts, or if estimates are missing: the estimator may
+                then have restarted, and would no longer have a suspect.
         """
         self._fire(Event.SUSPECT if is_isolated else Event.SUSPECT_LOST)
 

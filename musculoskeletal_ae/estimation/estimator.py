@@ -27,7 +27,12 @@ from musculoskeletal_ae.estimation import status
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
 from musculoskeletal_ae.estimation.detectors.joint_disagreement import GAP_LEARNED, GAP_YOUNG
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
-from musculoskeletal_ae.estimation.finding import REVOKING, Finding, Kind, Observation
+from musculoskeletal_ae.estimation.finding import (
+    REVOKING,
+    REVOKING_ONE,
+    Finding,
+    Observation,
+)
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.length_calibration import (
     LengthCalibration,
@@ -35,17 +40,21 @@ from musculoskeletal_ae.estimation.length_calibration import (
 )
 from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
+from musculoskeletal_ae.estimation.repair_check import problem_of
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.estimation.state_estimator import Estimate, StateEstimator
 from musculoskeletal_ae.estimation.status import SILENCE
 from musculoskeletal_ae.estimation.suspects import SuspectHandling
+from musculoskeletal_ae.estimation.verification import LONGEST
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.remedy import REPAIR
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 from musculoskeletal_ae.signals.heat import Heat
+from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
 #: largest time between two messages that detectors count [s]; a longer pause counts as this time
@@ -234,17 +243,38 @@ class Estimator:
         """Record θ [rad] (D,) as measured by the joint sensors at `now` [s]."""
         self._measured = now, theta
 
-    def reset(self) -> None:
-        """Clear the anomaly, and consider the body healthy in its present state.
-
-        If the length of the suspect has jumped since the finding, its length offset is checked
-        first. If this offset is wrong, all length offsets become unreliable.
+    def restore(self, muscles: Iterable[int]) -> None:
+        """Use isolated muscles (indices) again; muscles that are not isolated are ignored.
 
         Raises:
-            MusculoskeletalError: If the length offsets are unreliable, and joint sensors do not
+            MusculoskeletalError: If one of these muscles is being verified, or does not fit the
+                rest of the arm yet (`repair_check`). No muscle is restored then.
+        """
+        restored = [muscle for muscle in self.body.isolated if muscle in set(muscles)]
+        verification = self.suspects.verification
+        if verification is not None and verification.muscle in restored:
+            raise MusculoskeletalError(
+                f'{self.robot.muscles[verification.muscle]} is being verified, which ends by '
+                f'itself within {LONGEST:g} s; wait until anomaly_detected is false, then call '
+                'estimator/restore again if the muscle is still isolated'
+            )
+        if problems := list(filter(None, map(self._problem_of, restored))):
+            again = 'then call estimator/restore again'
+            raise MusculoskeletalError(f'{"; ".join(problems)}; {again}')
+        self.isolate(muscle for muscle in self.body.isolated if muscle not in restored)
+
+    def reset(self, isolating: Iterable[int] = ()) -> None:
+        """Clear the anomaly, and consider the body healthy in its present state.
+
+        Args:
+            isolating: Muscles (indices) that the caller isolates next; they need not be healthy.
+
+        Raises:
+            MusculoskeletalError: If the suspect does not fit the rest of the arm yet
+                (`repair_check`). Also if length offsets are unreliable, and joint sensors do not
                 confirm the lengths.
         """
-        self._check_repair()
+        self._check_suspect(tuple(isolating))
         if self.body.offsets.is_suspect:
             if not self.health.joints.agrees:
                 raise MusculoskeletalError(f'{self.cause}; {self.suspects.advice}')
@@ -412,53 +442,53 @@ class Estimator:
         elif self.mae is None and self.body.offsets.known and jumped:
             self._handle(finding_of(jumped), now)
 
-    def _check_repair(self) -> None:
-        """If the suspect's length has jumped since the finding, check its length offset.
+    def _check_suspect(self, isolating: Iterable[int]) -> None:
+        """Check that the suspect may be used again, unless it is among the muscles `isolating`.
 
-        The offset is then confirmed, or all length offsets become unreliable.
+        If its length has jumped since the finding, its length offset is then confirmed.
+
+        Raises:
+            MusculoskeletalError: If the suspect may not be used yet.
         """
         suspected, offsets = self.suspects.finding, self.body.offsets
-        if suspected is None or not self.suspects.has_suspect_jumped or not offsets.known:
+        if suspected is None or suspected.remedy != REPAIR or suspected.muscle in isolating:
             return
-        if suspected.muscle in self.body.isolated:
-            return
-        if evidence := self._wrong_zero(suspected.muscle):
-            finding = Finding(suspected.muscle, Kind.LENGTHS_DISAGREE, evidence)
-            self._handle(finding, self.stepped_at)
-        else:
+        if problem := self._problem_of(suspected.muscle):
+            again = 'then call estimator/reset again'
+            raise MusculoskeletalError(f'{self.cause}; {problem}; {again}')
+        if self.suspects.has_suspect_jumped and offsets.known:
             # The other nodes trust the length again because its offset is published with a larger
             # standard deviation (`follow_offsets`).
-            confirmed = offsets.confirmed(suspected.muscle)
-            self._use_body(self.body.with_offsets(confirmed))
+            self._use_body(self.body.with_offsets(offsets.confirmed(suspected.muscle)))
 
-    def _wrong_zero(self, muscle: int) -> str:
-        """Return evidence that the length offset of a repaired muscle is wrong, or '' if it is not.
-
-        The length of the muscle is compared with the joint sensors or, without them, with the
-        posture that the other muscles indicate.
-        """
-        joints, sample, mae = self.health.joints, self.sample, self.state.complete_mae
-        if joints.gap is not None:
-            return '' if joints.agrees else 'since its repair, lengths disagree with joint sensors'
-        assert sample is not None
-        assert mae is not None
-        others = mae.without((*self.body.isolated, muscle))
-        theta = others.estimate(sample.bone_tension, sample.length).theta
-        pull = np.clip(sample.bone_tension, 0.0, self.robot.tension.limit)
-        error = abs(float(sample.length[muscle] - mae.lengths(theta, pull)[muscle]))
-        limit = (GAP_LEARNED if self.health.residual.is_calibrated else GAP_YOUNG).single
-        if error <= limit:
+    def _problem_of(self, muscle: int) -> str:
+        """Return why a muscle must not be used yet, or '' if it may be used."""
+        sample, mae = self.sample, self.state.complete_mae
+        if sample is None or mae is None:
             return ''
-        return (
-            f'since its repair, its length differs from that which the other muscles indicate by '
-            f'{1e3 * error:.0f} mm (limit {1e3 * limit:.0f} mm)'
+        if muscle in self.stream.jumping:
+            return (
+                f'the length of {self.robot.muscles[muscle]} has just jumped; wait for '
+                f'{LIMITS.settled:g} s'
+            )
+        limits = GAP_LEARNED if self.health.residual.is_calibrated else GAP_YOUNG
+        return problem_of(
+            self.robot,
+            mae,
+            sample,
+            muscle,
+            self.body.isolated,
+            self.measured,
+            self._commands.demand(self.robot, sample.length, self.stepped_at),
+            float(np.max(limits.single)) if self.body.offsets.known else math.inf,
         )
 
     def _handle(self, finding: Finding | None, now: float) -> bool:
         """Latch a finding and isolate its muscle, as its kind and the settings require.
 
-        A finding that makes the lengths unreliable also revokes the length offsets. Return whether
-        the finding has just been latched; False without a finding, or if another one is latched.
+        A finding that makes one length or several lengths unreliable also revokes its offset or
+        all offsets. Return whether the finding has just been latched; False without a finding, or
+        if another one is latched.
         """
         if finding is None:
             return False
@@ -472,7 +502,9 @@ class Estimator:
             return False
         revokes = finding.kind in REVOKING and finding.muscle not in self.body.isolated
         if revokes and self.body.offsets.known:
-            self._use_body(self.body.with_offsets(self.body.offsets.revoked()))
+            is_one = finding.kind in REVOKING_ONE
+            muscles = (finding.muscle,) if is_one else None
+            self._use_body(self.body.with_offsets(self.body.offsets.revoked(muscles)))
         is_latched = before is None and self.suspects.finding is not None
         if is_latched:
             self._follows_network = False

@@ -28,14 +28,17 @@ class Kind(Enum):
     SENSOR_FROZEN = 'sensor_frozen'
     LENGTH_JUMP = 'length_jump'
     LENGTHS_JUMPED = 'lengths_jumped'
+    LENGTH_DISAGREES = 'length_disagrees'
     LENGTHS_DISAGREE = 'lengths_disagree'
     JOINT_SENSORS_DISAGREE = 'joint_sensors_disagree'
     THERMAL_DRIFT = 'thermal_drift'
     VALUES_MISSING = 'values_missing'
 
 
-#: findings of unreliable lengths; they revoke the length offsets unless their muscle is isolated
-REVOKING = frozenset({Kind.LENGTH_JUMP, Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE})
+#: findings of one unreliable length; they revoke its offset unless the muscle is isolated
+REVOKING_ONE = frozenset({Kind.LENGTH_JUMP, Kind.LENGTH_DISAGREES})
+#: findings of unreliable lengths; those of several lengths revoke all length offsets
+REVOKING = REVOKING_ONE | {Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE}
 
 
 #: remedies of findings that do not end with the repair of one muscle

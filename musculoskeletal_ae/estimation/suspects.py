@@ -23,20 +23,25 @@ consequences:
     lengths_jumped          concern several muscles, none of which is isolated. The length offsets
     lengths_disagree        become unreliable, and the finding stays latched until the next length
                             calibration, or until a reset while joint sensors agree with the
-                            lengths. The same applies to a `length_jump` of a muscle that is not
-                            isolated.
+                            lengths.
+    length_jump             concern one muscle, which is isolated and verified like any other. If
+    length_disagrees        it is not isolated, its length offset alone becomes unreliable, and the
+                            finding stays latched as for several muscles.
     joint_sensors_disagree  concerns no muscle, so none is isolated.
 
-A muscle may be repaired while its finding is latched, and the repair may make its length jump. A
-jump of this length alone therefore neither replaces the finding nor makes the length offsets
-unreliable. `Estimator.reset` then checks whether the length agrees with the rest of the arm.
+A muscle may be repaired while its finding is latched, and the repair may make its length jump, or
+its winch may take seconds to come back. A wrong length of this muscle alone therefore neither
+replaces the finding nor makes its length offset unreliable. `Estimator.reset` checks whether the
+length agrees with the rest of the arm, and so does `Estimator.restore` for isolated muscles. While
+a muscle is being verified, it cannot be restored.
 """
 
 from collections.abc import Iterable
 
-from musculoskeletal_ae.estimation.finding import REVOKING, Finding, Kind
+from musculoskeletal_ae.estimation.finding import REVOKING, REVOKING_ONE, Finding, Kind
 from musculoskeletal_ae.estimation.settings import ISOLATE, Detection
 from musculoskeletal_ae.estimation.verification import (
+    LONGEST,
     ModuleLaw,
     Outcome,
     PositionLaw,
@@ -62,8 +67,8 @@ class SuspectHandling:
         last_verdict: Index of the last verified suspect, or of a muscle isolated without a
             verification, and its verdict; None before the first.
         faults: Verdicts on the isolated muscles that turned out to be faulty, by index.
-        has_suspect_jumped: Whether the length of the suspect has jumped since the finding, as after
-            a repair.
+        has_suspect_jumped: Whether the length of the suspect has jumped, or has become wrong in
+            another way, since the finding, as after a repair.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -88,7 +93,7 @@ class SuspectHandling:
         """What ends the anomaly, as a text for users; '' without a latched finding."""
         if self.finding is None:
             return ''
-        wait = 'wait until the muscle has been verified'
+        wait = f'wait until the muscle has been verified, within {LONGEST:g} s'
         return wait if self.verification else sentence(self.finding.remedy)
 
     @property
@@ -134,7 +139,7 @@ class SuspectHandling:
         return (*isolated, muscle)
 
     def explains(self, finding: Finding) -> bool:
-        """Return whether a new finding is a length jump that the repair of a muscle explains.
+        """Return whether a new finding is a wrong length that the repair of a muscle explains.
 
         This is the case if the latched finding concerns the same muscle and is to be remedied by
         its repair.
@@ -142,7 +147,7 @@ class SuspectHandling:
         suspected = self.finding
         if suspected is None or suspected.remedy != REPAIR:
             return False
-        return finding.kind is Kind.LENGTH_JUMP and finding.muscle == suspected.muscle
+        return finding.kind in REVOKING_ONE and finding.muscle == suspected.muscle
 
     def _law(self, muscle: int) -> ModuleLaw:
         robot, bias = self._robot, float(self._robot.description.tension.bias[muscle])

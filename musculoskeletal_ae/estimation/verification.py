@@ -40,7 +40,8 @@ Under muscle stiffness control, the first row that applies decides:
     otherwise                                    jammed
 
 The noise of a working sensor changes every reading. Therefore readings that never change come from
-a broken sensor. A suspect that is not wound in within 8 s (PATIENCE) stays isolated.
+a broken sensor. A suspect that is not wound in within 8 s (PATIENCE) stays isolated. Every
+verification therefore ends within 10 s (LONGEST) of accepted messages.
 """
 
 import math
@@ -56,6 +57,7 @@ from musculoskeletal_ae.signals.limits import LIMITS
 WINDING_CHANGE = 0.001  # decrease of the command above which the suspect is being wound in [m]
 CLASSIFICATION_TIME = 0.8  # duration of winding in after which the suspect is classified [s]
 PATIENCE = 8.0  # time after which a suspect that was not wound in stays isolated [s]
+LONGEST = 10.0  # longest duration of a verification, with the time for winding in [s]
 FAR = 0.025  # smallest |l − l'| that noise and network errors do not explain [m]
 RUPTURE_CHANGE = 0.005  # decrease of l − l' when the rest of a ruptured tendon is wound in [m]
 #: T_bias for which CLOSE and JAM_EXCESS apply [N]; for a lower T_bias, they are scaled down
@@ -292,7 +294,8 @@ class Verification:
         tension, length, demand, excess, command, stretch = np.median(rows[-10:], axis=0)
         is_slack = tension < LIMITS.slack_share * self._bias
         is_stretched = stretch > law.stretched
-        if is_slack and not is_stretched and self._watched < LONGEST_WINDING:
+        may_wait = self._watched < LONGEST_WINDING and self._time < LONGEST
+        if is_slack and not is_stretched and may_wait:
             return None
         spread: Array = np.ptp([(row.tension, row.length) for row in self._rows], axis=0)
         first = self._rows[0]

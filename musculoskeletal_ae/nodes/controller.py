@@ -30,6 +30,7 @@ from musculoskeletal_ae.control.method_choice import check_method
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.control.stop_memory import StopMemory
 from musculoskeletal_ae.control.stops import LAST, StopCause
+from musculoskeletal_ae.estimation.verification import LONGEST
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.messages import (
     LATCHED,
@@ -271,6 +272,12 @@ class Controller(Shell):
     def _reset(self, _: Trigger.Request) -> str:
         present = self.core.reset(time.monotonic())
         if present is not None:
+            if present.cause is StopCause.ANOMALY and self.core.stopping.suspect is not None:
+                raise MusculoskeletalError(
+                    f'refused: {present}; the muscle is being verified; wait until this has ended, '
+                    f'within {LONGEST:g} s; the arm then moves on by itself, unless another stop '
+                    'cause needs a reset'
+                )
             if present.cause is StopCause.ANOMALY:
                 # The steps depend on the finding, which only the estimator knows.
                 unless = 'unless the estimator reports another `remedy` on /diagnostics'

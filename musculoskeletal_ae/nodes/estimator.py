@@ -156,7 +156,7 @@ class Estimator(Shell):
                 '`isolate_muscles` names no muscle; set that parameter first'
             )
         wanted = {*self.core.body.isolated, *self.muscles_to_isolate}
-        self.core.reset()  # called before isolating, because a reset restores a suspect
+        self.core.reset(wanted)  # called before isolating, because a reset restores a suspect
         answer = self._isolate(wanted)
         self._reset(request)
         return answer
@@ -164,8 +164,10 @@ class Estimator(Shell):
     def _restore(self, _: Trigger.Request) -> str:
         isolated = self.core.body.isolated
         restored = self.muscles_to_isolate or isolated  # all muscles if the parameter names none
+        self.core.restore(restored)
         self.candidates.validator.declare_repaired(restored, time.monotonic())
-        return self._isolate(set(isolated) - set(restored))
+        self._publish_isolated()
+        return f'isolated: {self.robot.names(self.core.body.isolated) or "none"}'
 
     def _reset(self, _: Trigger.Request) -> str:
         cause, finding = self.core.cause, self.core.suspects.finding

@@ -19,9 +19,10 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from musculoskeletal_ae import remedy
 from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.control import stops
-from musculoskeletal_ae.control.stops import StopCause
+from musculoskeletal_ae.control.stops import Clears, StopCause
 from musculoskeletal_ae.control.supervisor import Activity, StopState
 from musculoskeletal_ae.estimation.status import CALIBRATION, GENTLE_MOTION, ISOLATION
+from musculoskeletal_ae.estimation.verification import LONGEST
 from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC
 from musculoskeletal_ae.nodes.sources import SEVERAL
 from musculoskeletal_ae.remedy import REMEDY_STEPS, REPAIR, Step
@@ -123,6 +124,9 @@ class Situation:
         self._finding = ''  # kind of the estimator's finding; 'none', or '' if it is unknown
         self._clear_reports = 0  # successive reports of the estimator without a finding
         self._has_ended = False  # whether an anomaly has ended during the present stop
+        self._was_verifying = False  # whether the last anomaly ended with a verification
+        #: number of the estimator's reports since the last one during a length calibration
+        self._since_calibration = REPORTS + 1
         self.distance = self.limit = math.nan
         self._nodes: dict[str, Node] = {}  # last report of each node, by full name
         self._accepted: deque[str] = deque(maxlen=REPORTS)  # versions in the estimator's reports
@@ -172,6 +176,10 @@ class Situation:
         self.detected = self._finding not in ('', 'none')
         if self._finding == 'none' and was_detected:
             self._has_ended = True
+        if self.detected:
+            self._was_verifying = values.get('verification') == 'running'
+        is_calibrating = values.get('state') == 'calibrating'
+        self._since_calibration = 0 if is_calibrating else self._since_calibration + 1
         self._clear_reports = self._clear_reports + 1 if self._finding == 'none' else 0
         self.suspect = values.get('suspect muscle', '')
         self.evidence = values.get('evidence', '')
@@ -253,15 +261,18 @@ class Situation:
     def _has_consequences(self) -> bool:
         """Whether other stop causes, those in `stops.CONSEQUENCES`, are caused by an anomaly.
 
-        Users then need no steps against these other causes. The result is False if an earlier
-        anomaly has already ended during this stop: its remedy has not helped, and the anomaly may
-        itself be the consequence of another cause.
+        Users then need no steps against these other causes. Just after the end of an anomaly, the
+        last reports of other nodes may be older, so the result is still True. It is False if an
+        earlier anomaly has already ended during this stop: its remedy has not helped, and the
+        anomaly may itself be the consequence of another cause.
         """
-        return (
-            self.detected
-            and not self._has_ended
-            and f'{self._here}/estimator' not in self.silent_nodes()
-        )
+        is_new = not self._has_ended if self.detected else self._has_just_ended
+        return is_new and f'{self._here}/estimator' not in self.silent_nodes()
+
+    @property
+    def _has_just_ended(self) -> bool:
+        """Whether the anomaly of this stop has ended so recently that reports may be older."""
+        return self._has_ended and 0 < self._clear_reports <= REPORTS
 
     def _explains(self, node: Node) -> bool:
         """Return whether the anomaly explains why a node receives no usable estimates."""
@@ -281,7 +292,7 @@ class Situation:
             # When the anomaly has just ended, the last report of the waiting node may be older.
             return self.detected or 0 < self._clear_reports <= REPORTS
         if node.values.get(WAITS_FOR) == LENGTH_OFFSETS:
-            return bool(self._unknown_offsets)
+            return bool(self._unknown_offsets) or self._has_just_calibrated
         if name == f'{self._here}/controller':
             return node.values.get('mode') in (STOPPED, VERIFYING)
         if name == f'{self._here}/estimator':
@@ -293,30 +304,38 @@ class Situation:
         """Return the parts of the status line about an anomaly and a stop."""
         control, estimator = self._values('controller'), self._values('estimator')
         mode, cause = control.get('mode'), control.get('stop cause', '')
-        # The estimator may report a verification before the controller does.
-        is_verifying = mode == VERIFYING or self.is_verifying
         is_stopped = mode in (STOPPED, VERIFYING)
-        is_stopped_by_anomaly = is_stopped and cause == StopCause.ANOMALY.identifier
         causes = stops.parse(control.get(stops.STOP_CAUSES, cause))
+        # A verification, and what follows from it, ends the stop unless a cause needs a reset.
+        ends_by_itself = self.is_verifying or (self._has_just_ended and self._was_verifying)
+        passing = {each for each in causes if each.clears is Clears.VERIFICATION}
+        lasting = [each for each in causes if each not in passing | stops.CONSEQUENCES]
         # If the anomaly is one of the causes of the stop, the remedy is shown with the stop only.
         is_in_stop = is_stopped and StopCause.ANOMALY in causes
         evidence = f': {self.evidence}' if self.evidence else ''
         of_finding = remedy.parse(estimator.get(REMEDY_STEPS, '')) or REPAIR
         troubles = []
-        if self.detected and is_verifying:
-            troubles.append(Trouble(f'ANOMALY: {self.suspect} is being verified{evidence}'))
+        if self.detected and self.is_verifying:
+            end = f'(ends by itself within {LONGEST:g} s)'
+            troubles.append(Trouble(f'ANOMALY: {self.suspect} is being verified{evidence} {end}'))
         elif self.detected and is_in_stop:
             troubles.append(Trouble(f'ANOMALY: {self.suspect}{evidence}'))
         elif self.detected:
             troubles.append(_with_remedy(f'ANOMALY: {self.suspect}{evidence}', *of_finding))
-        if is_stopped and not (is_verifying and is_stopped_by_anomaly):
+        stop = control.get('stop', cause)
+        if is_stopped and ends_by_itself and not lasting:
+            if self.detected and cause != StopCause.ANOMALY.identifier:
+                troubles.append(Trouble(f'STOPPED: {stop}'))
+        elif is_stopped:
             text, steps = control.get('remedy', ''), remedy.parse(control.get(REMEDY_STEPS, ''))
             if (is_in_stop and self._finding) or (causes and self.detected):
                 # The estimator knows the kind of the finding, and whether the anomaly has ended.
-                explored, known = Step.EXPLORE in steps, of_finding if self.detected else ()
-                steps = tuple(stops.remedy_of(causes, explored, known, self._has_consequences))
+                explored = Step.EXPLORE in steps
+                known = of_finding if self.detected and not ends_by_itself else ()
+                settled = stops.CONSEQUENCES if self._has_consequences else ()
+                needed = lasting if ends_by_itself else causes
+                steps = tuple(stops.remedy_of(needed, explored, known, settled))
                 text = remedy.sentence(steps)
-            stop = control.get('stop', cause)
             troubles.append(Trouble(f'STOPPED: {stop} (to go on: {text})', steps))
         return troubles
 
@@ -377,9 +396,19 @@ class Situation:
 
     @property
     def _unknown_offsets(self) -> str:
-        """Names of the muscles with unknown length offsets, or ''."""
+        """Names of the muscles with unknown length offsets, or ''.
+
+        Just after a length calibration, the last report of the controller may be older.
+        """
         key = 'unknown length offsets'
-        return self._values('estimator').get(key) or self._values('controller').get(key, '')
+        names = self._values('estimator').get(key, '')
+        if names or self._has_just_calibrated:
+            return names
+        return self._values('controller').get(key, '')
+
+    @property
+    def _has_just_calibrated(self) -> bool:
+        return 0 < self._since_calibration <= REPORTS
 
     def _isolated(self) -> str:
         """Return a text on the isolated muscles, or ''.
@@ -400,7 +429,10 @@ class Situation:
 
     @property
     def is_verifying(self) -> bool:
-        """Whether a suspect is isolated only to be verified."""
+        """Whether a suspect is isolated only to be verified.
+
+        The estimator decides this. The controller may report the mode `verifying` for longer.
+        """
         return self._values('estimator').get('verification') == 'running'
 
     @property

@@ -51,6 +51,11 @@ class LengthOffsets:
         """Whether a fault has revoked known offsets."""
         return bool((self.deviation >= SUSPECT).any())
 
+    @property
+    def suspect(self) -> tuple[int, ...]:
+        """Indices of the muscles whose offsets a fault has revoked."""
+        return tuple(np.flatnonzero(self.deviation >= SUSPECT).tolist())
+
     def confirmed(self, muscle: int) -> LengthOffsets:
         """Return the same offsets after the offset of one muscle was confirmed.
 
@@ -61,9 +66,17 @@ class LengthOffsets:
         deviation[muscle] = min(np.hypot(deviation[muscle], CONFIRMED), 0.9 * KNOWN)
         return LengthOffsets(self.offset, deviation)
 
-    def revoked(self) -> LengthOffsets:
-        """Return the same offsets, marked as suspect until the next length calibration."""
-        return LengthOffsets(self.offset, np.full(len(self.offset), SUSPECT))
+    def revoked(self, muscles: Iterable[int] | None = None) -> LengthOffsets:
+        """Return the same offsets; those of some muscles are marked as suspect.
+
+        They remain suspect until the next length calibration.
+
+        Args:
+            muscles: Indices of these muscles; None for all muscles.
+        """
+        deviation = self.deviation.copy()
+        deviation[range(len(deviation)) if muscles is None else list(muscles)] = SUSPECT
+        return LengthOffsets(self.offset, deviation)
 
 
 @dataclass(frozen=True)

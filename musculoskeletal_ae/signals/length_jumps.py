@@ -200,6 +200,12 @@ class LengthJumps:
         muscles = np.flatnonzero(jump.remaining(used)).tolist()
         return Verdict(None, tuple(muscles), jump.is_unseen)
 
+    def jumping(self, used: Bools) -> tuple[int, ...]:
+        """Return the muscles in `used` (M,) whose new level has not been accepted yet."""
+        if self._jump is None:
+            return ()
+        return tuple(np.flatnonzero(self._jump.remaining(used)).tolist())
+
     def _pause(self, now: float, delay: float) -> float:
         """Return the pause between receptions or between sendings, whichever is longer [s]."""
         return longer_pause(max(now - self._last_at, 0.0), self._last_delay, delay)

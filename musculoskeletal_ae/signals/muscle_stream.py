@@ -231,6 +231,11 @@ class MuscleStream:
         self.displaced.use_body(body, is_calibrated)
         self.body = body
 
+    @property
+    def jumping(self) -> tuple[int, ...]:
+        """Muscles whose lengths have jumped, while the new level has not been accepted yet."""
+        return self._jumps.jumping(self.body.used)
+
     def implausible(self, now: float) -> str:
         """Return why messages have been implausible for longer than a glitch, or ''."""
         return self._implausible.lasting(now - self._delay)

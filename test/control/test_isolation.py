@@ -13,7 +13,7 @@ from robots import write_robot
 from musculoskeletal_ae.control import reach
 from musculoskeletal_ae.control.assumed_friction import FRICTION
 from musculoskeletal_ae.control.command import LENGTH, TENSION
-from musculoskeletal_ae.control.controller import APPROACHES
+from musculoskeletal_ae.control.controller import APPROACHES, LOST_TIME
 from musculoskeletal_ae.control.planner import Planner
 from musculoskeletal_ae.control.reach import lacking
 from musculoskeletal_ae.control.settings import METHODS, Settings
@@ -361,6 +361,21 @@ def test_a_restart_of_the_estimator_does_not_end_the_stop_for_a_suspect():
     bench.isolate([])
     bench.step(100)
     assert bench.cause == 'anomaly_detected'
+
+
+def test_a_verification_whose_suspect_is_in_use_again_is_abandoned_while_the_anomaly_lasts():
+    bench = VerificationBench()
+    bench.step(50)
+    assert bench.core.supervisor.mode == 'verifying'
+    bench.isolate([])
+    bench.step(round(LOST_TIME / 0.01) - 10)
+    assert bench.core.supervisor.mode == 'verifying'  # the end of the anomaly may be reported later
+    bench.step(30)
+    assert bench.core.supervisor.mode == 'stopped'
+    bench.core.anomaly(False)
+    bench.step(100)
+    assert bench.cause == 'anomaly_detected'
+    assert bench.core.reset(bench.now) is None
 
 
 def test_a_suspect_with_dead_sensors_is_wound_in_by_a_bounded_length():

@@ -8,7 +8,14 @@ import pytest
 
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.settings import Detection
-from musculoskeletal_ae.estimation.verification import PATIENCE, ModuleLaw, Outcome, Verification
+from musculoskeletal_ae.estimation.verification import (
+    LONGEST,
+    PATIENCE,
+    ModuleLaw,
+    Outcome,
+    Verification,
+)
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 
@@ -170,6 +177,9 @@ def test_on_anomaly_stop_is_the_default_and_isolates_no_muscle(robot, calibrated
 def test_a_reset_during_verification_restores_the_suspect(loop, healthy, cut):
     loop.step(healthy, 30)
     loop.step(cut, 20)
+    with pytest.raises(MusculoskeletalError, match='has no tension'):
+        loop.core.reset()
+    loop.step(healthy, 20)
     loop.core.reset()
     assert loop.core.body.isolated == ()
     assert loop.core.cause == ''
@@ -184,13 +194,41 @@ def test_without_a_verification_the_report_names_the_remedy(loop, healthy, cut):
     assert report.message.endswith('repair the muscle; call estimator/reset')
 
 
-def test_a_suspect_restored_during_verification_leaves_the_anomaly_latched(loop, healthy, cut):
+def test_a_suspect_cannot_be_restored_during_its_verification_which_always_ends(loop, healthy, cut):
     loop.step(healthy, 30)
     loop.step(cut, 20)
-    cause = loop.core.cause
-    loop.core.isolate(())
-    loop.step(cut, round(PATIENCE / 0.01) + 100)
-    assert loop.core.cause == cause
+    (suspect,) = loop.core.body.isolated
+    for _ in range(round(LONGEST / DT)):
+        if loop.core.cause == '':
+            break
+        with pytest.raises(MusculoskeletalError, match=r'is being verified.*within 10 s; wait'):
+            loop.core.restore([suspect])
+        assert loop.core.body.isolated == (suspect,)
+        loop.step(healthy)
+    assert loop.core.cause == ''
+    loop.core.restore([suspect])
+    assert loop.core.body.isolated == ()
+    loop.step(healthy, 300)
+    assert loop.core.cause == ''
+
+
+def test_another_muscle_can_be_restored_during_a_verification(loop, healthy, cut):
+    loop.step(healthy, 30)
+    loop.core.isolate([5])
+    loop.step(cut, 20)
+    loop.core.restore([5])
+    assert loop.core.body.isolated == (2,)
+    assert loop.core.suspects.verification is not None
+
+
+def test_an_anomaly_without_a_verification_always_has_a_remedy(loop, healthy, cut):
+    loop.step(healthy, 30)
+    loop.step(cut, 20)
+    assert 'remedy' not in loop.core.report(loop.now).values
+    loop.core.isolate(())  # the suspect is in use again, without a verdict
+    report = loop.core.report(loop.now)
+    assert report.values['verification'] == 'none'
+    assert report.values['remedy steps'] == 'repair_muscle, reset_estimator'
 
 
 def test_a_sensor_that_stands_still_while_the_arm_moves_is_detected(robot, calibrated, healthy):

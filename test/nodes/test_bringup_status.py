@@ -11,9 +11,10 @@ from sensor_msgs.msg import JointState
 
 from musculoskeletal_ae.control.stops import Condition, StopCause, remedy_of
 from musculoskeletal_ae.estimation.finding import Finding, Kind
+from musculoskeletal_ae.estimation.verification import LONGEST
 from musculoskeletal_ae.nodes import bringup_status
 from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC, slow_cause
-from musculoskeletal_ae.nodes.situation import Situation, figures
+from musculoskeletal_ae.nodes.situation import REPORTS, Situation, figures
 from musculoskeletal_ae.remedy import Step, identifiers, sentence
 
 
@@ -162,6 +163,7 @@ def stopped(cause, mode='stopped', also=(), explored=False):
 
 
 RESET = '(to go on: call controller/reset)'
+ENDS = f'(ends by itself within {LONGEST:g} s)'
 REPAIR = '(to go on: repair the muscle; call estimator/reset)'
 
 
@@ -209,7 +211,7 @@ def test_an_anomaly_is_shown_with_its_evidence_and_the_learner_advises_nothing_e
     situation.diagnosed(diagnostics('/left/estimator', **suspect, verification='running'))
     stopped_learner = 'stopped by an anomaly', DiagnosticStatus.WARN
     situation.diagnosed(diagnostics('/left/learner', *stopped_learner, waits_for='anomaly'))
-    verifying = 'ANOMALY: biceps is being verified: no tension'
+    verifying = f'ANOMALY: biceps is being verified: no tension {ENDS}'
     # The text is the same before and after the controller reports its stop.
     assert situation.trouble() == verifying
     situation.diagnosed(stopped(StopCause.ANOMALY))
@@ -274,13 +276,13 @@ def test_the_remedy_of_several_causes_repairs_nothing_if_only_lengths_are_off():
     situation.diagnosed(found(Kind.LENGTHS_JUMPED, unknown_length_offsets='biceps'))
     first, *also = causes
     situation.diagnosed(stopped(first, also=also, explored=True))
-    assert situation.steps() == [
-        'check_sensor', 'calibrate_lengths', 'reset_controller', 'explore_gently'
-    ]  # fmt: skip
+    assert situation.steps() == ['calibrate_lengths', 'reset_controller', 'explore_gently']
     assert 'repair' not in situation.trouble()
 
 
-CONSEQUENCES = StopCause.IMPLAUSIBLE_ESTIMATE, StopCause.STALE_ESTIMATE
+CONSEQUENCES = (
+    StopCause.IMPLAUSIBLE_MUSCLE_STATES, StopCause.IMPLAUSIBLE_ESTIMATE, StopCause.STALE_ESTIMATE
+)  # fmt: skip
 REPAIR_STEPS = ['repair_muscle', 'reset_estimator', 'reset_controller', 'explore']
 
 
@@ -304,10 +306,14 @@ def test_what_follows_from_an_anomaly_needs_no_steps_until_the_anomaly_has_retur
     assert situation.steps() == REPAIR_STEPS
     for consequence in ('checkpoint', 'estimator/zero', 'is running', 'no usable'):
         assert consequence not in situation.trouble()
-    situation.diagnosed(found(None))  # what is still present after the anomaly is necessary
+    for _ in range(REPORTS):  # the report of the controller may be older than the end
+        situation.diagnosed(found(None))
+        assert not {'repair_muscle', 'check_checkpoint', 'check_sensor'} & set(situation.steps())
+    situation.diagnosed(found(None))  # what is still present now is necessary
     after = situation.steps()
     assert 'repair_muscle' not in after
-    assert {'check_checkpoint', 'calibrate_lengths', 'check_estimator'} <= set(after)
+    needed = {'check_sensor', 'check_checkpoint', 'calibrate_lengths', 'check_estimator'}
+    assert needed <= set(after)
     situation.diagnosed(found(Kind.RESIDUAL_DISTANCE, **lengths))  # the repair has not helped
     assert {*REPAIR_STEPS, 'check_checkpoint', 'calibrate_lengths'} <= set(situation.steps())
     situation.diagnosed(diagnostics('/left/controller', mode='exploring'))
@@ -347,7 +353,7 @@ def test_a_suspect_counts_as_isolated_only_after_its_verification():
     assert 'isolated: triceps (ruptured) (to use' in situation.trouble()
     alone = {'isolated_muscles': 'biceps', 'isolated_muscles_with_faults': 'biceps'}
     situation.diagnosed(found(Kind.SLACK_TENDON, verification='running', **alone))
-    assert situation.trouble() == 'ANOMALY: biceps is being verified'
+    assert situation.trouble() == f'ANOMALY: biceps is being verified {ENDS}'
 
 
 def test_a_learner_that_waits_for_a_calibration_is_not_shown_beside_the_calibration():
@@ -359,6 +365,9 @@ def test_a_learner_that_waits_for_a_calibration_is_not_shown_beside_the_calibrat
     situation.diagnosed(diagnostics('/left/estimator', finding='none', **lengths))
     situation.diagnosed(waiting)
     assert situation.trouble() == 'length offsets unknown: biceps'
+    for _ in range(REPORTS):  # the report of the learner may be older than the end
+        situation.diagnosed(diagnostics('/left/estimator', finding='none'))
+        assert situation.trouble() == ''
     situation.diagnosed(diagnostics('/left/estimator', finding='none'))
     assert situation.trouble() == 'warning: /left/learner: waiting'
 
@@ -413,18 +422,52 @@ def test_several_silent_nodes_are_put_down_to_the_computer():
     )
 
 
+@pytest.mark.parametrize('cause', [StopCause.ANOMALY, StopCause.IMPLAUSIBLE_ESTIMATE])
+def test_while_a_verification_ends_the_stop_no_step_is_advised(cause):
+    situation = Situation('/left')
+    stop = with_silent_estimates(stopped(cause, 'verifying', also=CONSEQUENCES, explored=True))
+    situation.diagnosed(found(Kind.SLACK_TENDON, verification='running'))
+    situation.diagnosed(stop)
+    assert situation.steps() == []
+    assert 'to go on' not in situation.trouble()
+    for _ in range(REPORTS):  # the report of the controller may be older than the end
+        situation.diagnosed(found(None))
+        assert situation.steps() == []
+        assert 'STOPPED' not in situation.trouble()
+    situation.diagnosed(found(None))
+    assert 'reset_controller' in situation.steps()
+
+
+def test_at_the_end_of_a_calibration_an_older_report_of_the_controller_advises_nothing():
+    situation = Situation('/left')
+    lengths = {'unknown_length_offsets': 'biceps'}
+    situation.diagnosed(
+        diagnostics('/left/controller', 'gentle', DiagnosticStatus.WARN, mode='calibrating',
+                    **lengths)
+    )  # fmt: skip
+    situation.diagnosed(
+        diagnostics('/left/estimator', finding='none', state='calibrating', **lengths)
+    )
+    assert 'length offsets unknown' in situation.trouble()
+    for _ in range(REPORTS):
+        situation.diagnosed(diagnostics('/left/estimator', finding='none', state='estimating'))
+        assert situation.steps() == []
+        assert 'length offsets unknown' not in situation.trouble()
+    # A controller that does not learn the offsets is a fault.
+    situation.diagnosed(diagnostics('/left/estimator', finding='none', state='estimating'))
+    assert situation.steps() == ['calibrate_lengths']
+
+
 def test_a_suspect_that_is_verified_is_not_to_be_repaired_yet():
     situation = Situation('/left')
-    situation.diagnosed(
-        diagnostics('/left/estimator', finding='slack_tendon', suspect_muscle='biceps')
-    )
+    situation.diagnosed(found(Kind.SLACK_TENDON, verification='running'))
+    verifying = f'ANOMALY: biceps is being verified {ENDS}'
     situation.diagnosed(stopped(StopCause.ANOMALY, 'verifying'))
-    assert situation.trouble() == 'ANOMALY: biceps is being verified'
+    assert situation.trouble() == verifying
     situation.diagnosed(stopped(StopCause.OPERATOR, 'verifying'))
-    assert situation.trouble() == (
-        f'ANOMALY: biceps is being verified, STOPPED: controller/stop was called {RESET}'
-    )
-    situation.diagnosed(stopped(StopCause.OPERATOR))
+    assert situation.trouble() == f'{verifying}, STOPPED: controller/stop was called {RESET}'
+    # Only the estimator decides when the verification has ended.
+    situation.diagnosed(found(Kind.SLACK_TENDON, verification='none'))
     assert situation.trouble() == (
         f'ANOMALY: biceps {REPAIR}, STOPPED: controller/stop was called {RESET}'
     )

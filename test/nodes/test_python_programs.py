@@ -5,7 +5,7 @@ import re
 import sys
 from pathlib import Path
 
-import numpy as np
+import pytest
 from controlled_arm import ControlledArm
 from graph import Process
 
@@ -36,29 +36,62 @@ def run(graph, folder, program, *arguments, expected_status=0, **values):
     return output
 
 
-def test_the_programs_of_the_guide_move_the_arm_and_break_and_repair_a_muscle(
-    graph, arm26, trained_file, tmp_path
-):
-    move, repair, *_ = PROGRAMS
-    arm = ControlledArm(graph, arm26, trained_file)
-    assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
+@pytest.fixture
+def arm(graph, arm26, trained_file):
+    return ControlledArm(graph, arm26, trained_file)
+
+
+def test_the_first_program_moves_the_arm_and_says_if_a_target_is_refused(arm, tmp_path):
+    move, *_ = PROGRAMS
     theta = [-0.5, -1.2]
-    target = dict(zip(arm26.joints, theta, strict=True))
-    assert run(graph, tmp_path, move, TARGET=target) == 'moving, holding\n'
+    target = dict(zip(arm.robot.joints, theta, strict=True))
+    assert run(arm.graph, tmp_path, move, TARGET=target) == 'moving, holding\n'
     arm.goes_to(theta)
     short = move.replace('+ 30.0', '+ 2.0')
-    assert run(graph, tmp_path, short, TARGET={'wrist': 0.0}) == 'the target was refused\n'
-    muscle = arm26.muscles[int(np.argmax(arm.tension()))]
-    printed = run(graph, tmp_path, repair, MUSCLE=muscle)
-    assert f"['{muscle}']: set" in printed and "['']: set" in printed and 'restored:' in printed
-    assert arm.estimator.core.stream.body.isolated == ()
+    assert run(arm.graph, tmp_path, short, TARGET={'wrist': 0.0}) == 'the target was refused\n'
+
+
+def explores_healthily(arm):
+    """Wait until the arm explores with all muscles, and check that it has no anomaly."""
+    controller, core = arm.controller.core, arm.estimator.core
+    arm.graph.wait(
+        lambda: controller.supervisor.is_running and controller.supervisor.explores,
+        'the arm to explore',
+    )
+    assert core.cause == ''
+    assert core.body.offsets.known
+    assert core.body.isolated == ()
+    arm.graph.wait(lambda: controller.robot.isolated == (), 'the controller to use all muscles')
+
+
+# A program that does not wait for the verification must not do any harm either.
+HASTY = 'while detected[-1]:', 'while False:'
+
+
+@pytest.mark.parametrize(('number', 'is_hasty'), [(1, False), (3, True)])
+def test_the_second_program_breaks_and_repairs_a_muscle_and_the_arm_explores_on(
+    arm, tmp_path, number, is_hasty
+):
+    _, repair, *_ = PROGRAMS
+    assert repair.count(HASTY[0]) == 1
+    arm.controller.core.explore(True)
+    explores_healthily(arm)
+    muscle = arm.robot.muscles[number]
+    printed = run(
+        arm.graph, tmp_path, repair.replace(*HASTY) if is_hasty else repair, MUSCLE=muscle
+    )
+    assert 'isolate: set' in printed
+    assert f"['{muscle}']: set" in printed and "['']: set" in printed
+    assert 'restored: isolated: ' in printed
+    explores_healthily(arm)
+    arm.graph.spin(5.0)  # nothing else is found in the repaired arm
+    explores_healthily(arm)
 
 
 def test_the_programs_of_the_guide_call_services_set_parameters_and_send_nothing_to_a_stopped_arm(
-    graph, arm26, trained_file, tmp_path
+    graph, arm, arm26, tmp_path
 ):
     move, _, call, set_parameter = PROGRAMS
-    arm = ControlledArm(graph, arm26, trained_file)
     assert run(graph, tmp_path, call, 'controller/explore', 'true') == 'done: exploring\n'
     arm.says('exploring')
     assert 'done: stopped' in run(graph, tmp_path, call, 'controller/stop')

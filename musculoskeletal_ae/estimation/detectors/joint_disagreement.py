@@ -15,7 +15,8 @@ by as much as the offset.
 A joint sensor with an offset δθ changes g as well, but like a change of posture: Δ = −G δθ, where G
 is the muscle Jacobian ∂l/∂θ. Because muscles outnumber joints, arbitrary errors of lengths rarely
 have this form. If some δθ explains most of Δ, the joint sensor with the largest δθ is reported;
-otherwise, the lengths are reported.
+otherwise, the lengths are reported. If only one length disagrees with θ, only its muscle is
+reported.
 
 A healthy tendon that is shorter than l_net is stretched and has tension. If a tendon is shorter but
 has no tension, it is ruptured. Its muscle is reported, provided that the lengths of all other
@@ -40,10 +41,13 @@ LASTING = 1.0  # time for which Δ has to exceed its limits before it is reporte
 
 
 class Largest(NamedTuple):
-    """Largest tolerated differences between measured lengths and those of the network."""
+    """Largest tolerated differences between measured lengths and those of the network.
 
-    single: float  # largest absolute value of a single muscle [m]
-    all: float  # largest root mean square over the muscles in use [m]
+    A number applies to all muscles; an array has a value for each muscle, (M,).
+    """
+
+    single: Array | float  # largest absolute value of a single muscle [m]
+    all: Array | float  # largest root mean square over the muscles in use [m]
 
     def excess(self, change: Array, used: Bools) -> float:
         """Return the ratio of length differences to these limits; above 1, they are too large.
@@ -52,8 +56,23 @@ class Largest(NamedTuple):
             change: Difference of each length [m], (M,).
             used: The muscles in use, (M,).
         """
-        size = float(np.sqrt(np.square(change[used]).mean())) if used.any() else 0.0
-        return max(float(np.abs(change).max()) / self.single, size / self.all)
+        size = float(np.sqrt(np.square((change / self.all)[used]).mean())) if used.any() else 0.0
+        return max(float(np.abs(change / self.single).max()), size)
+
+    def text(self, change: Array, used: Bools, muscle: int) -> str:
+        """Return the difference of a muscle and that of all muscles, with limits, for users.
+
+        Args:
+            change: Difference of each length [m], (M,).
+            used: The muscles in use, (M,).
+            muscle: Index of the muscle.
+        """
+        single, together = (np.broadcast_to(limit, change.shape) for limit in self)
+        size = float(np.sqrt(np.square(change[used]).mean()))
+        return (
+            f'{1e3 * change[muscle]:.0f} mm (limit {1e3 * single[muscle]:.0f} mm); root mean '
+            f'square over all muscles: {1e3 * size:.0f} mm (limit {1e3 * together.min():.0f} mm)'
+        )
 
 
 # Largest values on healthy exploring Musashi arms. Half of the arms were of emulator model
@@ -93,9 +112,12 @@ class JointDisagreement(Detector):
         self._mae: Mae | None = None
         self._used: Bools = np.ones(robot.muscle_count, dtype=bool)
         self.gap: Array | None = None
-        #: θ, T_end and l of healthy messages, from which g_usual of any network follows
+        #: θ, T_end and l of healthy messages, from which g_usual of any network follows; l is NaN
+        #: for muscles that were isolated
         self._healthy: deque[tuple[Array, Array, Array]] = deque(maxlen=HEALTHY_COUNT)
-        self._usual: Array | None = None  # g_usual [m], (M,)
+        self._usual: Array = np.zeros(robot.muscle_count)  # g_usual [m], (M,); 0 if unknown
+        #: for which muscles g_usual is known, (M,)
+        self._has_usual: Bools = np.zeros(robot.muscle_count, dtype=bool)
         self._healthy_time = 0.0  # time since a message was last added to `_healthy` [s]
         self.reset()
 
@@ -116,13 +138,18 @@ class JointDisagreement(Detector):
         """Discard the last messages and the usual differences, because length offsets change."""
         self.reset()
         self._healthy.clear()
-        self._usual = None
+        self._compute_usual()
 
     def _compute_usual(self) -> None:
+        """Compute g_usual of each muscle from the messages in which it was in use."""
+        self._usual = np.zeros(self._robot.muscle_count)
+        self._has_usual = np.zeros(self._robot.muscle_count, dtype=bool)
         if len(self._healthy) < ENOUGH or self._mae is None:
             return
         theta, tension, length = map(np.array, zip(*self._healthy))
-        self._usual = np.median(length - self._mae.lengths(theta, tension), axis=0) * self._used
+        gap = length - self._mae.lengths(theta, tension)
+        self._has_usual = self._used & (np.count_nonzero(np.isfinite(gap), axis=0) >= ENOUGH)
+        self._usual[self._has_usual] = np.nanmedian(gap[:, self._has_usual], axis=0)
 
     @property
     def agrees(self) -> bool:
@@ -154,7 +181,8 @@ class JointDisagreement(Detector):
         self._beyond = self._beyond + dt if excess > 1.0 else 0.0
         if not observation.lengths_known:
             return None
-        if excess <= (1.0 if self._usual is None else HEALTHY_EXCESS):
+        known = self._used & self._has_usual
+        if excess <= 1.0 and self._excess(self.gap * known) <= HEALTHY_EXCESS:
             self._note_healthy(theta, sample, dt)
         return self._finding(observation) if self._beyond > LASTING else None
 
@@ -162,14 +190,15 @@ class JointDisagreement(Detector):
         self._healthy_time += dt
         if self._healthy_time >= HEALTHY_SPACING - 1e-9:
             self._healthy_time = 0.0
-            self._healthy.append((theta, sample.bone_tension, sample.length))
+            length = np.where(self._used, sample.length, np.nan)
+            self._healthy.append((theta, np.nan_to_num(sample.bone_tension), length))
             self._compute_usual()
 
     def _change(self, gap: Array) -> tuple[Array, Largest]:
         """Return how far the lengths differ from what is usual on the healthy arm, and the limits.
 
-        While it is not known what is usual, a difference of 0 counts as usual, and the limits are
-        wider.
+        While it is not known what is usual for a muscle, a difference of 0 counts as usual, and its
+        limits are wider. A muscle that was isolated for a minute is such a muscle.
 
         Args:
             gap: Measured minus computed lengths [m], (M,).
@@ -180,9 +209,9 @@ class JointDisagreement(Detector):
         assert self._mae is not None
         statistics = self._mae.anomaly
         has_learned = statistics is not None and statistics.calibrated
-        if self._usual is None:
-            return gap, GAP_LEARNED if has_learned else GAP_YOUNG
-        return gap - self._usual, CHANGE_LEARNED if has_learned else CHANGE_YOUNG
+        limits = (CHANGE_LEARNED, GAP_LEARNED) if has_learned else (CHANGE_YOUNG, GAP_YOUNG)
+        single, together = (np.where(self._has_usual, *pair) for pair in zip(*limits, strict=True))
+        return gap - self._usual, Largest(single, together)
 
     def _excess(self, gap: Array) -> float:
         change, largest = self._change(gap)
@@ -202,20 +231,25 @@ class JointDisagreement(Detector):
         jacobian = jacobian * self._used[:, None]
         shift = np.linalg.lstsq(jacobian, -change)[0]
         unexplained = change + jacobian @ shift
-        size = float(np.sqrt(np.square(change[self._used]).mean()))
         evidence = (
-            f'length differs from that at the measured posture by '
-            f'{1e3 * change[muscle]:.0f} mm (limit {1e3 * largest.single:.0f} mm); root mean '
-            f'square over all muscles: {1e3 * size:.0f} mm (limit {1e3 * largest.all:.0f} mm)'
+            'length differs from that at the measured posture by '
+            f'{largest.text(change, self._used, muscle)}'
         )
         if np.linalg.norm(unexplained) > UNEXPLAINED * np.linalg.norm(change):
-            return Finding(muscle, Kind.LENGTHS_DISAGREE, f'its {evidence}')
+            is_alone = self._others_agree(muscle, change, largest)
+            kind = Kind.LENGTH_DISAGREES if is_alone else Kind.LENGTHS_DISAGREE
+            return Finding(muscle, kind, f'its {evidence}')
         j = int(np.abs(shift / self._robot.kinematics.radian).argmax())
         offset = f'{shift[j]:.2f} {self._robot.units[j].theta}'
         cause = (
             f'the lengths look as if joint sensor {self._robot.joints[j]} had an offset of {offset}'
         )
         return Finding(muscle, Kind.JOINT_SENSORS_DISAGREE, f"{cause}: the muscle's {evidence}")
+
+    def _others_agree(self, muscle: int, change: Array, largest: Largest) -> bool:
+        """Return whether the lengths of all muscles but one agree with the measured posture."""
+        is_other = np.arange(len(change)) != muscle
+        return largest.excess(change * is_other, self._used & is_other) <= 1.0
 
     def _is_ruptured(
         self, muscle: int, sample: MuscleSample, change: Array, largest: Largest
@@ -230,6 +264,5 @@ class JointDisagreement(Detector):
         """
         slack_tension = LIMITS.slack_share * self._robot.tension.bias[muscle]
         is_slack = sample.motor_tension[muscle] < slack_tension
-        is_other = np.arange(len(change)) != muscle
-        others_agree = largest.excess(change * is_other, self._used & is_other) <= 1.0
+        others_agree = self._others_agree(muscle, change, largest)
         return bool(is_slack and change[muscle] < 0.0 and others_agree)

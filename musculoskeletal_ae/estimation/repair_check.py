@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks whether a muscle that was isolated or suspected fits the rest of the arm again.
+
+A muscle must not be used again while one of these problems is present:
+
+    a reading is NaN                the sensor is faulty
+    T < slack_share · T_ref         the tendon is slack although the command demands tension T_ref
+    |l − l'| > limit                the length does not fit the posture
+
+l' is the length that the network computes at the posture that joint sensors measure or, without
+them, at the posture that the other muscles indicate. A length may be wrong because the tendon is
+still ruptured, because the winch has not come back yet, or because the module has another length
+offset since the repair. A tendon that is slack because no tension is demanded may be longer than
+l'; the controller winds it in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample
+
+
+def length_error(
+    robot: Robot,
+    mae: Mae,
+    sample: MuscleSample,
+    muscle: int,
+    ignored: Iterable[int],
+    theta: Array | None,
+) -> float:
+    """Return l − l' of a muscle [m].
+
+    Args:
+        robot: The nominal body with all muscles.
+        mae: The network with all muscles.
+        sample: The readings.
+        muscle: Index of the muscle.
+        ignored: Indices of further muscles that do not indicate the posture.
+        theta: θ from joint sensors [rad], (D,), or None without them.
+    """
+    if theta is None:
+        others = mae.without({*ignored, muscle})
+        theta = others.estimate(sample.bone_tension, sample.length).theta
+    pull = np.nan_to_num(sample.bone_tension).clip(0.0, robot.tension.limit)
+    return float(sample.length[muscle] - mae.lengths(theta, pull)[muscle])
+
+
+def problem_of(
+    robot: Robot,
+    mae: Mae,
+    sample: MuscleSample,
+    muscle: int,
+    ignored: Iterable[int],
+    theta: Array | None,
+    demand: Array | None,
+    limit: float,
+) -> str:
+    """Return why a muscle must not be used yet, as a text for users; '' if it may be used.
+
+    Args:
+        robot: The nominal body with all muscles.
+        mae: The network with all muscles.
+        sample: The readings.
+        muscle: Index of the muscle.
+        ignored: Indices of further muscles that do not indicate the posture.
+        theta: θ from joint sensors [rad], (D,), or None without them.
+        demand: Tensions that the newest command demands [N], (M,); None if they are unknown.
+        limit: Largest |l − l'| [m]; infinite while the length offsets are unknown.
+    """
+    name, tension = robot.muscles[muscle], float(sample.motor_tension[muscle])
+    is_known = robot.tension_source.is_known
+    if np.isnan(sample.length[muscle]) or (is_known and np.isnan(tension)):
+        return f'{name}: a sensor reports NaN instead of a number; repair it'
+    bias = float(robot.tension.bias[muscle])
+    demanded = 0.0 if demand is None else float(demand[muscle])
+    if demanded >= bias and tension < LIMITS.slack_share * demanded:
+        return f'{name} has no tension although the command demands tension; repair it'
+    error = length_error(robot, mae, sample, muscle, ignored, theta)
+    may_be_slack = tension < LIMITS.slack_share * bias and error > 0.0
+    if abs(error) <= limit or may_be_slack:
+        return ''
+    reference = 'the other muscles indicate' if theta is None else 'the joint sensors indicate'
+    direction = 'longer' if error > 0.0 else 'shorter'
+    return (
+        f'the length of {name} is {1e3 * abs(error):.0f} mm {direction} than {reference} (limit '
+        f'{1e3 * limit:.0f} mm); wait until its winch has come to rest, or call estimator/zero if '
+        'the length stays wrong'
+    )
