@@ -15,6 +15,7 @@ Calibration does not change the network or the learner's samples.
 """
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.recording import (
     HELD_OUT_STREAM,
     SAMPLE_TIME,
@@ -79,7 +81,8 @@ class Loop:
             control.estimated(estimate.state.theta, now)
             if estimate.detected:
                 self.alarms += 1
-                estimator.reset()
+                with suppress(MusculoskeletalError):  # refused while the suspect does not fit
+                    estimator.reset()
             if (command := control.step(now)) is not None:
                 self.arm.command_length(command.value + zeros.offset)
                 estimator.commanded(now, length=command.value)

@@ -24,6 +24,7 @@ Every isolation in these hours counts as wrong.
   muscles can neither hold nor leave
 """
 
+from contextlib import suppress
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -38,7 +39,11 @@ from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.settings import Detection
-from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
+from musculoskeletal_ae.exceptions import (
+    InfeasibleError,
+    MessageError,
+    MusculoskeletalError,
+)
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.detection import grasp_and_release
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, make_error_function
@@ -228,7 +233,10 @@ def isolations_of_healthy_arm(
             arm.set_wrench(wrench)
         loop.explore()
         if loop.core.watchdog.has_anomaly and not loop.isolated:
-            loop.estimator.reset()  # the arm stays stopped after two false alarms until a reset
+            # The arm stays stopped after two false alarms until a reset, which is refused while the
+            # suspect does not fit the rest of the arm.
+            with suppress(MusculoskeletalError):
+                loop.estimator.reset()
     return [isolated for isolated, _ in loop.verdicts]
 
 
