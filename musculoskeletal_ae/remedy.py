@@ -19,10 +19,10 @@ class Step(Enum):
     RESET_CONTROLLER = 'reset_controller', 'call controller/reset'
     RESET_ESTIMATOR = 'reset_estimator', 'call estimator/reset'
     CALIBRATE_LENGTHS = 'calibrate_lengths', 'call estimator/zero'
-    EXPLORE = 'explore', 'call controller/explore to explore again'
+    EXPLORE = 'explore', 'call controller/explore true to explore again'
     EXPLORE_GENTLY = (
         'explore_gently',
-        'call controller/explore to explore again, gently until the offsets are known',
+        'call controller/explore true to explore again, gently until the offsets are known',
     )
     REPAIR_MUSCLE = 'repair_muscle', 'repair the muscle'
     RESTORE_MUSCLES = 'restore_muscles', 'call estimator/restore'

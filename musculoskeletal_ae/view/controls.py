@@ -41,7 +41,7 @@ BUTTONS = {
     'call controller/reset': RESET,
     'call estimator/restore': RESTORE,
     'call estimator/zero': CALIBRATE,
-    'call controller/explore to explore again': EXPLORE,
+    'call controller/explore true to explore again': EXPLORE,
 }
 PUSH_STIFFNESS = 200.0  # force on the hand per distance by which the mouse drags it [N/m]
 MOST_PUSH = 60.0  # largest force of a push with the mouse [N]

@@ -150,9 +150,7 @@ def test_a_bag_of_other_topics_says_what_it_has(tmp_path):
 def test_a_topic_of_the_wrong_type_is_refused(tmp_path):
     bag = make(tmp_path, ('/muscle_states', STRING))
     for use in (interface_topics, lambda bag: select(bag, ['all'], None, False)):
-        with pytest.raises(
-            BagError, match=r"/muscle_states has the type .*String', but .* name for 'std_msgs"
-        ):
+        with pytest.raises(BagError, match=r"/muscle_states .* type .*String'.* legal .*'std_msgs"):
             use(bag)
 
 

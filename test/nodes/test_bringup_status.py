@@ -196,8 +196,8 @@ def test_an_anomaly_is_shown_with_the_muscle_and_every_step_to_take():
     assert situation.trouble() == f'ANOMALY: biceps {REPAIR}'
     situation.diagnosed(stopped(StopCause.ANOMALY, explored=True))
     assert situation.trouble() == (
-        'ANOMALY: biceps, STOPPED: anomaly detected (to go on: repair the muscle; '
-        'call estimator/reset; call controller/reset; call controller/explore to explore again)'
+        'ANOMALY: biceps, STOPPED: anomaly detected (to go on: repair the muscle; call '
+        'estimator/reset; call controller/reset; call controller/explore true to explore again)'
     )
     assert situation.steps() == ['repair_muscle', 'reset_estimator', 'reset_controller', 'explore']
     situation.diagnosed(diagnostics('/left/estimator', finding='none'))

@@ -94,6 +94,9 @@ def test_the_programs_of_the_guide_call_services_set_parameters_and_send_nothing
     move, _, call, set_parameter = PROGRAMS
     assert run(graph, tmp_path, call, 'controller/explore', 'true') == 'done: exploring\n'
     arm.says('exploring')
+    for service, *value in ('controller/explore',), ('estimator/reset', 'true'):
+        printed = run(graph, tmp_path, call, service, *value, expected_status=1)
+        assert f'{service} ' + ('takes no value' if value else 'needs a value') in printed
     assert 'done: stopped' in run(graph, tmp_path, call, 'controller/stop')
     target = dict.fromkeys(arm26.joints, 0.0)
     printed = run(graph, tmp_path, move, TARGET=target, expected_status=1)
