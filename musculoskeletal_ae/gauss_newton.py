@@ -99,7 +99,11 @@ class Equations(NamedTuple):
 
     @classmethod
     def of_common(cls, common: Array) -> Equations:
-        """Return the matrix of a fit without unknowns of single samples; `common` is C, (P, P)."""
+        """Return the matrix of a fit whose samples have no unknowns of their own.
+
+        Args:
+            common: The block C of the unknowns that all samples share, (P, P).
+        """
         return cls(np.zeros((0, 0, 0)), np.zeros((0, 0, len(common))), common)
 
 
@@ -111,7 +115,11 @@ class RightSides(NamedTuple):
 
     @classmethod
     def of_common(cls, common: Array) -> RightSides:
-        """Return the right sides of a fit without unknowns of single samples; `common` is c."""
+        """Return the right sides of a fit whose samples have no unknowns of their own.
+
+        Args:
+            common: The part c of the unknowns that all samples share.
+        """
         return cls(np.zeros((0, 0)), common)
 
 

@@ -40,7 +40,7 @@ from musculoskeletal_ae.estimation.length_calibration import (
 )
 from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
-from musculoskeletal_ae.estimation.repair_check import problem_of
+from musculoskeletal_ae.estimation.repair_check import RepairCheck
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.estimation.state_estimator import Estimate, StateEstimator
 from musculoskeletal_ae.estimation.status import SILENCE
@@ -472,16 +472,10 @@ class Estimator:
                 f'{LIMITS.settled:g} s'
             )
         limits = GAP_LEARNED if self.health.residual.is_calibrated else GAP_YOUNG
-        return problem_of(
-            self.robot,
-            mae,
-            sample,
-            muscle,
-            self.body.isolated,
-            self.measured,
-            self._commands.demand(self.robot, sample.length, self.stepped_at),
-            float(np.max(limits.single)) if self.body.offsets.known else math.inf,
-        )
+        limit = float(np.max(limits.single)) if self.body.offsets.known else math.inf
+        demand = self._commands.demand(self.robot, sample.length, self.stepped_at)
+        check = RepairCheck(self.robot, mae, sample, self.body.isolated, self.measured)
+        return check.problem(muscle, demand, limit)
 
     def _handle(self, finding: Finding | None, now: float) -> bool:
         """Latch a finding and isolate its muscle, as its kind and the settings require.

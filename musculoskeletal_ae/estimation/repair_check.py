@@ -17,6 +17,7 @@ l'; the controller winds it in.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,69 +28,50 @@ from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 
-def length_error(
-    robot: Robot,
-    mae: Mae,
-    sample: MuscleSample,
-    muscle: int,
-    ignored: Iterable[int],
-    theta: Array | None,
-) -> float:
-    """Return l − l' of a muscle [m].
+class RepairCheck(NamedTuple):
+    """Checks muscles by the readings of one message."""
 
-    Args:
-        robot: The nominal body with all muscles.
-        mae: The network with all muscles.
-        sample: The readings.
-        muscle: Index of the muscle.
-        ignored: Indices of further muscles that do not indicate the posture.
-        theta: θ from joint sensors [rad], (D,), or None without them.
-    """
-    if theta is None:
-        others = mae.without({*ignored, muscle})
-        theta = others.estimate(sample.bone_tension, sample.length).theta
-    pull = np.nan_to_num(sample.bone_tension).clip(0.0, robot.tension.limit)
-    return float(sample.length[muscle] - mae.lengths(theta, pull)[muscle])
+    robot: Robot  # the nominal body with all muscles
+    mae: Mae  # the network with all muscles
+    sample: MuscleSample  # the readings
+    isolated: Iterable[int]  # indices of the muscles that do not indicate the posture
+    theta: Array | None  # θ from joint sensors [rad], (D,), or None without them
 
+    def problem(self, muscle: int, demand: Array | None, limit: float) -> str:
+        """Return why a muscle must not be used yet, as a text for users; '' if it may be used.
 
-def problem_of(
-    robot: Robot,
-    mae: Mae,
-    sample: MuscleSample,
-    muscle: int,
-    ignored: Iterable[int],
-    theta: Array | None,
-    demand: Array | None,
-    limit: float,
-) -> str:
-    """Return why a muscle must not be used yet, as a text for users; '' if it may be used.
+        Args:
+            muscle: Index of the muscle.
+            demand: Tensions that the newest command demands [N], (M,); None if they are unknown.
+            limit: Largest |l − l'| [m]; infinite while the length offsets are unknown.
+        """
+        robot, sample = self.robot, self.sample
+        name, tension = robot.muscles[muscle], float(sample.motor_tension[muscle])
+        is_known = robot.tension_source.is_known
+        if np.isnan(sample.length[muscle]) or (is_known and np.isnan(tension)):
+            return f'{name}: a sensor reports NaN instead of a number; repair it'
+        bias = float(robot.tension.bias[muscle])
+        demanded = 0.0 if demand is None else float(demand[muscle])
+        if demanded >= bias and tension < LIMITS.slack_share * demanded:
+            return f'{name} has no tension although the command demands tension; repair it'
+        error = self._length_error(muscle)
+        may_be_slack = tension < LIMITS.slack_share * bias and error > 0.0
+        if abs(error) <= limit or may_be_slack:
+            return ''
+        others = 'other muscles' if self.theta is None else 'joint sensors'
+        reference = f'the {others} indicate'
+        direction = 'longer' if error > 0.0 else 'shorter'
+        return (
+            f'the length of {name} is {1e3 * abs(error):.0f} mm {direction} than {reference} '
+            f'(limit {1e3 * limit:.0f} mm); wait until its winch has come to rest, or call '
+            'estimator/zero if the length stays wrong'
+        )
 
-    Args:
-        robot: The nominal body with all muscles.
-        mae: The network with all muscles.
-        sample: The readings.
-        muscle: Index of the muscle.
-        ignored: Indices of further muscles that do not indicate the posture.
-        theta: θ from joint sensors [rad], (D,), or None without them.
-        demand: Tensions that the newest command demands [N], (M,); None if they are unknown.
-        limit: Largest |l − l'| [m]; infinite while the length offsets are unknown.
-    """
-    name, tension = robot.muscles[muscle], float(sample.motor_tension[muscle])
-    is_known = robot.tension_source.is_known
-    if np.isnan(sample.length[muscle]) or (is_known and np.isnan(tension)):
-        return f'{name}: a sensor reports NaN instead of a number; repair it'
-    bias = float(robot.tension.bias[muscle])
-    demanded = 0.0 if demand is None else float(demand[muscle])
-    if demanded >= bias and tension < LIMITS.slack_share * demanded:
-        return f'{name} has no tension although the command demands tension; repair it'
-    error = length_error(robot, mae, sample, muscle, ignored, theta)
-    may_be_slack = tension < LIMITS.slack_share * bias and error > 0.0
-    if abs(error) <= limit or may_be_slack:
-        return ''
-    reference = 'the other muscles indicate' if theta is None else 'the joint sensors indicate'
-    direction = 'longer' if error > 0.0 else 'shorter'
-    return (
-        f'the length of {name} is {1e3 * abs(error):.0f} mm {direction} than {reference} (limit '
-        f'{1e3 * limit:.0f} mm); wait until its winch has come to rest, or call estimator/zero if '
-        'the length stays wrong'
-    )
+    def _length_error(self, muscle: int) -> float:
+        """Return l − l' of a muscle [m]."""
+        theta, sample = self.theta, self.sample
+        if theta is None:
+            others = self.mae.without({*self.isolated, muscle})
+            theta = others.estimate(sample.bone_tension, sample.length).theta
+        pull = np.nan_to_num(sample.bone_tension).clip(0.0, self.robot.tension.limit)
+        return float(sample.length[muscle] - self.mae.lengths(theta, pull)[muscle])

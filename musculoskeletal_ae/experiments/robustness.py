@@ -148,7 +148,7 @@ def _informed_oracle_error(arm: Any, recording: Recording) -> float:
 def _error_with_effects(
     study: Study, seed: int, effects: Mapping[str, float], run: int | None = None
 ) -> float:
-    """Return the error [rad] of an individual of `foreign` after learning with changed effects.
+    """Change effects of an individual of `foreign`, and return its error [rad] after learning.
 
     Args:
         study: The study of the emulator model `foreign`.

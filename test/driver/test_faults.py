@@ -428,12 +428,17 @@ def test_the_motion_test_of_a_sound_driver_finds_no_fault_at_33_hz():
     assert not verdict.faults, str(verdict)
 
 
-def test_a_driver_that_is_faster_than_expected_has_no_fault():
-    driver = Driver(ROBOT)
-    listening = Listening(ROBOT, 50.0)
-    for _ in range(200):
+def listen(rate, steps):
+    """Return a driver and its listener after some steps; `rate` is the expected rate [Hz]."""
+    driver, listening = Driver(ROBOT), Listening(ROBOT, rate)
+    for _ in range(steps):
         for _, rows in driver.step():
             listening.muscles(array(rows), driver.now)
+    return driver, listening
+
+
+def test_a_driver_that_is_faster_than_expected_has_no_fault():
+    driver, listening = listen(50.0, 200)
     verdict = listening.verdict(driver.now)
     assert not verdict.faults, str(verdict)
     assert 'came at 100 Hz, which is more than the expected 50 Hz' in str(verdict)
@@ -463,11 +468,7 @@ def test_a_gap_in_which_this_computer_was_blocked_is_recognised(is_busy):
 
 
 def test_a_driver_that_falls_silent_is_found():
-    driver = Driver(ROBOT)
-    listening = Listening(ROBOT, 100.0)
-    for _ in range(50):
-        for _, rows in driver.step():
-            listening.muscles(array(rows), driver.now)
+    driver, listening = listen(100.0, 50)
     assert not listening.verdict(driver.now).faults
     assert 'no message was received for 8.00 s' in str(listening.verdict(driver.now + 8.0))
 

@@ -135,7 +135,7 @@ class JointDisagreement(Detector):
         self.gap = None
 
     def forget(self) -> None:
-        """Discard the last messages and the usual differences, because length offsets change."""
+        """Discard the last messages and the usual differences, because length offsets changed."""
         self.reset()
         self._healthy.clear()
         self._compute_usual()
