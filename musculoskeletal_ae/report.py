@@ -37,6 +37,11 @@ def is_overloaded() -> bool:
     return os.getloadavg()[0] >= 2.0 * (os.cpu_count() or 1)
 
 
+def overload_text() -> str:
+    """Return that this computer is overloaded, with its load; '' if it is not overloaded."""
+    return f'this computer is overloaded (load {load_text()})' if is_overloaded() else ''
+
+
 def whole(value: float, unit: str = '') -> str:
     """Return a value, rounded to a whole number, with its unit; "–" for NaN (unknown)."""
     return '–' if math.isnan(value) else f'{value:.0f} {unit}'.rstrip()

@@ -24,6 +24,7 @@ from musculoskeletal_ae.control.supervisor import Activity, StopState
 from musculoskeletal_ae.estimation.status import CALIBRATION, GENTLE_MOTION, ISOLATION
 from musculoskeletal_ae.estimation.verification import LONGEST
 from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC
+from musculoskeletal_ae.nodes.progress import LONGEST_STALL
 from musculoskeletal_ae.nodes.sources import SEVERAL
 from musculoskeletal_ae.remedy import REMEDY_STEPS, REPAIR, Step
 from musculoskeletal_ae.report import (
@@ -33,6 +34,7 @@ from musculoskeletal_ae.report import (
     WAITS_FOR,
     Level,
     load_text,
+    overload_text,
 )
 
 LARGEST_AGE = 1.0  # age above which a measured or estimated value is no longer shown [s]
@@ -358,18 +360,21 @@ class Situation:
 
     def _silent(self) -> list[str]:
         silent = self.silent_nodes()
+        if not silent:
+            return []
+        names, longest = ', '.join(silent), max(silent.values())
+        since = f'{names}: no report for {longest:.0f} s'
+        if overload := overload_text():
+            text = f'{since}; {overload}; stop other programs'
+            # A node that hangs ends by itself by this time, so a healthy node has no reason to be
+            # restarted earlier.
+            if longest <= LONGEST_STALL:
+                return [text]
+            return [f'{text}; if it persists, see the log of each node and restart bringup.sh']
         if len(silent) > 1:  # several nodes hardly end together, so there is a common cause
-            names = ', '.join(silent)
-            since = f'no report for {max(silent.values()):.0f} s'
             advice = f'perhaps the computer is overloaded (load {load_text()})'
-            return [
-                f'{names}: {since}; {advice}; if it persists, see their logs and restart bringup.sh'
-            ]
-        return [
-            f'{name}: no report for {silence:.0f} s; see its log, then restart the node or '
-            'bringup.sh'
-            for name, silence in silent.items()
-        ]
+            return [f'{since}; {advice}; if it persists, see their logs and restart bringup.sh']
+        return [f'{since}; see its log, then restart the node or bringup.sh']
 
     def _body(self) -> list[Trouble]:
         """Return the parts of the status line about isolated muscles and length offsets.

@@ -2,6 +2,7 @@
 """The content of the status line."""
 
 import math
+import os
 
 import numpy as np
 import pytest
@@ -24,6 +25,12 @@ def diagnostics(
     pairs = [KeyValue(key=key.replace('_', ' '), value=value) for key, value in values.items()]
     status = DiagnosticStatus(name=f'{node}: state', message=message, level=level, values=pairs)
     return DiagnosticArray(status=[status])
+
+
+@pytest.fixture
+def load(monkeypatch):
+    """Return a function that sets the load average of this computer."""
+    return lambda value: monkeypatch.setattr(os, 'getloadavg', lambda: (value, 0.0, 0.0))
 
 
 def test_before_the_first_sample_a_hint_explains_why_the_error_may_rise():
@@ -409,8 +416,36 @@ def test_a_calibration_that_cannot_end_is_shown_with_its_remedy():
     assert 'check the named sensor' in situation.trouble()
 
 
-def test_several_silent_nodes_are_put_down_to_the_computer():
+@pytest.mark.parametrize('nodes', [['controller'], ['controller', 'sim']])
+def test_no_restart_is_advised_while_the_load_of_the_computer_explains_silence(load, nodes):
     now = 100.0
+    situation = Situation('/left', lambda: now)
+    for node in nodes:
+        situation.diagnosed(diagnostics(f'/left/{node}'))
+    advised = {}
+    for is_busy in (False, True):
+        load(1e3 if is_busy else 0.0)
+        for _ in range(6):
+            now += 1.0
+            situation.tick()
+            trouble = situation.trouble()
+            if 'no report' in trouble:
+                advised[is_busy] = 'restart' in trouble, 'this computer is overloaded' in trouble
+                assert all(node in trouble for node in nodes) and situation.level() == 'error'
+        situation.tick()
+        for node in nodes:
+            situation.diagnosed(diagnostics(f'/left/{node}'))
+        assert situation.trouble() == ''
+    assert advised == {False: (True, False), True: (False, True)}
+    for _ in range(12):  # so long a silence is not due to the load alone
+        now += 1.0
+        situation.tick()
+    assert 'restart' in situation.trouble()
+
+
+def test_several_silent_nodes_are_put_down_to_the_computer(load):
+    now = 100.0
+    load(0.0)  # the average over a minute has not risen yet
     situation = Situation('/left', lambda: now)
     for node in ('sim', 'learner'):
         situation.diagnosed(diagnostics(f'/left/{node}'))
@@ -519,8 +554,9 @@ def test_an_error_of_any_node_is_shown_until_it_is_over():
     assert situation.trouble() == ''
 
 
-def test_a_node_that_no_longer_reports_is_an_error_but_our_own_pause_is_none():
+def test_a_node_that_no_longer_reports_is_an_error_but_our_own_pause_is_none(load):
     now = 100.0
+    load(0.0)
     situation = Situation('/left', lambda: now)
 
     def second(*nodes, lasting=1.0):
