@@ -7,15 +7,22 @@ With `-p moved:=true`, the emulated arm moves slowly through its range, as if a 
 doc/howto/your_driver.md states the contract of a driver; `check_driver` checks it.
 """
 
+import os
+import signal
 import sys
 import time
 from functools import partial
 
+if __name__ == '__main__':  # while the driver starts, Ctrl-C or SIGTERM ends it at once
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: os._exit(0))
+
 import numpy as np
 import rclpy
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -112,11 +119,21 @@ class Driver(Node):
         self.joints.publish(joint_message(self.robot.joints, theta, now))
 
 
+def main() -> None:
+    """Run the driver until Ctrl-C or SIGTERM."""
+    # The signal handlers of rclpy would shut the publishers down while `tick` uses them.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    executor, signals = SingleThreadedExecutor(), []
+    executor.add_node(Driver())
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *arguments: signals.append(arguments))
+    while not signals:
+        executor.spin_once(timeout_sec=0.1)
+    rclpy.shutdown()
+
+
 if __name__ == '__main__':
-    rclpy.init()
     try:
-        rclpy.spin(Driver())
+        main()
     except (MusculoskeletalError, ParameterException) as error:  # `robot` is unknown, or no string
         sys.exit(f'error: {error}')
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass

@@ -9,6 +9,12 @@ Replace `EmulatedArm` by the interface to your muscles.
 """
 
 import argparse
+import os
+import signal
+
+if __name__ == '__main__':  # Ctrl-C or SIGTERM ends the program at once
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: os._exit(130))
 
 import numpy as np
 

@@ -10,14 +10,21 @@ corrects for both differences. doc/howto/ros2_control.md describes the connectio
 """
 
 import math
+import os
+import signal
 import sys
 import time
+
+if __name__ == '__main__':  # while the robot starts, Ctrl-C or SIGTERM ends it at once
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: os._exit(0))
 
 import numpy as np
 import rclpy
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -104,11 +111,21 @@ class FakeRobot(Node):
         self.hardware.write(dict(zip(self.joints, self.commands)))
 
 
+def main() -> None:
+    """Run the robot until Ctrl-C or SIGTERM."""
+    # The signal handlers of rclpy would shut the publisher down while `update` uses it.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    executor, signals = SingleThreadedExecutor(), []
+    executor.add_node(FakeRobot())
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *arguments: signals.append(arguments))
+    while not signals:
+        executor.spin_once(timeout_sec=0.1)
+    rclpy.shutdown()
+
+
 if __name__ == '__main__':
-    rclpy.init()
     try:
-        rclpy.spin(FakeRobot())
+        main()
     except (MusculoskeletalError, ParameterException) as error:  # `robot` is unknown, or no string
         sys.exit(f'error: {error}')
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
