@@ -31,6 +31,7 @@ from musculoskeletal_ae.estimation.finding import (
     REVOKING,
     REVOKING_ONE,
     Finding,
+    Kind,
     Observation,
 )
 from musculoskeletal_ae.estimation.health import HealthMonitor
@@ -49,7 +50,7 @@ from musculoskeletal_ae.estimation.verification import LONGEST
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
-from musculoskeletal_ae.remedy import REPAIR
+from musculoskeletal_ae.remedy import REPAIR, Step, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
@@ -151,6 +152,28 @@ class Estimator:
     def cause(self) -> str:
         """The latched finding as a text for users; '' if there is none."""
         return self.suspects.cause
+
+    @property
+    def remedy(self) -> tuple[Step, ...]:
+        """Steps by which a user ends the anomaly; () without one and during a verification.
+
+        After a repair, the suspect may have another length offset. A reset is then refused, and a
+        length calibration ends the anomaly instead.
+        """
+        finding = self.suspects.finding
+        if finding is None or self.suspects.verification is not None:
+            return ()
+        is_repaired = finding.kind is Kind.SLACK_TENDON or self.suspects.has_suspect_jumped
+        if finding.remedy == REPAIR and is_repaired and self._has_wrong_length(finding.muscle):
+            return (Step.CALIBRATE_LENGTHS,)
+        return finding.remedy
+
+    @property
+    def advice(self) -> str:
+        """What ends the anomaly, as a text for users; '' without an anomaly."""
+        if self.suspects.verification is not None:
+            return f'wait until the muscle has been verified, within {LONGEST:g} s'
+        return sentence(self.remedy)
 
     # -- settings and services ------------------------------------------------------------------
 
@@ -277,7 +300,7 @@ class Estimator:
         self._check_suspect(tuple(isolating))
         if self.body.offsets.is_suspect:
             if not self.health.joints.agrees:
-                raise MusculoskeletalError(f'{self.cause}; {self.suspects.advice}')
+                raise MusculoskeletalError(f'{self.cause}; {self.advice}')
             self._use_body(self.body.with_offsets(self._valid_offsets))
         self.health.accept(range(self.robot.muscle_count))
         self._clear(self.suspects.clear(self.body.isolated))
@@ -454,8 +477,7 @@ class Estimator:
         if suspected is None or suspected.remedy != REPAIR or suspected.muscle in isolating:
             return
         if problem := self._problem_of(suspected.muscle):
-            again = 'then call estimator/reset again'
-            raise MusculoskeletalError(f'{self.cause}; {problem}; {again}')
+            raise MusculoskeletalError(f'{problem}; then call estimator/reset again')
         if self.suspects.has_suspect_jumped and offsets.known:
             # The other nodes trust the length again because its offset is published with a larger
             # standard deviation (`follow_offsets`).
@@ -463,19 +485,36 @@ class Estimator:
 
     def _problem_of(self, muscle: int) -> str:
         """Return why a muscle must not be used yet, or '' if it may be used."""
-        sample, mae = self.sample, self.state.complete_mae
-        if sample is None or mae is None:
+        check = self._repair_check()
+        if check is None:
             return ''
         if muscle in self.stream.jumping:
             return (
                 f'the length of {self.robot.muscles[muscle]} has just jumped; wait for '
                 f'{LIMITS.settled:g} s'
             )
+        demand = self._commands.demand(self.robot, check.sample.length, self.stepped_at)
+        return check.problem(muscle, demand, self._length_limit)
+
+    def _has_wrong_length(self, muscle: int) -> bool:
+        """Return whether a muscle is taut and at rest, but has a wrong length."""
+        check = self._repair_check()
+        if check is None or muscle in self.stream.jumping:
+            return False
+        return check.is_taut_with_wrong_length(muscle, self._length_limit)
+
+    def _repair_check(self) -> RepairCheck | None:
+        """Return a check of the newest readings, or None before the first and without a network."""
+        sample, mae = self.sample, self.state.complete_mae
+        if sample is None or mae is None:
+            return None
+        return RepairCheck(self.robot, mae, sample, self.body.isolated, self.measured)
+
+    @property
+    def _length_limit(self) -> float:
+        """Largest deviation of a length that fits the posture [m]."""
         limits = GAP_LEARNED if self.health.residual.is_calibrated else GAP_YOUNG
-        limit = float(np.max(limits.single)) if self.body.offsets.known else math.inf
-        demand = self._commands.demand(self.robot, sample.length, self.stepped_at)
-        check = RepairCheck(self.robot, mae, sample, self.body.isolated, self.measured)
-        return check.problem(muscle, demand, limit)
+        return float(np.max(limits.single)) if self.body.offsets.known else math.inf
 
     def _handle(self, finding: Finding | None, now: float) -> bool:
         """Latch a finding and isolate its muscle, as its kind and the settings require.

@@ -55,7 +55,7 @@ class RepairCheck(NamedTuple):
         if demanded >= bias and tension < LIMITS.slack_share * demanded:
             return f'{name} has no tension although the command demands tension; repair it'
         error = self._length_error(muscle)
-        may_be_slack = tension < LIMITS.slack_share * bias and error > 0.0
+        may_be_slack = self._is_slack(muscle) and error > 0.0
         if abs(error) <= limit or may_be_slack:
             return ''
         others = 'other muscles' if self.theta is None else 'joint sensors'
@@ -66,6 +66,21 @@ class RepairCheck(NamedTuple):
             f'(limit {1e3 * limit:.0f} mm); wait until its winch has come to rest, or call '
             'estimator/zero if the length stays wrong'
         )
+
+    def is_taut_with_wrong_length(self, muscle: int, limit: float) -> bool:
+        """Return whether a muscle is not slack, but its length does not fit the posture.
+
+        Its tendon is then not ruptured. Unless its winch is still moving, the length has an offset.
+
+        Args:
+            muscle: Index of the muscle.
+            limit: Largest |l − l'| [m]; infinite while the length offsets are unknown.
+        """
+        return not self._is_slack(muscle) and abs(self._length_error(muscle)) > limit
+
+    def _is_slack(self, muscle: int) -> bool:
+        bias = float(self.robot.tension.bias[muscle])
+        return float(self.sample.motor_tension[muscle]) < LIMITS.slack_share * bias
 
     def _length_error(self, muscle: int) -> float:
         """Return l − l' of a muscle [m]."""

@@ -43,7 +43,7 @@ def report(core: Estimator, now: float) -> Report:
         **_familiarity(core),
     }
     if core.suspects.finding is not None:
-        text = f'anomaly detected: {core.suspects.cause}; {core.suspects.advice}'
+        text = f'anomaly detected: {core.cause}; {core.advice}'
         return Report('error', text, {**values, 'state': 'anomaly'})
     if now - core.stepped_at > SILENCE:
         return Report('warn', 'no muscle_states', {**values, 'state': 'no_muscle_states'})
@@ -88,9 +88,9 @@ def _suspects(core: Estimator) -> dict[str, str]:
     values['finding'] = 'none' if suspects.finding is None else suspects.finding.kind.value
     if suspects.finding is not None:
         values['evidence'] = suspects.finding.evidence
-        if suspects.verification is None:
-            values['remedy'] = sentence(suspects.finding.remedy)
-            values[REMEDY_STEPS] = identifiers(suspects.finding.remedy)
+        if steps := core.remedy:
+            values['remedy'] = sentence(steps)
+            values[REMEDY_STEPS] = identifiers(steps)
     values['verification'] = 'none' if suspects.verification is None else 'running'
     if suspects.last_verdict is not None:
         values['last verified'] = suspects.last_verification

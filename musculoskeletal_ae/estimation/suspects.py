@@ -41,14 +41,13 @@ from collections.abc import Iterable
 from musculoskeletal_ae.estimation.finding import REVOKING, REVOKING_ONE, Finding, Kind
 from musculoskeletal_ae.estimation.settings import ISOLATE, Detection
 from musculoskeletal_ae.estimation.verification import (
-    LONGEST,
     ModuleLaw,
     Outcome,
     PositionLaw,
     Verdict,
     Verification,
 )
-from musculoskeletal_ae.remedy import REPAIR, sentence
+from musculoskeletal_ae.remedy import REPAIR
 from musculoskeletal_ae.robot.robot import Robot
 
 ACQUITTALS = 2  # number of suspects verified as healthy after which the next one is not verified
@@ -87,14 +86,6 @@ class SuspectHandling:
         if self.finding is None:
             return ''
         return f'{self._robot.muscles[self.finding.muscle]}: {self.finding.evidence}'
-
-    @property
-    def advice(self) -> str:
-        """What ends the anomaly, as a text for users; '' without a latched finding."""
-        if self.finding is None:
-            return ''
-        wait = f'wait until the muscle has been verified, within {LONGEST:g} s'
-        return wait if self.verification else sentence(self.finding.remedy)
 
     @property
     def last_verification(self) -> str:

@@ -170,7 +170,7 @@ class Estimator(Shell):
         return f'isolated: {self.robot.names(self.core.body.isolated) or "none"}'
 
     def _reset(self, _: Trigger.Request) -> str:
-        cause, finding = self.core.cause, self.core.suspects.finding
+        finding = self.core.suspects.finding
         self.core.reset()
         if finding is not None:
             self.candidates.validator.declare_repaired([finding.muscle], time.monotonic())
@@ -180,9 +180,10 @@ class Estimator(Shell):
         self.detected.publish(Bool(data=False))
         self._publish_isolated()
         self._report()
-        if not cause:
+        if finding is None:
             return 'no anomaly was detected'
-        return f'cleared: {cause}; if the cause is still present, it is detected again'
+        muscle = self.robot.muscles[finding.muscle]
+        return f'cleared the anomaly of {muscle}; a fault that is still present is detected again'
 
     def _check_health(self, _: Trigger.Request) -> str:
         """Confirm that no anomaly is detected; other nodes then clear the anomaly they latched.
@@ -270,7 +271,7 @@ class Estimator(Shell):
             self.published_anomaly = detected
             self.detected.publish(Bool(data=detected))  # first, because it stops the arm
             if detected:
-                text = f'anomaly detected: {self.core.cause}; {self.core.suspects.advice}'
+                text = f'anomaly detected: {self.core.cause}; {self.core.advice}'
             else:
                 text = self.core.suspects.last_verification
             self.get_logger().warning(text)

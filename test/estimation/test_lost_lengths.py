@@ -153,7 +153,7 @@ def test_a_ruptured_tendon_is_not_taken_for_a_wrong_length_while_no_commands_arr
     arm.go(2.0)
     assert arm.kind is Kind.SLACK_TENDON
     assert arm.core.suspects.finding.muscle == muscle
-    assert 'repair' in arm.core.suspects.advice
+    assert 'repair' in arm.core.advice
     assert arm.offsets.known
 
 
@@ -186,7 +186,7 @@ def test_the_repair_of_a_suspect_keeps_the_offsets(ruptured):
     repair(ruptured)
     assert ruptured.core.suspects.has_suspect_jumped
     assert ruptured.kind is Kind.SLACK_TENDON
-    assert ruptured.core.suspects.advice == 'repair the muscle; call estimator/reset'
+    assert ruptured.core.advice == 'repair the muscle; call estimator/reset'
     assert ruptured.offsets is before
     ruptured.core.reset()
     ruptured.go(3.0, sensors=ruptured.has_sensors)
@@ -206,7 +206,7 @@ def test_a_jump_of_another_muscle_during_a_repair_revokes_the_offsets(ruptured, 
     ruptured.off = jump
     ruptured.go(2.0, sensors=ruptured.has_sensors)
     assert ruptured.offsets.is_suspect
-    assert ruptured.core.suspects.advice == 'call estimator/zero'
+    assert ruptured.core.advice == 'call estimator/zero'
     with pytest.raises(MusculoskeletalError, match='estimator/zero'):
         ruptured.core.reset()
 
@@ -217,6 +217,7 @@ def test_after_a_repair_with_another_zero_the_reset_is_refused_until_a_calibrati
     with pytest.raises(MusculoskeletalError, match=r'(shorter|longer) than.*estimator/zero'):
         ruptured.core.reset()
     assert ruptured.kind is Kind.SLACK_TENDON
+    assert ruptured.core.report(ruptured.time).values['remedy steps'] == 'calibrate_lengths'
     ruptured.core.calibrate_lengths()
     assert ruptured.kind is None
 
@@ -364,6 +365,8 @@ def test_a_reset_right_after_the_jump_of_a_repair_is_refused_until_the_jump_is_o
 
 
 def test_a_reset_without_a_repair_is_refused_but_the_suspect_can_be_isolated(ruptured):
+    steps = ruptured.core.report(ruptured.time).values['remedy steps']
+    assert steps == 'repair_muscle, reset_estimator'
     with pytest.raises(MusculoskeletalError, match=r'no tension|shorter'):
         ruptured.core.reset()
     ruptured.core.reset(isolating=[2])

@@ -177,7 +177,7 @@ def test_an_anomaly_is_published_logged_and_latched_until_reset(estimator, healt
         answer(estimator, healthy)
     assert detected[-1].data
     response = estimator.call(Trigger, 'estimator/reset')
-    assert response.success and response.message.startswith('cleared: ')
+    assert response.success and response.message.startswith('cleared the anomaly')
     estimator.wait(lambda: not detected[-1].data, 'the reset')
     assert estimator.call(Trigger, 'estimator/reset').message == 'no anomaly was detected'
 
