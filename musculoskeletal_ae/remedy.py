@@ -60,11 +60,29 @@ STEPS = {step.identifier: step for step in Step}  # all steps by identifier
 REMEDY_STEPS = 'remedy steps'  # key of a value in /diagnostics
 #: remedy for an anomaly
 REPAIR = Step.REPAIR_MUSCLE, Step.RESET_ESTIMATOR
+#: key of a value of hardware_emulator: the parameters that cause a fault, separated by commas
+EMULATED_FAULTS = 'emulated faults'
+#: how to repair a muscle of an emulated arm, by the parameter of hardware_emulator
+EMULATED_REPAIRS = {
+    'ruptured_muscles': (
+        "set ruptured_muscles of hardware_emulator to [''], or press Repair on the page"
+    ),
+    'faults': "set faults of hardware_emulator to ['']",
+}
 
 
-def sentence(steps: Iterable[Step]) -> str:
-    """Return a remedy as a text for users."""
-    return '; '.join(step.text for step in steps)
+def sentence(steps: Iterable[Step], emulated_faults: str = '') -> str:
+    """Return a remedy as a text for users.
+
+    Args:
+        steps: The steps of the remedy.
+        emulated_faults: The value EMULATED_FAULTS of the emulator, or ''.
+    """
+    repairs = [
+        repair for name, repair in EMULATED_REPAIRS.items() if name in emulated_faults.split(', ')
+    ]
+    how = f': {" and ".join(repairs)}' if repairs else ''
+    return '; '.join(step.text + how * (step is Step.REPAIR_MUSCLE) for step in steps)
 
 
 def identifiers(steps: Iterable[Step]) -> str:

@@ -23,6 +23,7 @@ from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.arm import Arm, Markers
 from musculoskeletal_ae.nodes.messages import RELIABLE, serve
+from musculoskeletal_ae.remedy import EMULATED_FAULTS, EMULATED_REPAIRS
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.robot.kinematics import body_frames
@@ -142,7 +143,12 @@ class HardwareEmulator(Arm):
     def report(self) -> Report:
         """Return the diagnostic report."""
         hottest = np.fmax.reduce(self.reading.temperature)  # NaN only if all temperatures are NaN
-        values = {'hottest module': f'{hottest:.1f} °C', 'real-time factor': f'{self.pace:.2f}'}
+        faults = [name for name in EMULATED_REPAIRS if any(self.parameter(name))]
+        values = {
+            'hottest module': f'{hottest:.1f} °C',
+            'real-time factor': f'{self.pace:.2f}',
+            EMULATED_FAULTS: ', '.join(faults) or 'none',
+        }
         if self.arm.has_diverged:
             problem = 'the simulation diverged under excessive forces'
             return Report('error', f'{problem}; call hardware_emulator/reset', values)

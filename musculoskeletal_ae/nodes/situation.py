@@ -11,7 +11,7 @@ import contextlib
 import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -26,7 +26,7 @@ from musculoskeletal_ae.estimation.verification import LONGEST
 from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC
 from musculoskeletal_ae.nodes.progress import LONGEST_STALL
 from musculoskeletal_ae.nodes.sources import SEVERAL
-from musculoskeletal_ae.remedy import REMEDY_STEPS, REPAIR, Step
+from musculoskeletal_ae.remedy import EMULATED_FAULTS, REMEDY_STEPS, REPAIR, Step
 from musculoskeletal_ae.report import (
     ANOMALY,
     END_OF_RECORDING,
@@ -323,7 +323,7 @@ class Situation:
         elif self.detected and is_in_stop:
             troubles.append(Trouble(f'ANOMALY: {self.suspect}{evidence}'))
         elif self.detected:
-            troubles.append(_with_remedy(f'ANOMALY: {self.suspect}{evidence}', *of_finding))
+            troubles.append(self._with_remedy(f'ANOMALY: {self.suspect}{evidence}', *of_finding))
         stop = control.get('stop', cause)
         if is_stopped and ends_by_itself and not lasting:
             if self.detected and cause != StopCause.ANOMALY.identifier:
@@ -337,9 +337,16 @@ class Situation:
                 settled = stops.CONSEQUENCES if self._has_consequences else ()
                 needed = lasting if ends_by_itself else causes
                 steps = tuple(stops.remedy_of(needed, explored, known, settled))
-                text = remedy.sentence(steps)
+                text = self._sentence(steps)
             troubles.append(Trouble(f'STOPPED: {stop} (to go on: {text})', steps))
         return troubles
+
+    def _with_remedy(self, text: str, *steps: Step) -> Trouble:
+        return Trouble(f'{text} (to go on: {self._sentence(steps)})', steps)
+
+    def _sentence(self, steps: Iterable[Step]) -> str:
+        """Return a remedy as a text, which also states how to repair an emulated arm."""
+        return remedy.sentence(steps, self._values('hardware_emulator').get(EMULATED_FAULTS, ''))
 
     def _mismatches(self) -> list[str]:
         return [
@@ -396,7 +403,7 @@ class Situation:
                 steps = CALIBRATION_STEPS if values.get('calibration problem') else ()
                 if not steps and values.get(CALIBRATION) == GENTLE_MOTION and self._stands_still:
                     steps = (Step.EXPLORE_GENTLY,)
-            troubles.append(_with_remedy(text, *steps) if steps else Trouble(text))
+            troubles.append(self._with_remedy(text, *steps) if steps else Trouble(text))
         return troubles
 
     @property
@@ -430,7 +437,7 @@ class Situation:
             return ''
         has_faults = values.get(ISOLATION, names) != names
         steps = (Step.REPAIR_MUSCLE,) * has_faults + (Step.RESTORE_MUSCLES,)
-        return f'isolated: {", ".join(each)} (to use it again: {remedy.sentence(steps)})'
+        return f'isolated: {", ".join(each)} (to use it again: {self._sentence(steps)})'
 
     @property
     def is_verifying(self) -> bool:
@@ -487,7 +494,3 @@ def _is_needed(name: str) -> bool:
 def _is_own(name: str) -> bool:
     """Return whether a node only summarizes the reports of other nodes."""
     return name.rpartition('/')[2] == 'bringup_status'
-
-
-def _with_remedy(text: str, *steps: Step) -> Trouble:
-    return Trouble(f'{text} (to go on: {remedy.sentence(steps)})', steps)

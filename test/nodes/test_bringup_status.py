@@ -212,6 +212,19 @@ def test_an_anomaly_is_shown_with_the_muscle_and_every_step_to_take():
     assert situation.trouble() == ''
 
 
+@pytest.mark.parametrize('parameter', ['ruptured_muscles', 'faults'])
+def test_on_an_emulated_arm_the_remedy_names_the_parameter_that_repairs_the_muscle(parameter):
+    situation = Situation('/left')
+    situation.diagnosed(found(Kind.SLACK_TENDON))
+    situation.diagnosed(diagnostics('/left/hardware_emulator', emulated_faults=parameter))
+    repair = f"repair the muscle: set {parameter} of hardware_emulator to ['']"
+    for report in (diagnostics('/left/controller'), stopped(StopCause.ANOMALY)):
+        situation.diagnosed(report)
+        assert repair in situation.trouble()
+    situation.diagnosed(diagnostics('/left/hardware_emulator', emulated_faults='none'))
+    assert 'hardware_emulator' not in situation.trouble()
+
+
 def test_an_anomaly_is_shown_with_its_evidence_and_the_learner_advises_nothing_else():
     situation = Situation('/left')
     suspect = {'finding': 'slack_tendon', 'suspect_muscle': 'biceps', 'evidence': 'no tension'}
