@@ -44,6 +44,8 @@ START_PATIENCE = 1800  # longest wait for the first status line, installation in
 COMMAND_PATIENCE = 900  # longest duration of all commands of a page after that [s]
 #: longest duration of a `ros2` command [s]; if the system has ended, the command would never end
 ANSWER_PATIENCE = 300
+#: what `bringup.sh` installs into a clone; the other files that a page creates are removed
+INSTALLED = ('/.venv', '/.cache', '/build', '/install', '/log', '__pycache__', '*.egg-info')
 NAME = 'musculoskeletal_ae'
 INSTALL, ROS2 = 'doc/howto/install.md', 'ros2'
 FUNCTIONS = f"""
@@ -177,8 +179,8 @@ def follow(page: str, clone: Path, home: Path, repository: Path) -> bool:
     ) as shell:  # fmt: skip
         for line in shell.stdout or ():
             print(line.replace(str(clone), '…').replace(str(home), '~'), end='', flush=True)
-    # Remove files that the page created, but keep ignored ones such as the installed packages.
-    subprocess.run(['git', 'clean', '-fdq'], cwd=clone, check=True)
+    keep = (f'--exclude={name}' for name in INSTALLED)
+    subprocess.run(['git', 'clean', '-fdqx', *keep], cwd=clone, check=True)
     return shell.returncode == 0
 
 
