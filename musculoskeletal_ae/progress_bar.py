@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shows the progress of a long task on stderr: a bar on a terminal, lines of text elsewhere."""
 
+import math
 import os
 import sys
 import time
@@ -10,7 +11,11 @@ from tqdm import tqdm
 
 REPORT_INTERVAL = 5.0  # time between two lines of text [s]
 NOTE_INTERVAL = 0.2  # time between two updates of the note behind a bar [s]
-FORMAT = '{desc}: {percentage:3.0f}%|{bar}| {elapsed} < {remaining}{postfix}'
+FORMAT = '{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}'
+#: time [s] and share of the task after which the remaining time is estimated; estimates from less
+#: are wrong by large factors
+ESTIMATE_TIME, ESTIMATE_SHARE = 5.0, 0.05
+SMOOTHING_TIME = 30.0  # time constant over which the speed is averaged [s]
 
 
 def is_bar_visible() -> bool:
@@ -29,7 +34,8 @@ class ProgressBar:
     """The progress of one task; use it as a context manager, and call `add` after each part.
 
     Lines of text look like `training: 40 %, loss 0.0213, about 12 s left`. They are printed every
-    REPORT_INTERVAL, so that short tasks print none.
+    REPORT_INTERVAL, so that short tasks print none. The remaining time is left out until
+    ESTIMATE_TIME has passed and ESTIMATE_SHARE is done.
     """
 
     def __init__(
@@ -49,6 +55,9 @@ class ProgressBar:
         )
         self._done = 0.0
         self._first: tuple[float, float] | None = None  # time [s] and sum after the first part
+        self._last = 0.0  # time of the last part [s]
+        # sums of durations [s] and parts since the first part, in which old ones count less
+        self._recent_time = self._recent_parts = 0.0
         self._shown = time.perf_counter()  # time of the last line of text or note [s]
 
     def __enter__(self) -> 'ProgressBar':
@@ -72,18 +81,34 @@ class ProgressBar:
         self._done = min(self._done + part, self._total)
         if self._first is None:
             self._first = now, self._done
-        elif self._is_bar:
-            if self._note is not None and now - self._shown >= NOTE_INTERVAL:
-                self._shown = now
-                self._bar.set_postfix_str(self._note(), refresh=False)
-        elif now - self._shown >= REPORT_INTERVAL:
+        else:
+            kept = math.exp((self._last - now) / SMOOTHING_TIME)
+            self._recent_time = kept * self._recent_time + now - self._last
+            self._recent_parts = kept * self._recent_parts + part
+        self._last = now
+        if now - self._shown >= (NOTE_INTERVAL if self._is_bar else REPORT_INTERVAL):
             self._shown = now
-            begun, done = self._first
-            share = 100.0 * self._done / self._total
-            left = (self._total - self._done) / (self._done - done) * (now - begun)
-            note = '' if self._note is None else f', {self._note()}'
-            self._print(f'{self._title}: {share:.0f} %{note}, about {left:.0f} s left')
+            self._show(now)
         self._bar.update(self._done - self._bar.n)
+
+    def _show(self, now: float) -> None:
+        """Show the note and the remaining time beside the bar, or a line of text."""
+        note = '' if self._note is None else self._note()
+        texts = ', '.join(filter(None, (note, self._left(now))))
+        if self._is_bar:
+            self._bar.set_postfix_str(texts, refresh=False)
+        else:
+            share = f'{self._title}: {100.0 * self._done / self._total:.0f} %'
+            self._print(', '.join(filter(None, (share, texts))))
+
+    def _left(self, now: float) -> str:
+        """Return the remaining time as a text, or '' while an estimate would be unreliable."""
+        assert self._first is not None
+        begun, done = self._first
+        if now - begun < ESTIMATE_TIME or self._done - done < ESTIMATE_SHARE * self._total:
+            return ''
+        left = (self._total - self._done) * self._recent_time / self._recent_parts
+        return f'about {left:.0f} s left'
 
     def _print(self, text: str) -> None:
         print(text, file=sys.stderr, flush=True)

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 import fcntl
 import os
+import re
 import struct
 import sys
 import termios
 import time
 from contextlib import suppress
+from types import SimpleNamespace
 
 import pytest
 
@@ -49,10 +51,44 @@ def test_a_short_task_prints_one_line_and_no_progress(capsys):
 
 def test_a_long_task_prints_its_progress_at_intervals(capsys, monkeypatch):
     monkeypatch.setattr(progress_bar, 'REPORT_INTERVAL', 0.1)
+    monkeypatch.setattr(progress_bar, 'ESTIMATE_TIME', 0.0)
     work(seconds=0.5, parts=100)
     first, *lines = capsys.readouterr().err.splitlines()
     assert first == 'working hard' and 1 <= len(lines) <= 5 + 1
-    assert lines[0].startswith('working: ') and ' %, note, about ' in lines[0]
+    assert lines[0].startswith('working: ') and ' %, note, about ' in lines[-1]
+
+
+def lines_of(durations, capsys, monkeypatch):
+    """Return the time [s] and the text of each line about parts with these durations [s]."""
+    now = 0.0
+    monkeypatch.setattr(progress_bar, 'time', SimpleNamespace(perf_counter=lambda: now))
+    lines = []
+    with ProgressBar('working', len(durations)) as bar:
+        for duration in durations:
+            now += duration
+            bar.add()
+            lines += [(now, line) for line in capsys.readouterr().err.splitlines()]
+    return lines
+
+
+@pytest.mark.parametrize('part', [0.05, 1.0], ids=['time', 'share'])
+def test_the_remaining_time_is_not_shown_before_5_s_and_5_percent(part, capsys, monkeypatch):
+    lines = lines_of([5.5, *[part] * 999], capsys, monkeypatch)
+    for at, line in lines:
+        is_reliable = at >= 5.5 + max(5.0, part * 50.0)
+        assert (' s left' in line) == is_reliable, (at, line)
+    assert ' s left' in lines[-1][1] and ' s left' not in lines[0][1]
+
+
+def test_the_remaining_time_does_not_jump_if_some_parts_take_much_longer(capsys, monkeypatch):
+    durations = [3.0 if part % 20 == 19 else 0.1 for part in range(1000)]
+    ends = [
+        at + float(match[1])
+        for at, line in lines_of(durations, capsys, monkeypatch)
+        if (match := re.search(r'about (\d+) s left', line))
+    ]
+    assert len(ends) > 30
+    assert all(abs(end - sum(durations)) < 0.3 * sum(durations) for end in ends)
 
 
 def test_a_terminal_shows_a_bar(shown_on):
