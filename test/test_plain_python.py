@@ -12,6 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.robot.robot import Robot
+
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / 'musculoskeletal_ae'
 #: folders of the package, and the extra of setup.cfg that installs what they import
@@ -112,6 +115,23 @@ def test_the_example_learns_without_ros(tmp_path):
     assert any(line.startswith('training on the geometric model: step 0 ') for line in progress)
     assert sum(line.startswith('posture ') for line in progress) == 4  # a line for each posture
     assert (tmp_path / 'a.safetensors').exists()
+
+
+def test_the_example_saves_what_it_has_learned_when_it_is_interrupted(tmp_path):
+    options = ['--postures', '1000', '--steps', '100', '--out', str(tmp_path / 'a.safetensors')]
+    with subprocess.Popen(
+        [sys.executable, ROOT / 'examples' / 'learn_in_python.py', *options],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+    ) as example:  # fmt: skip
+        assert any(line.startswith('posture 3 ') for line in example.stdout)
+        example.terminate()
+        _, printed = example.communicate(timeout=60)
+    assert example.returncode == 130
+    learned = tmp_path / 'a.interrupted.safetensors'
+    assert printed.strip() == f'interrupted: {learned} has the network learned so far'
+    checkpoint.load(learned, Robot.load('arm26'))
+    assert not (tmp_path / 'a.safetensors').exists()
 
 
 def test_bringup_and_the_recordings_are_installed_with_the_package(monkeypatch):
