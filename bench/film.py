@@ -82,7 +82,7 @@ def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[st
         browser.close_notifications()
         take(options.learning, EVERY)
         kept = {'view.png': len(frames) - 1}
-        browser.click(*browser.centre('Rupture'))
+        browser.press('Rupture')
         if not take(PATIENCE, EVERY_LATER, until=lambda text: 'ANOMALY' in text):
             raise AssertionError(f'no anomaly was detected within {PATIENCE:g} s')
         kept['view_rupture.png'] = len(frames) - 1

@@ -31,6 +31,13 @@ SLOWLY = """
 const soon = window.requestAnimationFrame.bind(window);
 window.requestAnimationFrame = (draw) => setTimeout(() => soon(draw), 300);
 """
+#: script that notes the text of each button that receives a click
+NOTE_PRESSED = """
+document.addEventListener('click', (event) => {
+  const button = event.target.closest('button');
+  if (button) window.pressed = button.innerText.trim();
+}, true);
+"""
 #: expression for all text on the page, without that in shadow trees
 TEXT = 'document.body ? document.body.innerText : ""'
 
@@ -67,7 +74,8 @@ class Browser:
                 'Emulation.setDeviceMetricsOverride', width=size[0], height=size[1], **metrics
             )
             self.call('Page.enable')
-            self.call('Page.addScriptToEvaluateOnNewDocument', source=SLOWLY)
+            for script in SLOWLY, NOTE_PRESSED:
+                self.call('Page.addScriptToEvaluateOnNewDocument', source=script)
             self.call('Page.navigate', url=url)
         except BaseException:
             self._process.kill()
@@ -124,12 +132,6 @@ class Browser:
             clickCount=int(kind != 'mouseMoved'),
         )
 
-    def click(self, x: float, y: float) -> None:
-        """Click at (x, y) [pixels] with the left button."""
-        self.mouse('mouseMoved', x, y)
-        self.mouse('mousePressed', x, y, pressed=True)
-        self.mouse('mouseReleased', x, y)
-
     def drag(self, start: tuple[float, float], end: tuple[float, float], steps: int = 8) -> None:
         """Press the left button at `start` and move to `end`; keep the button pressed."""
         self.mouse('mouseMoved', *start)
@@ -139,18 +141,27 @@ class Browser:
             self.mouse('mouseMoved', *at, pressed=True)
             time.sleep(0.06)
 
-    def centre(self, button: str) -> tuple[float, float]:
-        """Return the position [pixels] of the button with the text `button`."""
-        result = self._wait(
-            lambda: self.evaluate(
-                '(() => { const b = [...document.querySelectorAll("button")].find('
-                f'b => b.innerText.trim() === {json.dumps(button)}); if (!b) return null;'
-                'b.scrollIntoView({block: "center"}); const r = b.getBoundingClientRect();'
-                'return [r.x + r.width / 2, r.y + r.height / 2]; })()'
-            ),
-            f'the button {button}',
+    def press(self, button: str) -> None:
+        """Press the button with the text `button`, by the keyboard.
+
+        A click could miss the button, because it moves whenever the readings above it need more or
+        fewer lines.
+        """
+        focus = (
+            '(() => { const b = [...document.querySelectorAll("button")].find('
+            f'b => b.innerText.trim() === {json.dumps(button)}); if (!b) return false;'
+            'b.scrollIntoView({block: "center"}); b.focus(); return true; })()'
         )
-        return result[0], result[1]
+
+        def is_pressed() -> bool:
+            if self.evaluate(focus):
+                for kind in 'keyDown', 'keyUp':
+                    key = {'key': 'Enter', 'code': 'Enter', 'windowsVirtualKeyCode': 13}
+                    self.call('Input.dispatchKeyEvent', type=kind, text='\r', **key)
+            return self.evaluate('window.pressed') == button
+
+        self.evaluate('window.pressed = null')
+        self._wait(is_pressed, f'the button {button}')
 
     def type_at(self, slider: str, text: str) -> None:
         """Replace the number in the box of the slider with the label `slider`, key by key."""

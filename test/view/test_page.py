@@ -214,7 +214,7 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         assert 'Recording' not in page.text  # this panel appears only while a bag is replayed
         page.close_notifications()
         before = page.screenshot(SCREENSHOTS / 'loaded.png')
-        page.click(*page.centre('Explore'))
+        page.press('Explore')
         see('exploring')
         start = np.array(graph.received['estimated_joint_states'][-1].position)
         graph.wait(
@@ -226,7 +226,7 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         page.close_notifications()
         assert page.screenshot(SCREENSHOTS / 'moving.png') != before
         assert not targets and not any(message.data for message in detected)
-        page.click(*page.centre('End exploring'))
+        page.press('End exploring')
         graph.wait(lambda: modes[-1].data == 'idle', 'the end of the exploration')
         # When the arm comes to rest, the sliders show its posture, and would replace a number that
         # is being typed at this moment.
@@ -234,14 +234,14 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         graph.next('estimated_joint_states', 100)  # time for the page to show this posture
         page.type_at('elbow', '-1.2')
         graph.wait(lambda: targets and list(targets[-1].position) == [-1.2], 'the target')
-        page.click(*page.centre('Explore'))
+        page.press('Explore')
         see('exploring')
-        page.click(*page.centre('Rupture'))
+        page.press('Rupture')
         see('ANOMALY: ')
         assert detected[-1].data
         # The page must refuse this as long as the muscle is ruptured, because the arm would stop
         # again.
-        page.click(*page.centre('Reset after a stop'))
+        page.press('Reset after a stop')
         see('press "Repair" first')
         assert 'controller/reset' not in page.text
         graph.spin(1.0)
