@@ -198,10 +198,10 @@ class Listening:
                     if unknown
                     else 'the angles of all joints were never known at the same time'
                 )
-                verdict.notes.append(
-                    f'sign, zero and order of l were not checked, because {reason}; publish '
-                    'joint_states of all joints, or hold the arm still and use --posture of '
-                    'check_driver'
+                verdict.advise(
+                    ('order', 'sign', 'zero') if self._zeroed else ('order', 'sign'),
+                    f'{reason}; publish joint_states of all joints, or hold the arm still and use '
+                    '--posture of check_driver',
                 )
         return verdict
 
@@ -453,8 +453,15 @@ class Listening:
         if all_turned and self._are_turned(length, model, moved):
             verdict.failed('all signs', *range(len(own)), doubt=doubt)
             return float(np.minimum(fit[rows, best], inverse).sum())
-        if doubt:
-            verdict.notes.append('sign and order were checked at rest only' + doubt)
+        by_hand = 'move the arm by hand while check_driver listens, without --move'
+        if self._stated:
+            by_hand = f'publish joint_states of all joints, and {by_hand}'
+        of_positions = 'use --move, with a --tension at which the joints move'
+        verdict.advise(('order', 'sign'), robot.actuation.choose(by_hand, of_positions))
+        # Columns that fit better if they are exchanged with another one, but not clearly enough for
+        # a fault, (M,).
+        square, own_square = np.square(fit), np.square(own)
+        is_unclear = (square + square.T < own_square[:, None] + own_square).any(axis=1)
         for m, other in enumerate(best.tolist()):
             off = float(np.median((length - model)[:, m]))
             turned = all_turned or inverse[m] < fit[m, other]
@@ -474,7 +481,8 @@ class Listening:
                     inverted = SLOPES[0] < -slope < SLOPES[1]
                     verdict.failed('sign' if inverted else 'slope', m, detail=detail)
                     continue
-                verdict.passed('order', m)
+                if not is_unclear[m]:
+                    verdict.passed('order', m)
                 verdict.passed('sign', m)
             if not self._zeroed:
                 continue

@@ -53,8 +53,11 @@ class Verdict:
         self._state = np.full((robot.muscle_count, len(CHECKS)), OPEN, dtype=object)
         self.faults: list[Fault] = []
         self.notes: list[str] = []  # remarks, and checks that were not possible
+        #: checks that were not possible for all muscles, and how to make them possible
+        self._remedies: list[tuple[tuple[Check, ...], str]] = []
         #: observations of checks that failed while this computer was overloaded, by check
         self._excused: dict[str, list[str]] = {}
+        self._load = ''  # load of this computer at the first of these observations
         #: why the motion test must not begin although no fault was found; empty if it may begin
         self.obstacle = ''
 
@@ -68,6 +71,10 @@ class Verdict:
         """Record that some muscles, or none, passed a check, unless they have failed it."""
         for m in muscles:
             self.passed(check, m)
+
+    def has_passed(self, check: Check, m: int) -> bool:
+        """Return whether muscle m passed a check."""
+        return bool(self._state[m, CHECKS.index(check)] == OK)
 
     def failed(self, what: str, *muscles: int, **values: object) -> None:
         """Record a fault.
@@ -94,7 +101,12 @@ class Verdict:
             check: The check.
             observation: What would have been a fault on a computer that is not overloaded.
         """
+        self._load = self._load or load_text()
         self._excused.setdefault(check, []).append(observation)
+
+    def advise(self, checks: tuple[Check, ...], remedy: str) -> None:
+        """Record how to make checks; the report names the muscles that still lack one of them."""
+        self._remedies.append((checks, remedy))
 
     def forbid_motion(self, reason: str) -> None:
         """Record why the motion test must not begin although no fault was found."""
@@ -107,6 +119,7 @@ class Verdict:
         self._state[(self._state == OPEN) & (other._state == OK)] = OK
         self.faults += other.faults
         self.notes += other.notes
+        self._remedies += other._remedies
         for check, observations in other._excused.items():
             self._excused.setdefault(check, []).extend(observations)
         self.obstacle = self.obstacle or other.obstacle
@@ -135,14 +148,18 @@ class Verdict:
         """
         if self.faults:
             return 'driver check FAILED: fix the faults above'
+        if not (unjudged := self._unjudged(CHECKS)):
+            return 'the driver keeps its contract'
+        return f'no fault found; not judged: {unjudged}'
+
+    def _unjudged(self, checks: Sequence[Check]) -> str:
+        """Return which of these checks were not made, and for which muscles; '' if all were."""
         names: dict[str, list[str]] = {}  # checks by the muscles that they did not judge
-        for check, is_open in zip(CHECKS, (self._state == OPEN).T, strict=True):
+        for check in checks:
+            is_open = self._state[:, CHECKS.index(check)] == OPEN
             if is_open.any():
                 names.setdefault(self._whose(np.flatnonzero(is_open).tolist()), []).append(check)
-        if not names:
-            return 'the driver keeps its contract'
-        parts = [f'{", ".join(checks)} of {whose}' for whose, checks in names.items()]
-        return f'no fault found; not judged: {"; ".join(parts)}'
+        return '; '.join(f'{", ".join(checks)} of {whose}' for whose, checks in names.items())
 
     def _whose(self, muscles: Sequence[int]) -> str:
         """Return the names of muscles, separated by commas, or 'all muscles' for all of them."""
@@ -150,25 +167,41 @@ class Verdict:
             return 'all muscles'
         return ', '.join(self.robot.muscles[m] for m in muscles)
 
-    def __str__(self) -> str:
+    @property
+    def table(self) -> str:
+        """The result of each check for each muscle."""
         names = self.robot.muscles
         width = max(map(len, names)) + 2
         rows = zip(('', *names), (CHECKS, *self._state))
         lines = [f'{name:<{width}}' + ''.join(f'{cell:>9}' for cell in row) for name, row in rows]
-        lines.append(f'{OPEN}: not judged')
+        return '\n'.join(lines)
+
+    @property
+    def remarks(self) -> list[str]:
+        """Explanations of the table: faults, checks that were not possible, and notes."""
+        remarks = [f'{OPEN}: not judged']
         if (self._state[:, CHECKS.index('zero')] == OK).any():
             tolerance = f'{1e3 * ZERO_TOLERANCE:.0f} mm'
-            lines.append(f'zero ok: within {tolerance} of the route; smaller errors are not found')
-        for fault in self.faults:
-            lines += [
-                f'fault: {fault.check} of {self._whose(fault.muscles)}: {fault.observation}',
-                f'    change: {fault.change}',
-            ]
+            remarks.append(
+                f'zero ok: within {tolerance} of the route; smaller errors are not found'
+            )
+        remarks += [
+            f'fault: {fault.check} of {self._whose(fault.muscles)}: {fault.observation}\n'
+            f'    change: {fault.change}'
+            for fault in self.faults
+        ]
         if self._excused:
             observations = '; '.join(chain.from_iterable(self._excused.values()))
-            lines.append(
+            remarks.append(
                 f'not judged: {", ".join(self._excused)} (this computer is overloaded, load '
-                f'{load_text()}): {observations}. A driver that runs here may be slow for this '
+                f'{self._load}): {observations}. A driver that runs here may be slow for this '
                 'reason alone: end other programs and repeat the check'
             )
-        return '\n'.join([*lines, *(f'note: {note}' for note in self.notes)])
+        remarks += [f'note: {note}' for note in self.notes]
+        for checks, remedy in self._remedies:
+            if unjudged := self._unjudged(checks):
+                remarks.append(f'note: {unjudged} not judged: {remedy}')
+        return remarks
+
+    def __str__(self) -> str:
+        return '\n'.join([self.table, *self.remarks])

@@ -211,12 +211,13 @@ def _check(options: Namespace, arguments: list[str]) -> int:
         kind = import_heavy('musculoskeletal_ae.driver.verdict').Verdict
         _winding(robot, kind(robot), options)
     start_ros(arguments)
-    driver, reported = CheckDriver(robot, options), None
+    driver, reported, remarks = CheckDriver(robot, options), None, list[str]()
     while True:
         verdict = driver.listen()
         faults = {fault[:2] for fault in verdict.faults}
         if faults != reported:
             _say(verdict)
+            remarks = verdict.remarks
         reported = faults
         if verdict.allows_motion or not options.wait:
             break
@@ -229,7 +230,8 @@ def _check(options: Namespace, arguments: list[str]) -> int:
         driver.alone()
         if verdict.allows_motion:
             driver.wind(verdict)
-            _say(verdict)
+            new = [remark for remark in verdict.remarks if remark not in remarks]
+            _say('\n'.join(['after the motion test:', verdict.table, *new]))
         else:
             reason = 'fix the faults above first' if verdict.faults else verdict.obstacle
             _say(f'motion test skipped: {reason}')

@@ -311,6 +311,36 @@ def test_only_a_complete_check_says_that_the_driver_keeps_its_contract():
     assert verdict.conclusion == 'the driver keeps its contract'
 
 
+@pytest.mark.parametrize('joints', [True, False])
+@pytest.mark.parametrize('follows', ['muscle stiffness', 'position'])
+def test_a_remark_names_a_check_as_not_judged_only_while_the_table_shows_it_as_not_judged(
+    follows, joints
+):
+    driver = Driver(ROBOT if follows == 'muscle stiffness' else POSITION)
+    driver.listen(3.0)
+    if not joints:
+        driver.angles = lambda theta: np.full_like(theta, np.nan)
+    heard = driver.listen(3.0, joints=joints)
+    (before,) = not_judged(heard)
+    assert before.startswith('note: order, sign')
+    assert 'of all muscles not judged: ' in before
+    verdict = driver.wind(heard=heard)
+    assert not verdict.faults, str(verdict)
+    assert all(verdict.has_passed('sign', m) for m in range(M))
+    for remark in not_judged(verdict):
+        checks, _, muscles = remark.partition(' not judged: ')[0].partition(' of ')
+        assert 'sign' not in checks
+        named = [m for m, name in enumerate(ROBOT.muscles) if name in muscles.split(', ')]
+        assert not any(verdict.has_passed('order', m) for m in named)
+
+
+def not_judged(verdict):
+    """Return the remarks that say how to make a check."""
+    return [
+        text for text in verdict.remarks if text.startswith('note: ') and ' not judged: ' in text
+    ]
+
+
 def test_unknown_length_offsets_are_no_fault_if_the_user_says_so():
     driver = Driver(ROBOT)
     driver.publish = lambda rows: rows + [np.linspace(-0.13, 0.13, M), np.zeros(M), np.zeros(M)]
@@ -497,7 +527,7 @@ def test_additional_joints_and_joints_in_several_messages_are_no_fault():
             listening.muscles(array(rows), driver.now)
     verdict = listening.verdict(driver.now)
     assert not verdict.faults, str(verdict)
-    assert 'missing joint' in str(verdict) and 'were not checked, because' not in str(verdict)
+    assert 'missing joint' in str(verdict) and 'are unknown; publish' not in str(verdict)
 
 
 def test_unknown_joint_names_are_found():

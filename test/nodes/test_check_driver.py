@@ -41,6 +41,10 @@ def test_a_sound_driver_passes_and_is_moved_only_with_move(graph):
     assert status == 0 or faults
     graph.spin(0.5)
     assert commands
+    heard, moved = output.split('after the motion test:\n')
+    assert 'biceps_long ' in heard and 'biceps_long ' in moved  # both contain the table
+    repeated = {*heard.splitlines()} & {line for line in moved.splitlines() if ': ' in line}
+    assert not repeated  # no remark is printed twice
 
 
 def test_with_wait_check_driver_reports_faults_until_the_driver_is_right(graph):
