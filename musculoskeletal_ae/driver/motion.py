@@ -10,11 +10,12 @@ Since the test also moves the joints, their sensors are compared with the length
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Generator, Sequence
+from typing import Literal
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.driver.order import Order, corrected, judge_order
+from musculoskeletal_ae.driver.order import JOINTS_BETTER, Order, corrected, judge_order, wrong_side
 from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.report import is_overloaded
 from musculoskeletal_ae.signals.joint_sensors import judge
@@ -30,9 +31,6 @@ ABOVE_BIAS = 40.0  # default of the highest tension, above T_bias [N]
 RUN_AWAY_TENSION = 60.0
 MOMENT = 0.1  # time for which a muscle may exceed a limit, for example because the arm falls [s]
 LATEST = 0.1  # longest time from a command to the first response [s]
-#: Exchanged muscles explain the lengths better than a fault of joint sensors if they reduce the
-#: misfit to less than this fraction.
-JOINTS_BETTER = 0.8
 #: longest time for which a moving target advances between two messages [s], so that it does not
 #: jump after a gap
 LONGEST_ADVANCE = 0.05
@@ -180,7 +178,28 @@ class MotionTest(ABC):
         moves = [f'winding in {names[first]} moved the readings of {names[other]}']
         moves += [f'winding in {names[m]} those of {names[other]}' for m, other in more]
         misplaced = dict.fromkeys([*winds, *winds.values()])
-        self.verdict.failed('misplaced', *misplaced, moves=', and '.join(moves))
+        # Modules that follow positions hold their lengths, so a hand cannot move the arm.
+        is_movable = self._robot.actuation.choose(self._knows_joints(), False)
+        if side := self._wrong_side(winds):
+            fault = f'misplaced {side}'
+        else:
+            fault = 'misplaced movable' if is_movable else 'misplaced'
+        self.verdict.failed(fault, *misplaced, moves=', and '.join(moves), first=names[first])
+
+    def _knows_joints(self) -> bool:
+        """Return whether the angles of all joints were known in a message."""
+        return any(np.isfinite(theta).all() for theta, _, _ in self._history)
+
+    def _wrong_side(self, winds: dict[int, int]) -> Literal['readings', 'commands'] | None:
+        """Return whether the readings or the commands are exchanged; None if it is unknown."""
+        if any(self.verdict.has_passed('order', column) for column in winds.values()):
+            return 'commands'  # the readings were checked while a hand moved the arm
+        if not self._knows_joints():
+            return None
+        theta, states, tested = map(np.array, zip(*self._history, strict=True))
+        messages = theta, states[:, 0], states[:, 1]
+        faults = judge(self._robot, *messages, segments=tested).faults
+        return wrong_side(self._robot, *messages, tested, winds, faults)
 
     def _judge_joints(self) -> None:
         """Compare the joint sensors with the lengths, unless the lengths are wrong."""
@@ -188,7 +207,7 @@ class MotionTest(ABC):
         if not self._history or {'order', 'unit', 'sign'} & verdict.wrong:
             return
         theta, states, tested = map(np.array, zip(*self._history, strict=True))
-        if not np.isfinite(theta).all(axis=1).any():
+        if not self._knows_joints():
             verdict.notes.append('θ of some joints is unknown, so signs of θ were not checked')
             return
         judgement = judge(robot, theta, states[:, 0], states[:, 1], segments=tested)

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find muscles whose readings and commands are both exchanged, by the joint angles.
+"""Judge by the joint angles whether the readings of muscles are exchanged.
 
-Such muscles obey the control law, but their lengths change like those of another muscle. For N
-messages of a moving arm,
+If the readings and the commands of muscles are exchanged in the same way, the muscles obey the
+control law, but their lengths change like those of another muscle. If only one of the two is
+exchanged, winding in a muscle moves the readings of another one; the joint angles then tell whether
+the readings or the commands are wrong. For N messages of a moving arm,
 
     e_jk = rms(l_j(t) − f_k(θ(t), T_j(t)) − c_jk)
 
@@ -15,7 +17,7 @@ models), no exchange reduced the misfit by more than the factor 1.05.
 """
 
 from itertools import combinations
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -26,6 +28,9 @@ from musculoskeletal_ae.signals.joint_sensors import DEGREES, ORDER, SIGN, Joint
 #: Two columns are exchanged if this divides their misfit by at least this factor. Their order is
 #: right if exchanging them multiplies it by at least this factor.
 BETTER = 1.4
+#: Exchanged muscles explain the lengths better than a fault of joint sensors if they reduce the
+#: misfit to less than this fraction.
+JOINTS_BETTER = 0.8
 MOST_SAMPLES = 400  # largest number of messages that are used, evenly distributed
 
 
@@ -48,10 +53,7 @@ def judge_order(robot: Robot, theta: Array, length: Array, tension: Array, segme
         tension: T [N], (N, M).
         segments: Number of the segment to which each message belongs, (N,).
     """
-    rows = np.flatnonzero(np.isfinite(theta).all(axis=1))
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_SAMPLES)).astype(int)]
-    tension = robot.actuation.known_tension(tension[rows])
-    square = _square_misfits(robot, theta[rows], length[rows], tension, segments[rows])
+    square = _square_misfits(robot, theta, length, tension, segments)
     order, pairs = np.arange(len(square)), list(combinations(range(len(square)), 2))
 
     def misfits(a: int, b: int) -> tuple[float, float]:
@@ -78,6 +80,50 @@ def judge_order(robot: Robot, theta: Array, length: Array, tension: Array, segme
     return Order(misplaced, right, float(np.sqrt(square[np.arange(len(square)), order].sum())))
 
 
+def wrong_side(
+    robot: Robot,
+    theta: Array,
+    length: Array,
+    tension: Array,
+    segments: Ints,
+    winds: dict[int, int],
+    joint_faults: list[JointFault],
+) -> Literal['readings', 'commands'] | None:
+    """Judge by the joint angles whether the readings or the commands of muscles are exchanged.
+
+    Column k = winds[m] of the readings has responded to the command of muscle m. It belongs to
+    muscle m if the readings are exchanged, and to muscle k if the commands are. The misfits of the
+    two cases must differ by the factor BETTER.
+
+    Args:
+        robot: The geometric model.
+        theta: Measured θ [rad], (N, D). Messages with NaN are not used.
+        length: l [m], (N, M).
+        tension: T [N], (N, M).
+        segments: Number of the segment to which each message belongs, (N,).
+        winds: The column that responded to each command, by muscle.
+        joint_faults: Faults that would explain the lengths if the readings are right. Exchanged
+            readings must explain them better.
+
+    Returns:
+        The exchanged side, or None if the joint angles do not tell it.
+    """
+
+    def misfit(theta: Array, owner: dict[int, int]) -> float:
+        """Return the misfit [m] if column k belongs to muscle `owner[k]`."""
+        square = _square_misfits(robot, theta, length, tension, segments)
+        return float(np.sqrt(sum(square[k, m] for k, m in owner.items())))
+
+    of_readings = misfit(theta, {k: m for m, k in winds.items()})
+    of_commands = misfit(theta, own := {k: k for k in winds.values()})
+    if BETTER * of_commands < of_readings:
+        return 'commands'
+    if BETTER * of_readings > of_commands:
+        return None
+    of_joints = misfit(corrected(theta, joint_faults), own)
+    return 'readings' if of_readings < JOINTS_BETTER * of_joints else None
+
+
 def corrected(theta: Array, faults: list[JointFault]) -> Array:
     """Return θ (N, D) as the joint sensors would publish it without these faults."""
     theta = theta.copy()
@@ -96,6 +142,10 @@ def _square_misfits(
     robot: Robot, theta: Array, length: Array, tension: Array, segments: Ints
 ) -> Array:
     """Return e² of the module docstring [m²], (M, M)."""
+    rows = np.flatnonzero(np.isfinite(theta).all(axis=1))
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_SAMPLES)).astype(int)]
+    theta, length, segments = theta[rows], length[rows], segments[rows]
+    tension = robot.actuation.known_tension(tension[rows])
     groups = [np.flatnonzero(segments == each) for each in np.unique(segments)]
     square = np.empty((robot.muscle_count,) * 2)
     for j in range(robot.muscle_count):

@@ -555,8 +555,7 @@ class Winding(MotionTest):
         yield from self._go(m, home.length[m])
         if other != m and pulled[other] > self._response[other]:
             yield from self._search_order([m])
-            self.verdict.failed('other one', m, other=self._robot.muscles[other])
-            return
+            raise WrongOrderError({m: other})
         self._target[m] = home.length[m] + ((self._highest - self._bias) / self._robot.stiffness)[m]
         yield from self._wait(HOLD)
         answered = self._mean().tension[m] - home.tension[m] > self._response[m]

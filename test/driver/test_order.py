@@ -2,11 +2,13 @@
 """Muscles in a wrong order are named, and no sound driver is accused of a wrong order."""
 
 from functools import cache
+from itertools import combinations
 
 import numpy as np
 import pytest
 
-from driver.scripted import Driver
+from driver.scripted import Driver, array, joint_state
+from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.driver.motion import ABOVE_BIAS
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.robot.description import with_modules
@@ -66,6 +68,66 @@ def test_muscles_in_a_wrong_order_are_the_only_fault_and_are_not_pulled_hard(wha
 def test_exchanged_readings_of_other_arms_are_named(name, muscles, seed, reality):
     robot = robot_named(name)
     assert_names(misordered(robot, muscles, 'readings', seed, reality).wind(), muscles)
+
+
+@pytest.mark.parametrize('what', ['readings', 'commands'])
+@pytest.mark.parametrize(
+    ('robot', 'muscles', 'seed', 'otherwise'),
+    [
+        (ARM26, (4, 5), 0, ''),
+        (ARM26, (3, 5), 0, ''),
+        (ARM26, (2, 5), 0, 'misplaced movable'),
+        (POSITION, (0, 5), 0, 'misplaced'),
+        (POSITION, (0, 5), 1, ''),
+    ],
+)
+def test_the_exchanged_side_is_told_if_the_joint_angles_show_it(
+    robot, muscles, seed, otherwise, what
+):
+    (fault,) = misordered(robot, muscles, what, seed).wind().faults
+    assert fault.name == (otherwise or f'misplaced {what}')
+
+
+def test_commands_are_exchanged_if_a_moving_hand_showed_that_the_readings_are_right():
+    driver = misordered(ARM26, (2, 5), 'commands')
+    heard = driver.listen(8.0, moved=True)
+    driver.listen(3.0)
+    (fault,) = driver.wind(heard=heard).faults
+    assert fault.name == 'misplaced commands'
+
+
+def test_without_joint_sensors_the_report_says_how_to_find_the_exchanged_side():
+    driver = misordered(ARM26, (4, 5), 'readings')
+    driver.angles = lambda theta: np.full_like(theta, np.nan)
+    (fault,) = driver.wind().faults
+    assert fault.name == 'misplaced'
+    assert ARM26.muscles[4] in fault.change or ARM26.muscles[5] in fault.change
+
+
+@pytest.mark.parametrize('share', [0.4, 1.0])
+def test_exchanged_readings_never_pass_the_check_of_order_while_a_hand_moves_the_arm(share):
+    """A hand moves every joint through a share of its range."""
+    arm, low, high = make_arm(ARM26, 1, 'foreign'), ARM26.lower, ARM26.upper
+    periods = 10.0 * (1.0 + 0.3 * np.arange(len(low)))
+    readings = []
+    for now in np.arange(0.0, 30.0, 0.05):
+        arm.reset(0.5 * (low + high - share * np.cos(2.0 * np.pi * now / periods) * (high - low)))
+        arm.step(0.05)
+        readings.append((now, arm.sense()))
+
+    def passing(*exchanged):
+        """Return the muscles that pass the check of order, with two exchanged columns."""
+        order, listening = np.arange(ARM26.muscle_count), Listening(ARM26, 20.0)
+        order[list(exchanged)] = exchanged[::-1]
+        for now, reading in readings:
+            listening.joints(joint_state(dict(zip(ARM26.joints, reading.theta))))
+            listening.muscles(array(np.stack(reading[1:])[:, order]), now)
+        verdict = listening.verdict(30.0)
+        return {m for m in range(ARM26.muscle_count) if verdict.has_passed('order', m)}
+
+    assert len(passing()) >= ARM26.muscle_count - 1
+    for pair in combinations(range(ARM26.muscle_count), 2):
+        assert not passing(*pair) & set(pair)
 
 
 @pytest.mark.parametrize('muscles', PAIRS)
