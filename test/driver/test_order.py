@@ -143,8 +143,9 @@ def test_exchanged_modules_that_follow_positions_are_named(what, muscles):
     assert_names(misordered(POSITION, muscles, what).wind(), muscles)
 
 
-@pytest.mark.parametrize(('name', 'seed'), [('arm26', 2), ('musashi_left_arm', 0)])
-@pytest.mark.parametrize('reality', ['kin', 'foreign'])
+@pytest.mark.parametrize(
+    ('name', 'seed', 'reality'), [('arm26', 2, 'kin'), ('musashi_left_arm', 0, 'foreign')]
+)
 def test_no_sound_driver_is_accused_of_a_wrong_order(name, seed, reality):
     verdict = misordered(robot_named(name), (), 'both', seed, reality).wind()
     assert 'order' not in verdict.wrong, str(verdict)
