@@ -419,8 +419,11 @@ if [ $learner = true ]; then
 fi
 [ -z "$record" ] || start record -o "$record" "${files[@]}" --ros-args "${under[@]}"
 if [ -n "$bag" ]; then
-  # A recording contains time and commands, so no controller is started.
-  start replay "$bag" --clock "${files[@]}" --ros-args "${under[@]}"
+  # A recording contains time and commands, so no controller is started. These nodes receive every
+  # message, however slow this computer is.
+  receivers=estimator
+  [ $learner = false ] || receivers+=,learner
+  start replay "$bag" --clock --wait-for "$receivers" "${files[@]}" --ros-args "${under[@]}"
 elif [ $controller = true ]; then
   [ -n "$explore" ] || explore=$([ $hardware = true ] && echo false || echo true)
   kept_in controller

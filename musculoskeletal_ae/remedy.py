@@ -40,6 +40,7 @@ class Step(Enum):
         'check_estimator',
         'check that the estimator is running and that the computer is not overloaded',
     )
+    CHECK_REPLAY = 'check_replay', 'check that the replay is not paused and has not ended'
     STOP_SECOND_PUBLISHER = (
         'stop_second_publisher',
         'stop the node that does not belong to this arm',

@@ -7,9 +7,13 @@ from typing import Literal, NamedTuple
 
 MOST_DIGITS = 17  # significant digits that identify a double
 #: key in /diagnostics that tells what a component waits for, and the values of this key if the
-#: component waits for the end of an anomaly, or for known length offsets
+#: component waits for the end of an anomaly, for known length offsets, or for muscle_states
 WAITS_FOR, ANOMALY, LENGTH_OFFSETS = 'waits for', 'anomaly', 'length_offsets'
-END_OF_RECORDING = 'end_of_recording'  # value `state` of a replay that has ended
+MUSCLE_STATES = 'muscle_states'
+#: values of `state` in the reports of a replay
+WAITING, PLAYING, PAUSED, END_OF_RECORDING = 'waiting', 'playing', 'paused', 'end_of_recording'
+#: key in the last report of a replay: names of nodes that may have missed messages
+NOT_WAITED_FOR = 'nodes not waited for'
 Level = Literal['ok', 'warn', 'error']
 
 

@@ -9,9 +9,10 @@ t₀ is the time of the last start, jump, pause or resumption. A motion that was
 becomes a smoothed trajectory, whose points are evenly spaced in time.
 """
 
+import heapq
 import math
 from collections import defaultdict
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from itertools import chain
 from typing import NamedTuple
@@ -19,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.bags.bunches import Bunch
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import BagMessage
 from musculoskeletal_ae.bags.topics import latched_topics
@@ -58,11 +60,25 @@ def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
     return first, min(bag.end, first + round(duration * 1e9))
 
 
-def lap(bag: Bag, topics: Collection[str], start: int, stop: int) -> Iterator[BagMessage]:
+def lap(
+    bag: Bag,
+    topics: Collection[str],
+    start: int,
+    stop: int,
+    bunched: Mapping[str, Bunch] | None = None,
+) -> Iterator[BagMessage]:
     """Yield the messages that playback publishes from one recorded time to another [ns].
 
-    The last message before `start` of each latched topic comes first, because a subscriber that
-    joins at this time would receive it.
+    The log time of each message is the time at which it is to be published. The last message before
+    `start` of each latched topic comes first, because a subscriber that joins at this time would
+    receive it.
+
+    Args:
+        bag: The recording.
+        topics: Recorded names of the topics to play.
+        start: Recorded time of the first messages [ns].
+        stop: Recorded time of the last messages [ns].
+        bunched: Topics whose messages are timed by publication.
 
     Raises:
         BagError: If a message cannot be decoded; replay must not publish it.
@@ -71,9 +87,29 @@ def lap(bag: Bag, topics: Collection[str], start: int, stop: int) -> Iterator[Ba
     if start > bag.start:
         for message in bag.messages(latched_topics(bag) & set(topics), stop=start - 1):
             latched[message.topic] = message._replace(log_time=start - 1)
-    for message in chain(latched.values(), bag.messages(topics, start, stop)):
+    for message in chain(latched.values(), _timed(bag, topics, start, stop, bunched or {})):
         bag.decode(message)
         yield message
+
+
+def _timed(
+    bag: Bag, topics: Collection[str], start: int, stop: int, bunched: Mapping[str, Bunch]
+) -> Iterator[BagMessage]:
+    """Yield messages in the order of the times at which they are to be published."""
+    longest = max((bunch.longest for bunch in bunched.values()), default=0)
+    waiting: list[tuple[int, int, BagMessage]] = []  # a heap
+    for n, message in enumerate(bag.messages(topics, start, stop + longest)):
+        # Later messages of the bag are to be published after this time.
+        while waiting and waiting[0][0] < message.log_time - longest:
+            yield heapq.heappop(waiting)[2]
+        bunch = bunched.get(message.topic)
+        time = message.log_time if bunch is None else bunch.time(message)
+        if start == bag.start:
+            time = max(time, start)
+        if start <= time <= stop:
+            heapq.heappush(waiting, (time, n, message._replace(log_time=time)))
+    while waiting:
+        yield heapq.heappop(waiting)[2]
 
 
 class Timeline:
@@ -114,13 +150,13 @@ class Timeline:
         self.jump(self.recorded(now), now)
         self.paused = paused
 
-    def catch_up(self, recorded: int, now: float) -> None:
-        """Set recorded time to `recorded` [ns] if that time was due more than 1 s ago.
+    def catch_up(self, recorded: int, now: float, longest: float) -> None:
+        """Set recorded time to `recorded` [ns] if that time was due more than `longest` [s] ago.
 
         After a long interruption, playback thus goes on at its normal rate and does not publish
         all late messages at once. `now` is the reading of the steady clock [s].
         """
-        if self.wait(recorded, now) < -LONGEST_LAG:
+        if self.wait(recorded, now) < -longest:
             self.jump(recorded, now)
 
 

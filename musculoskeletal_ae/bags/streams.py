@@ -3,7 +3,6 @@
 
 import heapq
 import math
-from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.bags.bunches import Bunch, bunches
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LATEST
 from musculoskeletal_ae.bags.topics import NO_MOTORS, interface_topics
@@ -32,11 +32,6 @@ from musculoskeletal_ae.validity import (
     read_names,
     read_posture,
 )
-
-# The log times of a topic count as bunched if all of these conditions hold.
-FEW = 20  # it has at least this number of messages
-BUNCHED = 50_000_000  # the delays of its messages differ by more than this [ns]
-MANY = 0.3  # more than this fraction of its messages was written together with the message before
 
 
 class Series(NamedTuple):
@@ -230,16 +225,16 @@ def read_streams(
     for name, stream in arm.by_topic.items():
         if name in recorded:
             takers[recorded[name]][labels[name]] = stream.take
-    clock_offsets = _bunched(bag, list(takers), stop)
+    bunched = bunches(bag, takers, stop)
     early = [recorded[name] for name in BODY_TOPICS if name in recorded]
-    _deliver(bag, takers, early, clock_offsets, reception, progress, stop)
+    _deliver(bag, takers, early, bunched, reception, progress, stop)
     # A topic of motors that also counts as joint_states need not contain joint angles, because the
     # joints may have no sensors.
     optional = f'{recorded.get("joint_states")} as joint_states'
     _check_fit(bag, {key: each for key, each in used.items() if key != optional}, warnings)
     notes = [
         f'{topic}: the recorder wrote messages late and in bunches; their publish times are used'
-        for topic in clock_offsets
+        for topic in bunched
     ]
     joints, states, lengths, tensions, isolated, _ = (
         stream.series() for stream in arm.by_topic.values()
@@ -274,7 +269,7 @@ def _deliver(
     bag: Bag,
     takers: Mapping[str, Mapping[str, Callable[[Any], None]]],
     early: Sequence[str],
-    clock_offsets: Mapping[str, int],
+    bunched: Mapping[str, Bunch],
     reception: Reception,
     progress: Callable[[float], None],
     stop: int,
@@ -288,8 +283,8 @@ def _deliver(
         takers: For each recorded topic, the functions to call, by the name under which `reception`
             counts the messages.
         early: Recorded names of the topics that are read before the other topics.
-        clock_offsets: Offset [ns] of the publisher's clock for each topic whose messages are timed
-            by publication; messages of other topics are timed by their log times.
+        bunched: Topics whose messages are timed by publication; messages of other topics are timed
+            by their log times.
         reception: Rejects messages for which a function raises a MessageError, and counts them.
         progress: Called after each message with its share of all messages.
         stop: Latest log time [ns] of the messages to read.
@@ -308,9 +303,8 @@ def _deliver(
                 reception.of(label, take, lambda: 1)
                 for label, take in takers[message.topic].items()
             ]
-        came = message.log_time
-        if message.topic in clock_offsets:
-            came = message.publish_time + clock_offsets[message.topic]
+        bunch = bunched.get(message.topic)
+        came = message.log_time if bunch is None else bunch.time(message)
         sent = {'source_timestamp': message.publish_time, 'publication_sequence_number': 0}
         time = (came - bag.start) / 1e9
         arrival = _Arrival(time, delays[sender].step(time, message.publish_time))
@@ -332,30 +326,6 @@ def _check_fit(bag: Bag, used: Mapping[str, _Stream], warnings: Sequence[str]) -
         if reasons and not stream.values:
             problem = f'no message of {label} fits the robot ({reasons[-1]})'
             raise BagError(bag.path, problem, 'choose the robot that was recorded')
-
-
-def _bunched(bag: Bag, topics: list[str], stop: int) -> dict[str, int]:
-    """Return the topics with bunched log times, and an offset for their publish times [ns].
-
-    A recorder that was blocked for a moment writes many messages with almost the same log time.
-    The publish times are then more accurate, but the publisher's clock may differ from that of the
-    recorder. The offset to add to a publish time is the shortest difference between the log time
-    and the publish time of a message.
-    """
-    times = {topic: (array('q'), array('q')) for topic in topics}
-    for message in bag.messages(topics, stop=stop):
-        times[message.topic][0].append(message.log_time)
-        times[message.topic][1].append(message.publish_time)
-    bunched = {}
-    for topic, parts in times.items():
-        log, sent = (np.array(part, dtype=np.int64) for part in parts)
-        if len(log) < FEW or not (sent > 0).all() or (np.diff(sent) < 0).any():
-            continue
-        delay = log - sent
-        together = (np.diff(log) < 0.1 * np.median(np.diff(sent))).mean()
-        if np.ptp(delay) > BUNCHED and together > MANY:
-            bunched[topic] = int(delay.min())
-    return bunched
 
 
 def _latched(times: ArrayLike, when: ArrayLike) -> Any:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from musculoskeletal_ae.remedy import REMEDY_STEPS, identifiers, sentence
-from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.report import MUSCLE_STATES, WAITS_FOR, Report
 from musculoskeletal_ae.signals.body_state import KNOWN
 
 if TYPE_CHECKING:
@@ -46,7 +46,8 @@ def report(core: Estimator, now: float) -> Report:
         text = f'anomaly detected: {core.cause}; {core.advice}'
         return Report('error', text, {**values, 'state': 'anomaly'})
     if now - core.stepped_at > SILENCE:
-        return Report('warn', 'no muscle_states', {**values, 'state': 'no_muscle_states'})
+        waits = {'state': 'no_muscle_states', WAITS_FOR: MUSCLE_STATES}
+        return Report('warn', 'no muscle_states', values | waits)
     if core.calibration is not None:
         progress = core.calibration.progress
         text = f'calibrating the lengths: {progress}'

@@ -6,8 +6,16 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from musculoskeletal_ae.learning.calibration import is_calibrated, is_learned
+from musculoskeletal_ae.learning.collector import NO_MESSAGES
 from musculoskeletal_ae.learning.job import Update
-from musculoskeletal_ae.report import ANOMALY, LENGTH_OFFSETS, WAITS_FOR, Level, Report
+from musculoskeletal_ae.report import (
+    ANOMALY,
+    LENGTH_OFFSETS,
+    MUSCLE_STATES,
+    WAITS_FOR,
+    Level,
+    Report,
+)
 from musculoskeletal_ae.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -36,6 +44,8 @@ def learner_report(learner: Learner) -> Report:
         waits_for = {WAITS_FOR: ANOMALY}
     elif (idle_time := learner.idle_time) > LONGEST_IDLE:
         message = f'no usable data for {idle_time:.0f} s: {learner.collector.obstacle}'
+        if learner.collector.obstacle == NO_MESSAGES:
+            waits_for = {WAITS_FOR: MUSCLE_STATES}
     else:
         level, message = 'ok', 'learning'
     return Report(level, message, {**_values(learner), 'state': message, **waits_for})

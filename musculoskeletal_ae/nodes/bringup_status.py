@@ -27,6 +27,7 @@ from musculoskeletal_ae.report import Report
 SETTLING = 4.0
 #: shortest time between two lines before the first estimate [s]
 WAITING_INTERVAL = 5.0
+LAST_REPORT_WAIT = 5.0  # longest wait for the learner's report after the end of a recording [s]
 
 
 class BringupStatus(Shell):
@@ -46,6 +47,7 @@ class BringupStatus(Shell):
         self.anomalies: list[float] = []
         self.situation = Situation(self.get_namespace())
         self.started: float | None = None
+        self.ended: float | None = None  # when the end of the recording was first reported [s]
         self.waiting = ''  # the last line before the first estimate
         self.waiting_since = -math.inf  # when it was printed [s]
         self.printed_hint = ''
@@ -101,6 +103,11 @@ class BringupStatus(Shell):
         if self.started is None:
             reason = self.situation.why_no_estimate()
             sys.exit(f'the recording brought no estimate: {reason}; see the logs of the nodes')
+        self.ended = self.ended or time.monotonic()
+        if not self.situation.has_last_report and time.monotonic() - self.ended < LAST_REPORT_WAIT:
+            return
+        if learned := self.situation.learned():
+            print(f'-- {printable(learned)}', flush=True)
         raise ExternalShutdownException
 
     def _print_waiting(self, now: float) -> None:

@@ -7,11 +7,13 @@ from collections.abc import Mapping
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
 
 from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 
+MANY_REPORTS = QoSProfile(depth=50)  # QoS of /diagnostics, on which all nodes of the graph report
 PERIOD = 1.0  # time between reports [s]
 
 

@@ -8,13 +8,21 @@ from collections.abc import Callable, Iterable, Mapping
 
 from rclpy.node import Node
 
+from musculoskeletal_ae.control.stops import StopCause
+from musculoskeletal_ae.nodes.progress import LONGEST_STALL
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.remedy import REMEDY_STEPS, Step
-from musculoskeletal_ae.report import Report, load_text
+from musculoskeletal_ae.report import MUSCLE_STATES, WAITS_FOR, Report, load_text, overload_text
 
 #: topics that are published continually, so that silence is an error, and the remedy for silence
 STREAMS = {'muscle_states': Step.CHECK_DRIVER, 'estimated_joint_states': Step.CHECK_ESTIMATOR}
 EMULATOR = 'hardware_emulator'  # name of the node that emulates the driver and the arm
+REPLAY = 'replay'  # name of the node that plays a recording
+#: values of `waits for` of a report whose message already says that a stream is missing
+WAITS = {
+    'muscle_states': (MUSCLE_STATES, StopCause.STALE_MUSCLE_STATES.identifier),
+    'estimated_joint_states': (StopCause.STALE_ESTIMATE.identifier,),
+}
 SILENT_TOPIC = 'silent topic'  # key of a value in reports
 SILENCE = 1.0  # time without a usable message after which a stream is silent [s]
 SLOW = 0.4  # fraction of the expected rate below which messages come too slowly
@@ -27,9 +35,31 @@ def slow_cause(publishers: Iterable[str]) -> str:
     Args:
         publishers: Names of the nodes that publish the topic.
     """
-    if set(publishers) == {EMULATOR}:
+    present = set(publishers)
+    if present == {EMULATOR}:
         return f'this computer is overloaded (load {load_text()}); stop other programs'
+    if overload := overload_text():
+        return f'{overload}; stop other programs'
+    if present == {REPLAY}:
+        return 'the recording is played slowly, or its messages are rare'
     return 'the driver is slow, or this computer is overloaded'
+
+
+def silence_remedy(topic: str, silence: float, publishers: Iterable[str]) -> tuple[Step, str]:
+    """Return the step against silence of a stream, and what to do as a text for users.
+
+    Args:
+        topic: The stream, one of STREAMS.
+        silence: How long the stream has been silent [s].
+        publishers: Names of the nodes that publish the topic.
+    """
+    step = STREAMS[topic]
+    if set(publishers) == {REPLAY}:
+        return Step.CHECK_REPLAY, Step.CHECK_REPLAY.text
+    # A publisher that hangs ends by itself by this time, if it is a node of this package.
+    if silence <= LONGEST_STALL and (overload := overload_text()):
+        return step, f'{overload}; stop other programs'
+    return step, step.text
 
 
 class NeededTopics:
@@ -79,11 +109,18 @@ class NeededTopics:
         silent = next(filter(self._is_silent, self._topics), None)
         if silent is None:
             return report
-        step = STREAMS[silent]
-        text = f'no usable {silent} for {self._reception.silence(silent):.0f} s: {step.text}'
+        silence = self._reception.silence(silent)
+        step, advice = silence_remedy(silent, silence, self._publishers(silent))
+        text = f'no usable {silent} for {silence:.0f} s: {advice}'
         steps = ', '.join(filter(None, [report.values.get(REMEDY_STEPS), step.identifier]))
         values = {**report.values, SILENT_TOPIC: text, REMEDY_STEPS: steps}
-        return Report('error', f'{report.message}; {text}', values)
+        is_known = report.values.get(WAITS_FOR) in WAITS[silent]
+        return Report('error', text if is_known else f'{report.message}; {text}', values)
+
+    def _publishers(self, topic: str) -> list[str]:
+        """Return the names of the nodes that publish a topic."""
+        name = self._full_name(topic)
+        return [each.node_name for each in self._node.get_publishers_info_by_topic(name)]
 
     def _with_slowness(self, report: Report, rates: Mapping[str, float]) -> Report:
         """Return a report with a warning for each topic whose messages keep coming too slowly.
@@ -95,8 +132,7 @@ class NeededTopics:
             is_slow = 0.0 < rate < SLOW * expected
             self._slow_reports[topic] = self._slow_reports[topic] + 1 if is_slow else 0
             if self._slow_reports[topic] >= SLOW_REPORTS:
-                publishers = self._node.get_publishers_info_by_topic(self._full_name(topic))
-                cause = slow_cause(publisher.node_name for publisher in publishers)
+                cause = slow_cause(self._publishers(topic))
                 report = report.with_warning(
                     f'{topic} come at {rate:.0f} Hz instead of {expected:g} Hz: {cause}'
                 )

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `replay`: plays a recorded bag onto its topics, or checks its contents."""
 
+import math
 import sys
 import time
 from argparse import Namespace
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -20,24 +22,37 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
+from musculoskeletal_ae.bags.bunches import Bunch, bunches
 from musculoskeletal_ae.bags.playback import (
+    LONGEST_LAG,
     TAUGHT_TOPIC,
     Timeline,
     lap,
     window,
 )
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.topics import ALL, DEFAULT, latched_topics, select
-from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
+from musculoskeletal_ae.bags.topics import ALL, DEFAULT, DIAGNOSTICS, latched_topics, select
+from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
+from musculoskeletal_ae.nodes.diagnostics import MANY_REPORTS, PERIOD, Diagnostics
+from musculoskeletal_ae.nodes.lockstep import Lockstep
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
 from musculoskeletal_ae.nodes.parameters import motor_settings
+from musculoskeletal_ae.nodes.rejections import Rejections
 from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, message_class, run_tool, start_ros
 from musculoskeletal_ae.nodes.taught_motion import ACKNOWLEDGE_TIME, send_taught_motion
 from musculoskeletal_ae.options import Parser, names, not_negative, number, positive
 from musculoskeletal_ae.progress_bar import is_bar_visible
 from musculoskeletal_ae.reception import Reception
-from musculoskeletal_ae.report import END_OF_RECORDING, Report
+from musculoskeletal_ae.report import (
+    END_OF_RECORDING,
+    NOT_WAITED_FOR,
+    PAUSED,
+    PLAYING,
+    WAITING,
+    Report,
+    overload_text,
+)
+from musculoskeletal_ae.signals.motor_interface import STATES
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
 #: depth of the QoS; a reader that is one second late still receives every message
@@ -50,6 +65,8 @@ LAP_GAP = 10_000_000  # time between the last message of a lap and the first of 
 WAIT = 2.0  # default of the longest wait for subscribers; playback may start without them [s]
 SEND_WAIT = 10.0  # default of the same wait for --as-trajectory, which needs a subscriber [s]
 CLOCK_PERIOD = 0.005  # recorded time between two messages on /clock [s]
+SLOW = 0.5  # share of the wanted speed below which playback counts as slow
+LOCKSTEP_LAG = 0.005  # in lockstep, recorded time makes up for at most this delay [s]
 #: shortest wall time between two messages on /clock that nodes can handle [s]
 SHORTEST_CLOCK_PERIOD = 0.001
 
@@ -57,10 +74,19 @@ SHORTEST_CLOCK_PERIOD = 0.001
 class Replay(Node):
     """Publishes recorded messages, as serialized bytes, at their recorded times."""
 
-    def __init__(self, bag: Bag, names: dict[str, str], options: Namespace) -> None:
-        """Advertise the topics; `names` maps a recorded topic to the topic that is published."""
+    def __init__(
+        self, bag: Bag, names: dict[str, str], bunched: dict[str, Bunch], options: Namespace
+    ) -> None:
+        """Advertise the topics.
+
+        Args:
+            bag: The recording.
+            names: The topic on which to publish, by recorded topic.
+            bunched: Topics whose messages are played at the times of their publication.
+            options: Options of the command line.
+        """
         super().__init__('replay')
-        self._bag, self._names = bag, names
+        self._bag, self._names, self._bunched = bag, names, bunched
         self._start, self._stop = window(bag, options.start, options.duration)
         self.length = (self._stop - self._start) / 1e9  # duration of the played part [s]
         self._before = (self._start - bag.start) / 1e9  # skipped time at the start of the bag [s]
@@ -76,6 +102,9 @@ class Replay(Node):
         # Times of the next /clock message, service round and report on the steady clock [s].
         self._next_tick = self._next_service = self._next_report = 0.0
         self._sought: int | None = None  # recorded time to seek to [ns]
+        self._rate = options.rate
+        # Steady time and recorded time of the last report, and steady time of the last seek [s].
+        self._reported, self._seek_time = (math.inf, 0.0), math.inf
         description = 'position in the bag [s]; set this parameter to seek'
         descriptor = ParameterDescriptor(description=description)
         end = self._before + self.length
@@ -90,14 +119,34 @@ class Replay(Node):
         self._diagnostics = Diagnostics(self, reception, bag.path.name)
         self._next_time = self._start
         self._timeline = Timeline(self._start - 1, options.rate, time.monotonic())
+        self._lockstep: Lockstep | None = None
+        if options.wait_for:
+            self._lockstep = Lockstep(self, options.wait_for, _warn)
+        topics = [publisher.topic_name for publisher in self._publisher.values()]
+        if options.params_file:  # nodes count messages of motors as muscle_states
+            topics.append(self.resolve_topic_name(STATES))
+        if DIAGNOSTICS not in topics:  # otherwise the reports may be recorded ones
+            rejections = Rejections(topics, str(options.bag), _warn)
+            self.create_subscription(DiagnosticArray, DIAGNOSTICS, rejections.take, MANY_REPORTS)
         if options.paused:
             self._timeline.hold(True, time.monotonic())
         self._spinner = Spinner(self)
 
     def get_ready(self, longest: float) -> None:
-        """Wait at most `longest` [s] until every topic has a subscriber; then offer services."""
-        topics = [*self._publisher.values(), *filter(None, [self._recorded_time])]
-        _await_subscribers(self._spinner, topics, longest)
+        """Wait until messages are received, then offer services.
+
+        In lockstep, wait for the nodes. Otherwise wait at most `longest` [s] until every topic has
+        a subscriber.
+
+        Raises:
+            MusculoskeletalError: If a node of the lockstep does not start.
+        """
+        if self._lockstep is not None:
+            self._lockstep.start(self._spinner, self._report_waiting)
+            time.sleep(SETTLE_TIME)
+        else:
+            topics = [*self._publisher.values(), *filter(None, [self._recorded_time])]
+            _await_subscribers(self._spinner, topics, longest)
         for work in (self.pause, self.resume, self.step):
             serve(self, Trigger, f'replay/{work.__name__}', work)
 
@@ -113,19 +162,46 @@ class Replay(Node):
         self._sought = self._start if self._sought is None else self._sought
         while self._sought is not None:
             start, self._sought = self._sought, None
+            self._seek_time = time.monotonic()
             # Jump to just before the first message, so that it is not due while playback is paused.
             self._timeline.jump(start - 1, time.monotonic())
-            for message in lap(self._bag, self._names, start, self._stop):
+            for message in lap(self._bag, self._names, start, self._stop, self._bunched):
                 if not self._wait(message.log_time, progress):
                     break
-                self._timeline.catch_up(message.log_time, time.monotonic())
+                self._wait_for_nodes(message.log_time)
                 self._tick()
                 STOP.raise_if_received()
                 self._publisher[message.topic].publish(message.data)
+                if self._lockstep is not None:
+                    self._lockstep.count()
+
+    def _wait_for_nodes(self, recorded: int) -> None:
+        """Wait until nodes are ready for a message with the recorded time `recorded` [ns].
+
+        If the message is late, recorded time goes on from `recorded`.
+        """
+        longest = LONGEST_LAG
+        if self._lockstep is not None:
+            longest = LOCKSTEP_LAG
+            if self._lockstep.is_due(recorded):
+                self._lockstep.step(recorded, self._spinner)
+            self._next_tick = 0.0  # the nodes are to know the time of this message
+        self._timeline.catch_up(recorded, time.monotonic(), longest)
+
+    def _report_waiting(self) -> None:
+        """Report, once a second, which nodes the replay waits for."""
+        STOP.raise_if_received()
+        if self._lockstep is not None and time.monotonic() > self._next_report:
+            self._next_report = time.monotonic() + PERIOD
+            waiting = f'waiting until {" and ".join(self._lockstep.missing())} can receive'
+            self._diagnostics.tell(Report('ok', waiting, {'state': WAITING}), {})
 
     def acknowledge(self) -> None:
         """Report the end, and wait until reliable subscribers have received the last messages."""
         values = {'position': self._position(), 'state': END_OF_RECORDING}
+        if self._lockstep is not None:
+            self._lockstep.step(self._stop, self._spinner)
+            values[NOT_WAITED_FOR] = ', '.join(self._lockstep.lost)
         self._diagnostics.tell(Report('ok', 'end of the recording', values), {})
         end = time.monotonic() + ACKNOWLEDGE_TIME
         for publisher in self._publisher.values():
@@ -142,19 +218,21 @@ class Replay(Node):
         while (due := self._timeline.wait(recorded, now := time.monotonic())) > 0:
             if self._sought is not None:
                 break
-            self._tick()
+            if self._lockstep is not None and self._lockstep.is_due(recorded):
+                self._lockstep.ask()  # early, so that the answers have come when the time is due
+            # A node that has not used the last messages yet must not receive a later time.
+            is_asking = self._lockstep is not None and bool(self._lockstep.missing())
             wait = min(due, SERVICE_PERIOD)
-            if self._recorded_time:
+            if self._recorded_time and not is_asking:
+                self._tick()
                 wait = min(wait, max(self._next_tick - now, 0.0))
-            if wait > LONGEST_SLEEP or now > self._next_service:
+            if is_asking or wait > LONGEST_SLEEP or now > self._next_service:
                 self._next_service = now + SERVICE_PERIOD
                 self._spinner.spin_once(wait)
                 STOP.raise_if_received()
                 if now > self._next_report:
                     self._next_report = now + PERIOD
-                    doing = 'paused' if self._timeline.paused else 'playing'
-                    report = Report('ok', doing, {'position': self._position()})
-                    self._diagnostics.tell(report, {})
+                    self._diagnostics.tell(self._report(now), {})
                     seconds = self._before + np.array([self._done(), self.length])
                     self._position_publisher.publish(array_message(seconds, ''))
                 progress.update(max(0.0, self._done() - progress.n))
@@ -162,11 +240,31 @@ class Replay(Node):
                 time.sleep(wait)
         return self._sought is None
 
+    def _report(self, now: float) -> Report:
+        """Return the status during playback; `now` is the time of the steady clock [s]."""
+        state = PAUSED if self._timeline.paused else PLAYING
+        report = Report('ok', state, {'position': self._position(), 'state': state})
+        # Only the lockstep keeps playback back for a long time.
+        before, self._reported = self._reported, (now, self._done())
+        speed = (self._reported[1] - before[1]) / max(now - before[0], 1e-3)
+        is_slow = 0.0 < speed < SLOW * self._rate and before[0] > self._seek_time
+        if state == PAUSED or self._lockstep is None or not is_slow:
+            return report
+        cause = overload_text() or 'they are slow'
+        return report.with_warning(
+            f'at {speed / self._rate:.0%} of the wanted speed, because it waits for nodes: {cause}'
+        )
+
     def _tick(self) -> None:
-        """Publish the recorded time on /clock, if enabled and due."""
+        """Publish the recorded time on /clock, if enabled and due.
+
+        The clock does not run ahead of a message that is late, so it never goes back when recorded
+        time goes on from that message.
+        """
         if self._recorded_time and (now := time.monotonic()) >= self._next_tick:
             self._next_tick = now + self._clock_period
-            seconds, nanoseconds = divmod(self._timeline.recorded(now), 1_000_000_000)
+            recorded = min(self._timeline.recorded(now), self._next_time)
+            seconds, nanoseconds = divmod(recorded, 1_000_000_000)
             self._recorded_time.publish(Clock(clock=Time(sec=seconds, nanosec=nanoseconds)))
 
     def _seek(self, parameters: list[Parameter]) -> None:
@@ -206,6 +304,11 @@ class Replay(Node):
         return f'{self._before + self._done():.6f} s'
 
 
+def _warn(text: str) -> None:
+    """Print a warning, above the progress bar if there is one."""
+    tqdm.write(printable(f'warning: {text}'), file=sys.stderr)
+
+
 def _await_subscribers(spinner: Spinner, publishers: list[Publisher], longest: float) -> None:
     """Wait at most `longest` [s] until every topic has a subscriber that can receive messages."""
     spinner.spin_until(lambda: all(p.get_subscription_count() for p in publishers), longest)
@@ -226,9 +329,13 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
             'the nodes'
         )
         print(f'warning: --loop: {problem}', file=sys.stderr)
+    bunched = bunches(bag, names)
+    if bunched:
+        problem = 'the recorder wrote messages late and in bunches; their publish times are used'
+        print(f'note: {", ".join(bunched)}: {problem}', file=sys.stderr)
     with STOP.reacting(Reaction.REMEMBER):
         start_ros(arguments)
-        node = Replay(bag, names, options)
+        node = Replay(bag, names, bunched, options)
         bar = '{percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s'
         with tqdm(
             total=node.length, bar_format=bar, disable=not is_bar_visible(), leave=False
@@ -275,6 +382,11 @@ def parse(arguments: list[str]) -> Namespace:
     paused = 'start paused: wait for replay/resume or replay/step'
     add('--paused', action='store_true', help=paused)
     wait = f'longest wait for subscribers [s] (default: {WAIT:g}, --as-trajectory: {SEND_WAIT:g})'
+    nodes = (
+        'nodes that have to receive every message, separated by commas: playback begins when they '
+        'run, and waits for them when they are slow; needs --clock'
+    )
+    add('--wait-for', type=names, default=[], metavar='NODES', help=nodes)
     add('--wait', type=not_negative, metavar='S', help=wait)
     options = parser.parse_args(arguments)
     _check_combination(parser, options)
@@ -289,6 +401,11 @@ def _check_combination(parser: Parser, options: Namespace) -> None:
         parser.error(
             '--rate other than 1 needs --clock, and nodes with use_sim_time, because nodes with '
             'clocks of their own would compute wrong speeds; add --clock'
+        )
+    if options.wait_for and not options.clock:
+        parser.error(
+            '--wait-for needs --clock, and nodes with use_sim_time, because recorded time stands '
+            'still while the replay waits; add --clock'
         )
     if options.robot and not options.check:
         parser.error('--robot requires --check; add it, or remove --robot')

@@ -43,7 +43,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.anomaly_latch import AnomalyLatch
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, CheckpointQueue
-from musculoskeletal_ae.nodes.diagnostics import PERIOD, Diagnostics
+from musculoskeletal_ae.nodes.diagnostics import MANY_REPORTS, PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.nodes.needed_topics import NeededTopics
 from musculoskeletal_ae.nodes.node_parameters import NodeParameters, naming_parameter
@@ -89,7 +89,6 @@ QOS_REMEDIES = {
     ('subscriber needs', QoSPolicyKind.RELIABILITY): 'subscribe best-effort',
     ('subscriber needs', QoSPolicyKind.DURABILITY): 'subscribe volatile',
 }
-MANY_REPORTS = QoSProfile(depth=50)  # QoS of /diagnostics, on which all nodes of the graph report
 
 
 class Shell(Node):

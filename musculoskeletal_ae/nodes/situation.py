@@ -31,6 +31,10 @@ from musculoskeletal_ae.report import (
     ANOMALY,
     END_OF_RECORDING,
     LENGTH_OFFSETS,
+    MUSCLE_STATES,
+    NOT_WAITED_FOR,
+    PLAYING,
+    WAITING,
     WAITS_FOR,
     Level,
     load_text,
@@ -130,6 +134,7 @@ class Situation:
         #: number of the estimator's reports since the last one during a length calibration
         self._since_calibration = REPORTS + 1
         self.distance = self.limit = math.nan
+        self._recording_ended_at = math.inf  # when `replay` first reported its end [s]
         self._nodes: dict[str, Node] = {}  # last report of each node, by full name
         self._accepted: deque[str] = deque(maxlen=REPORTS)  # versions in the estimator's reports
         #: version of the network that a node uses instead of the accepted network, and the number
@@ -169,6 +174,10 @@ class Situation:
                 self.doing = node.message
                 if node.values.get('mode') not in (STOPPED, VERIFYING):
                     self._has_ended = False
+            elif name == 'replay' and not self.has_recording_ended:
+                self._recording_ended_at = math.inf
+            elif name == 'replay':
+                self._recording_ended_at = min(self._recording_ended_at, self._now)
             if name in FOLLOWERS:
                 self._compare_network(name, node.values.get(VERSION, ''))
 
@@ -219,12 +228,16 @@ class Situation:
     def _troubles(self) -> list[Trouble]:
         others = [Trouble(text) for text in (*self._mismatches(), *self._silent())]
         errors, warnings = list[Trouble](), list[Trouble]()
-        if has_ended := self.has_recording_ended:
+        replay = self._values('replay').get('state', PLAYING)
+        if self.has_recording_ended:
             errors.append(Trouble('end of the recording'))
+        elif replay == WAITING:
+            errors.append(Trouble(f'replay is {self._nodes[f"{self._here}/replay"].message}'))
         for name, node in self._nodes.items():
             if _is_own(name) or node.level == DiagnosticStatus.OK:
                 continue
-            if has_ended and SILENT_TOPIC in node.values:
+            is_silence = SILENT_TOPIC in node.values or node.values.get(WAITS_FOR) == MUSCLE_STATES
+            if replay != PLAYING and is_silence:
                 continue
             if self._is_shown(name, node):
                 if (silent := node.values.get(SILENT_TOPIC)) and not self._explains(node):
@@ -246,6 +259,29 @@ class Situation:
     def has_recording_ended(self) -> bool:
         """Whether `replay` has played its recording to the end."""
         return self._values('replay').get('state') == END_OF_RECORDING
+
+    @property
+    def has_last_report(self) -> bool:
+        """Whether the learner, if there is one, has reported since the recording ended."""
+        learner = self._nodes.get(f'{self._here}/learner')
+        return learner is None or learner.heard_at > self._recording_ended_at
+
+    def learned(self) -> str:
+        """Return from how many samples of a recording the learner has learned; '' without one.
+
+        If nodes may have missed messages, the text says so, with the remedy.
+        """
+        if self.samples == '':
+            return ''
+        postures = 'resting posture' if self.samples == '1' else 'resting postures'
+        text = f'learned from {self.samples} {postures} of the recording'
+        if lost := self._values('replay').get(NOT_WAITED_FOR):
+            cause = overload_text() or 'see their logs'
+            text += (
+                f'; {lost} may have missed messages, because the replay got no answer ({cause}): '
+                'play the recording again, or use train --from-bag, which loses none'
+            )
+        return text
 
     def why_no_estimate(self) -> str:
         """Return why there are no estimates: the last rejected message of the estimator, or ''.

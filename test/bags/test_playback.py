@@ -3,8 +3,11 @@ import math
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
+from bags import bag_samples as samples
 from bags.arm_bag import JOINTS, Arm, joints
+from musculoskeletal_ae.bags.bunches import bunches
 from musculoskeletal_ae.bags.playback import (
     LONGEST_LAG,
     TAUGHT_TOPIC,
@@ -51,9 +54,9 @@ def test_a_step_makes_everything_up_to_its_time_due():
 
 def test_after_a_long_stop_of_the_process_it_goes_on_instead_of_catching_up():
     timeline = Timeline(0, 1.0, now=0.0)
-    timeline.catch_up(SECOND, 1.0 + 0.9 * LONGEST_LAG)
+    timeline.catch_up(SECOND, 1.0 + 0.9 * LONGEST_LAG, LONGEST_LAG)
     assert timeline.wait(2 * SECOND, 2.0) == 0.0
-    timeline.catch_up(SECOND, 100.0)
+    timeline.catch_up(SECOND, 100.0, LONGEST_LAG)
     assert timeline.wait(2 * SECOND, 100.0) == 1.0
 
 
@@ -61,6 +64,29 @@ def test_a_lap_is_everything_from_start_to_stop_in_order(bag, content):
     opened = Bag.open(bag)
     played = list(lap(opened, opened.topics, opened.start, opened.end))
     assert [message.data for message in played] == [sample.data for sample in content]
+
+
+def test_messages_that_a_recorder_wrote_in_bunches_are_played_as_they_were_published(
+    tmp_path, content
+):
+    first = next(sample for sample in content if sample.topic.endswith('/muscle_states'))
+    count, blocked = 120, 20
+    recorded = []
+    for n in range(count):
+        sent = samples.START + n * samples.PERIOD
+        # Of 40 messages, the recorder writes the second half late and together.
+        late = blocked * samples.PERIOD - (n % 40 - blocked) * samples.PERIOD if n % 40 > 19 else 0
+        log = sent + late + 3600 * SECOND  # the clock of the recorder is an hour ahead
+        recorded.append(first._replace(log_time=log, publish_time=sent))
+    samples.write_ours(tmp_path / 'bunched', recorded, 'none', finish=True)
+    bag = Bag.open(tmp_path / 'bunched')
+    found = bunches(bag, bag.topics)
+    times = [message.log_time for message in lap(bag, bag.topics, bag.start, bag.end, found)]
+    assert len(times) == count
+    assert_array_equal(np.diff(times), samples.PERIOD)
+    # A part that begins and ends among late messages is played completely.
+    part = lap(bag, bag.topics, times[30], times[75], found)
+    assert [message.log_time for message in part] == times[30:76]
 
 
 def test_a_window_lies_within_the_bag(bag, content):

@@ -8,6 +8,7 @@ from array import array
 
 import numpy as np
 import pytest
+import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -23,6 +24,8 @@ from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.nodes import record as record_tool
 from musculoskeletal_ae.nodes import replay as replay_tool
 from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.learner import Learner
+from musculoskeletal_ae.nodes.messages import SENSOR
 from musculoskeletal_ae.validity import read_array
 
 from .arm_bag import JOINTS, joints
@@ -269,6 +272,64 @@ def test_the_clock_ticks_a_hundred_times_in_a_recorded_second(tool, graph, tmp_p
     assert times[-1] > content[-2].log_time
 
 
+def stream(count):
+    """Return messages of muscle_states, one every PERIOD."""
+    first = next(s for s in samples.samples(63, '') if s.topic == '/muscle_states')
+    times = [samples.START + n * samples.PERIOD for n in range(count)]
+    return [first._replace(log_time=time, publish_time=time) for time in times]
+
+
+def test_a_slow_node_misses_nothing_of_a_replay_that_waits_for_it(tool, graph, tmp_path):
+    content = stream(300)
+    samples.write_ours(tmp_path / 'bag', content, 'none', finish=True)
+    clock, received = graph.listen(Clock, '/clock', QoSProfile(depth=1)), []
+
+    def take(_):
+        seconds = clock[-1].clock
+        received.append(seconds.sec * 10**9 + seconds.nanosec)
+        if len(received) % 100 == 50:
+            time.sleep(0.5)  # the queue holds only 10 messages
+
+    graph.node.create_subscription(Float64MultiArray, 'muscle_states', take, SENSOR)
+    replay = tool('replay', tmp_path / 'bag', '--clock', '--wait-for', 'test', *ros(graph))
+    graph.wait(lambda: replay.process.poll() is not None, 'the end of the replay')
+    assert replay.process.returncode == 0, replay.output()
+    assert len(received) == len(content)
+    late = np.array(received) - [message.log_time for message in content]
+    assert np.abs(late).max() < samples.PERIOD, late
+
+
+def test_a_replay_begins_when_the_nodes_run_that_it_waits_for(tool, graph, tmp_path):
+    content = [s for s in samples.samples(1200, '') if s.topic == '/muscle_states'][:20]
+    samples.write_ours(tmp_path / 'bag', content, 'none', finish=True)
+    graph.listen(DiagnosticArray, '/diagnostics')
+    received = graph.listen(Float64MultiArray, 'muscle_states')
+    replay = tool('replay', tmp_path / 'bag', '--clock', '--wait-for', 'test,late', *ros(graph))
+    graph.wait(lambda: 'late' in graph.report('replay').message, 'the replay to wait for `late`')
+    assert graph.report('replay').values['state'] == 'waiting'
+    graph.spin(1.5 * replay_tool.WAIT)
+    assert not received
+    late = rclpy.create_node('late', context=graph.context, namespace=graph.namespace)
+    graph.hosted.append(late)
+    graph.executor.add_node(late)
+    graph.wait(lambda: replay.process.poll() is not None, 'the end of the replay')
+    assert replay.process.returncode == 0 and len(received) == len(content)
+
+
+def test_a_replay_beside_nodes_of_another_robot_says_so(tool, graph, tmp_path):
+    content = stream(500)
+    samples.write_ours(tmp_path / 'bag', content, 'none', finish=True)
+    graph.host(Learner, robot='arm26', state_directory='')
+    replay = tool('replay', tmp_path / 'bag', *ros(graph))
+    graph.wait(lambda: replay.process.poll() is not None, 'the end of the replay')
+    output = replay.output()
+    assert replay.process.returncode == 0, output
+    warnings = [line for line in output.splitlines() if line.startswith('warning: ')]
+    assert len(warnings) == 1, output
+    for part in f'{graph.namespace}/learner', 'arm26', 'muscle_states', '--check --robot arm26':
+        assert part in warnings[0]
+
+
 def test_sigterm_ends_a_replay_without_complaint(tool, graph, bag):
     received = graph.listen(Float64MultiArray, 'muscle_states')
     replay = tool('replay', bag, '--loop', '--wait', '0', *ros(graph))
@@ -297,6 +358,7 @@ def test_an_impossible_request_is_reported_in_one_line(tool, bag):
     ('parse', 'arguments', 'problem'),
     [
         (replay_tool.parse, [], 'BAG'),
+        (replay_tool.parse, ['bag', '--wait-for', 'a'], '--wait-for needs --clock'),
         (replay_tool.parse, ['bag', '--rate', '2'], '--rate other than 1 needs --clock'),
         (replay_tool.parse, ['bag', '--rate', '0', '--clock'], 'expected 0.001 to 1000'),
         (replay_tool.parse, ['bag', '--rate', 'nan', '--clock'], 'expected 0.001 to 1000'),

@@ -14,7 +14,7 @@ from musculoskeletal_ae.control.stops import Condition, StopCause, remedy_of
 from musculoskeletal_ae.estimation.finding import Finding, Kind
 from musculoskeletal_ae.estimation.verification import LONGEST
 from musculoskeletal_ae.nodes import bringup_status
-from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC, slow_cause
+from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC, silence_remedy, slow_cause
 from musculoskeletal_ae.nodes.situation import REPORTS, Situation, figures
 from musculoskeletal_ae.remedy import Step, identifiers, sentence
 
@@ -132,6 +132,23 @@ def test_the_end_of_a_recording_without_estimates_is_an_error(graph, had_estimat
         node._print()
     if not had_estimates:
         assert 'no estimate: rejected muscle_states: wrong length' in str(ended.value)
+
+
+@pytest.mark.parametrize('lost', ['', 'learner'])
+def test_at_the_end_of_a_recording_the_samples_and_losses_are_printed(graph, capsys, lost):
+    node = graph.host(bringup_status.BringupStatus, robot='arm26', end_with_replay=True)
+    learner = f'{graph.namespace}/learner'
+    node.anomalies.append(0.5)
+    node.situation.diagnosed(diagnostics(learner, samples='9'))
+    end = {'state': 'end_of_recording', 'nodes_not_waited_for': lost}
+    node.situation.diagnosed(diagnostics(f'{graph.namespace}/replay', 'end', **end))
+    node._print()  # the learner has not reported since the end
+    node.situation.diagnosed(diagnostics(learner, samples='10'))
+    with pytest.raises(ExternalShutdownException):
+        node._print()
+    line = capsys.readouterr().out.splitlines()[-1]
+    assert '10 resting postures' in line
+    assert ('learner' in line and 'train --from-bag' in line) == bool(lost)
 
 
 def found(kind, **more):
@@ -392,6 +409,22 @@ def test_a_learner_that_waits_for_a_calibration_is_not_shown_beside_the_calibrat
     assert situation.trouble() == 'warning: /left/learner: waiting'
 
 
+@pytest.mark.parametrize('state', ['waiting', 'paused'])
+def test_silence_of_a_replay_that_does_not_play_is_not_put_down_to_a_driver(state):
+    situation = Situation('/left')
+    situation.diagnosed(diagnostics('/left/replay', 'waiting until learner can', state=state))
+    silent = {'silent_topic': 'no usable muscle_states: check the driver', 'finding': 'none'}
+    situation.diagnosed(diagnostics('/left/estimator', 'old', DiagnosticStatus.ERROR, **silent))
+    waits = {'waits_for': 'muscle_states', 'samples': '0'}
+    situation.diagnosed(diagnostics('/left/learner', 'no data', DiagnosticStatus.WARN, **waits))
+    is_waiting = state == 'waiting'
+    assert situation.trouble() == ('replay is waiting until learner can' if is_waiting else '')
+    situation.diagnosed(diagnostics('/left/replay', 'playing', state='playing'))
+    assert 'check the driver' not in situation.trouble() and '/left/estimator: old' in (
+        situation.trouble()
+    )
+
+
 def test_silence_after_a_recording_is_put_down_to_its_end():
     situation = Situation('/left')
     silent = {'silent_topic': 'no usable muscle_states', 'finding': 'none'}
@@ -625,9 +658,25 @@ def test_the_situation_is_as_bad_as_the_worst_node_and_shows_warnings_and_the_bo
     assert 'the same again' not in situation.trouble()
 
 
-def test_slow_messages_of_the_emulator_are_put_down_to_the_computer_not_to_a_driver():
+def test_slow_messages_of_the_emulator_are_put_down_to_the_computer_not_to_a_driver(load):
+    load(0.0)
     assert 'driver' not in slow_cause(['hardware_emulator'])
     assert 'driver' in slow_cause(['my_driver'])
+
+
+def test_silence_is_put_down_to_what_publishes_or_to_the_load(load):
+    load(0.0)
+    assert silence_remedy('muscle_states', 3.0, ['my_driver']) == (
+        Step.CHECK_DRIVER,
+        Step.CHECK_DRIVER.text,
+    )
+    step, text = silence_remedy('muscle_states', 3.0, ['replay'])
+    assert step is Step.CHECK_REPLAY and 'driver' not in text
+    load(1e3)
+    for silence, is_explained in ((3.0, True), (30.0, False)):
+        step, text = silence_remedy('muscle_states', silence, ['my_driver'])
+        assert step is Step.CHECK_DRIVER
+        assert ('driver' not in text and 'this computer is overloaded' in text) == is_explained
 
 
 def test_a_silent_topic_is_shown_beside_a_stop_of_another_cause():
