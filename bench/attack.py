@@ -79,13 +79,13 @@ class Row(NamedTuple):
 class Steps(NamedTuple):
     """How fast the commands of one controller process changed."""
 
-    count: int
+    commands: int
     largest_in: float  # largest winding in within one tick [m]
     largest_out: float  # largest paying out within one tick [m]
     too_fast: list[str]
 
 
-def changes(time: Array, number: Array, value: Array, rate: float, relieved: Array) -> Steps:
+def changes(time: Array, number: Array, value: Array, rate: float, relieved: Bools) -> Steps:
     """Check how fast the commands of one controller process changed, against the legal rate.
 
     Args:
@@ -114,7 +114,7 @@ def changes(time: Array, number: Array, value: Array, rate: float, relieved: Arr
     )
 
 
-def relieved(time: Array, loads: list[tuple[float, Array]], limit: Array, muscles: int) -> Array:
+def relieved(time: Array, loads: list[tuple[float, Array]], limit: Array, muscles: int) -> Bools:
     """Return for each command which muscles exceeded their tension limit shortly before it.
 
     The period before a command is RELIEF seconds long.
@@ -232,7 +232,7 @@ def evaluate(attack: 'Attack') -> list[Row]:
         value = np.array([command.value for command in mine])
         number = np.array([command.number for command in mine])
         steps = changes(at, number, value, Settings().rate_limit, eased)
-        count += steps.count
+        count += steps.commands
         fast += steps.too_fast
         for begin, end, mode in stops:
             if (length := wound_in(at, value, begin + JITTER, end)) > STILL:

@@ -28,7 +28,9 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 LONGEST = 5.0  # longest legal CPU time for one file [s]
 MOST_MEMORY = 300  # largest memory that reading one file may add to the peak of the process [MB]
-NASTY = (0.0, -1.0, 1e-300, 1e300, -1e300, float('nan'), float('inf'), 2**70, '', '\x1b[2J', [], {})
+NASTY: tuple[object, ...] = (
+    0.0, -1.0, 1e-300, 1e300, -1e300, float('nan'), float('inf'), 2**70, '', '\x1b[2J', [], {},
+)  # fmt: skip
 KINDS = ('urdf', 'muscles', 'table', 'checkpoint', 'state', 'metadata', 'mcap')
 
 

@@ -317,7 +317,8 @@ class Attack:
 
     def call(self, kind: Any, service: str, request: Any = None) -> Any:
         """Call a service; return its response, or None if no response arrives in time."""
-        client, futures = self._client(kind, service), []
+        client = self._client(kind, service)
+        futures: list[Any] = []
 
         def answered() -> bool:
             # A killed node seems ready for some time, and requests to it are lost. The request is
@@ -427,7 +428,7 @@ class Attack:
             return filled(kind(), rng)
         message = kind(**{name: getattr(last, name) for name in kind.get_fields_and_field_types()})
         for name in ('data', 'position'):
-            values = getattr(message, name, None)
+            values = getattr(message, name, ())
             if getattr(values, 'typecode', '') != 'd' or not len(values):
                 continue
             values = np.array(values, dtype=float)

@@ -132,9 +132,11 @@ class Scene:
             node = name.rpartition('/')[2]
             attack.processes[node].kill()
             attack.start(node)
-            attack.wait(
-                lambda node=node: node in attack.levels, 'the remedy helps', f'a report of {node}'
-            )
+
+            def has_reported(node: str = node) -> bool:
+                return node in attack.levels
+
+            attack.wait(has_reported, 'the remedy helps', f'a report of {node}')
         for identifier in attack.situation.steps():
             self._take(STEPS[identifier])
 

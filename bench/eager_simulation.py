@@ -7,12 +7,13 @@ are batched tensors.
 """
 
 from itertools import combinations_with_replacement
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.mae.units import scale_vector
@@ -27,7 +28,7 @@ from musculoskeletal_ae.simulation.equilibrium import (
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 
-def _single(array: Array) -> Tensor:
+def _single(array: NDArray[Any]) -> Tensor:
     return torch.as_tensor(np.ascontiguousarray(array), dtype=torch.float32)
 
 
@@ -68,6 +69,7 @@ class EagerSimulation:
         self.springs, self.preload = _single(tree.springs), _single(tree.preload)
         self.sliding = torch.as_tensor(tree.slides[1:])[:, None]
         self.limbs = []
+        parts: tuple[NDArray[Any], ...]
         parts = limbs.joints, limbs.muscles, limbs.first, limbs.second
         for d, m in limbs.counts:
             pairs = np.array([*combinations_with_replacement(range(d), 2)]).T
@@ -97,7 +99,7 @@ class EagerSimulation:
             compliance = 1.0 / (body.rate * (body.force + end.clamp(min=0.0))) + stretch
             turning, viscous = slid, torch.diag_embed(body.viscosity / h)
             for _ in range(ROUNDS):
-                sliding = turning.abs() < 1.0
+                sliding = torch.abs(turning) < 1.0
                 rub = torch.where(sliding, body.friction * end / REVERSAL, 0.0)
                 lost = torch.where(sliding, 0.0, body.friction * end * (turning - slid))
                 by_motor = passed * compliance
@@ -119,7 +121,7 @@ class EagerSimulation:
                 moved = (way + compliance * lost - by_motor * (pull - tension)) / give
                 before, turning = turning, (slid - moved / REVERSAL).clamp(-1.0, 1.0)
                 rough = (body.friction * end != 0.0).any()
-                if not rough or ((before.abs() < 1.0) == (turning.abs() < 1.0)).all():
+                if not rough or ((torch.abs(before) < 1.0) == (torch.abs(turning) < 1.0)).all():
                     break
             holding = torch.where(held, -push, 0.0)
             self.state = ArmState(arrived, pull, length + moved, followed, holding, turning)

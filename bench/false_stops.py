@@ -28,6 +28,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -219,7 +220,7 @@ class BusyLoop:
                 continue
             if core.body is not self._body:
                 self._body = core.body
-                self._reliable.append(lambda body=core.body: self.controller.use_body(body))
+                self._reliable.append(partial(self.controller.use_body, core.body))
             if output is not None:
                 self._estimates.append(output.state.theta)
 

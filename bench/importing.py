@@ -89,10 +89,10 @@ def lengths_of_cardsflow(file: Path, source: Source) -> Callable[[dict[str, Arra
         if not all(straight[m]):
             continue
         tendon = spec.add_tendon(name=name)
-        for i, (link, via) in enumerate(own):
-            at = np.add(centres.get(link, [0.0] * 3), [*map(float, (via.text or '').split())])
-            body = bodies.get(link, spec.worldbody)
-            tendon.wrap_site(body.add_site(name=f'{name} {i}', pos=at).name)
+        for i, (owner, via) in enumerate(own):
+            place = np.add(centres.get(owner, [0.0] * 3), [*map(float, (via.text or '').split())])
+            body = bodies.get(owner, spec.worldbody)
+            tendon.wrap_site(body.add_site(name=f'{name} {i}', pos=place).name)
         measured.append(name)
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -136,8 +136,8 @@ def row(file: Path, out: Path, minutes: float | None) -> list[str]:
         return [name, str(error)[-160:]]
     parts = comparison if comparison and comparison.lengths else ({'': np.nan},) * 3
     lengths, arms, flips = (np.array(list(part.values())) for part in parts)
-    errors = f'{1e3 * lengths.max():.3f}', f'{1e3 * np.median(lengths):.3f}'
-    errors += f'{1e3 * arms.max():.3f}', f'{(flips > 0.0).sum()}'
+    errors = [f'{1e3 * lengths.max():.3f}', f'{1e3 * np.median(lengths):.3f}']
+    errors += [f'{1e3 * arms.max():.3f}', f'{(flips > 0.0).sum()}']
     check = check_verdict(check_robot(robot, 100)).removeprefix('check_robot: ')
     wraps = len(set(robot.routes.muscle[robot.routes.wrapping].tolist()))
     counts = (robot.joint_count, robot.muscle_count, wraps)
@@ -150,7 +150,7 @@ def learned(robot: Robot, minutes: float, out: Path) -> list[str]:
     study = Study(robot, 'default', (INDIVIDUAL,), minutes, quick=False, folder=out)
     for preset in PRESETS:
         online_learning.train_initial(study, preset)
-    cells = []
+    cells = list[str]()
     for keys, experiment in (
         (('before_rad', 'after_rad', 'oracle_rad'), online_learning.measure),
         (('proposed',), control.measure),

@@ -122,9 +122,10 @@ class Body:
         """
         right, pair = number % 2, number // 2
         prefix = ('left_', 'right_')[right] + (f'{pair + 1}_' if pair else '')
-        held, wires = ('elbow_yaw' if wires == 'held' else ''), wires if wires != 'held' else 0
+        held = 'elbow_yaw' if wires == 'held' else ''
+        tendons = wires if isinstance(wires, int) else 0
         parts = [p for p in self._arm if p.tag != 'material' and p.get('name') != 'torso']
-        if wires:
+        if tendons:
             parts = [p for p in parts if p.get('name') != 'wrist']
             parts[-1:-1] = ET.fromstring(WRIST)  # noqa: S314
         names = {p.get('name') for p in parts}
@@ -145,14 +146,15 @@ class Body:
             base = part.find("parent[@link='torso']")
             if base is not None and pair:
                 origin = part.find('origin')
-                x, y, z = origin.get('xyz', '').split()  # type: ignore[union-attr]
-                origin.set('xyz', f'{x} {y} {-BELOW * pair:g}')  # type: ignore[union-attr]
+                assert origin is not None  # every joint of the arm's URDF has an origin
+                before, left, _ = origin.get('xyz', '').split()
+                origin.set('xyz', f'{before} {left} {-BELOW * pair:g}')
             self.urdf.append(part)
         muscles = [(m['name'], [(p['link'], p['xyz']) for p in m['route']])
                    for m in self._description['muscles']
                    if not (held and m['name'] == 'pronator_teres')]  # fmt: skip
         signs = [sign for sign in self._signs if sign[1] != held]
-        for name, angle in WRIST_WIRES.get(wires, {}).items():  # type: ignore[arg-type]
+        for name, angle in WRIST_WIRES.get(tendons, {}).items():
             route = [('ulna', on_ring(angle, WRIST_RADIUS, -0.04)),
                      ('forearm', on_ring(angle, WRIST_RADIUS, -0.19)),
                      ('hand', on_ring(angle, WRIST_RADIUS, -0.03))]  # fmt: skip

@@ -240,8 +240,8 @@ def rupture_cells(study: Study, seed: int) -> list[str]:
     initial = study.network(None)
     with_ruptures = record(study.arm(seed), initial, 0xC0 + seed, plan.duration, plan)
     healthy = record(study.arm(seed), initial, 0xD0 + seed, study.held_out_time)
-    runs = (run_detector(robot, mae, recording) for recording in (with_ruptures, healthy))
-    result = detection(robot, plan, *runs, mae)
+    faulty, well = (run_detector(robot, mae, each) for each in (with_ruptures, healthy))
+    result = detection(robot, plan, faulty, well, mae)
     count = result['counted_cuts']
     return [f'{round(result[k] * count)} of {count}' for k in ('detected_share', 'named_share')]
 

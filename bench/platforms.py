@@ -128,7 +128,8 @@ def interpreter(version: str) -> Path | None:
     The result is None if neither PATH nor pyenv has this version.
     """
     pyenv = Path(os.environ.get('PYENV_ROOT', Path.home() / '.pyenv')) / 'versions'
-    candidates = [shutil.which(f'python{version}'), *sorted(pyenv.glob(f'{version}.*/bin/python'))]
+    candidates = [shutil.which(f'python{version}')]
+    candidates += map(str, sorted(pyenv.glob(f'{version}.*/bin/python')))
     for candidate in filter(None, candidates):
         # A candidate on PATH may be a shim of pyenv. It runs no Python, but reports an error, if
         # pyenv has not selected this version.

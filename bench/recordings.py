@@ -143,12 +143,15 @@ def models(
     def shifted(run: Run) -> Run:
         return replace(run, length=run.length - at_zero)
 
+    def of_shifted(model: Model) -> Model:
+        return lambda run: model(shifted(run))
+
     for with_effort in efforts:
         key = split.name.partition(' → ')[0], with_effort
         if key not in learned:
             learned[key] = package(link, directory, shifted(split.training), with_effort)
         what = 'lengths and efforts' if with_effort else 'lengths'
-        yield f'this package, {what}', lambda run, model=learned[key]: model(shifted(run))
+        yield f'this package, {what}', of_shifted(learned[key])
     if split.rests:
         robot = Robot.load(link.write(directory))
         yield 'statics with learned springs, payload known', Statics(robot, split.rests).posture

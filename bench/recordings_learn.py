@@ -40,11 +40,11 @@ def error(model: Model, run: Run) -> float:
 
 def joined(runs: list[Run]) -> Run:
     """Return the rows of several runs as one."""
-    parts = [
+    length, effort, theta = (
         np.concatenate([getattr(run, part) for run in runs])
         for part in ('length', 'effort', 'theta')
-    ]
-    return Run('', float('nan'), *parts, runs[0].rests[:0])
+    )
+    return Run('', float('nan'), length, effort, theta, runs[0].rests[:0])
 
 
 def polynomial(training: Run, degree: int, with_effort: bool) -> Model:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 #: robot that stands for a soft link: two joints, whose axes cross in the middle of the link, with
@@ -53,7 +53,7 @@ class Run:
     length: Array
     effort: Array  # effort of the motors in units of the recording, (N, M); (N, 0) if it is unknown
     theta: Array  # θ, which an independent sensor measured [rad], (N, D)
-    rests: Array  # first row of each rest, and the row after its last row, (R, 2)
+    rests: Ints  # first row of each rest, and the row after its last row, (R, 2)
 
     def at_rest(self, rows: slice = slice(None)) -> Run:
         """Return a run with one row for each rest: the means of lengths, efforts and θ in it."""
@@ -173,7 +173,7 @@ def _columns(text: str) -> dict[str, Array]:
     return dict(zip(lines[0].strip().split(','), rows.T, strict=True))
 
 
-def _ends(changes: Array, count: int, rows: int) -> Array:
+def _ends(changes: Ints, count: int, rows: int) -> Ints:
     """Return for each pose its last `rows` rows, as the first row and the row after the last one.
 
     A pose ends at a row in `changes` or at `count`. Poses of at most twice `rows` are left out. The

@@ -209,6 +209,6 @@ def main(argv: list[str]) -> int:
             print(line(seed, what, excess, stops, rest), flush=True)
             failures += (excess.longest > LONGEST) + stops
             worst = Excess(*np.maximum(worst, excess))
-    samples, error = np.mean(rows, axis=0) if rows else (np.nan, np.nan)
-    print(line(-1, 'worst, mean', worst, failures, f' {samples:>7.0f} {error:>7.3f}'))
+    means = np.mean(rows, axis=0) if rows else (np.nan, np.nan)
+    print(line(-1, 'worst, mean', worst, failures, f' {means[0]:>7.0f} {means[1]:>7.3f}'))
     return int(failures > 0)

@@ -24,7 +24,7 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Thread
@@ -204,9 +204,11 @@ class System:
             def take(_: Any, info: dict[str, Any], topic: str = topic) -> None:
                 self.stamps[topic].append(info['source_timestamp'])
 
+            # The annotation of rclpy leaves out that a callback may also take the message's info.
+            callback: Callable[..., None] = take
             # Only the time stamps are needed. Leaving messages serialized saves CPU time.
             self._node.create_subscription(
-                Float64MultiArray, topic, take, qos_profile_sensor_data, raw=True
+                Float64MultiArray, topic, callback, qos_profile_sensor_data, raw=True
             )
 
         def listen() -> None:

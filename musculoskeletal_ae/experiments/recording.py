@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.control.command import LENGTH, Command
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.exploration import Exploration
@@ -44,7 +44,7 @@ class Recording(NamedTuple):
     tension: Array  # measured tensions T_read [N], (N, M)
     command: Array  # l_target [m], (N, M)
 
-    def part(self, rows: slice) -> Recording:
+    def part(self, rows: slice | Ints) -> Recording:
         """Return a part of the samples."""
         return Recording(*(column[rows] for column in self))
 
