@@ -14,6 +14,7 @@ MUSCLE_STATES = 'muscle_states'
 WAITING, PLAYING, PAUSED, END_OF_RECORDING = 'waiting', 'playing', 'paused', 'end_of_recording'
 #: key in the last report of a replay: names of nodes that may have missed messages
 NOT_WAITED_FOR = 'nodes not waited for'
+OVERLOADED = 'this computer is overloaded'
 Level = Literal['ok', 'warn', 'error']
 
 
@@ -43,7 +44,7 @@ def is_overloaded() -> bool:
 
 def overload_text() -> str:
     """Return that this computer is overloaded, with its load; '' if it is not overloaded."""
-    return f'this computer is overloaded (load {load_text()})' if is_overloaded() else ''
+    return f'{OVERLOADED} (load {load_text()})' if is_overloaded() else ''
 
 
 def whole(value: float, unit: str = '') -> str:

@@ -20,7 +20,7 @@ from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.situation import LARGEST_AGE, Situation, figures
-from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.report import OVERLOADED, Report, overload_text
 
 #: time after the first estimate during which problems are not shown, because most of them end by
 #: themselves while the nodes start [s]
@@ -48,7 +48,8 @@ class BringupStatus(Shell):
         self.situation = Situation(self.get_namespace())
         self.started: float | None = None
         self.ended: float | None = None  # when the end of the recording was first reported [s]
-        self.waiting = ''  # the last line before the first estimate
+        #: the last line before the first estimate, and whether it named an overload
+        self.waiting = '', False
         self.waiting_since = -math.inf  # when it was printed [s]
         self.printed_hint = ''
         self.follow_posture('joint_states', self._on_measured_posture, some=True)
@@ -80,9 +81,9 @@ class BringupStatus(Shell):
         self.situation.tick()
         if self.started is None and not self.anomalies:
             if 0.0 < self.patience < now - self.begun:
+                advice = '; '.join(filter(None, [overload_text(), 'see the logs of the nodes']))
                 sys.exit(
-                    f'the system did not come up: no estimate within {self.patience:g} s; see the '
-                    'logs of the nodes'
+                    f'the system did not come up: no estimate within {self.patience:g} s; {advice}'
                 )
             self._end_with_replay()
             self._print_waiting(now)
@@ -116,9 +117,14 @@ class BringupStatus(Shell):
         # Most problems end by themselves while the nodes start.
         if now - self.begun >= SETTLING and (reason := self.situation.why_no_estimate()):
             line += f': {reason}'
-        if line != self.waiting and now - self.waiting_since >= WAITING_INTERVAL:
-            self.waiting, self.waiting_since = line, now
-            print(printable(line), flush=True)
+        overload = overload_text() if now - self.begun >= SETTLING else ''
+        if OVERLOADED in line:  # a node has already said so
+            overload = ''
+        # The load itself changes all the time, which is no reason to print the line again.
+        waiting = line, bool(overload)
+        if waiting != self.waiting and now - self.waiting_since >= WAITING_INTERVAL:
+            self.waiting, self.waiting_since = waiting, now
+            print(printable('; '.join(filter(None, [line, overload]))), flush=True)
 
     def _print_line(self, running_time: float) -> None:
         means = [sum(v) / len(v) if v else math.nan for v in (self.errors, self.anomalies)]

@@ -23,6 +23,7 @@ from musculoskeletal_ae.control.stops import Clears, StopCause
 from musculoskeletal_ae.control.supervisor import Activity, StopState
 from musculoskeletal_ae.estimation.status import CALIBRATION, GENTLE_MOTION, ISOLATION
 from musculoskeletal_ae.estimation.verification import LONGEST
+from musculoskeletal_ae.nodes.diagnostics import PERIOD
 from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC
 from musculoskeletal_ae.nodes.progress import LONGEST_STALL
 from musculoskeletal_ae.nodes.sources import SEVERAL
@@ -385,12 +386,19 @@ class Situation:
         return remedy.sentence(steps, self._values('hardware_emulator').get(EMULATED_FAULTS, ''))
 
     def _mismatches(self) -> list[str]:
-        return [
-            f'{node} uses network {version}, but the estimator uses network {self._accepted[-1]}; '
-            f'if this lasts, restart {node} or bringup.sh'
-            for node, (version, reports) in self._other_networks.items()
-            if reports >= REPORTS
-        ]
+        overload = overload_text()
+        mismatches = []
+        for node, (version, reports) in self._other_networks.items():
+            if reports < REPORTS:
+                continue
+            advice = f'if this lasts, restart {node} or bringup.sh'
+            if overload and reports * PERIOD <= LONGEST_STALL:
+                advice = f'{overload}; stop other programs'
+            mismatches.append(
+                f'{node} uses network {version}, but the estimator uses network '
+                f'{self._accepted[-1]}; {advice}'
+            )
+        return mismatches
 
     def silent_nodes(self) -> dict[str, float]:
         """Return the time [s] since the last report of each needed node that is silent, by name."""

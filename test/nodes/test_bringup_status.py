@@ -102,7 +102,8 @@ def test_silent_joint_sensors_are_shown_as_missing(graph, capsys):
     assert 'error waits for joint_states' in capsys.readouterr().out
 
 
-def test_before_the_first_estimate_a_line_says_why_there_is_none(graph, capsys, monkeypatch):
+def test_before_the_first_estimate_a_line_says_why_there_is_none(graph, capsys, monkeypatch, load):
+    load(0.0)
     monkeypatch.setattr(bringup_status, 'WAITING_INTERVAL', 0.0)
     node = graph.host(bringup_status.BringupStatus, robot='arm26')
     node._print()
@@ -116,6 +117,11 @@ def test_before_the_first_estimate_a_line_says_why_there_is_none(graph, capsys, 
     assert capsys.readouterr().out == line
     node._print()
     assert capsys.readouterr().out == ''  # nothing has changed
+    for busy in (1e3, 2e3):
+        load(busy)
+        node._print()
+    (line,) = capsys.readouterr().out.splitlines()  # printed once
+    assert rejected['last_rejected'] in line and 'this computer is overloaded' in line
 
 
 @pytest.mark.parametrize('had_estimates', [True, False])
@@ -554,7 +560,20 @@ def test_a_suspect_that_is_verified_is_not_to_be_repaired_yet():
     )
 
 
-def test_a_node_with_another_network_than_the_estimator_is_shown_after_some_seconds():
+def test_the_load_of_the_computer_explains_another_network_for_some_seconds(load):
+    load(1e3)
+    situation, advised = Situation('/left'), []
+    for _ in range(20):
+        situation.diagnosed(diagnostics('/left/estimator', checkpoint_version='20'))
+        situation.diagnosed(diagnostics('/left/controller', checkpoint_version='3'))
+        if 'uses network 3' in (trouble := situation.trouble()):
+            advised.append('restart' in trouble)
+    assert advised[0] is False and advised[-1] is True
+    assert advised == sorted(advised)
+
+
+def test_a_node_with_another_network_than_the_estimator_is_shown_after_some_seconds(load):
+    load(0.0)
     situation = Situation('/')
 
     def second(estimator, controller):
