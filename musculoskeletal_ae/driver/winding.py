@@ -242,14 +242,19 @@ class Winding(MotionTest):
     def _misplaced(self) -> list[int]:
         """Return the muscles that pull more than demanded, if a wrong order explains all of them.
 
-        Each of them must then follow the command of another muscle, which is at a shorter length,
-        and no two of them the same one. If every muscle pulls, the order is therefore not wrong.
+        Each of them must then follow the command of another muscle, which demands the excess, and
+        no two of them the same one. If every muscle pulls, the order is therefore not wrong.
         """
         length, tension, _ = self._recent[-1][1]
-        excess = tension - self._demanded(length)
+        demand = self._demanded(length)
+        excess = tension - demand
         pulls = excess > self._tolerance
-        needed = 0.5 * np.where(pulls, excess, -np.inf) / self._robot.stiffness
-        explained: Bools = length[:, None] - self._sent[None, :] > needed[:, None]
+        needed = 0.5 * np.where(pulls, excess, -np.inf)
+        # The module evaluates the law with its own l, or with the l that is published for the other
+        # muscle.
+        own: Array = self._robot.stiffness[:, None] * (length[:, None] - self._sent[None, :])
+        published = (demand - self._bias)[None, :]
+        explained: Bools = np.maximum(own, published) > needed[:, None]
         np.fill_diagonal(explained, ~pulls)
         rows, columns = linear_sum_assignment(~explained)
         if not pulls.any() or not explained[rows, columns].all():

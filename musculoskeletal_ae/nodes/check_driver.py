@@ -153,7 +153,7 @@ class CheckDriver:
                     publisher.publish(motor_command(self.motors, target))
                 else:
                     publisher.publish(array_message(target, 'muscle'))
-            if winding.trying != trying:
+            if winding.trying != trying and not winding.done:
                 trying = winding.trying
                 _say(f'moving: {trying}')
 
