@@ -103,6 +103,7 @@ class Replay(Node):
         self._next_tick = self._next_service = self._next_report = 0.0
         self._sought: int | None = None  # recorded time to seek to [ns]
         self._rate = options.rate
+        self._printed = ''  # the nodes that it waits for, as last printed
         # Steady time and recorded time of the last report, and steady time of the last seek [s].
         self._reported, self._seek_time = (math.inf, 0.0), math.inf
         description = 'position in the bag [s]; set this parameter to seek'
@@ -195,6 +196,9 @@ class Replay(Node):
             self._next_report = time.monotonic() + PERIOD
             waiting = f'waiting until {" and ".join(self._lockstep.missing())} can receive'
             self._diagnostics.tell(Report('ok', waiting, {'state': WAITING}), {})
+            if waiting != self._printed:
+                self._printed = waiting
+                print(waiting, file=sys.stderr, flush=True)
 
     def acknowledge(self) -> None:
         """Report the end, and wait until reliable subscribers have received the last messages."""
