@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fill numba's cache by one step of both emulator models and of the simulator.
+"""Fill numba's cache by steps of both emulator models and of the simulator, and by one wrap.
 
 A node that compiles at run time cannot keep its rate, and cannot be stopped meanwhile. The progress
 is printed, because compilation takes half a minute on a fast computer, and minutes on a busy one.
@@ -16,6 +16,8 @@ from numba.extending import is_jitted
 import musculoskeletal_ae
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.mae.initial_training import initial_mae
+from musculoskeletal_ae.presets.registry import PRESETS
+from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 
@@ -63,9 +65,19 @@ class Progress(event.Listener):
             print(f'compiling: {len(self._compiled)} of {len(self._functions)}', flush=True)
 
 
+def compute_wrap(robot: Robot) -> None:
+    """Compute the lengths of a robot with a wrap; no shipped robot has one."""
+    (start, *rest), *others = robot.description.routes
+    sphere = Wrap(start.link, start.xyz + 0.05, radius=0.01, axis=None, side=None)
+    robot.with_routes([(start, sphere, *rest), *others])  # computes the lengths at θ = 0
+
+
 import_functions()
 with event.install_listener('numba:compile', Progress()):
     robot = Robot.load('arm26')
     for reality in ('kin', 'foreign'):
         make_arm(robot, seed=0, reality=reality).step(0.001)
-    Simulation(robot, initial_mae(robot, steps=1).mae).step(0.01)
+    # Networks of the presets have different activations, and one simulator runs them all.
+    for preset in PRESETS:
+        Simulation(robot, initial_mae(robot, preset, steps=1).mae).step(0.01)
+    compute_wrap(robot)
