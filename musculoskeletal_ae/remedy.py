@@ -63,6 +63,7 @@ REMEDY_STEPS = 'remedy steps'  # key of a value in /diagnostics
 REPAIR = Step.REPAIR_MUSCLE, Step.RESET_ESTIMATOR
 #: key of a value of hardware_emulator: the parameters that cause a fault, separated by commas
 EMULATED_FAULTS = 'emulated faults'
+NO_FAULTS = 'none'  # the value EMULATED_FAULTS while no parameter causes a fault
 #: how to repair a muscle of an emulated arm, by the parameter of hardware_emulator
 EMULATED_REPAIRS = {
     'ruptured_muscles': (

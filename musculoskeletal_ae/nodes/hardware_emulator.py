@@ -23,7 +23,7 @@ from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.arm import Arm, Markers
 from musculoskeletal_ae.nodes.messages import RELIABLE, serve
-from musculoskeletal_ae.remedy import EMULATED_FAULTS, EMULATED_REPAIRS
+from musculoskeletal_ae.remedy import EMULATED_FAULTS, EMULATED_REPAIRS, NO_FAULTS
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.robot.kinematics import body_frames
@@ -147,7 +147,7 @@ class HardwareEmulator(Arm):
         values = {
             'hottest module': f'{hottest:.1f} °C',
             'real-time factor': f'{self.pace:.2f}',
-            EMULATED_FAULTS: ', '.join(faults) or 'none',
+            EMULATED_FAULTS: ', '.join(faults) or NO_FAULTS,
         }
         if self.arm.has_diverged:
             problem = 'the simulation diverged under excessive forces'

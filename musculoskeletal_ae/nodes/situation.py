@@ -27,7 +27,7 @@ from musculoskeletal_ae.nodes.diagnostics import PERIOD
 from musculoskeletal_ae.nodes.needed_topics import SILENT_TOPIC
 from musculoskeletal_ae.nodes.progress import LONGEST_STALL
 from musculoskeletal_ae.nodes.sources import SEVERAL
-from musculoskeletal_ae.remedy import EMULATED_FAULTS, REMEDY_STEPS, REPAIR, Step
+from musculoskeletal_ae.remedy import EMULATED_FAULTS, NO_FAULTS, REMEDY_STEPS, REPAIR, Step
 from musculoskeletal_ae.report import (
     ANOMALY,
     END_OF_RECORDING,
@@ -132,6 +132,8 @@ class Situation:
         self._clear_reports = 0  # successive reports of the estimator without a finding
         self._has_ended = False  # whether an anomaly has ended during the present stop
         self._was_verifying = False  # whether the last anomaly ended with a verification
+        #: whether an emulator has reported, since the last anomaly began, that no muscle is faulty
+        self._has_no_faults = False
         #: number of the estimator's reports since the last one during a length calibration
         self._since_calibration = REPORTS + 1
         self.distance = self.limit = math.nan
@@ -171,6 +173,8 @@ class Situation:
             elif name == 'estimator':
                 self._take_estimator(node.values)
                 self._accepted.append(node.values.get(VERSION, ''))
+            elif name == 'hardware_emulator':
+                self._has_no_faults = node.values.get(EMULATED_FAULTS) == NO_FAULTS
             elif name == 'controller':
                 self.doing = node.message
                 if node.values.get('mode') not in (STOPPED, VERIFYING):
@@ -186,6 +190,8 @@ class Situation:
         was_detected = self.detected
         self._finding = values.get('finding', '')
         self.detected = self._finding not in ('', 'none')
+        if self.detected and not was_detected:
+            self._has_no_faults = False  # the last report of the emulator may be older
         if self._finding == 'none' and was_detected:
             self._has_ended = True
         if self.detected:
@@ -375,15 +381,21 @@ class Situation:
                 needed = lasting if ends_by_itself else causes
                 steps = tuple(stops.remedy_of(needed, explored, known, settled))
                 text = self._sentence(steps)
-            troubles.append(Trouble(f'STOPPED: {stop} (to go on: {text})', steps))
+            troubles.append(Trouble(f'STOPPED: {stop} (to go on: {text})', self._needed(steps)))
         return troubles
 
     def _with_remedy(self, text: str, *steps: Step) -> Trouble:
-        return Trouble(f'{text} (to go on: {self._sentence(steps)})', steps)
+        return Trouble(f'{text} (to go on: {self._sentence(steps)})', self._needed(steps))
+
+    def _needed(self, steps: Iterable[Step]) -> tuple[Step, ...]:
+        """Return the steps of a remedy without a repair that an emulated arm does not need."""
+        needless = {Step.REPAIR_MUSCLE} if self._has_no_faults else set()
+        return tuple(step for step in steps if step not in needless)
 
     def _sentence(self, steps: Iterable[Step]) -> str:
         """Return a remedy as a text, which also states how to repair an emulated arm."""
-        return remedy.sentence(steps, self._values('hardware_emulator').get(EMULATED_FAULTS, ''))
+        faults = self._values('hardware_emulator').get(EMULATED_FAULTS, '')
+        return remedy.sentence(self._needed(steps), faults)
 
     def _mismatches(self) -> list[str]:
         overload = overload_text()

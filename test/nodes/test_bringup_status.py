@@ -248,6 +248,24 @@ def test_on_an_emulated_arm_the_remedy_names_the_parameter_that_repairs_the_musc
     assert 'hardware_emulator' not in situation.trouble()
 
 
+def test_a_muscle_of_an_emulated_arm_that_has_been_repaired_is_not_to_be_repaired_again():
+    situation = Situation('/left')
+    emulator = '/left/hardware_emulator'
+    sound = diagnostics(emulator, emulated_faults='none')
+    isolated = {'isolated_muscles': 'triceps', 'isolated_muscles_with_faults': 'triceps (ruptured)'}
+    situation.diagnosed(sound)
+    situation.diagnosed(stopped(StopCause.ANOMALY))
+    # The last report of the emulator may be older than the rupture.
+    for report in (found(Kind.SLACK_TENDON, **isolated), diagnostics(emulator, emulated_faults='')):
+        situation.diagnosed(report)
+        assert situation.trouble().count(Step.REPAIR_MUSCLE.text) == 2
+        assert situation.steps()[0] == 'repair_muscle'
+    situation.diagnosed(sound)
+    assert situation.steps() == ['reset_estimator', 'reset_controller']
+    assert Step.REPAIR_MUSCLE.text not in situation.trouble()
+    assert Step.RESTORE_MUSCLES.text in situation.trouble()
+
+
 def test_an_anomaly_is_shown_with_its_evidence_and_the_learner_advises_nothing_else():
     situation = Situation('/left')
     suspect = {'finding': 'slack_tendon', 'suspect_muscle': 'biceps', 'evidence': 'no tension'}
