@@ -84,6 +84,8 @@ class FakeRobot(Node):
         topic = 'tendon_controller/commands'
         self.create_subscription(Float64MultiArray, topic, self.on_commands, 10)
         self.create_timer(1.0 / UPDATE_RATE, self.update)
+        name = self.hardware.robot.description.directory.name
+        self.get_logger().info(f'publishing at {UPDATE_RATE:g} Hz for {name}')
 
     def on_commands(self, message: Float64MultiArray) -> None:
         """Store a command until the next one; drop it with a warning if it is not finite."""

@@ -42,8 +42,14 @@ def start_fake_robot(graph):
     graph.listen(JointState, STATES)
     command = [sys.executable, str(EXAMPLE / 'fake_robot.py')]
     command += ['--ros-args', '-r', f'__ns:={graph.namespace}']
-    graph.processes.append(Process('fake_robot', command))
+    robot = Process('fake_robot', command)
+    graph.processes.append(robot)
     graph.next(STATES)
+    return robot
+
+
+def test_the_fake_robot_says_that_it_publishes(graph, arm26):
+    assert arm26.description.directory.name in start_fake_robot(graph).wait_for_output('Hz')
 
 
 def test_the_files_of_controllers_and_nodes_state_the_same_motors():
