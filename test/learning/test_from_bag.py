@@ -21,7 +21,7 @@ from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.stop_signals import INTERRUPTED
 from musculoskeletal_ae.tools import bag_learning, model_training, network_cache
-from musculoskeletal_ae.tools.bag_learning import anomaly_in, error, learn, read
+from musculoskeletal_ae.tools.bag_learning import anomaly_in, error, learn, read, repetition
 from musculoskeletal_ae.tools.network_cache import network_file
 from musculoskeletal_ae.tools.train import main
 
@@ -233,6 +233,17 @@ def test_an_anomaly_in_a_held_out_recording_is_reported_with_the_error_before_it
     text = anomaly_in(arm26, recording, initial, 'default')
     assert f'({arm26.muscles[2]}: {Kind.SLACK_TENDON.value}) begins 3.0 s after the start' in text
     assert f'until then the error is {error(initial, recording.first(300)):.4f} rad' in text
+
+
+def test_a_held_out_recording_of_the_learned_postures_is_reported(arm26):
+    rng = np.random.default_rng(0)
+    learned, others = arm26.random_postures(20, rng), arm26.random_postures(20, rng)
+    noise = rng.normal(0.0, 0.005, (10, 20, 2))
+    again, new = ((rests + noise).reshape(-1, 2) for rests in (learned, others))
+    again[::7] = np.nan  # messages in which the joint angles are unknown
+    assert 'controller:seed' in repetition(arm26, again, learned)
+    assert repetition(arm26, new, learned) == ''
+    assert repetition(arm26, again[:0], learned) == repetition(arm26, again, learned[:0]) == ''
 
 
 @pytest.fixture
