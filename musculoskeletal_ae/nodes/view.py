@@ -270,8 +270,7 @@ class View(Node):
         """Tell visitors, SETTLE_TIME after a reset, whether the arm has stopped again."""
         if time.monotonic() > self.reset_at + SETTLE_TIME:
             self.reset_at = math.inf
-            trouble = self.page.with_buttons(self.situation.trouble())
-            is_stopped = self.situation.is_stopped
+            trouble, is_stopped = self.situation.trouble(), self.situation.is_stopped
             self.page.notify(f'stopped again: {trouble}' if is_stopped else 'reset', not is_stopped)
 
     def _reset(self) -> None:

@@ -34,7 +34,7 @@ RESET, RESTORE = 'Reset after a stop', 'Restore isolated muscles'
 RUPTURE, REPAIR = 'Rupture', 'Repair'
 CALIBRATE = 'Find the length offsets'
 PAYLOAD, POSITION = 'payload [kg]', 'at [s]'  # labels of sliders
-#: phrases in remedies of stops, and the button for each; longer phrases first
+#: phrases in remedies and in answers of services, and the button for each; longer phrases first
 BUTTONS = {
     'call estimator/reset; call controller/reset': RESET,
     'call estimator/reset': RESET,
@@ -42,6 +42,7 @@ BUTTONS = {
     'call estimator/restore': RESTORE,
     'call estimator/zero': CALIBRATE,
     'call controller/explore true to explore again': EXPLORE,
+    'call controller/explore': EXPLORE,
 }
 PUSH_STIFFNESS = 200.0  # force on the hand per distance by which the mouse drags it [N/m]
 MOST_PUSH = 60.0  # largest force of a push with the mouse [N]

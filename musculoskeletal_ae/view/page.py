@@ -168,10 +168,12 @@ class Page:
         return text if self.controls is None else with_buttons(text)
 
     def notify(self, text: str, good: bool) -> None:
-        """Notify all visitors of the outcome of a request."""
+        """Notify all visitors of the outcome of a request, naming buttons instead of services."""
         title, color = ('done', 'teal') if good else ('refused', 'red')
         for client in self._server.get_clients().values():
-            client.add_notification(title, text, color=color, auto_close_seconds=6)
+            client.add_notification(
+                title, self.with_buttons(text), color=color, auto_close_seconds=6
+            )
 
     def offer(self, nodes: Iterable[str], explores: bool = False) -> None:
         """Show the controls of the running nodes only.

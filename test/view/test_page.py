@@ -28,6 +28,7 @@ from musculoskeletal_ae.remedy import Step
 pytest.importorskip('viser', reason='./bringup.sh --view installs what the page needs')
 
 import msgspec
+import viser
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -154,6 +155,20 @@ def test_remedies_name_the_buttons_of_the_page(arm26):
             assert text.count('Reset after a stop') <= 1
     finally:
         page.close()
+
+
+@pytest.mark.parametrize('read_only', [False, True])
+def test_notifications_name_the_buttons_of_the_page(arm26, monkeypatch, read_only):
+    page = Page(arm26, '127.0.0.1', free_port(), read_only, lambda *_: None)
+    notified = []
+    visitor = SimpleNamespace(add_notification=lambda *texts, **_: notified.extend(texts))
+    monkeypatch.setattr(viser.ViserServer, 'get_clients', lambda _: {0: visitor})
+    try:
+        page.notify('it has jumped; then call estimator/reset again', False)
+    finally:
+        page.close()
+    call = 'call estimator/reset' if read_only else f'press "{controls.RESET}"'
+    assert notified == ['refused', f'it has jumped; then {call} again']
 
 
 def test_the_tab_of_the_browser_names_the_arm(arm26):
