@@ -45,7 +45,10 @@ class BringupStatus(Shell):
         self.measured: tuple[float, Array | None] = -math.inf, None
         self.errors: list[float] = []
         self.anomalies: list[float] = []
-        self.situation = Situation(self.get_namespace())
+        self.situation = Situation(
+            self.get_namespace(), expects_replay=self.parameter('end_with_replay')
+        )
+        self.last_known = [math.nan, math.nan]  # last estimation error and A in a status line
         self.started: float | None = None
         self.ended: float | None = None  # when the end of the recording was first reported [s]
         #: the last line before the first estimate, and whether it named an overload
@@ -115,14 +118,19 @@ class BringupStatus(Shell):
         """Print that there is no estimate yet, and why; again if the reason has changed."""
         line = 'waiting for the first estimate'
         # Most problems end by themselves while the nodes start.
-        if now - self.begun >= SETTLING and (reason := self.situation.why_no_estimate()):
+        is_settled = now - self.begun >= SETTLING
+        waiting_replay = self.situation.replay_waits()
+        reason = self.situation.why_no_estimate() if is_settled else waiting_replay
+        if reason:
             line += f': {reason}'
-        overload = overload_text() if now - self.begun >= SETTLING else ''
+        overload = overload_text() if is_settled else ''
         if OVERLOADED in line:  # a node has already said so
             overload = ''
         # The load itself changes all the time, which is no reason to print the line again.
         waiting = line, bool(overload)
-        if waiting != self.waiting and now - self.waiting_since >= WAITING_INTERVAL:
+        is_new = waiting_replay not in self.waiting[0]
+        is_due = is_new or now - self.waiting_since >= WAITING_INTERVAL
+        if waiting != self.waiting and is_due:
             self.waiting, self.waiting_since = waiting, now
             print(printable('; '.join(filter(None, [line, overload]))), flush=True)
 
@@ -130,6 +138,11 @@ class BringupStatus(Shell):
         means = [sum(v) / len(v) if v else math.nan for v in (self.errors, self.anomalies)]
         unit = self.robot.kinematics.distance_unit
         situation = self.situation
+        self.last_known = [
+            old if math.isnan(new) else new for new, old in zip(means, self.last_known)
+        ]
+        if situation.has_recording_ended:  # no further messages are expected
+            means = self.last_known
         known = figures(self.theta is not None, means[0], means[1], unit)
         self.errors, self.anomalies = [], []
         line = f'{running_time:6.0f} s  {known}'

@@ -121,8 +121,19 @@ class Situation:
         doing: Message of the controller's last report.
     """
 
-    def __init__(self, namespace: str, clock: Callable[[], float] = time.monotonic) -> None:
-        """Start without reports; `clock` returns the time of a steady clock [s]."""
+    def __init__(
+        self,
+        namespace: str,
+        clock: Callable[[], float] = time.monotonic,
+        expects_replay: bool = False,
+    ) -> None:
+        """Start without reports.
+
+        Args:
+            namespace: The namespace of the arm.
+            clock: Returns the time of a steady clock [s].
+            expects_replay: Whether messages come from a node `replay`, which may not run yet.
+        """
         self._clock, self._awake = clock, AwakeClock(TICK)
         self._here = namespace.rstrip('/')
         self.detected = False
@@ -137,6 +148,8 @@ class Situation:
         #: number of the estimator's reports since the last one during a length calibration
         self._since_calibration = REPORTS + 1
         self.distance = self.limit = math.nan
+        #: when `replay` began or continued to play [s]; inf: it does not play; -inf: there is none
+        self._playing_since = math.inf if expects_replay else -math.inf
         self._recording_ended_at = math.inf  # when `replay` first reported its end [s]
         self._nodes: dict[str, Node] = {}  # last report of each node, by full name
         self._accepted: deque[str] = deque(maxlen=REPORTS)  # versions in the estimator's reports
@@ -153,6 +166,8 @@ class Situation:
         for name, node in list(self._nodes.items()):
             if not _is_needed(name) and self._now - node.heard_at > FORGET_TIME:
                 del self._nodes[name]
+                if name == f'{self._here}/replay':
+                    self._playing_since = -math.inf
 
     @property
     def _now(self) -> float:
@@ -179,10 +194,8 @@ class Situation:
                 self.doing = node.message
                 if node.values.get('mode') not in (STOPPED, VERIFYING):
                     self._has_ended = False
-            elif name == 'replay' and not self.has_recording_ended:
-                self._recording_ended_at = math.inf
             elif name == 'replay':
-                self._recording_ended_at = min(self._recording_ended_at, self._now)
+                self._take_replay(node.values.get('state', PLAYING))
             if name in FOLLOWERS:
                 self._compare_network(name, node.values.get(VERSION, ''))
 
@@ -205,6 +218,16 @@ class Situation:
         with contextlib.suppress(ValueError):
             self.distance = float(values.get('d', 'nan'))
             self.limit = float(values.get('d limit', 'nan'))
+
+    def _take_replay(self, state: str) -> None:
+        if state != PLAYING:
+            self._playing_since = math.inf
+        elif math.isinf(self._playing_since):
+            self._playing_since = self._now
+        if state != END_OF_RECORDING:
+            self._recording_ended_at = math.inf
+        elif math.isinf(self._recording_ended_at):
+            self._recording_ended_at = self._now
 
     def _compare_network(self, node: str, version: str) -> None:
         """Count the successive reports in which a node's network differs from the estimator's."""
@@ -235,16 +258,17 @@ class Situation:
     def _troubles(self) -> list[Trouble]:
         others = [Trouble(text) for text in (*self._mismatches(), *self._silent())]
         errors, warnings = list[Trouble](), list[Trouble]()
-        replay = self._values('replay').get('state', PLAYING)
         if self.has_recording_ended:
             errors.append(Trouble('end of the recording'))
-        elif replay == WAITING:
-            errors.append(Trouble(f'replay is {self._nodes[f"{self._here}/replay"].message}'))
+        elif waiting := self.replay_waits():
+            errors.append(Trouble(waiting))
+        # Just after a replay has begun to play, the last reports of nodes may be older.
+        is_silence_explained = self._now - self._playing_since < REPORTS * PERIOD
         for name, node in self._nodes.items():
             if _is_own(name) or node.level == DiagnosticStatus.OK:
                 continue
             is_silence = SILENT_TOPIC in node.values or node.values.get(WAITS_FOR) == MUSCLE_STATES
-            if replay != PLAYING and is_silence:
+            if is_silence and is_silence_explained:
                 continue
             if self._is_shown(name, node):
                 if (silent := node.values.get(SILENT_TOPIC)) and not self._explains(node):
@@ -261,6 +285,12 @@ class Situation:
                 steps = remedy.parse(node.values.get(REMEDY_STEPS, ''))
                 errors.append(Trouble(f'{name}: {node.message}', steps))
         return [*self._stops(), *others, *errors, *self._body(), *warnings]
+
+    def replay_waits(self) -> str:
+        """Return what `replay` waits for before it begins to play, or ''."""
+        if self._values('replay').get('state') != WAITING:
+            return ''
+        return f'replay is {self._nodes[f"{self._here}/replay"].message}'
 
     @property
     def has_recording_ended(self) -> bool:

@@ -124,6 +124,39 @@ def test_before_the_first_estimate_a_line_says_why_there_is_none(graph, capsys, 
     assert rejected['last_rejected'] in line and 'this computer is overloaded' in line
 
 
+def test_what_a_replay_waits_for_is_printed_as_soon_as_it_changes(graph, capsys, load):
+    load(0.0)
+    node = graph.host(bringup_status.BringupStatus, robot='arm26', end_with_replay=True)
+    node._print()
+    missing = ('estimator and learner', 'learner')
+    for nodes in missing:
+        message = f'waiting until {nodes} can receive'
+        waiting = diagnostics(f'{graph.namespace}/replay', message, state='waiting')
+        for _ in range(2):
+            node.situation.diagnosed(waiting)
+            node._print()
+    first, *lines = capsys.readouterr().out.splitlines()
+    assert 'replay' not in first and len(lines) == len(missing)
+    assert all(f'until {nodes} can receive' in line for nodes, line in zip(missing, lines))
+
+
+def test_at_the_end_of_a_recording_the_last_values_are_shown(graph, capsys):
+    node = graph.host(bringup_status.BringupStatus, robot='arm26', end_with_replay=True)
+    node.situation.diagnosed(diagnostics(f'{graph.namespace}/learner', samples='9'))
+    node.anomalies.append(0.5)
+    node._on_measured_posture(np.zeros(2))
+    node._on_estimate(np.ones(2))
+    node._print()
+    end = diagnostics(f'{graph.namespace}/replay', 'end', state='end_of_recording')
+    node.situation.diagnosed(end)
+    node.measured = node.measured[0] - 2.0, node.measured[1]
+    for _ in range(2):  # the learner has not reported since the end
+        node.started -= bringup_status.SETTLING
+        node._print()
+    lines = capsys.readouterr().out.splitlines()
+    assert sum('error 1.414 rad  A 0.500' in line for line in lines) == 3
+
+
 @pytest.mark.parametrize('had_estimates', [True, False])
 def test_the_end_of_a_recording_without_estimates_is_an_error(graph, had_estimates):
     node = graph.host(bringup_status.BringupStatus, robot='arm26', end_with_replay=True)
@@ -435,7 +468,8 @@ def test_a_learner_that_waits_for_a_calibration_is_not_shown_beside_the_calibrat
 
 @pytest.mark.parametrize('state', ['waiting', 'paused'])
 def test_silence_of_a_replay_that_does_not_play_is_not_put_down_to_a_driver(state):
-    situation = Situation('/left')
+    now = 100.0
+    situation = Situation('/left', lambda: now)
     situation.diagnosed(diagnostics('/left/replay', 'waiting until learner can', state=state))
     silent = {'silent_topic': 'no usable muscle_states: check the driver', 'finding': 'none'}
     situation.diagnosed(diagnostics('/left/estimator', 'old', DiagnosticStatus.ERROR, **silent))
@@ -444,18 +478,39 @@ def test_silence_of_a_replay_that_does_not_play_is_not_put_down_to_a_driver(stat
     is_waiting = state == 'waiting'
     assert situation.trouble() == ('replay is waiting until learner can' if is_waiting else '')
     situation.diagnosed(diagnostics('/left/replay', 'playing', state='playing'))
+    assert situation.trouble() == ''  # the reports of the other nodes are older
+    for _ in range(REPORTS):
+        now += 1.0
+        situation.tick()
+        situation.diagnosed(diagnostics('/left/replay', 'playing', state='playing'))
+        situation.diagnosed(diagnostics('/left/estimator', 'old', DiagnosticStatus.ERROR, **silent))
     assert 'check the driver' not in situation.trouble() and '/left/estimator: old' in (
         situation.trouble()
     )
 
 
+def test_nothing_counts_as_silent_before_an_expected_replay_has_begun():
+    silent = {'silent_topic': 'no usable muscle_states: check the driver', 'finding': 'none'}
+    for expects_replay in (False, True):
+        situation = Situation('/left', expects_replay=expects_replay)
+        situation.diagnosed(diagnostics('/left/estimator', 'old', DiagnosticStatus.ERROR, **silent))
+        assert situation.trouble() == ('' if expects_replay else '/left/estimator: old')
+
+
 def test_silence_after_a_recording_is_put_down_to_its_end():
-    situation = Situation('/left')
+    now = 100.0
+    situation = Situation('/left', lambda: now)
     silent = {'silent_topic': 'no usable muscle_states', 'finding': 'none'}
     situation.diagnosed(diagnostics('/left/replay', 'end', state='end_of_recording'))
     situation.diagnosed(diagnostics('/left/estimator', 'old', DiagnosticStatus.ERROR, **silent))
     assert situation.trouble() == 'end of the recording'
     situation.diagnosed(diagnostics('/left/replay', 'playing'))
+    assert situation.trouble() == ''
+    for _ in range(REPORTS):
+        now += 1.0
+        situation.tick()
+        situation.diagnosed(diagnostics('/left/replay', 'playing'))
+        situation.diagnosed(diagnostics('/left/estimator', 'old', DiagnosticStatus.ERROR, **silent))
     assert situation.trouble() == '/left/estimator: old'
 
 
