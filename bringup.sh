@@ -41,8 +41,9 @@ doc/howto/your_robot.md is the guide for your own robot.
   --no-learner               no online learning
   --preset default|paper     the most accurate methods, or exactly those of the paper
                              (default: default)
-  --seed N                   seed of the emulated individual (default: 0; for a MuJoCo model:
-                             the model without deviations)
+  --seed N                   seed of the emulated individual and of the exploration (default: 0;
+                             with --hardware another one at each start, so that an arm explores
+                             other postures; for a MuJoCo model: the model without deviations)
   --reality kin|foreign|FILE.xml
                              emulator model: kin, foreign (with mechanics that the learner does not
                              model), or a MuJoCo model with the robot's names (default: kin)
@@ -374,6 +375,11 @@ kept_in() { # NODE
   kept=()
   [ $hardware = true ] || kept=(-p "state_directory:=$(quoted "$logs/$1")")
 }
+
+if [ $hardware = true ] && ! is_given --seed; then
+  seed=$RANDOM # otherwise, an arm would explore the same postures after every start
+  say "seed of the exploration: $seed (--seed $seed repeats it)"
+fi
 
 quoted() { printf "'%s'" "${1//\'/\'\'}"; } # as YAML, the format of ROS parameters
 

@@ -300,6 +300,8 @@ def test_an_arm_of_ones_own_is_waited_for_checked_and_learned_and_ctrl_c_ends_it
     graph = join('/own')
     graph.processes += [run, driver('own')]
     transcript += read_until(run, 'starting controller')
+    # Every start explores other postures, and states how to repeat them.
+    assert re.search(r'seed of the exploration: \d+', transcript)
     explore_fast(graph, 'controller')
     learned = graph.listen(UInt8MultiArray, 'mae_checkpoint', LATCHED)
     graph.wait(lambda: len(learned) > 1, 'an update of the network', 8 * DEADLINE)
