@@ -493,7 +493,10 @@ class Listening:
                 predicted = f'the route predicts {model[0, m]:+.3f} m'
                 verdict.failed('sign', m, detail=f'{measured}, {predicted}{doubt}')
             else:
-                verdict.failed('zero', m, off=1e3 * off)
+                # Only lengths that a hand has changed distinguish this from a wrong sign or order.
+                is_movable = robot.actuation.choose(not self._stated, False)
+                what = 'zero at rest' if is_movable and not moved[m] else 'zero'
+                verdict.failed(what, m, off=1e3 * off)
         return float(np.minimum(fit[rows, best], inverse).sum())
 
 

@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
+from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.files import read_table
 from musculoskeletal_ae.report import load_text
 from musculoskeletal_ae.robot.robot import Robot
@@ -21,6 +22,14 @@ ZERO_TOLERANCE = 0.045
 OK, WRONG, OPEN = 'ok', 'WRONG', '-'
 POSITION_LAW = 'l → l_target, for as long as T is below T_max'
 LAW = 'T = min(T_max, T_bias + max(0, K (l − l_target))), T_bias {:g} N, K {:g} N/m'
+
+
+def _change_text(change: str) -> str:
+    """Return the text of a change; if it has several steps, one numbered line for each."""
+    steps = change.splitlines()
+    if len(steps) == 1:
+        return change
+    return '\n            '.join(f'{n}. {step}' for n, step in enumerate(steps, 1))
 
 
 class FaultTexts(Strict, frozen=True, array_like=True):
@@ -152,11 +161,18 @@ class Verdict:
             return 'the driver keeps its contract'
         return f'no fault found; not judged: {unjudged}'
 
-    def _unjudged(self, checks: Sequence[Check]) -> str:
-        """Return which of these checks were not made, and for which muscles; '' if all were."""
+    def _unjudged(self, checks: Sequence[Check], excluded: Bools | None = None) -> str:
+        """Return which of these checks were not made, and for which muscles; '' if all were.
+
+        Args:
+            checks: The checks.
+            excluded: Muscles to leave out, (M,); None for none.
+        """
         names: dict[str, list[str]] = {}  # checks by the muscles that they did not judge
         for check in checks:
             is_open = self._state[:, CHECKS.index(check)] == OPEN
+            if excluded is not None:
+                is_open &= ~excluded
             if is_open.any():
                 names.setdefault(self._whose(np.flatnonzero(is_open).tolist()), []).append(check)
         return '; '.join(f'{", ".join(checks)} of {whose}' for whose, checks in names.items())
@@ -187,7 +203,7 @@ class Verdict:
             )
         remarks += [
             f'fault: {fault.check} of {self._whose(fault.muscles)}: {fault.observation}\n'
-            f'    change: {fault.change}'
+            f'    change: {_change_text(fault.change)}'
             for fault in self.faults
         ]
         if self._excused:
@@ -198,8 +214,12 @@ class Verdict:
                 'reason alone: end other programs and repeat the check'
             )
         remarks += [f'note: {note}' for note in self.notes]
+        # Where the motion of the arm showed a fault, the other checks of l are open because of the
+        # fault, and the remedy would not make them.
+        columns = [CHECKS.index(check) for check in ('order', 'unit', 'sign')]
+        has_fault: Bools = (self._state[:, columns] == WRONG).any(axis=1)
         for checks, remedy in self._remedies:
-            if unjudged := self._unjudged(checks):
+            if unjudged := self._unjudged(checks, has_fault):
                 remarks.append(f'note: {unjudged} not judged: {remedy}')
         return remarks
 

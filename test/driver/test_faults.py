@@ -165,6 +165,17 @@ def offset(m, rows):
     return rows
 
 
+@pytest.mark.parametrize('moved', [False, True])
+def test_the_first_step_against_a_wrong_zero_of_an_arm_at_rest_is_to_move_it_by_hand(moved):
+    driver = Driver(ROBOT)
+    driver.publish = shifted
+    (fault,) = driver.listen(8.0 if moved else 3.0, moved=moved).faults
+    assert fault.check == 'zero'
+    first, *others = fault.change.splitlines()
+    assert ('without --move' in first) != moved
+    assert bool(others) != moved
+
+
 def test_the_reversed_sign_of_every_length_is_one_fault_of_a_moved_arm():
     driver = Driver(ROBOT)
     driver.publish = flipped
@@ -309,6 +320,16 @@ def test_only_a_complete_check_says_that_the_driver_keeps_its_contract():
         assert check in verdict.conclusion
         verdict.passed(check)
     assert verdict.conclusion == 'the driver keeps its contract'
+
+
+def test_no_remark_advises_to_move_an_arm_that_was_moved_for_muscles_in_the_wrong_order():
+    driver = Driver(ROBOT)
+    driver.publish = exchanged
+    verdict = driver.listen(8.0, moved=True)
+    misplaced = {ROBOT.muscles[m] for fault in verdict.faults for m in fault.muscles}
+    assert len(misplaced) == 2
+    for remark in not_judged(verdict):
+        assert 'all muscles' not in remark and not any(name in remark for name in misplaced)
 
 
 @pytest.mark.parametrize('joints', [True, False])
