@@ -41,11 +41,24 @@ if TYPE_CHECKING:  # slow imports, which --help does not need
 JOINTS = 'joint_states'
 DISCOVERY_TIME = 1.0  # time in which other nodes are discovered [s]
 SILENCE = 1.0  # time without messages after which the motion test ends [s]
+COUNTDOWN = 10.0  # time between two statements of the remaining time [s]
 TICK = 0.02  # period of a timer [s]; a late tick shows that this process was paused
 
 
 def _say(text: object) -> None:
     print(text, flush=True)
+
+
+def _instruction(robot: Robot, options: Namespace, has_joint_sensors: bool) -> str:
+    """Return what to do with the arm while `check_driver` listens."""
+    if options.move:
+        return 'do not touch the arm; it moves by itself afterwards, if no fault is found'
+    if options.posture:
+        return 'hold the arm still in the posture that --posture states'
+    by_hand = 'move the arm by hand through its whole range'
+    if not has_joint_sensors:
+        by_hand = 'hold the arm still, because joint_states has no publisher'
+    return robot.actuation.choose(by_hand, 'the modules hold the arm, so do not touch it')
 
 
 class CheckDriver:
@@ -54,6 +67,7 @@ class CheckDriver:
     def __init__(self, robot: Robot, options: Namespace) -> None:
         self.node = Node('check_driver')
         self.robot, self.options = robot, options
+        self.has_listened = False
         self.motors = _motors(robot, options)
         command = self.motors.command_topic or 'muscle_length_command'
         resolve = self.node.resolve_topic_name
@@ -75,9 +89,21 @@ class CheckDriver:
         kinds = {info.topic_type for info in self.node.get_publishers_info_by_topic(self.topic)}
         return ', '.join(sorted(kinds - {self.motors.state_type}))
 
+    def _listen_for(self, duration: float) -> None:
+        """Receive messages for `duration` [s], and say from time to time how long it will last."""
+        left = duration
+        while left > COUNTDOWN:
+            self.spin_until(lambda: False, COUNTDOWN)
+            left -= COUNTDOWN
+            _say(f'{left:g} s left')
+        self.spin_until(lambda: False, left)
+
     def listen(self) -> Verdict:
         """Wait for a driver, listen to its messages, and return the verdict on them."""
         chosen, node = self.options, self.node
+        if is_first := not self.has_listened:
+            self.has_listened = True
+            _say(f'check_driver expects messages of {self.topic}')
         kind: Any = import_heavy('musculoskeletal_ae.driver.listening').Listening
         self.motors.reset()
         listening = kind(self.robot, chosen.rate, chosen.posture, not chosen.unzeroed, self.motors)
@@ -95,7 +121,11 @@ class CheckDriver:
             wait = math.inf if chosen.wait else chosen.seconds
             self.spin_until(lambda: listening.count or self._mistyped(), wait)
         if listening.count:
-            self.spin_until(lambda: False, chosen.seconds)
+            if is_first:
+                has_joint_sensors = node.count_publishers(JOINTS) > 0
+                instruction = _instruction(self.robot, chosen, has_joint_sensors)
+                _say(f'listening for {chosen.seconds:g} s: {instruction}')
+            self._listen_for(chosen.seconds)
         verdict: Verdict = listening.verdict(time.monotonic())
         if wrong := self._mistyped():
             expected = self.motors.state_type
@@ -138,6 +168,7 @@ class CheckDriver:
         if not publisher.get_subscription_count():
             verdict.failed('deaf', topic=self.command)
             return
+        _say('the arm moves now: all muscles hold it, then each muscle is wound in slightly')
         last, trying = time.monotonic(), ''
 
         def follow(message: Any, _: dict[str, int]) -> None:

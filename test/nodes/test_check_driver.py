@@ -2,6 +2,7 @@
 """`check_driver` on the graph: it waits, checks a live driver, and moves only if asked to."""
 
 import signal
+from argparse import Namespace
 
 import pytest
 from graph import PATIENCE
@@ -9,6 +10,7 @@ from std_msgs.msg import Float32MultiArray, Float64MultiArray
 
 from musculoskeletal_ae.nodes import check_driver
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
+from musculoskeletal_ae.robot.robot import Robot
 
 
 def check(graph, *options):
@@ -59,6 +61,35 @@ def test_with_wait_check_driver_reports_faults_until_the_driver_is_right(graph):
     assert status == 0
     assert output.splitlines()[-1].startswith('no fault found; not judged: '), output
     assert 'keeps its contract' not in output
+
+
+def test_check_driver_says_at_the_first_message_what_it_does_and_then_the_remaining_time(graph):
+    start_driver(graph)
+    process = check(graph, '--seconds', '1010')
+    graph.wait(lambda: '1010 s' in process.output, 'the instruction')
+    graph.wait(lambda: '1000 s' in process.output, 'the remaining time')
+    assert process.alive()
+    process.end()
+
+
+def test_the_arm_is_announced_to_move_before_the_first_command(graph):
+    start_driver(graph)
+    commands = graph.listen(Float64MultiArray, 'muscle_length_command')
+    process = check(graph, '--wait', '--seconds', '1', '--move', '--muscles', 'biceps_long')
+    graph.wait(lambda: commands, 'the first command')
+    assert 'moves now' in process.output
+    process.end()
+
+
+def test_what_to_do_while_check_driver_listens_depends_on_arm_and_options():
+    robot = Robot.load('arm26')
+    options = {'move': False, 'posture': None}
+    cases = [({}, True), ({}, False), ({'move': True}, True), ({'posture': [0.0, 0.0]}, False)]
+    instructions = {
+        check_driver._instruction(robot, Namespace(**options | changes), has_joint_sensors)
+        for changes, has_joint_sensors in cases
+    }
+    assert len(instructions) == len(cases)
 
 
 def test_a_topic_of_the_wrong_type_is_reported(graph):
