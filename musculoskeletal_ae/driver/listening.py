@@ -10,7 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from itertools import combinations, permutations
+from itertools import chain, combinations, permutations
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -21,6 +21,7 @@ from musculoskeletal_ae.driver.verdict import FAULTS, ZERO_TOLERANCE, Verdict
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals import joint_sensors
 from musculoskeletal_ae.signals.limits import length_range, reading_range
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
@@ -323,17 +324,26 @@ class Listening:
                 what, names = explanation
                 verdict.failed(what, names=', '.join(names))
                 return
-        if is_suspect:  # an angle changes the lengths of several muscles
-            lengths_verdict.notes += self._suspected_signs(theta, length, tension)
+            # A single angle changes the lengths of several muscles.
+            names = self._suspected_signs(theta, length, tension)
+            if names and self._look_exchanged(lengths_verdict, theta):
+                # On a symmetric arm, the reversed sign of one joint sensor looks like several
+                # exchanges. One fault is more likely than several.
+                columns = chain.from_iterable(fault.muscles for fault in lengths_verdict.faults)
+                muscles = ', '.join(self._robot.muscles[m] for m in columns)
+                verdict.failed('joint sign or order', names=' or '.join(names), muscles=muscles)
+                return
+            if names:
+                lengths_verdict.notes.append(
+                    f'all lengths would fit if the sign of the angle of {" or ".join(names)} were '
+                    'reversed: check these joint sensors first'
+                )
+        elif not lengths_verdict.faults:
+            self._judge_joint_signs(verdict, theta, length, tension)
         verdict.add(lengths_verdict)
 
     def _suspected_signs(self, theta: Array, length: Array, tension: Array) -> list[str]:
-        """Return a note on joints of which a reversed sign would explain all wrong lengths.
-
-        Returns:
-            A list with one text, which names every joint whose sign alone would suffice. The list
-            is empty if there is no such joint.
-        """
+        """Return the joints of which a reversed sign alone would explain all wrong lengths."""
         names = []
         for j, name in enumerate(self._robot.joints):
             turned, other = theta.copy(), Verdict(self._robot)
@@ -341,13 +351,40 @@ class Listening:
             self._judge_lengths(other, turned, length, tension)
             if not other.faults:
                 names.append(name)
-        if not names:
-            return []
-        note = (
-            f'all lengths would fit if the sign of the angle of {" or ".join(names)} were '
-            'reversed: check these joint sensors first'
+        return names
+
+    def _look_exchanged(self, verdict: Verdict, theta: Array) -> bool:
+        """Return whether the joints moved, and more than two muscles look exchanged.
+
+        Args:
+            verdict: The faults of the lengths.
+            theta: θ [rad], (N, D).
+        """
+        are_places = all(fault.name == 'place' for fault in verdict.faults)
+        return bool(self._moved(theta).any()) and are_places and len(verdict.faults) > 2
+
+    def _moved(self, theta: Array) -> Bools:
+        """Return which joints moved enough to check the signs of their angles, (D,)."""
+        moved: Bools = np.ptp(theta, axis=0) > MOVED_JOINT * self._robot.kinematics.radian
+        return moved
+
+    def _judge_joint_signs(
+        self, verdict: Verdict, theta: Array, length: Array, tension: Array
+    ) -> None:
+        """Record which joint sensors have the right sign, if a hand has moved the arm.
+
+        Args:
+            verdict: Receives the results.
+            theta: θ [rad], (N, D).
+            length: l [m], (N, M). No fault of lengths was found.
+            tension: T [N], (N, M).
+        """
+        if self._stated or not self._moved(theta).any():
+            return
+        right = joint_sensors.judge(self._robot, theta, length, tension).right
+        verdict.notes += joint_sensors.sign_notes(
+            self._robot, right, 'Move the arm by hand through its whole range'
         )
-        return [note]
 
     def _angles(self, theta: Array) -> Iterator[tuple[str, list[str], Array]]:
         """Yield the postures that would be right if the joint sensors had a certain fault.
@@ -363,14 +400,14 @@ class Listening:
             The name of the fault, the names of the affected joints, and the corrected θ [rad],
             (N, D).
         """
-        robot, radian = self._robot, self._robot.kinematics.radian
+        robot = self._robot
         joints = range(robot.joint_count)
         turning = [j for j in joints if not robot.kinematics.slides[j]]
         if np.abs(theta[:, turning]).max(initial=0.0) > math.pi:
             degrees = theta.copy()
             degrees[:, turning] = np.radians(degrees[:, turning])
             yield 'degrees', [robot.joints[j] for j in turning], degrees
-        moved = np.ptp(theta, axis=0) > MOVED_JOINT * radian
+        moved = self._moved(theta)
         for j in np.flatnonzero(moved).tolist():
             turned = theta.copy()
             turned[:, j] *= -1.0

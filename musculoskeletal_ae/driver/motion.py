@@ -18,7 +18,7 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.driver.order import JOINTS_BETTER, Order, corrected, judge_order, wrong_side
 from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.report import is_overloaded
-from musculoskeletal_ae.signals.joint_sensors import judge
+from musculoskeletal_ae.signals.joint_sensors import judge, sign_notes
 
 RELEASE = 0.6  # wait after a release [s]
 MEAN = 0.3  # time over which readings are averaged [s]
@@ -230,19 +230,14 @@ class MotionTest(ABC):
                 )
             return
         verdict.passed_some('order', [m for m in self._muscles if m in order.right])
-        unknown = [name for j, name in enumerate(robot.joints) if j not in judgement.right]
-        if judgement.right:
-            names = ', '.join(robot.joints[j] for j in judgement.right)
-            verdict.notes.append(f'these joint sensors have the right sign: {names}')
-        if unknown:
-            highest = float(self._highest.max())
-            higher = min(1.5 * highest, float(robot.tension.limit.min()))
-            again = f'Repeat the test with --tension {higher:.0f}, or move'
-            verdict.notes.append(
-                f'the sign of these joint sensors is not known, because the joints moved too '
-                f'little: {", ".join(unknown)}. {again if higher > highest + 1.0 else "Move"} '
-                'the arm by hand while check_driver listens'
-            )
+        highest = float(self._highest.max())
+        higher = min(1.5 * highest, float(robot.tension.limit.min()))
+        again = f'Repeat the test with --tension {higher:.0f}, or move'
+        remedy = (
+            f'{again if higher > highest + 1.0 else "Move"} the arm by hand while check_driver '
+            'listens'
+        )
+        verdict.notes += sign_notes(robot, judgement.right, remedy)
 
     def _report_misplaced(self, order: Order) -> None:
         """Record muscles whose readings and commands are both misplaced."""

@@ -16,7 +16,7 @@ the same at θ and −θ. In the second case, a wrong sign is found only if both
 have the same sign. Readings with the wrong sign are then beyond the limits.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -107,6 +107,27 @@ def judge(
     right = signs.is_known.copy()
     right[list(reversed_joints)] = False
     return Judgement(faults, tuple(np.flatnonzero(right).tolist()))
+
+
+def sign_notes(robot: Robot, right: Sequence[int], remedy: str) -> list[str]:
+    """Return sentences on the joint sensors whose sign is right, and on those not judged.
+
+    Args:
+        robot: The robot.
+        right: Indices of the joints whose sign is right.
+        remedy: How to make the other joints move more.
+    """
+    notes = []
+    unknown = [name for j, name in enumerate(robot.joints) if j not in right]
+    if right:
+        names = ', '.join(robot.joints[j] for j in right)
+        notes.append(f'these joint sensors have the right sign: {names}')
+    if unknown:
+        notes.append(
+            'the sign of these joint sensors is not known, because the joints moved too little: '
+            f'{", ".join(unknown)}. {remedy}'
+        )
+    return notes
 
 
 def stuck_sensors(

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 
 from driver.scripted import Driver, array, joint_state
 from musculoskeletal_ae import validity
@@ -208,6 +209,91 @@ def test_a_fault_of_the_joint_sensors_is_not_blamed_on_the_lengths(name):
     verdict = driver.listen(8.0, moved=True)
     assert verdict.wrong == {check}, str(verdict)
     assert reported in str(verdict)
+
+
+def test_listening_names_the_joint_sensors_of_right_sign_if_the_arm_was_moved():
+    (right,) = joint_notes(Driver(ROBOT).listen(8.0, moved=True))
+    assert all(joint in right for joint in ROBOT.joints)
+    assert not joint_notes(Driver(ROBOT).listen(2.0))
+
+
+def joint_notes(verdict):
+    return [note for note in verdict.notes if 'sign' in note and 'joint sensors' in note]
+
+
+NECK = """<robot name="neck">
+  <link name="torso"/>
+  <joint name="pitch" type="revolute">
+    <parent link="torso"/><child link="neck"/><axis xyz="0 1 0"/>
+    <limit lower="-0.5" upper="0.6" effort="20" velocity="6"/>
+  </joint>
+  <link name="neck">
+    <inertial><origin xyz="0 0 0.015"/><mass value="0.2"/>
+      <inertia ixx="2e-4" ixy="0" ixz="0" iyy="2e-4" iyz="0" izz="2e-4"/></inertial>
+  </link>
+  <joint name="roll" type="revolute">
+    <parent link="neck"/><child link="skull"/><origin xyz="0 0 0.03"/><axis xyz="1 0 0"/>
+    <limit lower="-0.5" upper="0.5" effort="20" velocity="6"/>
+  </joint>
+  <link name="skull">
+    <inertial><origin xyz="0.01 0 0.1"/><mass value="1.5"/>
+      <inertia ixx="6e-3" ixy="0" ixz="0" iyy="6e-3" iyz="0" izz="5e-3"/></inertial>
+  </link>
+</robot>
+"""
+
+
+@pytest.fixture
+def neck(tmp_path):
+    """Return a robot that is symmetric about the plane y = 0, with two muscles on each side."""
+    muscles = [
+        {
+            'name': f'{end}_{side}',
+            'route': [
+                {'link': 'torso', 'xyz': [0.05 * x, 0.05 * y, -0.08]},
+                {'link': 'skull', 'xyz': [0.04 * x, 0.04 * y, 0.03]},
+            ],
+        }
+        for end, x in (('front', 1), ('back', -1))
+        for side, y in (('left', 1), ('right', -1))
+    ]
+    description = {
+        'joints': ['pitch', 'roll'],
+        'muscles': muscles,
+        'series_elastic': {'force': 100.0, 'rate': 30.0, 'wire_stretch': 2e-5},
+        'stiffness': 10000.0,
+        'tension': {'bias': 30.0, 'limit': 200.0, 'max': 500.0},
+        'end_effector': 'skull',
+    }
+    (tmp_path / 'robot.urdf').write_text(NECK, encoding='utf-8')
+    (tmp_path / 'muscles.yaml').write_text(yaml.safe_dump(description), encoding='utf-8')
+    return Robot.load(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ('order', 'signs', 'faults', 'named'),
+    [
+        ([0, 1, 2, 3], [1, 1], [], ''),
+        ([0, 1, 2, 3], [1, -1], ['joint sign or order'], 'roll'),
+        ([1, 0, 2, 3], [1, 1], ['place', 'place'], 'front_right'),
+    ],
+)
+def test_a_reversed_joint_sensor_of_a_symmetric_arm_is_not_taken_for_several_exchanges(
+    neck, order, signs, faults, named
+):
+    listening, noise = Listening(neck, 100.0), np.random.default_rng(0)
+    for k in range(400):
+        share = 0.5 - 0.5 * np.cos(0.02 * k * np.array([1.0, 1.3]))
+        theta = neck.lower + share * (neck.upper - neck.lower)
+        length = neck.muscle_lengths(theta, neck.tension.bias)
+        rows = np.stack([length, neck.tension.bias, np.full(4, 30.0)])
+        rows += 1e-4 * noise.normal(size=rows.shape)
+        listening.joints(joint_state(dict(zip(neck.joints, signs * theta))))
+        listening.muscles(array(rows[:, order]), 0.01 * k)
+    verdict = listening.verdict(4.0)
+    assert [fault.name for fault in verdict.faults] == faults, str(verdict)
+    assert not faults or named in verdict.faults[0].observation
+    assert not verdict.allows_motion or not faults
 
 
 def test_advice_on_a_rejected_message_is_that_of_its_topic():
