@@ -122,9 +122,11 @@ class CheckDriver:
             self.spin_until(lambda: listening.count or self._mistyped(), wait)
         if listening.count:
             if is_first:
-                has_joint_sensors = node.count_publishers(JOINTS) > 0
-                instruction = _instruction(self.robot, chosen, has_joint_sensors)
-                _say(f'listening for {chosen.seconds:g} s: {instruction}')
+                text = f'listening for {chosen.seconds:g} s'
+                if chosen.seconds >= COUNTDOWN:  # otherwise nobody can follow an instruction
+                    has_joint_sensors = node.count_publishers(JOINTS) > 0
+                    text += f': {_instruction(self.robot, chosen, has_joint_sensors)}'
+                _say(text)
             self._listen_for(chosen.seconds)
         verdict: Verdict = listening.verdict(time.monotonic())
         if wrong := self._mistyped():
