@@ -123,7 +123,7 @@ class CheckDriver:
         if listening.count:
             if is_first:
                 text = f'listening for {chosen.seconds:g} s'
-                if chosen.seconds >= COUNTDOWN:  # otherwise nobody can follow an instruction
+                if chosen.move or chosen.seconds >= COUNTDOWN:  # otherwise too short to follow it
                     has_joint_sensors = node.count_publishers(JOINTS) > 0
                     text += f': {_instruction(self.robot, chosen, has_joint_sensors)}'
                 _say(text)
