@@ -100,7 +100,7 @@ def motion_text(robot: Robot, recording: Pairs) -> str:
     least = preset_named('default').least_samples
     text = f'different resting postures to learn from: {samples}'
     if samples >= least:
-        return text
+        return f'{text} (at least {least} are needed; the more, the smaller the error)'
     return (
         f'{text}; too little motion for `train --from-bag`, which needs at least {least}. Record '
         'an arm that moves from posture to posture and rests in each, as with controller/explore'
