@@ -47,6 +47,12 @@ def overload_text() -> str:
     return f'{OVERLOADED} (load {load_text()})' if is_overloaded() else ''
 
 
+def overload_advice() -> str:
+    """Return that this computer is overloaded, and what to do; '' if it is not overloaded."""
+    text = overload_text()
+    return f'{text}; stop other programs' if text else ''
+
+
 def whole(value: float, unit: str = '') -> str:
     """Return a value, rounded to a whole number, with its unit; "–" for NaN (unknown)."""
     return '–' if math.isnan(value) else f'{value:.0f} {unit}'.rstrip()

@@ -69,9 +69,9 @@ def lap(
 ) -> Iterator[BagMessage]:
     """Yield the messages that playback publishes from one recorded time to another [ns].
 
-    The log time of each message is the time at which it is to be published. The last message before
-    `start` of each latched topic comes first, because a subscriber that joins at this time would
-    receive it.
+    In these messages, the log time is the time at which to publish the message. The last message
+    before `start` of each latched topic comes first, because a subscriber that joins at this time
+    would receive it.
 
     Args:
         bag: The recording.

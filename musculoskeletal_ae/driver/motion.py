@@ -187,7 +187,7 @@ class MotionTest(ABC):
         self.verdict.failed(fault, *misplaced, moves=', and '.join(moves), first=names[first])
 
     def _knows_joints(self) -> bool:
-        """Return whether the angles of all joints were known in a message."""
+        """Return whether at least one message was received while all joint angles were known."""
         return any(np.isfinite(theta).all() for theta, _, _ in self._history)
 
     def _wrong_side(self, winds: dict[int, int]) -> Literal['readings', 'commands'] | None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks whether a muscle that was isolated or suspected fits the rest of the arm again.
+"""Checks whether a muscle that was isolated or suspected may be used again.
 
 A muscle must not be used again while one of these problems is present:
 

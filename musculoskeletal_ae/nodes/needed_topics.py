@@ -12,7 +12,14 @@ from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.nodes.progress import LONGEST_STALL
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.remedy import REMEDY_STEPS, Step
-from musculoskeletal_ae.report import MUSCLE_STATES, WAITS_FOR, Report, load_text, overload_text
+from musculoskeletal_ae.report import (
+    MUSCLE_STATES,
+    OVERLOADED,
+    WAITS_FOR,
+    Report,
+    load_text,
+    overload_advice,
+)
 
 #: topics that are published continually, so that silence is an error, and the remedy for silence
 STREAMS = {'muscle_states': Step.CHECK_DRIVER, 'estimated_joint_states': Step.CHECK_ESTIMATOR}
@@ -37,9 +44,9 @@ def slow_cause(publishers: Iterable[str]) -> str:
     """
     present = set(publishers)
     if present == {EMULATOR}:
-        return f'this computer is overloaded (load {load_text()}); stop other programs'
-    if overload := overload_text():
-        return f'{overload}; stop other programs'
+        return f'{OVERLOADED} (load {load_text()}); stop other programs'
+    if advice := overload_advice():
+        return advice
     if present == {REPLAY}:
         return 'the recording is played slowly, or its messages are rare'
     return 'the driver is slow, or this computer is overloaded'
@@ -57,8 +64,8 @@ def silence_remedy(topic: str, silence: float, publishers: Iterable[str]) -> tup
     if set(publishers) == {REPLAY}:
         return Step.CHECK_REPLAY, Step.CHECK_REPLAY.text
     # A publisher that hangs ends by itself by this time, if it is a node of this package.
-    if silence <= LONGEST_STALL and (overload := overload_text()):
-        return step, f'{overload}; stop other programs'
+    if silence <= LONGEST_STALL and (advice := overload_advice()):
+        return step, advice
     return step, step.text
 
 

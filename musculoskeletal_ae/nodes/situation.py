@@ -39,6 +39,7 @@ from musculoskeletal_ae.report import (
     WAITS_FOR,
     Level,
     load_text,
+    overload_advice,
     overload_text,
 )
 
@@ -428,14 +429,14 @@ class Situation:
         return remedy.sentence(self._needed(steps), faults)
 
     def _mismatches(self) -> list[str]:
-        overload = overload_text()
+        overload = overload_advice()
         mismatches = []
         for node, (version, reports) in self._other_networks.items():
             if reports < REPORTS:
                 continue
             advice = f'if this lasts, restart {node} or bringup.sh'
             if overload and reports * PERIOD <= LONGEST_STALL:
-                advice = f'{overload}; stop other programs'
+                advice = overload
             mismatches.append(
                 f'{node} uses network {version}, but the estimator uses network '
                 f'{self._accepted[-1]}; {advice}'
@@ -457,8 +458,8 @@ class Situation:
             return []
         names, longest = ', '.join(silent), max(silent.values())
         since = f'{names}: no report for {longest:.0f} s'
-        if overload := overload_text():
-            text = f'{since}; {overload}; stop other programs'
+        if overload := overload_advice():
+            text = f'{since}; {overload}'
             # A node that hangs ends by itself by this time, so a healthy node has no reason to be
             # restarted earlier.
             if longest <= LONGEST_STALL:

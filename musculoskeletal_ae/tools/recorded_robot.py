@@ -22,7 +22,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
 
-BEGINNING = 2_000_000_000  # duration of the part that decides whether a recording fits [ns]
+BEGINNING = 2_000_000_000  # first part of a recording, in which most wrong robots are noticed [ns]
 
 
 def misfit(bag: Bag, name: str, motors: MotorSettings = NO_MOTORS) -> str:
