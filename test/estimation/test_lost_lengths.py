@@ -2,6 +2,7 @@
 """When modules lose their length offsets, nothing uses the lengths until a calibration."""
 
 from contextlib import suppress
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 
-DT = 0.01
+DT = 0.02
 SIGNS = np.array([1.0, 0.9, -0.8, -0.9, 0.9, -1.0])
 SEVERAL = 0.05 * SIGNS
 ONE = 0.06 * (np.arange(6) == 2)
@@ -56,6 +57,41 @@ class MovingArm:
     @property
     def offsets(self):
         return self.core.body.offsets
+
+
+@pytest.fixture(scope='module')
+def moved_once(robot, mae):
+    arm = MovingArm(robot, mae)
+    arm.go(8.0)
+    return arm
+
+
+@pytest.fixture
+def moved(moved_once):
+    """Return an arm that has moved for 8 s, so that the usual lengths are known."""
+    return deepcopy(moved_once)
+
+
+@pytest.fixture(scope='module')
+def ruptured_once(moved_once):
+    arm = deepcopy(moved_once)
+    arm.tense = 1.0 - np.eye(6)[2]
+    for wound in np.linspace(0.0, 0.2, 50):
+        arm.off = -wound * np.eye(6)[2]
+        arm.go(0.04)
+    arm.go(1.5)
+    return arm
+
+
+@pytest.fixture(params=[True, False], ids=['joint sensors', 'no joint sensors'])
+def ruptured(request, ruptured_once):
+    """Return an arm whose estimator has latched the rupture of muscle 2.
+
+    The module has wound in the ruptured tendon. The joint sensors, if any, continue to measure.
+    """
+    arm = deepcopy(ruptured_once)
+    arm.has_sensors = request.param
+    return arm
 
 
 @pytest.mark.parametrize(
@@ -104,31 +140,26 @@ def test_a_jump_during_the_length_calibration_begins_it_again(robot, mae):
     assert arm.core.calibration is not before
 
 
-def test_offsets_are_those_of_before_once_joint_sensors_agree_with_the_lengths(robot, mae):
-    arm = MovingArm(robot, mae)
-    arm.go(8.0)
-    before = arm.offsets
-    arm.off = SEVERAL
-    arm.go(2.0)
+def test_offsets_are_those_of_before_once_joint_sensors_agree_with_the_lengths(moved):
+    before = moved.offsets
+    moved.off = SEVERAL
+    moved.go(2.0)
     with pytest.raises(MusculoskeletalError, match='estimator/zero'):
-        arm.core.reset()
-    arm.off = np.zeros(6)
-    arm.go(3.0)
-    arm.core.reset()
-    assert arm.kind is None
-    assert arm.offsets is before
+        moved.core.reset()
+    moved.off = np.zeros(6)
+    moved.go(3.0)
+    moved.core.reset()
+    assert moved.kind is None
+    assert moved.offsets is before
 
 
-@pytest.mark.parametrize('size', [0.03, 0.08])
-def test_lengths_that_drift_are_found_by_joint_sensors(robot, mae, size):
-    arm = MovingArm(robot, mae)
-    arm.go(8.0)
+def test_lengths_that_drift_are_found_by_joint_sensors(moved):
     for share in np.linspace(0.0, 1.0, 50):
-        arm.off = 2.0 * share * size * SIGNS
-        arm.go(0.1)
-    arm.go(2.0)
-    assert arm.kind is Kind.LENGTHS_DISAGREE
-    assert arm.offsets.is_suspect
+        moved.off = 0.06 * share * SIGNS
+        moved.go(0.1)
+    moved.go(2.0)
+    assert moved.kind is Kind.LENGTHS_DISAGREE
+    assert moved.offsets.is_suspect
 
 
 def test_lengths_that_are_off_at_the_start_are_found_by_joint_sensors(robot, mae):
@@ -138,42 +169,14 @@ def test_lengths_that_are_off_at_the_start_are_found_by_joint_sensors(robot, mae
     assert arm.kind is Kind.LENGTHS_DISAGREE
 
 
-@pytest.mark.parametrize('muscle', [0, 4])
 def test_a_ruptured_tendon_is_not_taken_for_a_wrong_length_while_no_commands_arrive(
-    robot, mae, muscle
+    ruptured_once,
 ):
     """The module winds in the ruptured tendon, and the finding names only this muscle."""
-    arm = MovingArm(robot, mae)
-    arm.go(8.0)
-    ruptured = np.eye(6)[muscle]
-    arm.tense = 1.0 - ruptured
-    for wound in np.linspace(0.0, 0.2, 40):
-        arm.off = -wound * ruptured
-        arm.go(0.05)
-    arm.go(2.0)
-    assert arm.kind is Kind.SLACK_TENDON
-    assert arm.core.suspects.finding.muscle == muscle
-    assert 'repair' in arm.core.advice
-    assert arm.offsets.known
-
-
-@pytest.fixture(params=[True, False], ids=['joint sensors', 'no joint sensors'])
-def ruptured(request, robot, mae):
-    """An arm whose estimator has latched the rupture of muscle 2.
-
-    The module has wound in the ruptured tendon.
-    """
-    arm = MovingArm(robot, mae)
-    arm.has_sensors = request.param
-    arm.go(8.0)
-    arm.tense = 1.0 - np.eye(6)[2]
-    for wound in np.linspace(0.0, 0.2, 40):
-        arm.off = -wound * np.eye(6)[2]
-        arm.go(0.05)
-    arm.go(1.5)
-    assert arm.kind is Kind.SLACK_TENDON
-    assert arm.core.suspects.finding.muscle == 2
-    return arm
+    assert ruptured_once.kind is Kind.SLACK_TENDON
+    assert ruptured_once.core.suspects.finding.muscle == 2
+    assert 'repair' in ruptured_once.core.advice
+    assert ruptured_once.offsets.known
 
 
 def repair(arm, zero=0.0):
@@ -235,25 +238,22 @@ def test_joint_sensors_find_a_wrong_zero_after_a_reset_right_after_the_repair(ru
     assert ruptured.offsets.suspect == (2,)
 
 
-def test_a_joint_sensor_that_all_lengths_outvote_is_named_and_the_offsets_stay(robot, mae):
-    arm = MovingArm(robot, mae)
-    arm.go(8.0)
-    arm.joint_off = np.array([0.0, 1.0])
-    arm.go(4.0)
-    assert arm.kind is Kind.JOINT_SENSORS_DISAGREE
-    assert robot.joints[1] in arm.core.cause
-    assert arm.offsets.known
-    arm.joint_off[:] = 0.0
-    arm.go(2.0)
-    arm.core.reset()
-    arm.go(3.0)
-    assert arm.kind is None
+def test_a_joint_sensor_that_all_lengths_outvote_is_named_and_the_offsets_stay(moved):
+    moved.joint_off = np.array([0.0, 1.0])
+    moved.go(4.0)
+    assert moved.kind is Kind.JOINT_SENSORS_DISAGREE
+    assert moved.robot.joints[1] in moved.core.cause
+    assert moved.offsets.known
+    moved.joint_off[:] = 0.0
+    moved.go(2.0)
+    moved.core.reset()
+    moved.go(3.0)
+    assert moved.kind is None
 
 
-def test_a_healthy_arm_with_joint_sensors_is_healthy(robot, mae):
-    arm = MovingArm(robot, mae)
-    arm.go(20.0)
-    assert arm.kind is None
+def test_a_healthy_arm_with_joint_sensors_is_healthy(moved):
+    moved.go(12.0)
+    assert moved.kind is None
 
 
 def test_joint_sensors_that_are_dead_decide_nothing(robot, mae):
@@ -264,18 +264,17 @@ def test_joint_sensors_that_are_dead_decide_nothing(robot, mae):
     assert arm.core.health.joints.gap is None
 
 
-def isolated_for(robot, mae, seconds):
+def isolated_for(arm, seconds):
     """Return an arm with joint sensors of which muscle 2 has ruptured and is isolated."""
-    arm = MovingArm(robot, mae, on_anomaly='isolate')
-    arm.go(6.0)
+    arm.core.configure(Detection(on_anomaly='isolate'))
     arm.core.isolate([2])
     arm.off, arm.tense = -0.2 * np.eye(6)[2], 1.0 - np.eye(6)[2]
     arm.go(seconds)
     return arm
 
 
-def test_the_length_of_a_muscle_while_it_was_isolated_is_not_usual_for_it(robot, mae):
-    arm = isolated_for(robot, mae, 12.0)
+def test_the_length_of_a_muscle_while_it_was_isolated_is_not_usual_for_it(moved):
+    arm = isolated_for(moved, 10.0)  # longer than it was in use
     arm.off, arm.tense = np.zeros(6), np.ones(6)
     arm.go(0.5)
     arm.core.restore([2])
@@ -285,8 +284,8 @@ def test_the_length_of_a_muscle_while_it_was_isolated_is_not_usual_for_it(robot,
 
 
 @pytest.mark.parametrize('sensors', [True, False], ids=['joint sensors', 'no joint sensors'])
-def test_a_muscle_is_restored_only_after_its_winch_has_come_back(robot, mae, sensors):
-    arm = isolated_for(robot, mae, 1.0)
+def test_a_muscle_is_restored_only_after_its_winch_has_come_back(robot, moved, sensors):
+    arm = isolated_for(moved, 1.0)
     with pytest.raises(MusculoskeletalError, match=f'{robot.muscles[2]} has no tension|shorter'):
         arm.core.restore([2])
     arm.tense = np.ones(6)  # the tendon is repaired, but the winch has not come back yet
@@ -307,8 +306,8 @@ def test_a_muscle_is_restored_only_after_its_winch_has_come_back(robot, mae, sen
     assert arm.kind is None
 
 
-def test_a_muscle_with_another_length_offset_can_be_restored_after_a_calibration(robot, mae):
-    arm = isolated_for(robot, mae, 1.0)
+def test_a_muscle_with_another_length_offset_can_be_restored_after_a_calibration(robot, moved):
+    arm = isolated_for(moved, 1.0)
     arm.off, arm.tense = 0.12 * np.eye(6)[2], np.ones(6)
     arm.go(0.5)
     with pytest.raises(MusculoskeletalError, match='longer'):
@@ -324,18 +323,17 @@ def test_a_muscle_with_another_length_offset_can_be_restored_after_a_calibration
 
 
 @pytest.mark.parametrize(('on_anomaly', 'isolated'), [('stop', ()), ('isolate', (2,))])
-def test_one_wrong_length_revokes_no_other_offset(robot, mae, on_anomaly, isolated):
-    arm = MovingArm(robot, mae, on_anomaly=on_anomaly)
-    arm.go(8.0)
-    for share in np.linspace(0.0, 1.0, 20):
-        arm.off = -0.15 * share * np.eye(6)[2]
-        arm.go(0.05)
-    while arm.kind is None:
-        arm.go(0.1)
-        assert arm.time < 20.0
-    assert arm.kind is Kind.LENGTH_DISAGREES
-    assert arm.core.body.isolated == isolated
-    assert arm.offsets.suspect == (() if isolated else (2,))
+def test_one_wrong_length_revokes_no_other_offset(moved, on_anomaly, isolated):
+    moved.core.configure(Detection(on_anomaly=on_anomaly))
+    for share in np.linspace(0.0, 1.0, 25):
+        moved.off = -0.15 * share * np.eye(6)[2]
+        moved.go(0.04)
+    while moved.kind is None:
+        moved.go(0.1)
+        assert moved.time < 20.0
+    assert moved.kind is Kind.LENGTH_DISAGREES
+    assert moved.core.body.isolated == isolated
+    assert moved.offsets.suspect == (() if isolated else (2,))
 
 
 def test_the_winch_of_a_suspect_that_comes_back_slowly_revokes_nothing(ruptured):
