@@ -15,6 +15,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
+DT = 0.025  # time between two messages [s]
 OFFSET = np.array([0.06, -0.09, 0.12, -0.05, 0.1, -0.13])
 
 
@@ -46,7 +47,7 @@ def swinging(robot, mae):
 @pytest.fixture
 def seldom(monkeypatch):
     # Fits take much CPU time. Fitting less often saves it, and the calibration takes no longer.
-    monkeypatch.setattr(length_calibration, 'FIT_INTERVAL', 10.0)
+    monkeypatch.setattr(length_calibration, 'FIT_INTERVAL', 35.0)
 
 
 @pytest.fixture(scope='module')
@@ -62,10 +63,8 @@ def moment(swing):
 def run(calibration, moment, seconds, sees, begin=0.0):
     for n in range(round(seconds / WINDOW)):
         theta, tension, length = moment(begin + n * WINDOW)
-        for k in range(25):  # joint angles arrive with two of every three length messages
-            calibration.step(
-                tension, length + OFFSET, WINDOW / 25, theta if sees and k % 3 else None
-            )
+        for k in range(round(WINDOW / DT)):  # joint angles arrive with two of three messages
+            calibration.step(tension, length + OFFSET, DT, theta if sees and k % 3 else None)
         if calibration.is_done:
             break
     return calibration
@@ -96,7 +95,7 @@ def test_length_offsets_are_found_from_a_stated_posture_if_the_arm_stands(robot,
 
 
 def test_a_standing_arm_does_not_determine_the_length_offsets(robot, mae, moment):
-    calibration = run(LengthCalibration(robot, mae), lambda _: moment(3.0), 5.0, sees=False)
+    calibration = run(LengthCalibration(robot, mae), lambda _: moment(3.0), 3.0, sees=False)
     assert calibration.offsets is not None and not calibration.offsets.known
     assert f'0 of {length_calibration.ENOUGH:.0f} s of gentle motion' in calibration.progress
 
@@ -124,25 +123,25 @@ def test_without_length_offsets_only_a_muscle_without_tension_is_an_anomaly(
     estimator.calibrate_lengths()
     assert not estimator.body.offsets.known
     now, detected = 0.0, []
-    for n in range(300):
-        _, tension, length = moment(0.01 * n)
-        now += 0.01
+    for n in range(100):
+        _, tension, length = moment(n * DT)
+        now += DT
         estimator.commanded(now, length=length + OFFSET - estimator.body.offsets.offset)
-        if n > 200:
+        if n > 60:
             tension = tension * (np.arange(6) != 2)
-        elif n == 200:
+        elif n == 60:
             assert 'calibrating the lengths' in str(estimator.report(now))
         estimate = estimator.step(states(tension, length + OFFSET), now, now)
         detected += [n] * bool(estimate is not None and estimate.detected)
-    assert detected and detected[0] > 240 and estimator.cause.startswith(robot.muscles[2])
+    assert detected and detected[0] > 76 and estimator.cause.startswith(robot.muscles[2])
 
 
 @pytest.mark.parametrize('sees', [True, False])
 def test_the_readings_of_an_isolated_muscle_do_not_disturb_the_length_calibration(
     monkeypatch, robot, mae, moment, sees
 ):
-    # Fit even less often than the fixture `seldom`, because fits without a muscle take longer.
-    monkeypatch.setattr(length_calibration, 'FIT_INTERVAL', 30.0)
+    # Begin only one fit, because fits without a muscle take longer.
+    monkeypatch.setattr(length_calibration, 'FIRST_FIT', 19.0 if sees else 70.0)
     rng = np.random.default_rng(0)
 
     def disturbed(t):
@@ -166,14 +165,13 @@ def test_an_isolated_muscle_gets_an_uncertain_length_offset(robot, mae, moment):
     assert np.delete(off, 3).max() < 1e-3
 
 
-@pytest.mark.usefixtures('seldom')
 @pytest.mark.filterwarnings('error::RuntimeWarning')
 def test_length_calibration_of_an_arm_without_weight_stays_finite(mae):
     robot = Robot.load('arm26')
     # Without gravity, as in an arm whose joints all have vertical axes, weight carries no
     # information.
     robot.kinematics.model.gravity.linear = np.zeros(3)
-    calibration = run(LengthCalibration(robot, mae), swinging(robot, mae), 60.0, sees=False)
+    calibration = run(LengthCalibration(robot, mae), swinging(robot, mae), 6.0, sees=False)
     assert np.isfinite(calibration.offsets.offset).all()
 
 
@@ -181,18 +179,18 @@ def test_another_network_or_isolated_muscle_starts_the_length_calibration_again(
     estimator = Estimator(robot)
     estimator.use(mae)
     estimator.calibrate_lengths()
-    for n in range(400):
-        _, tension, length = moment(0.01 * n)
-        estimator.step(states(tension, length + OFFSET), 0.01 * n, 0.01 * n)
+    for now in np.arange(0.0, 4.0, 0.05):
+        _, tension, length = moment(now)
+        estimator.step(states(tension, length + OFFSET), now, now)
     reported = str(estimator.report(4.0))
     assert re.search('calibrating the lengths: [1-4] of', reported)
     estimator.isolate(())
     assert str(estimator.report(4.0)) == reported
     estimator.use(mae)  # any call of `use` counts as another network
     assert 'calibrating the lengths: 0 of' in str(estimator.report(4.0))
-    for n in range(400, 800):
-        _, tension, length = moment(0.01 * n)
-        estimator.step(states(tension, length + OFFSET), 0.01 * n, 0.01 * n)
+    for now in np.arange(4.0, 8.0, 0.05):
+        _, tension, length = moment(now)
+        estimator.step(states(tension, length + OFFSET), now, now)
     assert re.search('calibrating the lengths: [1-4] of', str(estimator.report(8.0)))
     estimator.isolate((3,))
     assert 'calibrating the lengths: 0 of' in str(estimator.report(8.0))
@@ -202,6 +200,7 @@ def test_lengths_that_no_posture_explains_call_for_joint_sensors_or_a_known_post
     robot, mae, moment, monkeypatch
 ):
     monkeypatch.setattr(length_calibration, 'ENOUGH', 4.0)
+    monkeypatch.setattr(length_calibration, 'FIRST_FIT', 5.5)
     monkeypatch.setattr(length_calibration, 'LARGEST_RESIDUAL', 1.0)
     calibration = LengthCalibration(robot, mae)
 
