@@ -2,7 +2,7 @@
 """A driver of the emulated arm without ROS, with faults that a test selects."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,17 +13,35 @@ from musculoskeletal_ae.driver.positioning import Positioning
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.driver.winding import Winding
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.faults import Faults, Readings
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 
 PERIOD = 0.01  # time between two published messages [s]
 
 
+class RecordedArm:
+    """Returns recorded readings of an emulated arm, one for each step; it obeys no command."""
+
+    def __init__(self, robot: Robot, readings: Sequence[Readings]) -> None:
+        self.faults = Faults(robot, np.random.default_rng(0))
+        self._readings, self._next = readings, -1
+
+    def step(self, _: float) -> None:
+        self._next += 1
+
+    def sense(self) -> Readings:
+        return self._readings[self._next]
+
+    def set_wrench(self, _: np.ndarray) -> None:
+        """Do nothing: the recorded arm was moved, or it was not."""
+
+
 class Driver:
     """Publishes muscle_states and follows muscle_length_command, with the selected faults."""
 
-    def __init__(self, robot: Robot, seed: int = 0) -> None:
-        self.robot, self.arm = robot, EmulatedArm(robot, seed)
+    def __init__(self, robot: Robot, seed: int = 0, arm: Any = None) -> None:
+        self.robot, self.arm = robot, arm or EmulatedArm(robot, seed)
         # Tests inject faults: `publish` changes the published rows (3, M), `take` the received
         # targets (M,), and `angles` the published θ (D,). `late` delays commands [s].
         self.publish: Callable = lambda rows: rows
@@ -35,10 +53,12 @@ class Driver:
         self.motors: MotorInterface | None = None
         self.period, self.late = PERIOD, 0.0
         self.now = 0.0
-        self.pulled: dict[str, float] = {}  # highest T [N] of any muscle in each phase of `wind`
+        #: highest true T [N] of any muscle in each phase of `wind`
+        self.pulled: dict[str, float] = {}
         self._commands: deque = deque()
         # Computes T [N] from l_target and the measured rows; if None, the arm's own law does.
         self.in_tension: Callable | None = None
+        self.law_period = PERIOD  # time between two evaluations of `in_tension` [s]
         self._target = None
         self._sent = -1.0
 
@@ -47,13 +67,15 @@ class Driver:
         self.now += PERIOD
         while self._commands and self._commands[0][0] <= self.now:
             self._target = self._commands.popleft()[1]
-        if self._target is not None:
-            if self.in_tension:
+        if self._target is not None and self.in_tension:
+            for _ in range(round(PERIOD / self.law_period)):
                 rows = np.stack(self.arm.sense()[1:])
                 self.arm.command_tension(self.in_tension(self._target, rows))
-            else:
+                self.arm.step(self.law_period)
+        else:
+            if self._target is not None:
                 self.arm.command_length(self._target)
-        self.arm.step(PERIOD)
+            self.arm.step(PERIOD)
         if self.now - self._sent < self.period - 1e-9:
             return []
         self._sent = self.now
@@ -78,7 +100,7 @@ class Driver:
         listening = Listening(self.robot, 1.0 / PERIOD, None, zeroed, self.motors)
         for k in range(round(seconds / PERIOD)):
             if moved:
-                self.arm.set_wrench(30.0 * np.sin(0.02 * k * np.array([1.0, 0.7, 1.3, 0, 0, 0])))
+                self.arm.set_wrench(hand(k))
             for theta, rows in self.step():
                 if joints:
                     angles = self.angles(theta)
@@ -105,11 +127,28 @@ class Driver:
         winding = kind(heard or Verdict(self.robot), muscles, highest)
         while not winding.done:
             for theta, rows in self.step():
-                tension = max(self.pulled.get(winding.trying, 0.0), self.arm.sense().tension.max())
+                tension = max(self.pulled.get(winding.trying, 0.0), self.arm.tension.max())
                 self.pulled[winding.trying] = tension
                 if (target := winding.step(rows, self.now, self.angles(theta))) is not None:
                     self.command(target)
         return winding.verdict
+
+
+def hand(k: int) -> np.ndarray:
+    """Return the wrench (6,) of a hand that moves the arm, in the step number k."""
+    wrench: np.ndarray = 30.0 * np.sin(0.02 * k * np.array([1.0, 0.7, 1.3, 0, 0, 0]))
+    return wrench
+
+
+def record(robot: Robot, seconds: float, moved: bool) -> list[Readings]:
+    """Return the readings of an arm that receives no commands; a hand may move it."""
+    arm, readings = EmulatedArm(robot), []
+    for k in range(round(seconds / PERIOD)):
+        if moved:
+            arm.set_wrench(hand(k))
+        arm.step(PERIOD)
+        readings.append(arm.sense())
+    return readings
 
 
 def array(rows: np.ndarray) -> SimpleNamespace:

@@ -8,13 +8,14 @@ import os
 import re
 from dataclasses import replace
 from functools import cache, partial
+from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
 
-from driver.scripted import Driver, array, joint_state
+from driver.scripted import Driver, RecordedArm, array, joint_state, record
 from musculoskeletal_ae import validity
 from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.driver.motion import ABOVE_BIAS, RUN_AWAY_TENSION
@@ -29,6 +30,7 @@ from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
 
 ROBOT = Robot.load('arm26')
+POSITION = Robot(with_modules(ROBOT.description, actuation='position'))
 M, BICEPS = ROBOT.muscle_count, 4
 BIAS, K = ROBOT.tension.bias[0], ROBOT.stiffness[0]
 
@@ -43,6 +45,24 @@ def _settled(seed):
 def settled(seed=0):
     """Return a copy of a driver whose arm has come to rest."""
     return copy.deepcopy(_settled(seed))
+
+
+@cache
+def recording(moved):
+    return record(ROBOT, 8.0 if moved else 3.0, moved)
+
+
+def silent(moved=False):
+    """Return a driver to listen to: at rest for 3 s, or moved by a hand for 8 s."""
+    return Driver(ROBOT, arm=RecordedArm(ROBOT, recording(moved)))
+
+
+def heard(moved=False, joints=True, zeroed=True, **faults):
+    """Return the verdict of listening to a driver with these faults, attributes of `Driver`."""
+    driver = silent(moved)
+    for attribute, value in faults.items():
+        setattr(driver, attribute, value)
+    return driver.listen(8.0 if moved else 3.0, moved, joints, zeroed)
 
 
 def rows_in(order):
@@ -93,22 +113,65 @@ def shifted(rows):
     return rows
 
 
-@pytest.mark.parametrize('seed', [0, 1])
-def test_a_sound_driver_is_found_sound(seed):
-    for verdict in (
-        Driver(ROBOT, seed).listen(),
-        Driver(ROBOT, seed).listen(8.0, moved=True),
-        Driver(ROBOT, seed).listen(joints=False),
-    ):
-        assert not verdict.faults, str(verdict)
-    verdict = settled(seed).wind()
+@pytest.mark.parametrize(
+    ('follows', 'seed'),
+    [
+        ('muscle stiffness', 0),
+        ('position', 0),
+        pytest.param('muscle stiffness', 1, marks=pytest.mark.thorough),
+    ],
+)
+def test_a_sound_driver_is_found_sound(follows, seed):
+    driver = Driver(ROBOT if follows == 'muscle stiffness' else POSITION, seed)
+    driver.listen(2.0)
+    at_rest = driver.listen()
+    assert not at_rest.faults, str(at_rest)
+    assert_not_judged(at_rest)
+    verdict = driver.wind(heard=at_rest)
     assert not verdict.faults, str(verdict)
     assert f'these joint sensors have the right sign: {", ".join(ROBOT.joints)}' in str(verdict)
-    reported = str(verdict).splitlines()
-    for name, line in zip(ROBOT.muscles, reported[1:]):
-        assert line.startswith(name)
-        # `Winding` alone does not judge rate, zero and clip, and order only where θ shows it.
-        assert line.count('ok') in (4, 5) and 'WRONG' not in line
+    assert_consistent(verdict)
+    for m, line in enumerate(str(verdict).splitlines()[1 : M + 1]):
+        assert line.startswith(ROBOT.muscles[m]) and 'WRONG' not in line
+        # `clip` is not reached, and θ does not show the order of all muscles.
+        passed = {check for check in CHECKS if verdict.has_passed(check, m)}
+        assert passed | {'order'} == {*CHECKS} - {'clip'}, line
+
+
+def test_a_sound_driver_is_found_sound_if_a_hand_moves_the_arm():
+    verdict = heard(moved=True)
+    assert not verdict.faults, str(verdict)
+
+
+@pytest.mark.parametrize('follows', ['muscle stiffness', 'position'])
+def test_a_sound_driver_without_joint_sensors_is_found_sound(follows):
+    driver = Driver(ROBOT if follows == 'muscle stiffness' else POSITION)
+    driver.listen(2.0)
+    driver.angles = lambda theta: np.full_like(theta, np.nan)
+    at_rest = driver.listen(3.0, joints=False)
+    assert not at_rest.faults, str(at_rest)
+    assert_not_judged(at_rest)
+    verdict = driver.wind((0, BICEPS), heard=at_rest)
+    assert not verdict.faults, str(verdict)
+    assert_consistent(verdict)
+    assert all(verdict.has_passed('sign', m) == (m in (0, BICEPS)) for m in range(M))
+
+
+def assert_not_judged(verdict):
+    """Assert that a remark explains how to check order and sign of an arm that was not moved."""
+    (remark,) = not_judged(verdict)
+    assert remark.startswith('note: order, sign')
+    assert 'of all muscles not judged: ' in remark
+
+
+def assert_consistent(verdict):
+    """Assert that the remarks name no check that the table shows as passed."""
+    for remark in not_judged(verdict):
+        for group in remark.removeprefix('note: ').partition(' not judged: ')[0].split('; '):
+            checks, _, names = group.partition(' of ')
+            muscles = ROBOT.muscles if names == 'all muscles' else names.split(', ')
+            for check, name in product(checks.split(', '), muscles):
+                assert not verdict.has_passed(check, ROBOT.muscles.index(name)), remark
 
 
 HEARD = {
@@ -168,9 +231,7 @@ def offset(m, rows):
 
 @pytest.mark.parametrize('moved', [False, True])
 def test_the_first_step_against_a_wrong_zero_of_an_arm_at_rest_is_to_move_it_by_hand(moved):
-    driver = Driver(ROBOT)
-    driver.publish = shifted
-    (fault,) = driver.listen(8.0 if moved else 3.0, moved=moved).faults
+    (fault,) = heard(moved, publish=shifted).faults
     assert fault.check == 'zero'
     first, *others = fault.change.splitlines()
     assert ('without --move' in first) != moved
@@ -178,9 +239,7 @@ def test_the_first_step_against_a_wrong_zero_of_an_arm_at_rest_is_to_move_it_by_
 
 
 def test_the_reversed_sign_of_every_length_is_one_fault_of_a_moved_arm():
-    driver = Driver(ROBOT)
-    driver.publish = flipped
-    verdict = driver.listen(8.0, moved=True)
+    verdict = heard(moved=True, publish=flipped)
     assert len(verdict.faults) == 1 and 'reverse the sign of every l' in str(verdict), str(verdict)
 
 
@@ -199,22 +258,21 @@ def test_the_reversed_sign_of_every_length_is_one_fault_of_an_arm_at_rest(robot)
 
 
 def test_the_tolerance_of_zeros_is_stated():
-    assert 'zero ok: within 45 mm of the route' in str(Driver(ROBOT).listen(0.5))
+    assert 'zero ok: within 45 mm of the route' in str(heard())
 
 
 @pytest.mark.parametrize('name', ANGLES)
 def test_a_fault_of_the_joint_sensors_is_not_blamed_on_the_lengths(name):
-    driver = Driver(ROBOT)
-    driver.angles, check, reported = ANGLES[name]
-    verdict = driver.listen(8.0, moved=True)
+    angles, check, reported = ANGLES[name]
+    verdict = heard(moved=True, angles=angles)
     assert verdict.wrong == {check}, str(verdict)
     assert reported in str(verdict)
 
 
 def test_listening_names_the_joint_sensors_of_right_sign_if_the_arm_was_moved():
-    (right,) = joint_notes(Driver(ROBOT).listen(8.0, moved=True))
+    (right,) = joint_notes(heard(moved=True))
     assert all(joint in right for joint in ROBOT.joints)
-    assert not joint_notes(Driver(ROBOT).listen(2.0))
+    assert not joint_notes(heard())
 
 
 def joint_notes(verdict):
@@ -326,14 +384,14 @@ def test_every_reason_to_reject_a_message_of_a_driver_has_its_own_advice():
 
 
 def ros2_control(**wrong):
-    """Return a driver with messages of ros2_control, which check_driver reads by settings.
+    """Return the verdict on a driver with messages of ros2_control, read by settings.
 
     The settings are right, except those in `wrong`.
     """
     right = MotorSettings(
         motor_state_topic='joint_states', spool_radius=(0.012,), motor_direction=(-1.0,)
     )
-    interface, driver = MotorInterface(right, ROBOT.muscles), settled()
+    interface = MotorInterface(right, ROBOT.muscles)
 
     def message(rows, now):
         names, position, effort = interface.joint_values(rows[0], rows[1])
@@ -342,13 +400,12 @@ def ros2_control(**wrong):
         arrays = {'position': position, 'velocity': [], 'effort': effort}
         return SimpleNamespace(header=header, name=list(names), **arrays)
 
-    driver.message = message
-    driver.motors = MotorInterface(replace(right, **wrong), ROBOT.muscles)
-    return driver
+    motors = MotorInterface(replace(right, **wrong), ROBOT.muscles)
+    return heard(moved=True, message=message, motors=motors)
 
 
 def test_the_motors_of_ros2_control_are_judged_as_muscles():
-    verdict = ros2_control().listen(5.0, moved=True)
+    verdict = ros2_control()
     assert not verdict.faults and 'nothing protects the motors from heat' in str(verdict)
 
 
@@ -363,24 +420,20 @@ def test_the_motors_of_ros2_control_are_judged_as_muscles():
     ],
 )
 def test_a_wrong_parameter_of_the_motors_is_found(wrong, check, reported):
-    verdict = ros2_control(**wrong).listen(5.0, moved=True)
+    verdict = ros2_control(**wrong)
     assert check in verdict.wrong, str(verdict)
     assert reported in str(verdict)
 
 
 def test_one_joint_sensor_without_a_number_is_named():
-    driver = settled()
-    driver.angles = lambda theta: np.array([theta[0], math.nan])
-    verdict = driver.listen(1.0)
-    assert 'the position of elbow was not finite in 100 messages' in str(verdict)
+    verdict = heard(angles=lambda theta: np.array([theta[0], math.nan]))
+    assert 'the position of elbow was not finite in 300 messages' in str(verdict)
 
 
 @pytest.mark.parametrize('name', HEARD)
 def test_a_fault_is_found_by_listening(name):
     publish, how, check, reported = HEARD[name]
-    driver = Driver(ROBOT)
-    driver.publish = publish
-    verdict = driver.listen(8.0 if how == 'moved' else 3.0, moved=how == 'moved')
+    verdict = heard(how == 'moved', publish=publish)
     assert verdict.wrong == {check}, str(verdict)
     assert reported in str(verdict)
     assert not verdict.allows_motion  # whatever the fault is
@@ -409,36 +462,11 @@ def test_only_a_complete_check_says_that_the_driver_keeps_its_contract():
 
 
 def test_no_remark_advises_to_move_an_arm_that_was_moved_for_muscles_in_the_wrong_order():
-    driver = Driver(ROBOT)
-    driver.publish = exchanged
-    verdict = driver.listen(8.0, moved=True)
+    verdict = heard(moved=True, publish=exchanged)
     misplaced = {ROBOT.muscles[m] for fault in verdict.faults for m in fault.muscles}
     assert len(misplaced) == 2
     for remark in not_judged(verdict):
         assert 'all muscles' not in remark and not any(name in remark for name in misplaced)
-
-
-@pytest.mark.parametrize('joints', [True, False])
-@pytest.mark.parametrize('follows', ['muscle stiffness', 'position'])
-def test_a_remark_names_a_check_as_not_judged_only_while_the_table_shows_it_as_not_judged(
-    follows, joints
-):
-    driver = Driver(ROBOT if follows == 'muscle stiffness' else POSITION)
-    driver.listen(3.0)
-    if not joints:
-        driver.angles = lambda theta: np.full_like(theta, np.nan)
-    heard = driver.listen(3.0, joints=joints)
-    (before,) = not_judged(heard)
-    assert before.startswith('note: order, sign')
-    assert 'of all muscles not judged: ' in before
-    verdict = driver.wind(heard=heard)
-    assert not verdict.faults, str(verdict)
-    assert all(verdict.has_passed('sign', m) for m in range(M))
-    for remark in not_judged(verdict):
-        checks, _, muscles = remark.partition(' not judged: ')[0].partition(' of ')
-        assert 'sign' not in checks
-        named = [m for m, name in enumerate(ROBOT.muscles) if name in muscles.split(', ')]
-        assert not any(verdict.has_passed('order', m) for m in named)
 
 
 def not_judged(verdict):
@@ -449,26 +477,22 @@ def not_judged(verdict):
 
 
 def test_unknown_length_offsets_are_no_fault_if_the_user_says_so():
-    driver = Driver(ROBOT)
-    driver.publish = lambda rows: rows + [np.linspace(-0.13, 0.13, M), np.zeros(M), np.zeros(M)]
-    assert driver.listen(2.0).wrong & {'zero', 'unit'}
+    offset = np.stack([np.linspace(-0.13, 0.13, M), np.zeros(M), np.zeros(M)])
+    assert heard(publish=lambda rows: rows + offset).wrong & {'zero', 'unit'}
     for moved in (False, True):
-        assert not driver.listen(8.0, moved=moved, zeroed=False).faults
-    driver.publish = lambda rows: flipped(rows) + [[0.1], [0], [0]]
-    assert driver.listen(8.0, moved=True, zeroed=False).wrong == {'sign'}
+        assert not heard(moved, zeroed=False, publish=lambda rows: rows + offset).faults
+    offset[0] = 0.1
+    turned = heard(moved=True, zeroed=False, publish=lambda rows: flipped(rows) + offset)
+    assert turned.wrong == {'sign'}
 
 
 def test_slow_repeated_and_frozen_messages_are_found():
-    slow = Driver(ROBOT)
-    slow.period = 0.05
-    verdict = slow.listen()
+    verdict = heard(period=0.05)
     assert verdict.wrong == {'rate'} and 'came at 20 Hz' in str(verdict)
     assert not verdict.allows_motion
-    repeating, rows = Driver(ROBOT), []
-    repeating.publish = lambda now: rows.append(now) or rows[len(rows) // 2]
-    assert 'repeat the previous message' in str(repeating.listen())
-    frozen = Driver(ROBOT)
-    first = []
+    rows, first = [], []
+    repeating = heard(publish=lambda now: rows.append(now) or rows[len(rows) // 2])
+    assert 'repeat the previous message' in str(repeating)
 
     def freeze(rows):
         first.append(rows)
@@ -476,8 +500,7 @@ def test_slow_repeated_and_frozen_messages_are_found():
         rows[:, 3] = first[0][:, 3]
         return rows
 
-    frozen.publish = freeze
-    verdict = frozen.listen()
+    verdict = heard(publish=freeze)
     assert [fault.muscles for fault in verdict.faults] == [(3,)], str(verdict)
 
 
@@ -485,7 +508,7 @@ class Messages:
     """Passes messages of a driver at rest to `Listening`, at times that the test chooses."""
 
     def __init__(self):
-        self.listening, self.driver = Listening(ROBOT, 100.0), settled()
+        self.listening, self.driver = Listening(ROBOT, 100.0), silent()
         self.number = 0
         self.ticks = []  # times at which `Listening` learns that this process is running [s]
 
@@ -529,11 +552,9 @@ def overload(monkeypatch):
 def test_a_slow_driver_on_an_overloaded_computer_has_no_fault_but_is_moved_at_30_hz_only(
     monkeypatch, period, allows_motion
 ):
-    driver = Driver(ROBOT)
-    driver.period = period
-    assert driver.listen().wrong == {'rate'}
+    assert heard(period=period).wrong == {'rate'}
     overload(monkeypatch)
-    verdict = driver.listen()
+    verdict = heard(period=period)
     assert not verdict.faults, str(verdict)
     assert verdict.allows_motion == allows_motion
     assert 'not judged: rate (this computer is overloaded, load 1000 on ' in str(verdict)
@@ -542,9 +563,7 @@ def test_a_slow_driver_on_an_overloaded_computer_has_no_fault_but_is_moved_at_30
 
 def test_a_driver_that_falls_silent_on_an_overloaded_computer_is_found(monkeypatch):
     overload(monkeypatch)
-    driver = Driver(ROBOT)
-    driver.period = 2.0
-    assert driver.listen(5.0).wrong == {'rate'}
+    assert heard(moved=True, period=2.0).wrong == {'rate'}
 
 
 @pytest.mark.parametrize('robot', ['muscle stiffness', 'position'])
@@ -561,13 +580,13 @@ def test_a_late_response_on_an_overloaded_computer_is_not_judged(monkeypatch, ro
 def test_the_motion_test_of_a_sound_driver_finds_no_fault_at_33_hz():
     driver = settled()
     driver.period = 0.03
-    verdict = driver.wind()
+    verdict = driver.wind((0, BICEPS))
     assert not verdict.faults, str(verdict)
 
 
 def listen(rate, steps):
     """Return a driver and its listener after some steps; `rate` is the expected rate [Hz]."""
-    driver, listening = Driver(ROBOT), Listening(ROBOT, rate)
+    driver, listening = silent(), Listening(ROBOT, rate)
     for _ in range(steps):
         for _, rows in driver.step():
             listening.muscles(array(rows), driver.now)
@@ -612,20 +631,18 @@ def test_a_driver_that_falls_silent_is_found():
 
 @pytest.mark.parametrize('share', [0.1, 0.3])
 def test_sensors_with_hardly_any_noise_are_no_fault(share):
-    driver, rng = settled(), np.random.default_rng(0)
-    steps, still = np.array([[1e-5], [0.5], [0.1]]), np.stack(driver.arm.sense()[1:])
+    rng = np.random.default_rng(0)
+    steps, still = np.array([[1e-5], [0.5], [0.1]]), np.stack(recording(False)[-1][1:])
 
     def publish(_):
         return np.rint(still / steps + share * rng.normal(size=still.shape)) * steps
 
-    driver.publish = publish
-    verdict = driver.listen()
+    verdict = heard(publish=publish)
     assert not verdict.faults, str(verdict)
 
 
 def test_additional_joints_and_joints_in_several_messages_are_no_fault():
-    driver = settled()
-    listening = Listening(ROBOT, 100.0)
+    driver, listening = silent(), Listening(ROBOT, 100.0)
     for _ in range(200):
         for theta, rows in driver.step():
             for name, angle in zip(ROBOT.joints, theta):
@@ -638,24 +655,18 @@ def test_additional_joints_and_joints_in_several_messages_are_no_fault():
 
 
 def test_unknown_joint_names_are_found():
-    driver = Driver(ROBOT)
-    driver.names = ('joint_1', 'joint_2')
-    verdict = driver.listen()
+    verdict = heard(names=('joint_1', 'joint_2'))
     assert 'missing joint' in str(verdict) and ROBOT.joints[0] in str(verdict)
 
 
 def test_missing_joint_sensors_are_no_fault():
-    driver = Driver(ROBOT)
-    driver.names = 'other', ROBOT.joints[1]
-    verdict = driver.listen()
+    verdict = heard(names=('other', ROBOT.joints[1]))
     assert not verdict.faults
     assert f'the angles of {ROBOT.joints[0]} are unknown' in str(verdict)
 
 
 def test_modules_without_thermometers_are_no_fault():
-    driver = Driver(ROBOT)
-    driver.publish = scaled(1, 1, math.nan)
-    verdict = driver.listen()
+    verdict = heard(publish=scaled(1, 1, math.nan))
     assert not verdict.faults
     assert 'nothing protects the motors from heat' in str(verdict)
 
@@ -713,7 +724,7 @@ def test_a_fault_is_found_by_winding_in(name):
     assert reported in str(verdict)
 
 
-@pytest.mark.parametrize('joint', range(ROBOT.joint_count))
+@pytest.mark.parametrize('joint', [0, pytest.param(1, marks=pytest.mark.thorough)])
 def test_a_joint_sensor_of_wrong_sign_is_named_by_winding_in(joint):
     driver, sign = settled(), np.ones(ROBOT.joint_count)
     sign[joint] = -1.0
@@ -752,8 +763,17 @@ HARMFUL = {
 }
 
 
-@pytest.mark.parametrize('name', HARMFUL)
-@pytest.mark.parametrize('highest', [None, 60.0])
+@pytest.mark.parametrize(
+    ('name', 'highest'),
+    [
+        ('inverted', None),
+        ('inverted and exchanged', None),
+        ('commands exchanged', 60.0),
+        pytest.param('inverted', 60.0, marks=pytest.mark.thorough),
+        pytest.param('inverted and exchanged', 60.0, marks=pytest.mark.thorough),
+        pytest.param('commands exchanged', None, marks=pytest.mark.thorough),
+    ],
+)
 def test_no_wrong_driver_pulls_above_the_test_tension_while_the_arm_is_held(name, highest):
     driver = settled()
     HARMFUL[name](driver)
@@ -806,33 +826,32 @@ def stiff_and_strong(stiffness):
     return Robot(replace(ROBOT.description, **parts))
 
 
-def wound_in_stiff(stiffness, seed=0, of_law=None):
+def wound_in_stiff(stiffness, muscles, /, law_period=0.005, seed=0, **of_law):
     """Return the verdict of the motion test on a stiff robot, whose modules regulate tension.
 
     `of_law` replaces constants of the control law in the driver, so that the law is wrong.
     """
-    robot = stiff_and_strong(stiffness)
-    driver = Driver(robot, seed)
-    driver.in_tension = law(
-        **{'bias': 100.0, 'stiffness': stiffness, 'most': 3000.0, **(of_law or {})}
-    )
+    driver = Driver(stiff_and_strong(stiffness), seed)
+    driver.in_tension = law(**{'bias': 100.0, 'stiffness': stiffness, 'most': 3000.0, **of_law})
+    driver.law_period = law_period
     driver.listen(2.0)
-    return driver.wind()
+    return driver.wind(muscles)
 
 
-@pytest.mark.parametrize('seed', [0, 1])
+@pytest.mark.parametrize('seed', [0, pytest.param(1, marks=pytest.mark.thorough)])
 def test_noise_of_length_is_no_fault_of_a_stiff_robot(seed):
-    verdict = wound_in_stiff(1.0e5, seed)
+    verdict = wound_in_stiff(1.0e5, (0, 3, BICEPS), seed=seed)
     assert not verdict.faults, str(verdict)
 
 
 @pytest.mark.parametrize('wrong', [{'stiffness': 5.0e4}, {'bias': 0.0}, {'gain': 1.0 / 9.81}])
 def test_a_fault_of_a_stiff_robot_is_found(wrong):
-    assert 'law' in wound_in_stiff(1.0e5, of_law=wrong).wrong
+    assert 'law' in wound_in_stiff(1.0e5, (BICEPS,), **wrong).wrong
 
 
 def test_oscillation_of_a_stiff_robot_is_reported():
-    verdict = wound_in_stiff(7.0e5)  # with 8 seeds, oscillation was ≥ 1.27 times the tolerance
+    # With the seeds 0 to 7, the oscillation was 1.1 to 1.6 times the tolerance (1.5 with seed 0).
+    verdict = wound_in_stiff(7.0e5, (BICEPS,), law_period=0.01)
     assert 'N (standard deviation) while it is held' in str(verdict)
     assert 'latency' not in verdict.wrong, str(verdict)
 
@@ -878,7 +897,7 @@ def test_weak_muscles_are_not_pulled_far_beyond_their_maximum(wrong, check):
     driver.in_tension = law(**{'bias': 5.0, 'most': 26.0, **wrong})
     most = []
     driver.publish = lambda rows: most.append(rows[1].max()) or rows
-    assert check in driver.wind((0, BICEPS)).wrong
+    assert check in driver.wind((BICEPS,)).wrong
     assert max(most) < 80.0
 
 
@@ -886,7 +905,7 @@ def test_weak_muscles_are_not_pulled_far_beyond_their_maximum(wrong, check):
 def test_clipping_at_the_maximum_is_checked_where_it_is_reachable(clip):
     driver = unclipped(with_tension(55.0, 60.0))
     driver.in_tension = law(most=60.0, clip=clip)
-    verdict = driver.wind((0, BICEPS))
+    verdict = driver.wind((BICEPS,))
     assert verdict.wrong == (set() if clip else {'clip'}), str(verdict)
 
 
@@ -900,7 +919,6 @@ def test_clipping_at_the_maximum_is_checked_where_it_is_reachable(clip):
         ('dead_sensor:biceps_long', {'rate', 'law'}, 'biceps_long'),
         ('bias:biceps_long:0.1', {'zero'}, 'zero of biceps_long'),
         ('bias:tension:biceps_long:40', {'law'}, 'biceps_long'),
-        ('stuck_motor:biceps_long', {'law'}, 'does not respond'),
     ],
 )
 def test_faults_of_the_emulated_arm_are_found(fault, checks, reported):
@@ -909,18 +927,6 @@ def test_faults_of_the_emulated_arm_are_found(fault, checks, reported):
     verdict = driver.wind((BICEPS,), heard=driver.listen())
     assert verdict.wrong & checks, str(verdict)
     assert reported in str(verdict)
-
-
-POSITION = Robot(with_modules(ROBOT.description, actuation='position'))
-
-
-def test_a_sound_driver_that_follows_positions_is_found_sound():
-    driver = Driver(POSITION, 0)
-    verdict = driver.listen(2.0)
-    assert not verdict.faults, str(verdict)
-    verdict = driver.wind()
-    assert not verdict.faults, str(verdict)
-    assert all(line.count('ok') in (4, 5) for line in str(verdict).splitlines()[1 : M + 1])
 
 
 POSITION_FAULTS = {
