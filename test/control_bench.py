@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A controller without an arm: the test provides sensor data and time."""
 
+import copy
 from dataclasses import replace
+from functools import cache, lru_cache
 
 import numpy as np
 from exact_mae import ExactMae, rest_readings
@@ -59,6 +61,12 @@ def inputs(mae, theta, limit, robot=ROBOT, dt=DT, tension=None):
     )
 
 
+@lru_cache(maxsize=8)
+def _readings(theta, tension):
+    """Return (l, T) of the arm at rest; the last ones are kept, because few benches move."""
+    return rest_readings(ROBOT, np.array(theta), None if tension is None else np.array(tension))
+
+
 class Bench:
     """A controller with healthy sensor data, unless a test changes them."""
 
@@ -78,12 +86,17 @@ class Bench:
         for _ in range(count):
             self.now += self.dt
             if 'muscles' not in self.blind:
-                length, tension = rest_readings(ROBOT, self.theta, self.tension)
-                self.core.muscles(np.array([length, tension, self.temperature]), self.now)
+                pull = None if self.tension is None else tuple(self.tension)
+                length, tension = _readings(tuple(self.theta), pull)
+                self.send(np.array([length, tension, self.temperature]))
             if 'estimate' not in self.blind:
                 self.core.estimated(self.theta, self.now)
             sent.append(self.core.step(self.now))
         return sent
+
+    def send(self, read):
+        """Give the controller a message of muscle states (3, M)."""
+        self.core.muscles(read, self.now)
 
     def configure(self, **chosen):
         self.core.configure(replace(self.core.settings, **chosen))
@@ -114,6 +127,19 @@ class Bench:
 
     def report(self):
         return status.report(self.core, self.now)
+
+
+@cache
+def _settled(kind, steps, **chosen):
+    bench = kind(**chosen)
+    bench.target(REST)
+    bench.step(steps)
+    return bench
+
+
+def settled(steps=100, kind=Bench, **chosen):
+    """Return a copy of a bench that has commanded the posture REST for a number of steps."""
+    return copy.deepcopy(_settled(kind, steps, **chosen))
 
 
 def values(commands):

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.control.controller import FIRST_ESTIMATE, Controller
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.emulator.arm import EmulatedArm
@@ -106,47 +106,67 @@ def loop(settled):
     return copy.deepcopy(settled)
 
 
-#: part of the stop cause under each fault; '' if the arm must continue, None if it may stop
-PROMISES = {
-    'drop:0.5': '',
-    'drop:1': 'older than',
-    'delay': '',
-    'duplicate': '',
-    'reorder': '',
-    f'spike:length:{MUSCLE}': '',
-    f'spike:tension:{MUSCLE}:400': '',
-    'spike:temperature': '',
-    f'bias:length:{MUSCLE}:0.3': 'muscle_states',
-    f'bias:tension:{MUSCLE}:400': 'overload: tension of',
-    f'bias:temperature:{MUSCLE}:90': 'overheated',
-    f'overheat:{MUSCLE}': '',  # 90 °C: the controller only limits the tension of this muscle
-    f'overheat:{MUSCLE}:120': 'overheated',
-    f'freeze:{MUSCLE}': None,
-    'freeze': None,
-    f'dead_sensor:{MUSCLE}': None,
-    f'nan_sensor:{MUSCLE}': 'older than',
-    f'dead_sensor:tension:{MUSCLE}': None,
-    f'stuck_motor:{MUSCLE}': None,
-    f'slack:{MUSCLE}': None,
-    f'winch_speed:{MUSCLE}:0.009': None,
-    f'unzeroed:{MUSCLE}:0.1': 'length',  # the cause is either an implausible length or a jump
+#: faults under which the arm must continue, with the seconds for which each is present
+TOLERATED = {
+    'drop:0.5': 1.0,
+    'delay': 1.0,
+    'duplicate': 1.0,
+    'reorder': 1.0,
+    f'spike:length:{MUSCLE}': 1.0,
+    f'spike:tension:{MUSCLE}:400': 1.0,
+    'spike:temperature': 1.0,
+    f'overheat:{MUSCLE}': 2.5,  # 90 °C: the controller only limits the tension of this muscle
 }
+thorough = pytest.mark.thorough
+#: other faults, the seconds for which each is present, and a part of the stop cause; None if the
+#: arm may stop
+OTHERS = [
+    pytest.param('drop:1', 1.0, 'older than', marks=thorough),
+    pytest.param(f'bias:length:{MUSCLE}:0.3', 1.0, 'muscle_states', marks=thorough),
+    (f'bias:tension:{MUSCLE}:400', 1.0, 'overload: tension of'),
+    pytest.param(f'bias:temperature:{MUSCLE}:90', 2.5, 'overheated', marks=thorough),
+    (f'overheat:{MUSCLE}:120', 2.5, 'overheated'),
+    pytest.param(f'freeze:{MUSCLE}', 2.5, None, marks=thorough),
+    ('freeze', 1.5, None),
+    (f'dead_sensor:{MUSCLE}', 1.5, None),
+    pytest.param(f'nan_sensor:{MUSCLE}', 1.0, 'older than', marks=thorough),
+    pytest.param(f'dead_sensor:tension:{MUSCLE}', 2.5, None, marks=thorough),
+    pytest.param(f'stuck_motor:{MUSCLE}', 2.5, None, marks=thorough),
+    (f'slack:{MUSCLE}', 1.5, None),
+    pytest.param(f'winch_speed:{MUSCLE}:0.009', 2.5, None, marks=thorough),
+    # The cause is either an implausible length or a jump.
+    (f'unzeroed:{MUSCLE}:0.1', 1.0, 'length'),
+]
 
 
-@pytest.mark.parametrize('fault', PROMISES)
-def test_under_each_fault_no_command_jumps_and_the_arm_resumes_after_the_repair(loop, fault):
-    held = loop.arm.theta
-    loop.arm.faults.set([fault])
-    loop.run(2.5)
-    cause, expected = loop.cause, PROMISES[fault]
+def check_that_no_command_jumped(loop):
     steps = np.diff(loop.commands, axis=0)
     tick = loop.controller.settings.rate_limit * DT * (1.0 + 1e-9)
     eased = np.array(loop.pulls)[1:] > ROBOT.tension.limit
     assert np.isfinite(steps).all()
     assert steps.min() >= -tick
     assert steps[~eased].max(initial=0.0) <= tick
-    if expected is not None:
-        assert expected in cause if expected else cause == '', cause
+
+
+def test_under_tolerable_faults_the_arm_goes_on_and_no_command_jumps(loop):
+    held = loop.arm.theta
+    for fault, seconds in TOLERATED.items():
+        loop.arm.faults.set([fault])
+        loop.run(seconds)
+        assert loop.cause == '', fault
+    check_that_no_command_jumped(loop)
+    assert np.linalg.norm(loop.arm.theta - held) < 0.35
+
+
+@pytest.mark.parametrize(('fault', 'seconds', 'cause'), OTHERS)
+def test_under_other_faults_no_command_jumps_and_the_arm_resumes_after_the_repair(
+    loop, fault, seconds, cause
+):
+    held = loop.arm.theta
+    loop.arm.faults.set([fault])
+    loop.run(seconds)
+    assert cause is None or cause in loop.cause
+    check_that_no_command_jumped(loop)
     assert loop.mend() is None
     assert loop.cause == ''
     assert np.linalg.norm(loop.arm.theta - held) < 0.35
@@ -161,8 +181,15 @@ def longest_overload(loop):
     return longest
 
 
-@pytest.mark.parametrize('offset', [0.05, 0.1, 0.3, -0.1])
-@pytest.mark.parametrize('muscles', [[3], range(6)], ids=['one muscle', 'all muscles'])
+@pytest.mark.parametrize(
+    ('offset', 'muscles'),
+    [
+        (0.05, [3]),
+        (0.1, range(6)),
+        *(pytest.param(offset, [3], marks=thorough) for offset in (0.1, 0.3, -0.1)),
+        *(pytest.param(offset, range(6), marks=thorough) for offset in (0.05, 0.3, -0.1)),
+    ],
+)
 def test_modules_that_lose_their_length_offsets_do_not_overload_the_arm(loop, offset, muscles):
     lost = np.where(np.isin(range(6), muscles), offset, 0.0)
     loop.arm.set_length_offset(lost * np.where(np.arange(6) % 2, 1.0, -1.0))
@@ -183,15 +210,16 @@ def test_the_services_of_a_length_calibration_may_follow_each_other_at_once(loop
     loop.controller.use_body(loop.estimator.body)
     assert loop.controller.reset(loop.now) is None
     assert loop.controller.explore(True) == ''
-    loop.run(4.0)
+    loop.run(2.0)
     assert loop.cause == ''
     assert np.ptp(loop.commands[-200:], axis=0).max() > 0.005
     loop.estimator.calibrate_lengths()
     loop.controller.use_body(loop.estimator.body)
     loop.estimate = lambda _: None  # from now on, the estimator does not respond
-    loop.run(7.0)
+    loop.run(FIRST_ESTIMATE + 0.5)
     assert 'estimated_joint_states are too old' in loop.cause
 
 
 def test_every_kind_of_fault_has_a_promise():
-    assert {fault.split(':')[0] for fault in PROMISES} == set(KINDS)
+    others = [case.values[0] if hasattr(case, 'values') else case[0] for case in OTHERS]
+    assert {fault.split(':')[0] for fault in [*TOLERATED, *others]} == set(KINDS)

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Distorted, false or late messages never make the controller move the arm dangerously."""
 
+from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
-from control_bench import COLD, DT, OTHER, REST, ROBOT, Bench, values
+from control_bench import COLD, DT, OTHER, REST, ROBOT, Bench, settled, values
+from exact_mae import rest_readings
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
@@ -22,22 +25,15 @@ MUSCLE = ROBOT.muscles[0]
 
 
 class DistortingBench(Bench):
-    """A bench that distorts its messages and counts the rejected ones."""
+    """A bench that can falsify its messages."""
 
     def __init__(self, **chosen):
         super().__init__(first_duration=0.5, **chosen)
-        self.refused = []
-        take = self.core.muscles
+        self.lie = lambda read: read
 
-        def muscles(read, now):
-            try:
-                take(self.lie(read), now)
-            except MessageError as error:
-                self.refused.append(str(error))
-
-        self.core.muscles, self.lie = muscles, lambda read: read
-        self.target(REST)
-        self.step(100)
+    def send(self, read):
+        with suppress(MessageError):
+            super().send(self.lie(read))
 
     def pull(self, tension):
         """Raise or lower the tensions from their bias to `tension` [N] as fast as motors can."""
@@ -62,6 +58,11 @@ class DistortingBench(Bench):
         return sent
 
 
+def distorting(**chosen):
+    """Return a bench whose arm rests at REST, with healthy messages so far."""
+    return settled(kind=DistortingBench, **chosen)
+
+
 def largest_step(before, sent):
     return np.abs(np.diff(values([before, *sent]), axis=0)).max()
 
@@ -77,7 +78,7 @@ LIES = st.one_of(
 @hypothesis_settings(max_examples=30)
 @given(st.lists(st.tuples(ROWS, LIES, st.integers(1, 30)), min_size=1, max_size=4))
 def test_no_bad_message_changes_a_command_by_more_than_the_rate_limit_allows(lies):
-    bench = DistortingBench()
+    bench = distorting()
     for row, lie, pause in lies:
         before = bench.core.limiter.command
         sent = bench.lies(1, **{row: lie}) + bench.step(pause)
@@ -97,9 +98,9 @@ def test_no_bad_message_changes_a_command_by_more_than_the_rate_limit_allows(lie
     ],
 )
 def test_implausible_data_that_last_stop_the_arm_with_their_cause_and_no_jump(row, lie, cause):
-    bench = DistortingBench()
+    bench = distorting()
     before = bench.core.limiter.command
-    sent = bench.lies(70 if 'jumped' in cause else 200, **{row: lie})
+    sent = bench.lies(200 if 'overheated' in cause else 70, **{row: lie})
     assert cause in bench.condition
     assert bench.core.supervisor.mode != 'paused'
     assert cause in str(bench.core.reset(bench.now))
@@ -107,18 +108,19 @@ def test_implausible_data_that_last_stop_the_arm_with_their_cause_and_no_jump(ro
     assert steps.min() >= -TICK - 1e-9
     # A muscle above its tension limit may be paid out faster than the rate limit allows.
     assert 'above 220 N' in cause or steps.max() <= TICK + 1e-9
-    bench.step(500)
+    bench.step(500 if 'overheated' in cause else 100)
     assert bench.core.reset(bench.now) is None
-    bench.step(200)
+    bench.step(100)
     assert bench.report().message == 'holding'
 
 
 @pytest.mark.parametrize('known', [[], [2]])
 def test_modules_without_thermometers_do_not_stop_the_arm_and_a_hot_one_among_them_does(known):
-    bench = DistortingBench()
+    bench = distorting()
+    bench.dt = 0.05
     bench.temperature = np.full(ROBOT.muscle_count, np.nan)
     bench.temperature[known] = 110.0
-    bench.step(500)
+    bench.step(100)
     assert bench.condition[:10] == ('overheated' if known else '')
     warm = np.isin(np.arange(ROBOT.muscle_count), known)
     tension = ROBOT.tension
@@ -128,7 +130,7 @@ def test_modules_without_thermometers_do_not_stop_the_arm_and_a_hot_one_among_th
 
 
 def test_an_estimate_far_outside_the_joints_is_not_used_and_stops_the_arm_if_it_lasts():
-    bench = DistortingBench()
+    bench = distorting()
     before = bench.core.limiter.command
     bench.blind = {'estimate'}
     for k in range(15):
@@ -142,7 +144,7 @@ def test_an_estimate_far_outside_the_joints_is_not_used_and_stops_the_arm_if_it_
 
 
 def test_a_glitch_of_temperature_changes_nothing_and_real_heat_pays_out_within_the_rate_limit():
-    bench = DistortingBench()
+    bench = distorting()
     bench.pull(np.full(ROBOT.muscle_count, 150.0))
     bench.step(300)
     limit, before = bench.core.watchdog.heat.planned.copy(), bench.core.limiter.command
@@ -156,7 +158,7 @@ def test_a_glitch_of_temperature_changes_nothing_and_real_heat_pays_out_within_t
 
 
 def test_temperatures_are_believed_only_as_fast_as_a_housing_can_warm():
-    bench = DistortingBench()
+    bench = distorting()
     bench.lies(3, temperature=lambda t: t * 0.0 + 199.0)
     bench.step(50)
     assert bench.cause == ''
@@ -164,7 +166,7 @@ def test_temperatures_are_believed_only_as_fast_as_a_housing_can_warm():
 
 
 def test_a_stop_by_overheating_can_be_reset_once_the_module_is_cool():
-    bench = DistortingBench()
+    bench = distorting()
     limit = bench.core.settings.temperature_limit
     bench.temperature = COLD.copy()
     bench.temperature[2] = limit + OVERHEATED + 1.0
@@ -181,7 +183,7 @@ def test_a_stop_by_overheating_can_be_reset_once_the_module_is_cool():
 
 
 def test_a_tension_that_stays_above_its_limit_is_reported_at_once_and_releases_the_arm():
-    bench = DistortingBench(hold_time=5.0)
+    bench = distorting(hold_time=5.0)
     tension = np.full(ROBOT.muscle_count, 60.0)
     bench.pull(tension)
     tension[3] = 230.0
@@ -222,7 +224,7 @@ def test_a_peak_of_tension_is_no_overload_because_the_controller_pauses(peak, is
 
 @pytest.mark.parametrize('what', ['muscles', 'estimate'])
 def test_data_that_are_late_briefly_stop_the_arm_and_it_resumes_by_itself(what):
-    bench = DistortingBench(max_age=0.2, hold_time=0.5)
+    bench = distorting(max_age=0.2, hold_time=0.5)
     bench.core.explore(True)
     bench.step(50)
     bench.blind = {what}
@@ -238,7 +240,7 @@ def test_data_that_are_late_briefly_stop_the_arm_and_it_resumes_by_itself(what):
 
 
 def test_data_that_stay_away_latch_the_stop_and_end_exploration():
-    bench = DistortingBench(max_age=0.2, hold_time=0.5)
+    bench = distorting(max_age=0.2, hold_time=0.5)
     bench.core.explore(True)
     bench.step(50)
     bench.blind = {'muscles'}
@@ -250,9 +252,9 @@ def test_data_that_stay_away_latch_the_stop_and_end_exploration():
     assert bench.core.reset(bench.now) is None
 
 
-@pytest.mark.parametrize('pause', [0.6, 5.0, 3600.0])
+@pytest.mark.parametrize('pause', [0.6, 3600.0])
 def test_a_pause_of_the_controller_itself_does_not_make_data_stale(pause):
-    bench = DistortingBench(max_age=0.2, hold_time=0.5)
+    bench = distorting(max_age=0.2, hold_time=0.5)
     before = bench.step()[-1]
     bench.now += pause
     sent = bench.step(100)
@@ -263,10 +265,10 @@ def test_a_pause_of_the_controller_itself_does_not_make_data_stale(pause):
     assert pause > OWN_PAUSE
 
 
-@pytest.mark.parametrize('pause', [0.6, 5.0, 3600.0])
+@pytest.mark.parametrize('pause', [0.6, 3600.0])
 def test_data_that_ends_with_a_pause_of_the_controller_is_stale_soon_afterwards(pause):
     """Messages that are read between the pause and the next step must not count as newer."""
-    bench = DistortingBench(max_age=0.2, hold_time=0.5)
+    bench = distorting(max_age=0.2, hold_time=0.5)
     bench.step()
     bench.now += pause
     bench.step()
@@ -278,7 +280,8 @@ def test_data_that_ends_with_a_pause_of_the_controller_is_stale_soon_afterwards(
 # -- clocks ---------------------------------------------------------------------------------------
 
 
-def run(pace, gap=0.0, at=150, count=250):
+@cache
+def run(pace, gap=0.0, at=150, count=150):
     """Return commands and stop cause of a controller whose message clock runs at another pace.
 
     Args:
@@ -290,14 +293,14 @@ def run(pace, gap=0.0, at=150, count=250):
     bench = Bench(first_duration=1.0, max_age=0.2)
     bench.target(OTHER)
     now, time, sent = 100.0, 5.0, []
+    read = np.array([*rest_readings(ROBOT, REST), COLD])
     for k in range(count):
         # During the gap no message arrives, and only the watchdog's timer steps the controller.
         for _ in range(round(gap / DT) if k == at else 0):
             now, time = now + DT, time + pace * DT
             sent.append(bench.core.step(now, time))
         now, time = now + DT / pace, time + DT
-        tension = np.full(ROBOT.muscle_count, ROBOT.tension.bias)
-        bench.core.muscles(np.array([ROBOT.muscle_lengths(REST, tension), tension, COLD]), now)
+        bench.core.muscles(read, now)
         bench.core.estimated(REST, now)
         sent.append(bench.core.step(now, time))
     return values(sent), bench.condition
@@ -313,8 +316,7 @@ def test_commands_follow_the_clock_of_the_messages_at_any_pace(pace):
 
 @pytest.mark.parametrize(
     ('pace', 'gap', 'late'),
-    [(1.0, 0.15, False), (1.0, 0.3, True), (3.0, 0.15, False), (3.0, 0.3, True)]
-    + [(0.3, 0.4, False), (0.3, 0.9, True)],
+    [(3.0, 0.15, False), (0.3, 0.4, False), (0.3, 0.9, True)],
 )
 def test_the_age_limit_grows_with_a_slow_clock_and_never_shrinks(pace, gap, late):
     _, cause = run(pace, gap, at=200, count=201)
@@ -327,7 +329,7 @@ def causes(bench):
 
 @pytest.mark.parametrize('is_confirmed', [True, False])
 def test_during_an_anomaly_the_estimator_decides_whether_a_jump_is_due_to_a_repair(is_confirmed):
-    bench = DistortingBench()
+    bench = distorting()
     bench.core.anomaly(True)
     bench.lies(round((LIMITS.settled + REACTION_TIME + 0.5) / DT), length=with_a_jump)
     bench.lie = lambda read: np.array([with_a_jump(read[0]), *read[1:]])
