@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from control_bench import DT, OTHER, REST, ROBOT, Bench, values
+from control_bench import DT, OTHER, REST, ROBOT, Bench, settled, values
 from exact_mae import ExactMae, rest_readings
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -41,7 +41,7 @@ def shifted():
 
 
 @settings(max_examples=20)
-@given(st.lists(st.tuples(st.sampled_from(sorted(EVENTS)), st.integers(0, 150)), max_size=8))
+@given(st.lists(st.tuples(st.sampled_from(sorted(EVENTS)), st.integers(0, 60)), max_size=8))
 def test_length_commands_are_finite_and_keep_the_rate_limit_under_any_sequence_of_events(events):
     bench = Bench(first_duration=1.0, second_duration=0.5)
     bench.target(REST)
@@ -57,9 +57,9 @@ def test_length_commands_are_finite_and_keep_the_rate_limit_under_any_sequence_o
 
 @pytest.mark.parametrize('method', [name for name in METHODS if name != 'float'])
 def test_every_method_arrives_at_its_command_and_stays_there(method):
-    bench = Bench(method=method, first_duration=1.0, second_duration=0.5)
+    bench = Bench(method=method, first_duration=0.5, second_duration=0.5)
     bench.target(REST)
-    sent = bench.step(400)
+    sent = bench.step(200)
     kind = TENSION if method == 'tension' else LENGTH
     assert {command.kind for command in sent} == {kind}
     np.testing.assert_allclose(sent[-1].value, sent[-2].value, atol=1e-6 if kind == LENGTH else 0.1)
@@ -98,9 +98,8 @@ def test_method_first_plans_with_the_constant_tension():
 
 
 def test_changing_between_length_and_tension_commands_causes_no_step_in_tension():
-    bench = Bench(first_duration=1.0)
-    bench.target(REST)
-    (sent,) = bench.step(200)[-1:]
+    bench = settled(first_duration=0.5)
+    (sent,) = bench.step()
     length, _ = rest_readings(ROBOT, REST)
     demand = ROBOT.actuation.demanded(length, sent.value)
     bench.configure(method='tension')
@@ -116,11 +115,10 @@ def test_changing_between_length_and_tension_commands_causes_no_step_in_tension(
 
 
 def test_an_effort_is_exerted_by_proposed_and_reported_as_ignored_by_first():
-    bench = Bench(first_duration=1.0)
-    bench.target(REST)
-    plain = bench.step(200)[-1].value
+    bench = settled(first_duration=0.5)
+    plain = bench.step()[-1].value
     bench.target(REST, (1.0, 0.0))
-    assert np.abs(bench.step(200)[-1].value - plain).max() > 1e-4
+    assert np.abs(bench.step(100)[-1].value - plain).max() > 1e-4
     bench.configure(method='first')
     bench.step()
     assert 'ignores the effort of the target' in bench.report().message
@@ -167,17 +165,13 @@ def test_an_anomaly_stops_the_arm_even_before_the_first_command():
     assert None not in bench.step(3)
 
 
-@pytest.mark.parametrize('fault', [ValueError('broken'), ZeroDivisionError(), MemoryError()])
-def test_an_exception_in_the_controller_stops_the_arm_and_the_controller_goes_on(fault):
-    mae = ExactMae(ROBOT)
-    bench = Bench(mae, first_duration=0.5)
-    bench.target(REST)
-    bench.step(100)
-    mae.fail = fault
+def test_an_exception_in_the_controller_stops_the_arm_and_the_controller_goes_on():
+    bench = settled(first_duration=0.5)
+    bench.mae.fail = ZeroDivisionError()
     bench.target(OTHER)
-    assert None not in bench.step(100)
-    assert type(fault).__name__ in bench.condition
-    mae.fail = None
+    assert None not in bench.step(50)
+    assert 'ZeroDivisionError' in bench.condition
+    bench.mae.fail = None
     assert bench.core.reset(bench.now) is None
     np.testing.assert_array_equal(bench.core.target_state.theta, OTHER)
     bench.step(300)
@@ -185,28 +179,26 @@ def test_an_exception_in_the_controller_stops_the_arm_and_the_controller_goes_on
 
 
 def test_a_network_that_answers_nan_stops_the_arm_and_no_command_is_nan():
-    bench = Bench(first_duration=0.5)
-    bench.target(REST)
-    bench.step(100)
+    bench = settled(first_duration=0.5)
     broken = ExactMae(ROBOT)
     broken.offset = np.nan
     bench.core.use(broken)
-    assert np.isfinite(values(bench.step(100))).all()
+    assert np.isfinite(values(bench.step(50))).all()
     assert bench.cause
     bench.core.use(ExactMae(ROBOT))
     assert bench.core.reset(bench.now) is None
-    bench.step(300)
+    bench.step(100)
     assert bench.cause == ''
 
 
 def test_after_reset_the_last_target_is_resumed_by_a_ramp():
-    bench = Bench(first_duration=1.0, feedback_gain=0.0)
+    bench = Bench(first_duration=0.5, feedback_gain=0.0)
     bench.target(OTHER)
-    goal = bench.step(300)[-1].value
+    goal = bench.step(200)[-1].value
     bench.stop()
-    bench.step(300)
+    bench.step(150)
     assert bench.core.reset(bench.now) is None
-    np.testing.assert_allclose(bench.step(300)[-1].value, goal, atol=1e-9)
+    np.testing.assert_allclose(bench.step(200)[-1].value, goal, atol=1e-9)
 
 
 def test_a_target_or_a_stop_ends_exploration_and_a_stop_refuses_it():
@@ -279,16 +271,16 @@ def test_a_hot_muscle_hands_its_load_to_others_and_is_reported():
     length, tension = rest_readings(robot, theta)
     temperature = np.full(robot.muscle_count, 30.0)
     planned = []
-    for step in range(1200):
-        if step == 300:
+    for step in range(300):
+        if step == 75:
             strongest = int(np.argmax(core.activities.follower.plan.tension.bone))
             temperature[strongest] = 84.0
-        core.muscles(np.array([length, tension, temperature]), 0.01 * step)
-        core.estimated(theta, 0.01 * step)
-        core.step(0.01 * step)
+        core.muscles(np.array([length, tension, temperature]), 0.04 * step)
+        core.estimated(theta, 0.04 * step)
+        core.step(0.04 * step)
         planned.append(core.activities.follower.plan.tension.bone)
     limit = core.watchdog.heat.planned[strongest]
-    assert limit < planned[299][strongest]
+    assert limit < planned[74][strongest]
     assert planned[-1][strongest] <= limit + REPLAN
     reported = status.report(core, 12.0)
     assert reported.level == 'warn'
@@ -394,36 +386,31 @@ def test_an_anomaly_that_has_ended_needs_no_repair():
 
 
 def test_a_new_network_keeps_the_correction_of_rest_feedback():
-    bench = Bench(first_duration=0.5)
-    bench.target(REST)
-    bench.step(50)
+    bench = settled(first_duration=0.5)
     bench.theta = REST + 0.05  # the arm rests beside its target, as friction may cause
-    bench.step(1000)
+    bench.step(200)
     correction = bench.follower.feedback.correction.copy()
     assert np.abs(correction).max() > 0.02
     bench.theta = REST
     bench.core.use(ExactMae(ROBOT))
-    bench.step(300)
+    bench.step(100)
     np.testing.assert_allclose(bench.follower.feedback.correction, correction)
 
 
 @pytest.mark.parametrize('chosen', [{'method': 'stiffness'}, {'method': 'second'}])
 def test_methods_stiffness_and_second_do_not_correct_a_push(chosen):
-    bench = Bench(first_duration=0.5, second_duration=0.5, **chosen)
-    bench.target(REST)
-    bench.step(200)
+    bench = settled(150, first_duration=0.5, second_duration=0.5, **chosen)
     if chosen['method'] == 'stiffness':  # let the sensors read the tensions that it demands
         bench.tension = bench.follower.plan.tension.bone
-    still = bench.step(200)[-1].value
+    still = bench.step(100)[-1].value
     bench.theta = REST + 0.05
     bench.core.estimated(bench.theta, bench.now)
-    np.testing.assert_allclose(bench.step(300)[-1].value, still, atol=1e-9)
+    np.testing.assert_allclose(bench.step(200)[-1].value, still, atol=1e-9)
 
 
 def test_a_new_desired_stiffness_is_ramped_to_and_one_of_wrong_length_is_refused():
-    bench = Bench(method='stiffness', first_duration=0.5)
-    bench.target(REST)
-    before = bench.step(100)[-1].value
+    bench = settled(method='stiffness', first_duration=0.5)
+    before = bench.step()[-1].value
     free = bench.follower.plan.solution.stiffness
     stiffer = 0.25 * free.lowest + 0.75 * free.highest
     with pytest.raises(MusculoskeletalError, match='2 numbers'):
@@ -442,33 +429,30 @@ def test_a_new_desired_stiffness_is_ramped_to_and_one_of_wrong_length_is_refused
 
 def test_a_hot_muscle_limited_to_the_tension_bias_does_not_stop_the_arm():
     for method in set(METHODS) - {'float'}:
-        bench = Bench(method=method, first_duration=0.5)
-        bench.target(REST)
-        bench.step(60)
+        bench = settled(60, method=method, first_duration=0.5)
+        bench.dt = 0.05
         bench.temperature = np.linspace(60.0, 100.0, ROBOT.muscle_count)
         bench.target(OTHER)
-        bench.step(400)
+        bench.step(80)
         assert bench.cause == ''
         assert bench.core.watchdog.heat.planned.min() == ROBOT.tension.bias[0]
 
 
 def test_gravity_compensation_follows_the_hand_refuses_targets_and_ends_where_the_arm_is():
-    bench = Bench(first_duration=1.0)
-    bench.target(REST)
-    bench.step(150)
+    bench = settled(first_duration=0.5)
     bench.core.explore(True)
     bench.configure(method='float')
-    sent = bench.step(200)
+    sent = bench.step(100)
     assert {command.kind for command in sent} == {TENSION}
     assert not bench.core.supervisor.explores and bench.report().message == 'gravity compensation'
     with pytest.raises(MessageError, match='method float'):
         bench.target(OTHER)
     assert 'float' in bench.core.explore(True)
-    for share in np.linspace(0.0, 1.0, 100):
+    for share in np.linspace(0.0, 1.0, 50):
         bench.theta = REST + share * (OTHER - REST)
         bench.step()
     bench.configure(method='proposed')
-    assert {command.kind for command in bench.step(300)} == {LENGTH}
+    assert {command.kind for command in bench.step(100)} == {LENGTH}
     np.testing.assert_allclose(bench.core.target_state.theta, OTHER, atol=0.06)
 
 
@@ -477,9 +461,9 @@ def test_a_stop_ends_gravity_compensation_and_a_reset_resumes_it():
     bench.step(50)
     bench.stop()
     bias = ROBOT.tension.bias
-    np.testing.assert_array_equal(bench.step(400)[-1].value, bias)
+    np.testing.assert_array_equal(bench.step(200)[-1].value, bias)
     assert not bench.core.reset(bench.now)
-    assert bench.step(200)[-1].value.max() > bias[0]
+    assert bench.step(100)[-1].value.max() > bias[0]
 
 
 def test_a_reset_ends_a_stop_by_late_data_at_once():
