@@ -55,7 +55,7 @@ def test_a_trajectory_is_followed_and_its_end_held_by_the_least_tension(bench):
     bench.core.trajectory(points(OTHER))
     sent = moved(bench, 50)
     assert bench.report().message == 'following a trajectory'
-    sent += moved(bench, 400)
+    sent += moved(bench, 200)
     assert {command.kind for command in sent} == {LENGTH}
     assert bench.report().message == 'holding'
     held = bench.follower.plan.tension.bone
@@ -72,7 +72,7 @@ def test_a_trajectory_too_fast_for_the_winches_is_slowed_as_a_whole_and_reported
     assert slowness(ROBOT, bench.mae, trajectory, bench.core.settings) == pytest.approx(1.0)
     sent = values(moved(bench, 20))
     assert 'slowed to' in bench.report().message
-    sent = np.vstack([sent, values(moved(bench, 600))])
+    sent = np.vstack([sent, values(moved(bench, 400))])
     assert np.abs(np.diff(sent, axis=0)).max() <= 0.05 * DT + 1e-9
     np.testing.assert_allclose(bench.follower.progress.desired.theta, OTHER)
 
@@ -150,11 +150,11 @@ def test_a_trajectory_goes_on_after_a_pause_of_the_controller(bench):
 def test_a_posture_is_held_by_the_same_tensions_after_a_pause_of_the_controller(bench):
     bench.configure(target_duration=0.5)
     bench.target(OTHER, (2.0, 0.0))
-    moved(bench, 500)
+    moved(bench, 200)
     held = bench.follower.plan.tension.bone
     assert held.max() > 1.5 * ROBOT.tension.bias[0]
     bench.now += 2.0
-    moved(bench, 200)
+    moved(bench, 100)
     # The arm has come to rest. Its tensions may differ by the tendon friction, whose direction is
     # unknown at rest.
     np.testing.assert_allclose(bench.follower.plan.tension.bone, held, rtol=0.25)
@@ -175,7 +175,7 @@ def test_a_slow_target_does_not_carry_a_moving_arm_beyond_its_limits(bench, dura
 def test_slow_hand_poses_and_twists_keep_a_moving_arm_within_its_limits(bench):
     bench.configure(hand_speed=0.02, target_duration=1.2, unreachable='nearest')
     rng = np.random.default_rng(0)
-    for theta in ROBOT.random_postures(6, rng):
+    for theta in ROBOT.random_postures(3, rng):
         bench.target(ROBOT.random_postures(1, rng)[0])
         moved(bench, 40)
         hand(bench, theta)
@@ -195,13 +195,13 @@ def test_a_target_takes_over_from_a_trajectory_without_a_jump(bench):
 
 
 def test_a_target_of_proposed_is_followed_like_a_trajectory_and_exerts_its_effort(bench):
-    bench.configure(target_duration=1.0)
+    bench.configure(target_duration=0.5)
     bench.target(OTHER)
-    moved(bench, 400)
+    moved(bench, 200)
     plain = bench.follower.plan.tension.bone
     assert bench.core.is_following
     bench.target(OTHER, (1.0, 0.0))
-    moved(bench, 400)
+    moved(bench, 200)
     np.testing.assert_allclose(bench.follower.progress.desired.theta, OTHER)
     more = ROBOT.routes.muscle_jacobian(OTHER).T @ (plain - bench.follower.plan.tension.bone)
     np.testing.assert_allclose(more, [1.0, 0.0], atol=0.05)
@@ -245,12 +245,12 @@ def driven(arm, intervals=(10,), push=0.0, **chosen):
         core.muscles(np.array([*read]), now)
         core.estimated(theta, now)
         if core.activities.follower.progress.trajectory is None:
-            core.trajectory(points(REST, 0.5))
-        elif now > 0.6 and not off:
+            core.trajectory(points(REST, 0.3))
+        elif now > 0.4 and not off:
             core.trajectory(points(OTHER))
             arm.set_wrench(np.array([push, 0.0, 0.0, 0.0, 0.0, 0.0]))
         arm.command_length(core.step(now).value)
-        if now > 0.6:
+        if now > 0.4:
             off.append(core.activities.follower.progress.desired.theta - arm.theta)
         interval = 0.001 * rng.choice(intervals)
         arm.step(interval)
@@ -259,15 +259,16 @@ def driven(arm, intervals=(10,), push=0.0, **chosen):
     return np.array(off)
 
 
-def test_tracking_is_as_good_at_500_hz_and_at_irregular_times():
-    arms = [EmulatedArm(ROBOT, seed) for seed in range(2)]
+@pytest.mark.parametrize('seed', [pytest.param(0, marks=pytest.mark.thorough), 1])
+def test_tracking_is_as_good_at_500_hz_and_at_irregular_times(seed):
+    arm = EmulatedArm(ROBOT, seed)
 
     def error(*intervals):
-        return np.array([np.linalg.norm(driven(arm, intervals), axis=1).mean() for arm in arms])
+        return np.linalg.norm(driven(arm, intervals), axis=1).mean()
 
     usual = error(10)
     for intervals in ((2,), (1, 2, 4, 8, 15, 25)):
-        assert error(*intervals).mean() < usual.mean() + usual.std()
+        assert error(*intervals) < 1.25 * usual
 
 
 def test_with_method_stiffness_a_moving_arm_yields_to_a_push_and_still_follows():
@@ -324,7 +325,7 @@ def test_feedback_demands_bounded_tension_when_the_estimate_does_not_move(bench)
 def test_feedback_does_not_overload_an_arm_that_is_stuck(bench, trajectory):
     bench.core.trajectory(points(OTHER)) if trajectory else bench.target(OTHER)
     pull, highest = ROBOT.tension.bias, -np.inf
-    for _ in range(4000):
+    for _ in range(800):
         (command,) = bench.step()
         length, _ = rest_readings(ROBOT, REST, bench.tension)
         demanded = np.clip(ROBOT.actuation.demanded(length, command.value), 0.0, ROBOT.tension.max)
@@ -414,32 +415,32 @@ def test_a_hand_pose_that_the_muscles_cannot_hold_is_refused(bench, monkeypatch)
 def test_a_stream_of_hand_poses_is_followed_without_lag(bench):
     start, speed = REST, np.array([0.2, 0.3])
     hand(bench, start)
-    moved(bench, 200)
+    moved(bench, 20)
     for n in range(60):
         hand(bench, start + 0.01 * n * speed)
         moved(bench, 1)
     wanted = ROBOT.kinematics.end_effector_pose(start + 0.6 * speed).translation
     at = ROBOT.kinematics.end_effector_pose(bench.follower.progress.desired.theta).translation
     assert np.linalg.norm(at - wanted) < 0.006
-    moved(bench, 150)  # no other pose arrives, so the hand comes to rest at the last one
+    moved(bench, 100)  # no other pose arrives, so the hand comes to rest at the last one
     assert not bench.follower.progress.is_moving
     last = ROBOT.kinematics.end_effector_pose(start + 0.59 * speed).translation
     at = ROBOT.kinematics.end_effector_pose(bench.follower.progress.desired.theta).translation
     assert np.linalg.norm(at - last) < 1e-3
 
 
-@pytest.mark.parametrize('every', [10, 20])
+@pytest.mark.parametrize('every', [10, pytest.param(20, marks=pytest.mark.thorough)])
 def test_a_repeated_hand_pose_is_approached_at_hand_speed(bench, every):
-    bench.configure(hand_speed=0.1)
+    bench.configure(hand_speed=0.2)
     place, fastest, where = ROBOT.kinematics.end_effector_pose, 0.0, None
-    for n in range(600):
+    for n in range(300):
         if n % every == 0:
             hand(bench, OTHER)
         moved(bench, 1)
         before, where = where, place(bench.follower.progress.desired.theta).translation
         if before is not None:
             fastest = max(fastest, float(np.linalg.norm(where - before)) / DT)
-    assert fastest < 0.15
+    assert fastest < 0.3
     np.testing.assert_allclose(where, place(OTHER).translation, atol=5e-3)
 
 
