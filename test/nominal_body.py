@@ -8,6 +8,8 @@
    quarter of the reported reachable range). Their ratio is compared with the predicted one.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
@@ -90,7 +92,11 @@ def push_deflection(robot: Robot, theta: Array, stiffness: Array, wrench: Array)
 
 
 def stiffness_ratios(
-    robot: Robot, mae: Mae, count: int, arm: EmulatedArm | None = None, push: float = PUSH
+    robot: Robot,
+    mae: Mae,
+    chosen: Sequence[int],
+    arm: EmulatedArm | None = None,
+    push: float = PUSH,
 ) -> Array:
     """Return by how much more the arm yields to a push at low than at high stiffness, (N, 2).
 
@@ -99,16 +105,16 @@ def stiffness_ratios(
     Args:
         robot: The geometric model.
         mae: The network.
-        count: Number of postures; in each of them, another joint is stiffened, in turn.
+        chosen: Numbers of random holdable postures; in each, another joint is stiffened, in turn.
         arm: The emulated arm; by default a nominal one.
         push: The push is the wrench that comes nearest to this torque [N·m] on that joint alone.
     """
     arm = arm or nominal_arm(robot)
     ratios = []
     postures = robot.random_postures(TRIES, np.random.default_rng(8))
-    held = holdable_postures(robot, postures, count, arm.individual.muscle_jacobian)
-    for n, (theta, _) in enumerate(held):
-        joint = n % robot.joint_count
+    held = [*holdable_postures(robot, postures, max(chosen) + 1, arm.individual.muscle_jacobian)]
+    for n in chosen:
+        (theta, _), joint = held[n], n % robot.joint_count
         torque = robot.kinematics.holding_torque(theta)
         desired = np.zeros(robot.joint_count)
         free = stiffness_command(robot, mae, theta, torque, desired, robot.tension.limit).stiffness

@@ -41,10 +41,10 @@ def holding(robot, desired=0.0):
     return holding_tension(robot, 0.5 * (robot.lower + robot.upper), desired)
 
 
-def step(feedback, robot, error, tension, gain=GAIN, motor=None):
+def step(feedback, robot, error, tension, gain=GAIN, motor=None, dt=DT):
     limit = np.full(robot.muscle_count, robot.tension.limit)
     pull = Pull(tension if motor is None else motor, tension)
-    return feedback.step(error, jacobian(robot), pull, limit, gain, DT)
+    return feedback.step(error, jacobian(robot), pull, limit, gain, dt)
 
 
 def test_feedback_waits_until_the_arm_has_settled(robot):
@@ -98,8 +98,9 @@ def test_tension_that_friction_keeps_in_a_tendon_after_winding_in_is_paid_out(ro
 def test_correction_and_relief_are_bounded_and_a_reset_clears_them(robot):
     feedback = rested(robot)
     error = np.full(robot.joint_count, 1.0)
-    for _ in range(3000):
-        step(feedback, robot, error, holding(robot, desired=150.0))
+    tension = holding(robot, desired=150.0)
+    for _ in range(300):
+        step(feedback, robot, error, tension, dt=0.1)
     assert np.abs(feedback.correction).max() == pytest.approx(CORRECTION)
     assert np.abs(feedback.relief).max() == pytest.approx(RELIEF)
     feedback.reset()
@@ -121,8 +122,9 @@ def test_60_mm_of_a_prismatic_joint_count_as_one_radian(tmp_path):
     feedback, slides = rested(robot), robot.kinematics.slides
     step(feedback, robot, 0.9 * DEADBAND * robot.kinematics.radian, holding(robot))
     assert not feedback.correction.any()
-    for _ in range(3000):
-        step(feedback, robot, np.ones(robot.joint_count), holding(robot))
+    tension = holding(robot)
+    for _ in range(300):
+        step(feedback, robot, np.ones(robot.joint_count), tension, dt=0.1)
     assert feedback.correction[slides] == pytest.approx(0.06 * CORRECTION)
     assert feedback.correction[~slides] == pytest.approx(CORRECTION)
 

@@ -76,7 +76,7 @@ def test_exploration_without_length_offsets_moves_the_arm_slowly_and_with_low_te
     loop.offset[:] = [0.1, -0.13, 0.08, -0.06, 0.12, 0.05]
     loop.core.explore(True)
     observed = []
-    for _ in range(200):
+    for _ in range(100):
         loop.run(0.1)
         observed.append(loop.arm.theta)
     assert not loop.core.supervisor.condition

@@ -76,7 +76,7 @@ def test_an_arm_that_does_not_follow_violates_the_path_tolerance_and_the_joint_i
 
 
 def test_an_arm_that_does_not_arrive_fails_after_the_goal_time_tolerance():
-    assert FollowingBench(goal=TIGHT).run(400, moves=False) == (None, 400)
+    assert FollowingBench(goal=TIGHT).run(200, moves=False) == (None, 200)
     followed = FollowingBench(goal=TIGHT, patience=0.5)
     (code, _), steps = followed.run(moves=False)
     assert code == BEYOND_GOAL
@@ -84,18 +84,18 @@ def test_an_arm_that_does_not_arrive_fails_after_the_goal_time_tolerance():
 
 
 def test_new_networks_do_not_extend_the_goal_time_tolerance(monkeypatch):
-    followed = FollowingBench(goal=TIGHT, patience=3.0)
+    followed = FollowingBench(goal=TIGHT, patience=1.0)
     step, bench = followed.bench.step, followed.bench
 
     def learning():
-        if round(bench.now / DT) % 150 == 0:
+        if round(bench.now / DT) % 60 == 0:
             bench.core.use(bench.mae)
         step()
 
     monkeypatch.setattr(bench, 'step', learning)
     (code, _), steps = followed.run(moves=False)
     assert code == BEYOND_GOAL
-    assert steps < 100.0 * (bench.follower.progress.trajectory.duration + 3.5)
+    assert steps < 100.0 * (bench.follower.progress.trajectory.duration + 1.5)
 
 
 @pytest.mark.parametrize('event', ['trajectory', 'target', 'stop', 'method'])

@@ -127,7 +127,7 @@ def test_the_methods_agree_with_an_implementation_by_autograd(trained, seed):
 
 def test_with_a_network_proposed_settles_nearer_than_first_and_near_the_least_tension(trained):
     robot = Robot.load('arm26')
-    table = posture_table(robot, trained['default'], trained['paper'], 4)
+    table = posture_table(robot, trained['default'], trained['paper'], 2)
     error, tension, bound = {name: rows.mean(axis=0) for name, rows in table.items()}['proposed']
     assert error < 0.03
     assert error < 0.2 * table['first'].mean(axis=0)[0]

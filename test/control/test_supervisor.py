@@ -182,8 +182,8 @@ class Arm(RuleBasedStateMachine):
 
 
 TestArm = Arm.TestCase
-# 12 500 random events
-TestArm.settings = settings(max_examples=250, stateful_step_count=50, deadline=None)
+# 4000 random events
+TestArm.settings = settings(max_examples=80, stateful_step_count=50, deadline=None)
 
 
 def test_the_table_names_every_state_and_event():

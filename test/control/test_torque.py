@@ -28,7 +28,7 @@ DT = 0.01
 
 def settled(control, target=THETA, effort=None, theta=THETA, limit=LIMIT):
     control.set_target(target, np.zeros(5) if effort is None else effort)
-    for _ in range(300):
+    for _ in range(50):
         command = control.step(inputs(MAE, theta, limit, ROBOT))
     return command.value
 
