@@ -38,6 +38,7 @@ class FaultTexts(Strict, frozen=True, array_like=True):
     check: Check
     observation: str
     change: str
+    subject: Literal['muscles', 'joint angles'] = 'muscles'
 
 
 #: texts by name of the fault; names of faults that reject messages begin with the topic
@@ -52,6 +53,11 @@ class Fault(NamedTuple):
     observation: str
     change: str  # what to change in the driver
     name: str  # its name in FAULTS
+
+    @property
+    def is_of_joints(self) -> bool:
+        """Whether the joint angles have the fault, so that no muscle could be judged."""
+        return FAULTS[self.name].subject == 'joint angles'
 
 
 class Verdict:
@@ -99,9 +105,11 @@ class Verdict:
             law = LAW.format(robot.tension.bias[first], robot.stiffness[first])
             values['law'] = robot.actuation.choose(law, POSITION_LAW)
         muscles = muscles or tuple(range(self.robot.muscle_count))
-        self._state[list(muscles), CHECKS.index(texts.check)] = WRONG
         observation, change = (text.format(**values) for text in (texts.observation, texts.change))
-        self.faults.append(Fault(texts.check, muscles, observation, change, what))
+        fault = Fault(texts.check, muscles, observation, change, what)
+        self.faults.append(fault)
+        if not fault.is_of_joints:
+            self._state[list(muscles), CHECKS.index(texts.check)] = WRONG
 
     def excuse(self, check: Check, observation: str) -> None:
         """Record that a check is not judged, because this computer is overloaded.
@@ -183,6 +191,9 @@ class Verdict:
             return 'all muscles'
         return ', '.join(self.robot.muscles[m] for m in muscles)
 
+    def _subject(self, fault: Fault) -> str:
+        return 'the joint angles' if fault.is_of_joints else self._whose(fault.muscles)
+
     @property
     def table(self) -> str:
         """The result of each check for each muscle."""
@@ -202,7 +213,7 @@ class Verdict:
                 f'zero ok: within {tolerance} of the route; smaller errors are not found'
             )
         remarks += [
-            f'fault: {fault.check} of {self._whose(fault.muscles)}: {fault.observation}\n'
+            f'fault: {fault.check} of {self._subject(fault)}: {fault.observation}\n'
             f'    change: {_change_text(fault.change)}'
             for fault in self.faults
         ]
@@ -218,6 +229,7 @@ class Verdict:
         # fault, and the remedy would not make them.
         columns = [CHECKS.index(check) for check in ('order', 'unit', 'sign')]
         has_fault: Bools = (self._state[:, columns] == WRONG).any(axis=1)
+        has_fault |= any(fault.is_of_joints for fault in self.faults)
         for checks, remedy in self._remedies:
             if unjudged := self._unjudged(checks, has_fault):
                 remarks.append(f'note: {unjudged} not judged: {remedy}')

@@ -732,6 +732,7 @@ def test_a_joint_sensor_of_wrong_sign_is_named_by_winding_in(joint):
     verdict = driver.wind()
     assert {fault.name for fault in verdict.faults} == {'joint sign'}, str(verdict)
     assert f'sign of the angle of {ROBOT.joints[joint]} is reversed' in str(verdict)
+    assert 'WRONG' not in verdict.table  # no muscle has a fault
 
 
 def test_a_test_that_moved_a_joint_too_little_names_the_tension_to_repeat_it_with():
