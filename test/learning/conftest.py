@@ -10,7 +10,7 @@ from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.priors import PRIOR
-from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.samples import Observations, Sample, SampleStore
 from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -46,14 +46,18 @@ class Stage:
     def __init__(self, body: CalibratedBody, seed: int = 0) -> None:
         self.body, self.rng = body, np.random.default_rng(seed)
 
-    def sample(self) -> Sample:
+    def observations(self, count: int) -> Observations:
         robot = self.body.robot
-        theta = robot.random_postures(1, self.rng)
-        tension = self.rng.uniform(30.0, 200.0, (1, robot.muscle_count))
-        direction = self.rng.choice([-1.0, 1.0], (1, robot.muscle_count))
+        theta = robot.random_postures(count, self.rng)
+        tension = self.rng.uniform(30.0, 200.0, (count, robot.muscle_count))
+        direction = self.rng.choice([-1.0, 1.0], tension.shape)
         (length,) = self.body.lengths(theta, tension, direction)
-        noise = 1e-4 * self.rng.standard_normal(robot.muscle_count)
-        return Sample(theta[0], tension[0], length[0] + noise, direction[0])
+        length = length + 1e-4 * self.rng.standard_normal(length.shape)
+        return Observations(theta, tension, length, direction, np.ones(length.shape, dtype=bool))
+
+    def sample(self) -> Sample:
+        drawn = self.observations(1)
+        return Sample(drawn.theta[0], drawn.tension[0], drawn.length[0], drawn.direction[0])
 
     def store(self, count: int) -> SampleStore:
         store = SampleStore()
@@ -91,7 +95,7 @@ def learned_once(arm26, initial, other_body):
     stage = Stage(other_body)
     updater = BodyUpdater(arm26, initial)
     store = stage.store(20)
-    for _ in range(6):
+    for _ in range(3):
         update = updater.update(job(store))
     return update.mae, updater, store, stage
 

@@ -9,7 +9,6 @@ import pytest
 from learning.conftest import drawn_body
 from musculoskeletal_ae.learning.body import CalibratedBody, ResidualModel
 from musculoskeletal_ae.learning.fit import fit_body, fit_to_network
-from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -92,15 +91,13 @@ def test_bad_samples_do_not_poison_the_fit(arm26, stage):
 
 def test_tendons_that_creep_are_followed_without_limit(arm26, stage):
     creep = 1e-5 * np.array([1.0, 1.0, 1.0, -1.0, 0.5, 0.0])
-    store, still = SampleStore(capacity=100), SampleStore(capacity=100)
-    for n in range(2000):
-        sample = stage.sample()
-        store.add(sample._replace(length=sample.length + n * creep))
-        still.add(sample)
+    still = stage.observations(100)
+    age = np.linspace(2000.0, 0.0, 100)  # number of samples that were taken later
     theta, tension, length = stage.states(300)
     body, spared = CalibratedBody(arm26), CalibratedBody(arm26)
-    fit_body(body, store.observations())
-    fit_body(spared, replace(still.observations(), age=np.zeros(100)))
+    crept = still.length + (2000.0 - age)[:, None] * creep
+    fit_body(body, replace(still, length=crept, age=age))
+    fit_body(spared, still)
     rates = [p[at.creep] for p, at in zip(body.parameters, body.layouts, strict=True)]
     np.testing.assert_allclose(rates, creep, atol=2e-7)
     now = theta, tension, length + 2000 * creep

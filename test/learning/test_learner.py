@@ -15,7 +15,7 @@ from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 
-DT = 0.01
+DT = 0.02  # time between two messages [s]
 
 
 class IdleTrainer(Trainer):
@@ -122,9 +122,9 @@ def test_two_centimetres_of_a_prismatic_joint_are_another_posture(tmp_path):
     theta = 0.5 * (robot.lower + robot.upper)
     theta[-1], length = 0.01, robot.muscle_lengths(theta, pull)
     # The arm rests for 4 s, moves at 5 mm/s for 4 s while no length changes, and rests again.
-    for k in range(1200):
-        theta = theta + [0.0, 0.0, 0.0, 0.005 * DT * (400 <= k < 800)]
-        learner.step(DT * k, theta, pull, length)
+    for time in np.arange(0.0, 12.0, DT):
+        theta = theta + [0.0, 0.0, 0.0, 0.005 * DT * (4.0 <= time < 8.0)]
+        learner.step(time, theta, pull, length)
     angles = [sample.theta[-1] for sample in learner.samples.samples]
     np.testing.assert_allclose(angles, [0.01, 0.03], atol=1e-4)
 

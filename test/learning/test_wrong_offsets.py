@@ -51,7 +51,9 @@ def lengths(learner):
     return [sample.length for sample in learner.samples.samples]
 
 
-@pytest.mark.parametrize('false', [OFF, -OFF, np.full(6, 0.08)])
+@pytest.mark.parametrize(
+    'false', [OFF, pytest.param(-OFF, marks=pytest.mark.thorough), np.full(6, 0.08)]
+)
 def test_false_zeros_are_not_believed_and_cost_nothing(learner, arm, false):
     before = lengths(learner)
     use(learner, np.zeros(6), known=False)
