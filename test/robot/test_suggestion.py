@@ -55,12 +55,12 @@ def without_points(directory):
 
 @pytest.fixture(autouse=True)
 def briefly(monkeypatch):
-    monkeypatch.setattr(suggestion, 'TRIES', 6)
+    monkeypatch.setattr(suggestion, 'TRIES', 3)
 
 
 def suggest(arm, out, *more):
     return main(
-        [str(arm), '--suggest', '--out', str(out), '--postures', '40', '--quiet', *map(str, more)]
+        [str(arm), '--suggest', '--out', str(out), '--postures', '20', '--quiet', *map(str, more)]
     )
 
 
@@ -69,7 +69,7 @@ def test_a_poor_arm_becomes_sound_by_via_points_moved_within_reach(tmp_path, cap
     out, mesh = arm / 'better', arm / 'meshes' / 'hand.stl'
     mesh.parent.mkdir()
     mesh.write_bytes(b'solid')
-    before = check_robot(Robot.load(arm), 400, seed=9)
+    before = check_robot(Robot.load(arm), 200, seed=9)
     # Premise of this test: the arm has faults.
     assert {'wrong_sign', 'not_held'} <= {fault.kind for fault in before.faults}
     assert suggest(arm, out, '--reach', reach) == 0
@@ -77,7 +77,7 @@ def test_a_poor_arm_becomes_sound_by_via_points_moved_within_reach(tmp_path, cap
     assert 'better: sound' in printed
     assert 'changes the sign of its main action' not in printed.split(str(out))[1]
     # The search did not use the postures of this check, which has another seed.
-    assert check_robot(Robot.load(out), 400, seed=9).faults == ()
+    assert check_robot(Robot.load(out), 200, seed=9).faults == ()
     distance = np.linalg.norm(points(out) - points(arm), axis=1)
     assert 0.0 < distance.max() < reach
     assert np.median(distance) < 1e-8  # most points stay where they were
