@@ -13,6 +13,7 @@ from robots import DRUM_ENDS, behind_a_drum
 from musculoskeletal_ae.emulator import foreign, individual
 from musculoskeletal_ae.emulator.foreign import ForeignArm
 from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.robot import jumps as robot_jumps
 from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.jumps import JUMP, jump_choices, jumps
 
@@ -62,12 +63,13 @@ def test_the_choices_that_a_jumping_length_leaves_are_named(tmp_path):
 def test_lengths_of_emulated_individuals_jump_only_where_the_models_do(
     tmp_path, monkeypatch, module, body, seed
 ):
+    monkeypatch.setattr(robot_jumps, 'LINES', 15)
     robot, odd = (behind_a_drum(tmp_path / name, end) for name, end in DRUM_ENDS.items())
-    m, laid = robot.muscles.index('straightener'), body(robot, seed)
-    monkeypatch.setattr(module, 'MOST_DRAWS', 0)
-    assert jumping(body(robot, seed).absolute_lengths, robot)[m]  # premise: this length jumps
-    assert not jumping(laid.absolute_lengths, robot).any()
-    monkeypatch.undo()
+    m = robot.muscles.index('straightener')
+    with monkeypatch.context() as patch:
+        patch.setattr(module, 'MOST_DRAWS', 0)
+        assert jumping(body(robot, seed).absolute_lengths, robot)[m]  # premise: this length jumps
+    assert not jumping(body(robot, seed).absolute_lengths, robot).any()
     np.testing.assert_array_equal(
         jumping(body(odd, seed).absolute_lengths, odd), np.arange(odd.muscle_count) == m
     )
