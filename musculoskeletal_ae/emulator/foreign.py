@@ -24,7 +24,7 @@ from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import STEP, Arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import Wrap
-from musculoskeletal_ae.robot.jumps import MOST_DRAWS, jumping
+from musculoskeletal_ae.robot.jumps import MOST_DRAWS, newly_jumping
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -127,11 +127,13 @@ def _individual_model(robot: Robot, draw: Draw) -> Any:
     if not any(isinstance(item, Wrap) for route in robot.description.routes for item in route):
         return model
 
-    def slipping(model: Any) -> Bools:
-        return jumping(ForeignBody(robot, model, draw).absolute_lengths, robot)
+    nominal = ForeignBody(robot, mjcf.from_directory(robot, Draw(0, NONE), again).compile(), draw)
 
-    smooth = ~slipping(mjcf.from_directory(robot, Draw(0, NONE), again).compile())
-    while again.max() < MOST_DRAWS and (wrong := slipping(model) & smooth).any():
+    def slipping(model: Any) -> Bools:
+        body = ForeignBody(robot, model, draw)
+        return newly_jumping(body.absolute_lengths, nominal.absolute_lengths, robot)
+
+    while again.max() < MOST_DRAWS and (wrong := slipping(model)).any():
         again += wrong
         model = mjcf.from_directory(robot, draw, again).compile()
     return model
@@ -144,11 +146,12 @@ def _deviate(robot: Robot, model: Any, draw: Draw) -> None:
     the end of an object, its points are redrawn. The number of draws is limited (MOST_DRAWS), so
     some tendons may still jump. Tendons that jump in the file are not redrawn.
     """
-    smooth = ~jumping(ForeignBody(robot, copy.copy(model), draw).absolute_lengths, robot)
+    given = ForeignBody(robot, copy.copy(model), draw)
     attachments = deviation.Attachments(robot, model, draw)
     for _ in range(MOST_DRAWS):
         body = ForeignBody(robot, copy.copy(model), draw)
-        if not (wrong := smooth & jumping(body.absolute_lengths, robot)).any():
+        wrong = newly_jumping(body.absolute_lengths, given.absolute_lengths, robot)
+        if not wrong.any():
             break
         attachments.move(wrong)
     deviation.change_masses(model, draw)

@@ -12,7 +12,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.wrapping import Placed, Tree, WrappedRoutes, wrapped_lengths
-from musculoskeletal_ae.robot.jumps import MOST_DRAWS, jumping
+from musculoskeletal_ae.robot.jumps import MOST_DRAWS, newly_jumping
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.wrapping import WrapObjects
@@ -124,9 +124,8 @@ class Individual:
             routes: Function that returns the true routes for deviations.
         """
         nominal = robot.routes
-        smooth = ~jumping(nominal.absolute_lengths, robot)
         for drawn in again:
-            wrong = smooth & jumping(self.absolute_lengths, robot)
+            wrong = newly_jumping(self.absolute_lengths, nominal.absolute_lengths, robot)
             if not wrong.any():
                 return
             places = wrong[nominal.muscle]

@@ -64,6 +64,21 @@ def jumping(lengths: Callable[[Array], Array], robot: Robot) -> Bools:
     return jumps(lengths, robot.lower, robot.upper)[0] > JUMP
 
 
+def newly_jumping(
+    lengths: Callable[[Array], Array], nominal: Callable[[Array], Array], robot: Robot
+) -> Bools:
+    """Return which lengths jump although those of the nominal body do not, (M,).
+
+    Args:
+        lengths: Function of θ [rad] (N, D) that returns M lengths [m], (N, M).
+        nominal: The same function of the nominal body.
+        robot: The geometric model, for its joint limits.
+    """
+    jump = jumping(lengths, robot)
+    # Nearly always, no length jumps, and the nominal body need not be examined.
+    return jump & ~jumping(nominal, robot) if jump.any() else jump
+
+
 def jumping_muscles(robot: Robot) -> list[tuple[int, float, Array]]:
     """Find the muscles whose length jumps somewhere within the joint limits.
 
