@@ -76,7 +76,7 @@ def test_a_foreign_body_without_effects_is_the_described_body(robot, coupled, im
 
 def test_a_coupled_joint_follows_its_master(coupled):
     arm = ForeignArm(coupled, 0, NONE)
-    drive(arm, 3.0)
+    drive(arm, 1.5)
     names = list(coupled.kinematics.model.names[1:])
     finger, bend = (arm._data.joint(name).qpos[0] for name in ('finger', 'bend'))
     assert {'finger', 'bend'} <= set(names)
@@ -88,7 +88,7 @@ def test_a_prismatic_joint_coupled_to_a_revolute_one_does_not_lag(tmp_path):
     document['joints'].remove('wrist')
     document['couplings'] = [{'joint': 'wrist', 'master': 'bend', 'ratio': -0.03}]
     arm = ForeignArm(Robot.load(write_muscles(tmp_path, document)), 0, NONE)
-    drive(arm, 2.0)
+    drive(arm, 1.0)
     wrist, bend = (arm._data.joint(name).qpos[0] for name in ('wrist', 'bend'))
     assert wrist == pytest.approx(-0.03 * bend, abs=5e-4)
 
@@ -103,9 +103,8 @@ def test_each_effect_alone_changes_the_motion(robot, name, monkeypatch):
     # Two effects change nothing alone: stiction needs tendon friction, and jitter needs a delay.
     others = {'stiction': {'guide_friction': 0.25}, 'jitter': {'delay': 0.0125}}.get(name, {})
     bare = replace(NONE, **others)
-    lives = [drive(ForeignArm(robot, 1, e)) for e in (bare, bare, replace(bare, **{name: size}))]
-    np.testing.assert_array_equal(lives[0], lives[1])
-    assert np.abs(lives[2] - lives[0]).max() > 1e-6
+    lives = [drive(ForeignArm(robot, 1, e)) for e in (bare, replace(bare, **{name: size}))]
+    assert np.abs(lives[1] - lives[0]).max() > 1e-6
 
 
 def test_switching_one_effect_off_keeps_the_random_draws_of_the_others(robot):
@@ -134,7 +133,7 @@ def test_creep_is_the_same_in_every_decade_of_time(robot):
     arm, crept = ForeignArm(robot, 1, replace(NONE, creep=0.04)), []
     arm.command_timeout = np.inf
     arm.command_tension(np.full(robot.muscle_count, 150.0))
-    for seconds in (1.0, 9.0, 40.0):
+    for seconds in (0.3, 2.7, 12.0):
         arm.step(seconds)
         crept.append(arm._memory.slow[:, :4].sum(axis=1) / arm._memory.elongation)
     decades = np.diff(crept, axis=0) / [[1.0], [np.log10(5.0)]]
@@ -195,7 +194,7 @@ def test_a_users_mjcf_file_moves_as_the_robot_imported_from_it(imported):
     theta = robot.random_postures(5, np.random.default_rng(0))
     lengths = arm.individual.absolute_lengths(theta)
     np.testing.assert_allclose(lengths, described.individual.absolute_lengths(theta), atol=1e-6)
-    motions = [drive(each, 2.0)[:, : robot.joint_count] for each in (arm, described)]
+    motions = [drive(each, 1.0)[:, : robot.joint_count] for each in (arm, described)]
     assert np.ptp(motions[0], axis=0).max() > 0.1
     assert np.isfinite(motions[0]).all()
     hand = robot.kinematics.end_effector_pose(arm.theta).translation
