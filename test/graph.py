@@ -6,9 +6,11 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +97,15 @@ class Process:
         if self.alive():
             self.process.send_signal(number)
         return self.ended()
+
+    def ends_silently(self, number: int) -> None:
+        """Stop the command; check its exit status, and that it writes no error meanwhile."""
+        before = self.output
+        status, output = self.end(number)
+        assert status in (0, 130), output
+        # The program may write more lines of its own, but no error.
+        written = output[len(before) :]
+        assert not any(word in written for word in ('Traceback', 'ERROR', 'Error')), output
 
     def ended(self) -> tuple[int, str]:
         """Wait for the end of the command; return exit status and output."""
@@ -190,6 +201,23 @@ class Graph:
         while time.monotonic() < end:
             self.executor.spin_once(LOOK)
 
+    @contextmanager
+    def spinning(self) -> Iterator[None]:
+        """Process messages in another thread during the block."""
+        ended = threading.Event()
+
+        def spin() -> None:
+            while not ended.is_set():
+                self.executor.spin_once(LOOK)
+
+        thread = threading.Thread(target=spin)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
     def wait(self, condition: Callable[[], Any], what: str, deadline: float = DEADLINE) -> Any:
         """Process messages until a condition holds, and return its value.
 
@@ -237,10 +265,15 @@ class Graph:
     def call(self, kind: type, service: str, request: Any = None) -> Any:
         """Call a service and return its response."""
         client = self.node.create_client(kind, service)
-        self.wait(client.service_is_ready, f'service {service}')
-        future = client.call_async(request or kind.Request())
-        self.wait(future.done, f'an answer of {service}')
+        response = self.ask(client, request or kind.Request())
         self.node.destroy_client(client)
+        return response
+
+    def ask(self, client: Any, request: Any) -> Any:
+        """Send a request by a client and return the response."""
+        self.wait(client.service_is_ready, f'service {client.srv_name}')
+        future = client.call_async(request)
+        self.wait(future.done, f'an answer of {client.srv_name}')
         return future.result()
 
     def set_parameter(self, node: str, name: str, value: Any) -> tuple[bool, str]:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A ros2_control robot on the graph: its messages reach the nodes, and their commands reach it."""
 
+import signal
 import sys
 from functools import partial
 from pathlib import Path
@@ -48,10 +49,6 @@ def start_fake_robot(graph):
     return robot
 
 
-def test_the_fake_robot_says_that_it_publishes(graph, arm26):
-    assert arm26.description.directory.name in start_fake_robot(graph).wait_for_output('Hz')
-
-
 def test_the_files_of_controllers_and_nodes_state_the_same_motors():
     controllers = yaml.safe_load((EXAMPLE / 'controllers.yaml').read_text(encoding='utf-8'))
     joints = controllers['tendon_controller']['ros__parameters']['joints']
@@ -65,8 +62,20 @@ def test_the_guide_shows_the_files_of_the_example(name):
     assert f'```yaml\n{text}```' in guide
 
 
-def test_states_reach_the_estimator_and_commands_reach_the_motors(graph, trained_file, arm26):
-    start_fake_robot(graph)
+def test_the_fake_robot_passes_check_driver_and_is_estimated_and_moved_by_the_nodes(
+    graph, trained_file, arm26
+):
+    robot = start_fake_robot(graph)
+    assert arm26.description.directory.name in robot.wait_for_output('Hz')
+    commands = graph.listen(Float64MultiArray, COMMANDS)
+    options = ['--seconds', '1', '--wait', '--move', '--muscles', 'brachialis']
+    process = graph.run('check_driver', '--robot', 'arm26', '--params-file', str(NODES), *options)
+    graph.wait(lambda: not process.alive(), 'the end of check_driver')
+    status, output = process.ended()
+    faults = [line.split()[1] for line in output.splitlines() if line.startswith('fault: ')]
+    assert set(faults) <= {'latency', 'rate'} and (status == 0 or faults), output
+    assert commands and len(commands[0].data) == len(MOTORS)
+
     estimator = host(graph, Estimator, checkpoint=trained_file)
     estimates = graph.listen(JointState, 'estimated_joint_states')
     graph.wait(lambda: estimates, 'an estimate')
@@ -75,7 +84,7 @@ def test_states_reach_the_estimator_and_commands_reach_the_motors(graph, trained
     assert not estimator.rejected
 
     controller = host(graph, Controller, checkpoint=trained_file)
-    commands = graph.listen(Float64MultiArray, COMMANDS)
+    commands.clear()
     lengths = graph.listen(Float64MultiArray, 'muscle_length_command')
     before = joint_values(graph, 'effort')
     targets = graph.publisher(JointState, 'target_joint_states')
@@ -91,6 +100,7 @@ def test_states_reach_the_estimator_and_commands_reach_the_motors(graph, trained
     converted = controller.motors.command(np.array(lengths[-1].data))
     assert any(np.allclose(message.data, converted) for message in commands[-5:])
     assert controller.core.supervisor.is_running
+    robot.ends_silently(signal.SIGINT)
 
 
 def test_a_second_publisher_of_the_motors_is_named(graph):
@@ -102,18 +112,6 @@ def test_a_second_publisher_of_the_motors_is_named(graph):
     nodes = ' and '.join(f'{graph.namespace}/{name}' for name in ('stranger', 'test'))
     assert f'{STATES} come from {nodes}' in estimator.intruders
     stranger.destroy_node()
-
-
-def test_check_driver_passes_the_robot_and_moves_it(graph):
-    start_fake_robot(graph)
-    options = ['--seconds', '2', '--wait', '--move', '--muscles', 'brachialis']
-    process = graph.run('check_driver', '--robot', 'arm26', '--params-file', str(NODES), *options)
-    commands = graph.listen(Float64MultiArray, COMMANDS)
-    graph.wait(lambda: not process.alive(), 'the end of check_driver')
-    status, output = process.ended()
-    faults = [line.split()[1] for line in output.splitlines() if line.startswith('fault: ')]
-    assert set(faults) <= {'latency', 'rate'} and (status == 0 or faults), output
-    assert commands and len(commands[0].data) == len(MOTORS)
 
 
 def test_the_emulator_plays_the_same_robot(graph, arm26):
