@@ -10,8 +10,10 @@ from musculoskeletal_ae.control.watchdog import LONGEST_STEP
 from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
+from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.validity import read_array, read_muscle_states
 
+RATE = 50.0  # messages a second; twice as many take almost twice the processor time [Hz]
 RATE_LIMIT = 0.2  # rate limit of length commands [m/s]
 #: the longest legal max_age [s], so that a loaded machine does not stop the arm
 PATIENT = 10.0
@@ -20,6 +22,7 @@ NODES = {
     'hardware_emulator': HardwareEmulator,
     'estimator': Estimator,
     'controller': Controller,
+    'learner': Learner,
 }
 
 
@@ -49,8 +52,8 @@ class ControlledArm:
 
     def start(self, name, **parameters):
         if name in self.processes:
-            return self.graph.start(name, robot='arm26', **parameters)
-        return self.graph.host(NODES[name], robot='arm26', **parameters)
+            return self.graph.start(name, robot='arm26', rate=RATE, **parameters)
+        return self.graph.host(NODES[name], robot='arm26', rate=RATE, **parameters)
 
     def start_controller(self, **parameters):
         return self.start(
