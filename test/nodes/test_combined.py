@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Estimator and controller in one process: the same nodes, and a common shutdown."""
 
+import os
 import signal
 
+import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
+from musculoskeletal_ae.nodes.parameters import check_names
 
 
 def test_both_nodes_of_one_process_move_the_arm_and_end_by_one_signal(graph, trained_file):
@@ -15,7 +21,7 @@ def test_both_nodes_of_one_process_move_the_arm_and_end_by_one_signal(graph, tra
         (JointState, 'estimated_joint_states'),
     ):
         graph.listen(kind, topic)
-    graph.start('hardware_emulator', robot='arm26')
+    graph.host(HardwareEmulator, robot='arm26')
     process = graph.start(
         'combined', robot='arm26', checkpoint=trained_file, explore=True, max_age=10.0
     )
@@ -24,11 +30,12 @@ def test_both_nodes_of_one_process_move_the_arm_and_end_by_one_signal(graph, tra
     for node in ('estimator', 'controller'):
         graph.wait(lambda node=node: graph.report(node).message != 'not heard of', node)
     graph.wait(lambda: graph.report('controller').message == 'exploring', 'exploration')
+    assert os.getpriority(os.PRIO_PROCESS, process.process.pid) == os.nice(0)
     done, why = graph.set_parameter('estimator', 'anomaly_threshold', -1.0)
     assert not done and 'anomaly_threshold' in why
     assert graph.ended(process, signal.SIGINT)[0] == 0
 
 
-def test_a_parameter_that_only_another_node_has_is_refused(graph):
-    status, output = graph.ended(graph.start('combined', payload=1.0))
-    assert status == 1 and 'combined has no parameter' in output
+def test_a_parameter_that_only_another_node_has_is_refused():
+    with pytest.raises(MusculoskeletalError, match='combined has no parameter'):
+        check_names(['payload'], 'combined')
