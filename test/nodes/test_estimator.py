@@ -2,7 +2,6 @@
 """The node `estimator` over DDS."""
 
 import shutil
-import signal
 import time
 from copy import deepcopy
 from dataclasses import replace
@@ -256,24 +255,6 @@ def test_a_marker_pose_becomes_joint_angles_with_the_stamp_of_the_picture(estima
 def test_a_wrong_parameter_is_refused_by_name(graph, parameters, error, expected):
     with pytest.raises(error, match=expected):
         graph.host(Estimator, **{'robot': 'arm26', **parameters})
-
-
-# -- the process ---------------------------------------------------------------------------------
-
-
-def test_ctrl_c_ends_the_estimator_without_a_traceback(graph, trained_file):
-    process = graph.start('estimator', robot='arm26', checkpoint=trained_file)
-    graph.wait(lambda: graph.node.count_publishers('anomaly') > 0, 'the estimator')
-    status, output = graph.ended(process, signal.SIGINT)
-    assert status == 0
-    assert 'Traceback' not in output
-
-
-def test_a_wrong_parameter_ends_the_process_with_one_clear_line(graph):
-    status, output = graph.ended(graph.start('estimator', robot='no_such_arm'))
-    assert status == 1
-    assert output.startswith('error: ') and output.count('\n') == 1
-    assert 'musashi_left_arm' in output
 
 
 def test_the_covariance_of_the_network_is_published(graph, arm26, trained_file, tmp_path):

@@ -14,6 +14,7 @@ from std_msgs.msg import Float64MultiArray
 from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes import render
 from musculoskeletal_ae.nodes.arm import Frames
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
@@ -53,32 +54,37 @@ def test_markers_of_estimate_and_hardware_differ_and_have_names_and_prefixed_fra
     assert mine.header.stamp.sec > 0
 
 
-@pytest.mark.parametrize(('file', 'status'), [('arm.png', 0), ('arm.foo', 2)])
-def test_render_writes_a_picture_and_refuses_an_unknown_file_type(graph, tmp_path, file, status):
-    graph.host(HardwareEmulator, robot='arm26')
-    out = tmp_path / file
-    tool = graph.run('render', '--out', str(out))
-    graph.wait(lambda: not tool.alive(), 'the end of render')
-    ended, output = tool.ended()
-    assert ended == status and out.exists() is (status == 0)
-    assert status == 0 or (file in output and '.png' in output and 'Traceback' not in output)
-
-
-def test_render_draws_the_estimate_without_an_emulator(graph, tmp_path):
+@pytest.mark.parametrize(
+    ('topic', 'emulated'), [('hardware_emulator/markers', True), ('estimated/markers', False)]
+)
+def test_render_draws_the_emulated_arm_or_without_an_emulator_the_estimate(
+    graph, tmp_path, capsys, topic, emulated
+):
     """With a physical arm there is no emulator, and without a network there are no markers."""
     publisher = graph.node.create_publisher(MarkerArray, 'estimated/markers', 10)
     bone = Marker(type=Marker.LINE_STRIP, points=[Point(), Point(z=0.3)])
-    out = tmp_path / 'arm.png'
-    tool = graph.run('render', '--out', str(out))
 
-    def ended():
+    def publish():
         for markers in ([], [bone]):
             publisher.publish(MarkerArray(markers=markers))
-        return not tool.alive()
 
-    graph.wait(ended, 'the end of render')
-    status, output = tool.ended()
-    assert (status, out.exists()) == (0, True) and 'estimated/markers' in output
+    graph.node.create_timer(0.1, publish)
+    if emulated:
+        graph.host(HardwareEmulator, robot='arm26')
+    out = tmp_path / 'arm.png'
+    with graph.spinning():
+        status = render.main(
+            ['--out', str(out), '--ros-args', '-r', f'__ns:={graph.namespace}'],
+        )
+    assert (status, out.exists()) == (0, True)
+    assert topic in capsys.readouterr().out
+
+
+def test_render_refuses_an_unknown_file_type(capsys):
+    with pytest.raises(SystemExit, match='2'):
+        render.main(['--out', 'arm.foo'])
+    refusal = capsys.readouterr().err
+    assert 'arm.foo' in refusal and '.png' in refusal
 
 
 def test_without_tf2_msgs_the_parameter_publish_tf_is_refused(graph, monkeypatch):

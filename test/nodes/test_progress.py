@@ -23,12 +23,12 @@ START = (
 
 
 @pytest.fixture
-def run() -> Iterator[Callable[[str], subprocess.Popen[str]]]:
+def run() -> Iterator[Callable[..., subprocess.Popen[str]]]:
     """Return a function that runs code in a process; those that still run at the end are killed."""
     processes = list[subprocess.Popen[str]]()
 
-    def start(code: str) -> subprocess.Popen[str]:
-        command = [sys.executable, '-X', 'faulthandler', '-c', START + code]
+    def start(code: str, before: str = START) -> subprocess.Popen[str]:
+        command = [sys.executable, '-X', 'faulthandler', '-c', before + code]
         pipes = {'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE}
         processes.append(subprocess.Popen(command, text=True, **pipes))
         return processes[-1]
@@ -48,7 +48,7 @@ def test_without_progress_the_process_ends_with_the_stacks_in_its_log(run):
 
 
 def test_a_native_call_that_keeps_the_lock_of_python_ends_the_process_too(run):
-    process = run('sum(range(10**12))')
+    process = run('sum(range(10**12))', START.replace('longest=1.0', 'longest=0.3'))
     _, errors = process.communicate(timeout=DEADLINE)
     assert process.returncode == -signal.SIGVTALRM
     assert 'most recent call first' in errors

@@ -101,7 +101,7 @@ def test_a_push_acts_until_it_is_zero(arm, arm26, core):
     message.header.frame_id = 'camera'
     message.wrench.force.x = 0.0
     push.publish(message)
-    arm.wait(lambda: 'wrong frame' in str(arm.report('sim').values), 'the rejection')
+    arm.wait(lambda: 'wrong frame' in str(arm.simulator.rejected), 'the rejection')
     message.header.frame_id = arm26.root_link
     push.publish(message)
     wait_for_posture(arm, rest, 'the release')
@@ -113,14 +113,14 @@ def test_joints_are_forced_and_released(arm, core):
     force.publish(JointState(name=['elbow'], position=[-0.8]))
     core.fixed[0] = [np.nan, -0.8]
     wait_for_posture(arm, core.settle().theta[0], 'the forced posture')
-    arm.wait(lambda: 'forced joints' in str(arm.report('sim').values), 'the report')
+    arm.wait(lambda: 'forced joints' in str(arm.simulator.report().values), 'the report')
     for names, extra, reason in (
         (['knee'], {}, 'unknown joint'),
         (['elbow'] * 2, {}, 'duplicate joint'),
         ([], {'effort': [1.0]}, 'empty'),  # only an entirely empty message releases the joints
     ):
         force.publish(JointState(name=names, position=[0.0] * len(names), **extra))
-        arm.wait(lambda reason=reason: reason in str(arm.report('sim').values), reason)
+        arm.wait(lambda reason=reason: reason in str(arm.simulator.rejected), reason)
     assert abs(posture(arm)[1] + 0.8) < 0.01
     force.publish(JointState())
     wait_for_posture(arm, rest, 'the release')
@@ -135,7 +135,7 @@ def test_an_unreachable_command_is_reported_and_bad_commands_change_nothing(arm,
     np.testing.assert_allclose(posture(arm), before, atol=1e-3)
     assert sum(arm.simulator.rejected.values()) == 4
     commands.publish(array_message(np.full(6, -1.0), 'muscle'))
-    arm.wait(lambda: 'at the limit: ' in arm.report('sim').message, 'the report')
+    arm.wait(lambda: 'at the limit: ' in arm.simulator.report().message, 'the report')
     _, tension, _ = read_muscle_states(arm.next('sim/muscle_states'), 6)
     assert tension.max() <= arm26.tension.max[0]
     theta = posture(arm)
@@ -144,19 +144,15 @@ def test_an_unreachable_command_is_reported_and_bad_commands_change_nothing(arm,
 
 def test_the_simulator_waits_for_a_checkpoint_and_refuses_unfit_ones(graph, mae, trained_file):
     graph.listen(JointState, 'sim/joint_states')
-    graph.listen(DiagnosticArray, '/diagnostics')
-    graph.host(Sim, robot='arm26')
-    graph.wait(lambda: 'waiting for a checkpoint' in graph.report('sim').message, 'the report')
+    sim = graph.host(Sim, robot='arm26')
+    graph.wait(lambda: 'waiting for a checkpoint' in sim.report().message, 'the report')
     assert not graph.received['sim/joint_states']
     graph.send_network(b'not a network', 'accepted_checkpoint')
-    graph.wait(
-        lambda: 'rejected accepted_checkpoint' in str(graph.report('sim').values), 'the refusal'
-    )
+    graph.wait(lambda: 'accepted_checkpoint' in str(sim.rejected), 'the refusal')
     for version in (41, 42):
         data = checkpoint.to_bytes(replace(mae, version=version))
         graph.send_network(data, 'accepted_checkpoint')
-        reported = f"'checkpoint version': '{version}'"
-        graph.wait(lambda reported=reported: reported in str(graph.report('sim').values), reported)
+        graph.wait(lambda version=version: sim.checkpoint_version == version, f'{version}')
     graph.next('sim/joint_states', 3)
     assert not graph.set_parameter('sim', 'checkpoint', '/nowhere')[0]
     # Once the estimator has published a network, it decides which network all nodes use.
