@@ -4,8 +4,10 @@
 import ast
 import re
 import subprocess
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -19,43 +21,48 @@ def sources(*folders: Path) -> list[Path]:
     return sorted(file for folder in folders for file in folder.rglob('*.py'))
 
 
-def imported(file: Path) -> set[str]:
-    names = set()
-    for node in ast.walk(ast.parse(file.read_text(encoding='utf-8'))):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names.add(node.module)
-    return names
+class Imports(NamedTuple):
+    """The modules that a file imports."""
+
+    names: set[str]  # modules as they are named in import statements
+    #: all modules, and names within modules, that the file may import when it runs, which excludes
+    #: imports for annotations alone
+    at_run_time: set[str]
 
 
-def runtime_imports(file: Path) -> set[str]:
-    """Return all modules, and names within modules, that a file may import when it runs."""
-    names = set()
-    open_nodes = [ast.parse(file.read_text(encoding='utf-8'))]
+@cache
+def imports(file: Path) -> Imports:
+    names, at_run_time = set[str](), set[str]()
+    tree = ast.parse(file.read_text(encoding='utf-8'))
+    open_nodes: list[tuple[ast.AST, bool]] = [(tree, True)]
     while open_nodes:
-        node = open_nodes.pop()
+        node, runs = open_nodes.pop()
         if isinstance(node, ast.If) and ast.unparse(node.test) == 'TYPE_CHECKING':
-            continue
+            runs = False
         if isinstance(node, ast.ImportFrom) and node.module:
-            names |= {node.module} | {f'{node.module}.{alias.name}' for alias in node.names}
+            names.add(node.module)
+            if runs:
+                whole = {node.module, *(f'{node.module}.{alias.name}' for alias in node.names)}
+                at_run_time |= whole
         elif isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        open_nodes += ast.iter_child_nodes(node)
-    return names
+            named = {alias.name for alias in node.names}
+            names |= named
+            at_run_time |= named if runs else set()
+        open_nodes += ((child, runs) for child in ast.iter_child_nodes(node))
+    return Imports(names, at_run_time)
 
 
 def test_only_nodes_imports_ros() -> None:
     outside = [file for file in sources(PACKAGE) if PACKAGE / 'nodes' not in file.parents]
     assert len(outside) > 40
-    speaking = {str(file): sorted(filter(ROS.match, imported(file))) for file in outside}
+    speaking = {str(file): sorted(filter(ROS.match, imports(file).names)) for file in outside}
     assert not {file: names for file, names in speaking.items() if names}
 
 
 def test_no_module_imports_itself_in_a_circle() -> None:
     # Imports within functions count as well, but imports for annotations alone do not.
     modules = {'.'.join(f.relative_to(ROOT).with_suffix('').parts): f for f in sources(PACKAGE)}
-    graph = {name: runtime_imports(file) & set(modules) for name, file in modules.items()}
+    graph = {name: imports(file).at_run_time & set(modules) for name, file in modules.items()}
     tuple(TopologicalSorter(graph).static_order())  # raises CycleError, which names the circle
 
 
@@ -63,7 +70,9 @@ def test_only_the_presets_import_the_paper() -> None:
     chosen = 'paper', 'presets'
     for file in sources(PACKAGE):
         if file.parent.name not in chosen:
-            taken = [name for name in imported(file) if name.startswith(f'{PACKAGE.name}.paper')]
+            taken = [
+                name for name in imports(file).names if name.startswith(f'{PACKAGE.name}.paper')
+            ]
             assert not taken, f'{file}: choose it through presets.registry instead'
 
 
@@ -83,7 +92,9 @@ def test_outside_its_folder_the_paper_is_only_cited() -> None:
 
 def test_one_file_imports_what_rclpy_does_not_publish() -> None:
     taking = [
-        file.name for file in sources(PACKAGE) if any('rclpy.impl' in n for n in imported(file))
+        file.name
+        for file in sources(PACKAGE)
+        if any('rclpy.impl' in n for n in imports(file).names)
     ]
     assert taking == ['rclpy_names.py']
 
@@ -92,7 +103,7 @@ def test_the_core_never_imports_the_nodes_or_the_tools() -> None:
     for file in sources(PACKAGE):
         if file.parent.name not in ('nodes', 'tools') and file.name != 'executables.py':
             upward = [
-                n for n in imported(file) if re.match(r'musculoskeletal_ae\.(nodes|tools)', n)
+                n for n in imports(file).names if re.match(r'musculoskeletal_ae\.(nodes|tools)', n)
             ]
             assert not upward, file
 
@@ -103,7 +114,7 @@ def test_the_foreign_emulator_shares_no_code_with_the_first_one_or_the_learner()
     for name in ('effects', 'foreign', 'mjcf', 'tendons'):
         file = PACKAGE / 'emulator' / f'{name}.py'
         pattern = rf'musculoskeletal_ae\.({first}|{model})'
-        assert not [n for n in imported(file) if re.match(pattern, n)], file
+        assert not [n for n in imports(file).names if re.match(pattern, n)], file
         assert 'robot.routes' not in file.read_text(encoding='utf-8'), file
 
 
