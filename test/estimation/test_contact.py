@@ -193,7 +193,7 @@ def test_healthy_torque_is_measured_in_motion_and_a_touch_hardly_counts():
     for _ in range(100):
         core.step(tension, length, DT)
     assert core.use(image).touch.time == 0.0  # only motion counts, and the arm was at rest
-    move(LEAST_MOTION + 20.0)
+    move(LEAST_MOTION + 2.0)
     healthy = core.use(image).touch.spread
     move(1.0, push=500.0)
     assert (core.use(image).touch.spread < 1.5 * healthy).all()

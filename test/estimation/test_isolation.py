@@ -162,14 +162,14 @@ def test_a_healthy_suspect_is_restored_but_a_third_anomaly_is_latched(loop, heal
         assert loop.core.cause == ''
     # The third finding isolates no muscle. It is latched, as with `on_anomaly: stop`.
     assert loop.core.body.isolated == ()
-    loop.step(healthy, 1000)
+    loop.step(healthy, 300)
     assert loop.core.cause
 
 
 def test_on_anomaly_stop_is_the_default_and_isolates_no_muscle(robot, calibrated, healthy, cut):
     loop = Loop(robot, calibrated, healthy)
     loop.core.configure(Detection())
-    loop.step(cut, 1000)
+    loop.step(cut, 300)
     assert loop.core.cause
     assert loop.core.body.isolated == ()
 
@@ -198,13 +198,13 @@ def test_a_suspect_cannot_be_restored_during_its_verification_which_always_ends(
     loop.step(healthy, 30)
     loop.step(cut, 20)
     (suspect,) = loop.core.body.isolated
-    for _ in range(round(LONGEST / DT)):
+    for _ in range(round(LONGEST / DT / 10)):
         if loop.core.cause == '':
             break
         with pytest.raises(MusculoskeletalError, match=r'is being verified.*within 10 s; wait'):
             loop.core.restore([suspect])
         assert loop.core.body.isolated == (suspect,)
-        loop.step(healthy)
+        loop.step(healthy, 10)
     assert loop.core.cause == ''
     loop.core.restore([suspect])
     assert loop.core.body.isolated == ()

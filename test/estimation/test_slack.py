@@ -94,8 +94,15 @@ def test_the_distance_waits_for_slack_but_not_for_a_rupture(
     assert (Kind.RESIDUAL_DISTANCE in kinds[:50]) == found
 
 
-@pytest.mark.parametrize('speed', [0.009, 0.036])
-@pytest.mark.parametrize('commanded', [True, False])
+@pytest.mark.parametrize(
+    ('speed', 'commanded'),
+    [
+        (0.009, True),
+        (0.036, False),
+        pytest.param(0.009, False, marks=pytest.mark.thorough),
+        pytest.param(0.036, True, marks=pytest.mark.thorough),
+    ],
+)
 def test_an_emulated_slow_winch_takes_up_slack_without_an_anomaly(
     robot, calibrated, speed, commanded
 ):
