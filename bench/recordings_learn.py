@@ -126,6 +126,7 @@ class Statics:
     #: standard deviations of the IMU's orientation in the prior, and of θ in a rest sample [rad]
     TILT, NOISE = 0.02, 0.015
     ROUNDS = 15
+    CONVERGED = 1e-10  # largest step at which the postures count as found [rad]
 
     def __init__(self, robot: Robot, rests: list[Run]) -> None:
         """Fit the unknowns to the rest samples of runs with different payloads."""
@@ -175,6 +176,8 @@ class Statics:
             slope = slope + np.maximum(0.0, 0.2 - least)[:, None, None] * eye
             step = np.linalg.solve(slope, torque[..., None])[..., 0]
             theta = np.clip(theta - np.clip(step, -0.2, 0.2), robot.lower, robot.upper)
+            if np.abs(step).max() < self.CONVERGED:
+                break
         return theta
 
 
