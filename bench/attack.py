@@ -63,7 +63,7 @@ class Size(NamedTuple):
 
 
 FULL = Size(None, 2000, messages=100_000, node_kills=40, learner_kills=12, files=600, episodes=20)
-QUICK = Size(1, 4, messages=800, node_kills=1, learner_kills=0, files=21, episodes=1)
+QUICK = Size(1, 2, messages=300, node_kills=1, learner_kills=0, files=7, episodes=1)
 SEEDS = 0, 1, 2, 3, 4
 EVENTS_IN_A_ROW = 50  # number of random events between two recoveries of the arm
 
@@ -297,11 +297,11 @@ def main(argv: list[str]) -> int:
     from bench.attack_kinds import KINDS, all_attacks
 
     parser = Parser('attack', 'Attacks the running system and counts what breaks.')
-    parser.add_quick('attack for about a minute only')
+    parser.add_quick('attack for about half a minute only')
     parser.add_argument(
         '--messages',
         type=whole(1, 10_000_000),
-        help='number of hostile messages (default: 100 000; with --quick 800)',
+        help='number of hostile messages (default: 100 000; with --quick 300)',
     )
     parser.add_argument('--out', type=Path, help='folder of the logs (default: a temporary one)')
     parser.add_argument('--initial', type=Path, help='initial checkpoint (default: train one)')

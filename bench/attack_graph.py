@@ -69,6 +69,7 @@ OWN = QoSProfile(depth=1000)
 JUDGE_PERIOD = 0.25  # time between two checks of the status line [s]
 PATIENCE = 90.0  # longest wait for an expected event [s]
 COOLING = 900.0  # longest additional wait for overheated windings to cool [s]
+WARM = 40.0  # temperature of a winding above which the emulated arm is reset [°C]
 LENGTH, TENSION = 'muscle_length_command', 'muscle_tension_command'
 
 FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-300, 1e9, -1e9, 1e308, -1e308, math.nan, math.inf, -math.inf)
@@ -368,7 +369,10 @@ class Attack:
         for node, name, value in HEALTHY:
             self.call(SetParameters, f'{node}/set_parameters', set_request(name, value))
         self.call(Trigger, 'estimator/restore')
-        self.call(Trigger, 'hardware_emulator/reset')
+        # Otherwise spare the arm the reset: it jumps to its first posture, and the jump of the
+        # lengths would require their calibration.
+        if self.levels['hardware_emulator'][1].level != DiagnosticStatus.OK or self.is_warm():
+            self.call(Trigger, 'hardware_emulator/reset')
         self.call(SetBool, 'learner/enable', SetBool.Request(data=True))
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
@@ -385,6 +389,11 @@ class Attack:
         why = answer.message if answer is not None else 'no answer'
         self.found('the arm moves again after an attack', f'in {PATIENCE:g} s: {why}')
         return False
+
+    def is_warm(self) -> bool:
+        """Return whether a winding was warmer than WARM in the last genuine message."""
+        states = self.genuine.get('muscle_states')
+        return states is None or not np.array(states.data).reshape(3, -1)[2].max() <= WARM
 
     # -- attacking ------------------------------------------------------------------------------
 
@@ -516,7 +525,8 @@ class Attack:
                 self.request(*rng.choice(services))
             if rng.random() < 0.02:
                 self.fault()
-            while when and messages - left >= when[0]:
+            sent = messages - (until - self.tried['messages'])
+            while when and sent >= when[0]:
                 when.pop(0)
                 self.kill()
             self.spin(rng.choice((0.01, 0.05)))
