@@ -52,6 +52,7 @@ class Browser:
 
     def __init__(self, profile: Path, url: str, size: tuple[int, int] = (1024, 640)) -> None:
         """Start Chromium and open the page `url` in a window of `size` [pixels]."""
+        self._url = url
         program = find_chromium()
         assert program is not None
         window = f'--window-size={size[0]},{size[1]}'
@@ -69,17 +70,19 @@ class Browser:
             tab = self._wait(self._find_tab)
             attached = self.call('Target.attachToTarget', targetId=tab, flatten=True)
             self._session = attached['sessionId']
-            metrics = {'deviceScaleFactor': 1, 'mobile': False}
-            self.call(
-                'Emulation.setDeviceMetricsOverride', width=size[0], height=size[1], **metrics
-            )
             self.call('Page.enable')
             for script in SLOWLY, NOTE_PRESSED:
                 self.call('Page.addScriptToEvaluateOnNewDocument', source=script)
-            self.call('Page.navigate', url=url)
+            self.visit(size)
         except BaseException:
             self._process.kill()
             raise
+
+    def visit(self, size: tuple[int, int]) -> None:
+        """Open the page anew, in a window of `size` [pixels]."""
+        metrics = {'deviceScaleFactor': 1, 'mobile': False}
+        self.call('Emulation.setDeviceMetricsOverride', width=size[0], height=size[1], **metrics)
+        self.call('Page.navigate', url=self._url)
 
     def _find_tab(self) -> str | None:
         targets = self.call('Target.getTargets')['targetInfos']

@@ -2,6 +2,7 @@
 """The page in a real Chromium, with real nodes. Screenshots stay in log/view."""
 
 import gzip
+import itertools
 import math
 import socket
 from concurrent.futures import ThreadPoolExecutor
@@ -76,25 +77,30 @@ def view(graph):
 
 
 @chromium
-@pytest.mark.parametrize('size', [(1280, 800), (800, 600)])
-def test_readings_and_controls_leave_room_for_the_arm(arm26, tmp_path, size):
+def test_readings_and_controls_leave_room_for_the_arm(arm26, tmp_path):
     SCREENSHOTS.mkdir(parents=True, exist_ok=True)
-    port, states = free_port(), np.array([[30.0] * 6, [25.0] * 6])
+    port, states, times = free_port(), np.array([[30.0] * 6, [25.0] * 6]), itertools.count()
     page = Page(arm26, '127.0.0.1', port, False, lambda *_: None)
     page.offer(['controller'])
-    browser = Browser(tmp_path / 'profile', f'http://127.0.0.1:{port}', size)
+    sizes = (1280, 800), (800, 600)
+    browser = Browser(tmp_path / 'profile', f'http://127.0.0.1:{port}', sizes[0])
+
+    def is_complete() -> bool:
+        page.draw({'estimated': np.array([0.0, -1.0])}, states[0], np.array([2, *[0] * 5]))
+        page.offer(['controller'], explores=True)
+        values = (0.1, np.nan, np.nan, np.nan)
+        page.tell(['error 0.1'], 'STOPPED: why', states, next(times), values)
+        texts = 'STOPPED: why', 'End exploring', 'Restore isolated muscles', '30 N', 'A: '
+        return all(text in browser.text for text in texts)
+
     try:
-        browser._wait(page.looked_at.is_set, 'the visitor')
-        for now in range(3):
-            page.draw({'estimated': np.array([0.0, -1.0])}, states[0], np.array([2, *[0] * 5]))
-            page.offer(['controller'], explores=True)
-            page.tell(['error 0.1'], 'STOPPED: why', states, now, (0.1, np.nan, np.nan, np.nan))
-        for text in ('STOPPED: why', 'End exploring', 'Restore isolated muscles', '30 N', 'A: '):
-            browser.wait_for(text)
-        width = browser.evaluate('document.querySelector("canvas").getBoundingClientRect().width')
-        assert width > 0.45 * size[0]
-        browser.close_notifications()
-        browser.screenshot(SCREENSHOTS / f'page_{size[0]}.png')
+        for size in sizes:
+            browser.visit(size)
+            browser._wait(is_complete, 'all readings and controls')
+            canvas = 'document.querySelector("canvas").getBoundingClientRect()'
+            assert browser.evaluate(f'{canvas}.width') > 0.45 * size[0]
+            browser.close_notifications()
+            browser.screenshot(SCREENSHOTS / f'page_{size[0]}.png')
     finally:
         browser.close()
         page.close()
@@ -203,8 +209,8 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
 ):
     SCREENSHOTS.mkdir(parents=True, exist_ok=True)
     graph.start('hardware_emulator', robot='arm26')
-    graph.start('estimator', robot='arm26', checkpoint=trained_file)
-    graph.start('controller', robot='arm26', checkpoint=trained_file, max_age=10.0)
+    nodes = {'robot': 'arm26', 'checkpoint': trained_file, 'max_age': 10.0, 'first_duration': 2.0}
+    graph.start('combined', **nodes)  # estimator and controller
     detected = graph.listen(Bool, 'anomaly_detected', LATCHED)
     targets = graph.listen(JointState, 'target_joint_states')
     modes = graph.listen(String, 'controller_mode', LATCHED)
@@ -259,30 +265,11 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         page.press('Reset after a stop')
         see('press "Repair" first')
         assert 'controller/reset' not in page.text
-        graph.spin(1.0)
         page.close_notifications()
         page.screenshot(SCREENSHOTS / 'rupture.png')
     finally:
         page.close()
     graph.wait(lambda: graph.node.count_subscribers(topic) == 0, 'the page to unsubscribe')
-
-
-@chromium
-def test_muscles_are_shown_although_an_isolated_one_sends_nan(graph, view, arm26, tmp_path):
-    page = Browser(tmp_path / 'profile', f'http://127.0.0.1:{view("--read-only")}')
-    try:
-        publish = no_number_of(graph, arm26, 'brachialis')
-
-        def shown():
-            publish()
-            return '61 N' in page.text
-
-        graph.wait(shown, 'the tensions of the other muscles')
-        page.wait_for('isolated: brachialis')
-        assert page.evaluate('document.title') == 'arm26 – musculoskeletal_ae'
-        assert 'brachialis' in page.text and 'nan' not in page.text
-    finally:
-        page.close()
 
 
 @pytest.mark.parametrize('limits', [(0.001, 0.009), (-1.5, 2.0)])
@@ -302,8 +289,11 @@ def test_sliders_reach_the_limits_of_a_prismatic_joint(tmp_path, limits):
         page.close()
 
 
-def test_implausible_estimates_and_unknown_parameters_do_not_end_the_page(graph, view, arm26):
-    port, asked = view(), []
+@chromium
+def test_nan_implausible_estimates_and_unknown_parameters_do_not_end_the_page(
+    graph, view, arm26, tmp_path
+):
+    port, asked = view('--read-only'), []
     graph.listen(DiagnosticArray, '/diagnostics')
     graph.wait(
         lambda: graph.report('view').message == 'the page has no visitors', 'the report of the page'
@@ -315,20 +305,28 @@ def test_implausible_estimates_and_unknown_parameters_do_not_end_the_page(graph,
         return response
 
     graph.node.create_service(GetParameters, 'hardware_emulator/get_parameters', answer)
-    with ThreadPoolExecutor(1) as aside, visit(port, f'http://localhost:{port}') as mine:
-        aside.submit(read, mine)
-        mine.send(msgspec.msgpack.encode({'type': 'ViewerCameraMessage', **CAMERA}))
+    page = Browser(tmp_path / 'profile', f'http://127.0.0.1:{port}')
+    try:
+        publish = no_number_of(graph, arm26, 'brachialis')
         joints = graph.publisher(JointState, 'estimated_joint_states')
 
         def shown():
+            publish()
             joints.publish(JointState(name=arm26.joints, position=[1e308, -1e308]))
-            return len(asked) > 2  # the page asks for parameters once a second, after drawing
+            # The page asks for parameters once a second, after drawing.
+            return len(asked) > 2 and '61 N' in page.text
 
-        graph.wait(shown, 'the page to go on')
+        graph.wait(shown, 'the page to go on, with the tensions of the other muscles')
+        page.wait_for('isolated: brachialis')
+        assert page.evaluate('document.title') == 'arm26 – musculoskeletal_ae'
+        assert 'brachialis' in page.text and 'nan' not in page.text
+        assert 'Stop' not in page.text  # a page without controls
         rate = 'estimated_joint_states rate'
         graph.wait(
             lambda: rate in graph.report('view').values, 'the rate of the estimates in the report'
         )
+    finally:
+        page.close()
     assert graph.processes[-1].alive()
 
 
@@ -498,23 +496,25 @@ def test_a_push_ends_when_its_visitor_leaves(arm26):
     assert what == 'push' and not force.any()
 
 
-def test_an_address_of_another_machine_is_refused(arm26):
+def test_an_address_that_cannot_be_used_is_refused(arm26):
     with pytest.raises(MusculoskeletalError, match=r'page at port \d+ of 192\.0\.2\.1: Cannot'):
         Page(arm26, '192.0.2.1', free_port(), False, lambda *_: None)
     with pytest.raises(MusculoskeletalError, match=r'of 127\.\.0\.1: .*choose another'):
         Page(arm26, '127..0.1', free_port(), False, lambda *_: None)
 
 
-def test_a_page_of_another_site_is_turned_away_and_a_port_in_use_is_named(view):
-    port = view('--read-only')
-    foreign = 'http://evil.example', f'http://evil.example:{port}', 'null', 'http://[bad'
-    for origin in foreign:
-        with pytest.raises(InvalidStatus, match='403'):
-            visit(port, origin)
-    with visit(port, f'http://localhost:{port}') as mine:
-        assert mine.recv(timeout=300)
-    second = Process('view', [*executable('view'), '--robot', 'arm26', '--port', str(port)])
-    status, output = second.ended()
-    assert status == 1
-    reported = f'error: cannot serve the page at port {port} of 127.0.0.1: Address already in use'
-    assert reported in output and 'Traceback' not in output
+def test_a_page_of_another_site_is_turned_away_and_a_port_in_use_is_named(arm26):
+    port = free_port()
+    page = Page(arm26, '127.0.0.1', port, True, lambda *_: None)
+    try:
+        foreign = 'http://evil.example', f'http://evil.example:{port}', 'null', 'http://[bad'
+        for origin in foreign:
+            with pytest.raises(InvalidStatus, match='403'):
+                visit(port, origin)
+        with visit(port, f'http://localhost:{port}') as mine:
+            assert mine.recv(timeout=300)
+        named = f'cannot serve the page at port {port} of 127.0.0.1: Address already in use'
+        with pytest.raises(MusculoskeletalError, match=named):
+            Page(arm26, '127.0.0.1', port, True, lambda *_: None)
+    finally:
+        page.close()
