@@ -13,10 +13,11 @@ from pathlib import Path
 import bodies
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 from graph import DEADLINE, Graph, Process
 from rcl_interfaces.srv import GetParameters
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, UInt8MultiArray
+from std_msgs.msg import Bool, String, UInt8MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.importing.convert import import_robot
@@ -158,8 +159,8 @@ def test_a_new_robot_is_trained_once_estimated_recorded_and_another_reality_repo
 
     # Option --network keeps the discovery range of the environment.
     recording = tmp_path / 'run'
-    options = ['--reality', str(model), '--network', '--duration', '8', '--record', str(recording)]
-    run = bringup(*chosen, *options, ROS_AUTOMATIC_DISCOVERY_RANGE='SUBNET')
+    options = ['--reality', str(model), '--network', '--duration', '5', '--record', str(recording)]
+    run = bringup(*chosen, *options, '--combined', ROS_AUTOMATIC_DISCOVERY_RANGE='SUBNET')
     reported = f"-- reality {model}: joint 'elbow' moves from -1.5 to 0.2 there"
     assert 'training the initial network' in read_until(run, reported)
     assert set(reaches(run)) == {'ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET'}
@@ -290,7 +291,7 @@ def driver(namespace):
     return Process('driver.py', [*command, '--ros-args', '-r', f'__ns:=/{namespace}'])
 
 
-def test_an_arm_of_ones_own_is_waited_for_checked_and_learned_and_ctrl_c_ends_it_cleanly(
+def test_an_arm_of_ones_own_is_waited_for_checked_and_explored_and_ctrl_c_ends_it_cleanly(
     bringup, environment, join
 ):
     run = bringup('--robot', 'arm26', '--hardware', '--explore', '--namespace', 'own')
@@ -299,12 +300,13 @@ def test_an_arm_of_ones_own_is_waited_for_checked_and_learned_and_ctrl_c_ends_it
     second = bringup('--robot', 'arm26', '--namespace', 'own')
     graph = join('/own')
     graph.processes += [run, driver('own')]
+    modes = graph.listen(String, 'controller_mode', LATCHED)
+    states = graph.listen(DiagnosticArray, '/diagnostics')
     transcript += read_until(run, 'starting controller')
     # Every start explores other postures, and states how to repeat them.
     assert re.search(r'seed of the exploration: \d+', transcript)
-    explore_fast(graph, 'controller')
-    learned = graph.listen(UInt8MultiArray, 'mae_checkpoint', LATCHED)
-    graph.wait(lambda: len(learned) > 1, 'an update of the network', 8 * DEADLINE)
+    graph.wait(lambda: modes and modes[-1].data == 'exploring', 'the exploration')
+    graph.wait(lambda: states and graph.report('learner').level == 'ok', 'the learner')
     status, output = second.ended()
     assert status == 2 and "'/own' is in use" in output and '--namespace' in output
     status, output = graph.ended(run, signal.SIGINT)
@@ -312,4 +314,4 @@ def test_an_arm_of_ones_own_is_waited_for_checked_and_learned_and_ctrl_c_ends_it
     assert 'no fault found; not judged: ' in transcript + output
     assert status == 130 and 'Traceback' not in output and left_behind(run) == ''
     kept = Path(environment['XDG_STATE_HOME']) / 'musculoskeletal_ae' / 'arm26' / 'own'
-    assert kept.is_dir()  # what was learned of a real arm is kept for the next run
+    assert kept.is_dir()  # what is learned of a real arm is kept for the next run
