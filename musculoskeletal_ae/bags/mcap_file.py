@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -264,6 +265,11 @@ def _qos(text: str) -> list[Qos]:
     if len(text) > _LONGEST_QOS:
         return []
     try:
-        return parse_qos(text)
+        return list(_parse_qos(text))
     except Exception:  # noqa: BLE001 - the library raises many types; profiles are only a hint
         return []
+
+
+@lru_cache(maxsize=64)  # most topics have equal profiles, and the library parses them slowly
+def _parse_qos(text: str) -> tuple[Qos, ...]:
+    return tuple(parse_qos(text))

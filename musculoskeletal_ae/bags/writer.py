@@ -49,6 +49,7 @@ class BagWriter:
         self._pending: list[tuple[int, str, int, bytes]] = []
         self._pending_size = 0
         self._times: tuple[int, int] | None = None  # earliest and latest log time [ns]
+        self._has_new_topics = True  # whether the next flush must write metadata.yaml
         with self._writing():
             is_new = not self.directory.exists()
             self.directory.mkdir(parents=True, exist_ok=True)
@@ -68,12 +69,11 @@ class BagWriter:
             )
             self._mcap.start(profile='ros2')
         self.flush()
-        self._write_metadata(finished=False)
 
     def add_topic(
         self, name: str, type_name: str, qos: Sequence[Qos] = (), schema: Schema | None = None
     ) -> None:
-        """Add a topic.
+        """Add a topic; the next `flush` writes it to metadata.yaml.
 
         Args:
             name: Absolute name.
@@ -97,7 +97,7 @@ class BagWriter:
         )
         self._hashes[name] = type_hash
         self.topics[name] = BagTopic(name, type_name, qos=list(qos))
-        self._write_metadata(finished=False)
+        self._has_new_topics = True
 
     def write(self, topic: str, log_time: int, publish_time: int, data: bytes) -> None:
         """Add a serialized message to a topic; the next `flush` writes it to the file."""
@@ -118,6 +118,8 @@ class BagWriter:
                 start, end = self._times or (log_time, log_time)
                 self._times = min(start, log_time), max(end, log_time)
             self._mcap.flush()
+        if self._has_new_topics:
+            self._write_metadata(finished=False)
 
     @property
     def message_count(self) -> int:
@@ -149,6 +151,7 @@ class BagWriter:
             metadata.write_metadata(
                 self.directory, self._name, topics, self._times, finished, self.custom
             )
+        self._has_new_topics = False
 
     @contextmanager
     def _writing(self) -> Iterator[None]:

@@ -69,6 +69,14 @@ def test_metadata_says_what_is_in_the_file(bag, content):
         assert qos['durability'] == ('transient_local' if latched else 'volatile')
 
 
+def test_metadata_of_a_recording_names_its_topics_since_the_last_flush(tmp_path, content):
+    samples.write_ours(tmp_path / 'bag', content, finish=False)
+    text = (tmp_path / 'bag' / 'metadata.yaml').read_text()
+    info = yaml.safe_load(text)['rosbag2_bagfile_information']
+    named = {entry['topic_metadata']['name'] for entry in info['topics_with_message_count']}
+    assert named == {sample.topic for sample in content}
+
+
 def test_qos_in_the_mcap_file_can_be_read_again(bag):
     assert Bag.open(bag).topics['/left_arm/robot_description'].qos == [offered_qos(latched=True)]
 
