@@ -12,7 +12,7 @@ from bags.bare_file import FLOAT, ONE, write
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError
 
-TRIALS = 30  # number of damaged copies of each kind of bag
+TRIALS = 20  # number of damaged copies of each kind of bag
 NUMBERS = (0, 1, 2**31, 2**32 - 1, 2**40, 2**62, 2**63, 2**64 - 1)
 
 
@@ -149,7 +149,7 @@ def test_a_file_that_becomes_shorter_while_it_is_read_is_refused(content, tmp_pa
 
 
 def test_a_few_kilobytes_do_not_become_hours_of_work(tmp_path):
-    still = [samples.Sample('/anomaly', FLOAT, 5, 5, ONE)] * 300_000
+    still = [samples.Sample('/anomaly', FLOAT, 5, 5, ONE + bytes(1000))] * 12_000
     options = {'chunk_size': 1 << 24, 'index_types': samples.IndexType.NONE}
     samples.write_mcap(tmp_path / 'a.mcap', still, **options)
     with pytest.raises(BagError, match='bytes decompress to more than'):
@@ -167,7 +167,7 @@ def test_a_chunk_that_decompresses_to_more_than_it_announces_is_refused(tmp_path
 
 
 def test_a_recording_whose_times_run_backwards_is_refused_at_once(tmp_path):
-    times = range(10**12, 0, -(10**7))
+    times = range(10**12, 99 * 10**10, -(10**7))
     back = [samples.Sample('/anomaly', FLOAT, time, time, ONE) for time in times]
     samples.write_mcap(tmp_path / 'a.mcap', back)
     with pytest.raises(BagError, match=r'log times of /anomaly go back by 1\.0\d* s; legal'):

@@ -14,17 +14,23 @@ from bags.bare_file import write
 from musculoskeletal_ae.bags import message_types
 from musculoskeletal_ae.bags.check import check_bag
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.topics import interface_topics
+from musculoskeletal_ae.bags.topics import TOPICS, interface_topics
 from musculoskeletal_ae.exceptions import BagError
 
 LINE = '=' * 80 + '\n'
 
 
-@pytest.mark.parametrize('end', ['\n', '\r\n'])
-def test_our_types_are_those_of_the_installed_ros_messages(end):
+@pytest.mark.parametrize(
+    'types',
+    [
+        {topic.type for topic in TOPICS.values()},
+        pytest.param(message_types.TYPESTORE.fielddefs, marks=pytest.mark.thorough, id='all'),
+    ],
+)
+def test_our_types_are_those_of_the_installed_ros_messages(types):
     share = Path(sys.prefix) / 'share'
     compared = 0
-    for type_name in sorted(message_types.TYPESTORE.fielddefs):
+    for type_name in sorted(types):
         package, _, name = type_name.split('/')
         file = share / package / 'msg' / f'{name}.msg'
         if not file.exists():
@@ -37,12 +43,14 @@ def test_our_types_are_those_of_the_installed_ros_messages(end):
                 package, name = line[5:].split('/')
                 contained = (share / package / 'msg' / f'{name}.msg').read_text()
                 text += f'\n{LINE}{line}\n{contained}'
-        text = end.join(text.splitlines())
-        assert message_types.mismatch(type_name, 'ros2msg', text.encode(), '') == ''
+        # A recorder on Windows writes other ends of lines.
+        end = '\r\n' if compared % 5 == 0 else '\n'
+        data = end.join(text.splitlines()).encode()
+        assert message_types.mismatch(type_name, 'ros2msg', data, '') == ''
         compared += 1
     if not compared:
         pytest.skip('the message packages are not in this environment')
-    assert compared > 100
+    assert compared > 0.6 * len(types)
 
 
 @pytest.mark.parametrize(
