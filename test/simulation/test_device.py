@@ -33,7 +33,10 @@ class Devices(TorchFunctionMode):
         return result
 
 
-@pytest.fixture(scope='module', params=['arm26', 'musashi_upper_body', 'slider'])
+@pytest.fixture(
+    scope='module',
+    params=['arm26', pytest.param('musashi_upper_body', marks=pytest.mark.thorough), 'slider'],
+)
 def robot(request, tmp_path_factory):
     if request.param != 'slider':
         return Robot.load(request.param)
@@ -46,7 +49,7 @@ def robot(request, tmp_path_factory):
 @pytest.fixture(scope='module')
 def mae(robot):
     touch = TouchStatistics(np.full(robot.muscle_count, 0.15), np.ones(robot.joint_count))
-    return replace(initial_mae(robot, steps=20).mae, touch=touch)
+    return replace(initial_mae(robot, steps=2).mae, touch=touch)
 
 
 def pushed(robot, mae, device):

@@ -102,10 +102,10 @@ def test_at_rest_tension_is_what_stiffness_control_makes_of_the_command(robot, b
     )
 
 
-def test_a_held_command_keeps_the_arm_still_for_a_thousand_steps(robot, body, commands):
+def test_a_held_command_keeps_the_arm_still_for_three_seconds(robot, body, commands):
     arms = settled(robot, body, commands)
     rest = arms.state
-    for _ in range(1000):
+    for _ in range(300):
         state = arms.step(0.01)
     assert np.abs(state.theta - rest.theta).max() < 1e-4
     assert np.abs(state.tension - rest.tension).max() < 0.05
@@ -247,7 +247,7 @@ def test_friction_holds_the_arm_after_winding_in(robot, commands, friction):
 
 
 def test_with_a_network_the_arm_rests_at_the_equilibrium_of_the_nominal_body(arm26, mae):
-    commands = random_commands(arm26, 10, seed=2)
+    commands = random_commands(arm26, 5, seed=2)
     theta, _, drift, tension_drift = rest_errors(arm26, mae, 'default', commands)
     # Networks of five training seeds had at most 0.004 rad (error), 1e-6 rad and 1e-4 N (drift).
     assert np.median(theta.max(axis=1)) < 0.02
@@ -293,7 +293,7 @@ def test_a_nonsense_network_keeps_the_arm_within_its_limits(arm26, mae, preset):
     arms = Simulation(arm26, replace(mae, decoder=wild), preset, arms=3)
     arms.command = random_commands(arm26, 3, seed=0)
     arms.wrench[:] = 1e6
-    state = arms.step(2.0)
+    state = arms.step(0.5)
     assert np.all((state.theta >= arm26.lower) & (state.theta <= arm26.upper))
     assert np.all((state.tension >= arm26.tension.bias) & (state.tension <= arm26.tension.max))
     arms.use(mae)
