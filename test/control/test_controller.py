@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from control_bench import DT, OTHER, REST, ROBOT, Bench, settled, values
 from exact_mae import ExactMae, rest_readings
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.control import status
@@ -42,6 +42,7 @@ def shifted():
 
 @settings(max_examples=20)
 @given(st.lists(st.tuples(st.sampled_from(sorted(EVENTS)), st.integers(0, 60)), max_size=8))
+@example([('moved', 1)])  # during the first motion
 def test_length_commands_are_finite_and_keep_the_rate_limit_under_any_sequence_of_events(events):
     bench = Bench(first_duration=1.0, second_duration=0.5)
     bench.target(REST)
