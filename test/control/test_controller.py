@@ -166,10 +166,14 @@ def test_an_anomaly_stops_the_arm_even_before_the_first_command():
     assert None not in bench.step(3)
 
 
-def test_an_exception_in_the_controller_stops_the_arm_and_the_controller_goes_on():
+@pytest.mark.parametrize('during', ['request', 'step'])
+def test_an_exception_in_the_controller_stops_the_arm_and_the_controller_goes_on(during):
     bench = settled(first_duration=0.5)
+    if during == 'step':
+        bench.target(OTHER)
     bench.mae.fail = ZeroDivisionError()
-    bench.target(OTHER)
+    if during == 'request':
+        bench.target(OTHER)
     assert None not in bench.step(50)
     assert 'ZeroDivisionError' in bench.condition
     bench.mae.fail = None
