@@ -22,8 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
-from matplotlib.figure import Figure
 
 from musculoskeletal_ae.control import stops_page
 from musculoskeletal_ae.experiments import plots, robustness, sensors
@@ -82,7 +80,6 @@ MODULES = {
 }
 
 
-MUSCLE_COLOURS = colormaps['tab10'].colors
 PARAMETERS_INTRODUCTION = """\
 `python doc/make.py` writes this page from the code. Pass parameters with `--ros-args -p
 NAME:=VALUE`, `--params-file FILE`, or `./bringup.sh -p NODE:NAME:=VALUE`.
@@ -358,6 +355,10 @@ def draw_series_elastic(file: Path) -> None:
 
 def draw_muscles(file: Path) -> None:
     """Draw an arm with its muscles, each in a different colour and with its name."""
+    from matplotlib import colormaps
+    from matplotlib.figure import Figure
+
+    colours = colormaps['tab10'].colors
     robot = Robot.load('musashi_left_arm')
     theta = robot.lower + 0.35 * (robot.upper - robot.lower)
     theta[0] = 0.4 * robot.upper[0]
@@ -374,7 +375,7 @@ def draw_muscles(file: Path) -> None:
         axes.view_init(elev=8.0, azim=azimuth + 12.0)
         axes.set_axis_off()
         axes.set_title(title, y=0.98)
-        muscles = iter(zip(robot.muscles, MUSCLE_COLOURS))
+        muscles = iter(zip(robot.muscles, colours))
         for part in parts:
             if part.kind != 'muscles':
                 axes.plot(*part.points.T, color='#D8D4C8', lw=9.0, solid_capstyle='round', zorder=1)

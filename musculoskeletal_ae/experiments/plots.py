@@ -6,7 +6,6 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from musculoskeletal_ae.experiments.recording import Motion
 from musculoskeletal_ae.robot.description import shown
@@ -38,6 +37,8 @@ STYLES: dict[str, dict[str, Any]] = {
 
 def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> Any:
     """Return a figure of `width` × `height` [inch], and an array of its axes, row by row."""
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(width, height), layout='constrained')
     return figure, figure.subplots(rows, columns, squeeze=False, **options).ravel()
 
@@ -135,11 +136,13 @@ def ranked_bars(
 
 def pictures(
     robot: Robot, motions: Mapping[str, Motion], moments: Mapping[str, int], title: str
-) -> Figure:
+) -> Any:
     """Draw arms in a grid: a row for each motion, and a column for each moment (index of a step).
 
     Bones are grey; muscles are green at T_bias and red at T_limit.
     """
+    from matplotlib.figure import Figure
+
     rows, columns = len(motions), len(moments)
     height = 2.6 * rows + HEADER
     figure = Figure(figsize=(2.5 * columns + 0.4, height))

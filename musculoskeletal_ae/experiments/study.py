@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.modules import Arm
@@ -158,7 +157,7 @@ def round_numbers(value: Any, path: str = '') -> Any:
 
 
 Rows = Mapping[int, Measured]  # the results of an experiment, by the individuals' seeds
-Plot = tuple[Figure, str]  # a figure and its caption
+Plot = tuple[Any, str]  # a figure of matplotlib and its caption
 
 
 def first_individual(rows: Rows) -> tuple[int, Measured]:

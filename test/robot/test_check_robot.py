@@ -6,7 +6,6 @@ import sys
 import numpy as np
 import pytest
 from graph import executable
-from matplotlib.figure import Figure
 from robots import copy_robot, read_muscles, write_muscles, write_robot
 from scipy.linalg import eigh
 
@@ -425,6 +424,8 @@ def test_a_plot_that_cannot_be_is_refused_before_the_work(file, tmp_path, capsys
 
 
 def test_a_plot_that_cannot_be_written_is_an_error(tmp_path):
+    from matplotlib.figure import Figure
+
     file = tmp_path / 'plot.png'
     file.mkdir()
     with pytest.raises(MusculoskeletalError, match='cannot be written'):
