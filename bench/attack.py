@@ -51,7 +51,7 @@ MOST_MEMORY = 500.0  # largest legal memory of a node at any time [MB]
 
 
 class Size(NamedTuple):
-    """Numbers of trials of each kind, over all seeds."""
+    """Numbers of trials of each kind, over all seeds, and the rate of the arm."""
 
     attacks: int | None  # number of known attacks, or None for all of them
     events: int
@@ -60,10 +60,11 @@ class Size(NamedTuple):
     learner_kills: int
     files: int
     episodes: int
+    rate: float = 100.0  # rate of the muscle modules' messages [Hz]
 
 
 FULL = Size(None, 2000, messages=100_000, node_kills=40, learner_kills=12, files=600, episodes=20)
-QUICK = Size(1, 2, messages=300, node_kills=1, learner_kills=0, files=7, episodes=1)
+QUICK = Size(1, 2, messages=300, node_kills=1, learner_kills=0, files=7, episodes=1, rate=50.0)
 SEEDS = 0, 1, 2, 3, 4
 EVENTS_IN_A_ROW = 50  # number of random events between two recoveries of the arm
 
@@ -179,7 +180,7 @@ def attack_graph(
     from bench.attack_kinds import Scene, random_event
 
     folder.mkdir(parents=True, exist_ok=True)
-    with Attack(folder, initial, seed) as attack:
+    with Attack(folder, initial, seed, size.rate) as attack:
         scene = Scene(attack)
         attack.spin(2.0)
         for number, (kind, shape, moment) in enumerate(planned):
