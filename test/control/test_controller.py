@@ -40,7 +40,7 @@ def shifted():
     return mae
 
 
-@settings(max_examples=20)
+@settings(max_examples=15)
 @given(st.lists(st.tuples(st.sampled_from(sorted(EVENTS)), st.integers(0, 60)), max_size=8))
 @example([('moved', 1)])  # during the first motion
 def test_length_commands_are_finite_and_keep_the_rate_limit_under_any_sequence_of_events(events):

@@ -127,7 +127,7 @@ OTHERS = [
     pytest.param(f'bias:temperature:{MUSCLE}:90', 2.5, 'overheated', marks=thorough),
     (f'overheat:{MUSCLE}:120', 2.5, 'overheated'),
     pytest.param(f'freeze:{MUSCLE}', 2.5, None, marks=thorough),
-    ('freeze', 1.5, None),
+    pytest.param('freeze', 1.5, None, marks=thorough),
     (f'dead_sensor:{MUSCLE}', 1.5, None),
     pytest.param(f'nan_sensor:{MUSCLE}', 1.0, 'older than', marks=thorough),
     pytest.param(f'dead_sensor:tension:{MUSCLE}', 2.5, None, marks=thorough),

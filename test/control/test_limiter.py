@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from control_bench import sample
 from hypothesis import given
+from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -31,6 +32,7 @@ def vectors(low, high):
     return st.lists(st.floats(low, high), min_size=COUNT, max_size=COUNT).map(np.array)
 
 
+@hypothesis_settings(max_examples=40)
 @given(
     st.lists(st.tuples(vectors(-1.0, 1.0), vectors(-0.3, 0.02), vectors(BIAS, MAX)), max_size=6),
     st.floats(0.001, 1.0),
@@ -106,6 +108,7 @@ def test_a_wrong_length_sensor_pays_out_to_the_longest_length_of_the_muscle_at_m
     assert (sent <= ROBOT.routes.relative_lengths(theta).max(axis=0) + 1.1 * LENGTH_MARGIN).all()
 
 
+@hypothesis_settings(max_examples=40)
 @given(st.lists(st.tuples(vectors(-100.0, 900.0), vectors(BIAS, MAX)), max_size=6))
 def test_tensions_stay_within_bias_and_limit_and_rise_no_faster_than_the_lengths_would(commands):
     settings = Settings()
@@ -118,6 +121,7 @@ def test_tensions_stay_within_bias_and_limit_and_rise_no_faster_than_the_lengths
         before = sent
 
 
+@hypothesis_settings(max_examples=40)
 @given(
     st.lists(
         st.tuples(st.booleans(), vectors(-0.1, 0.1), vectors(BIAS, MAX)), min_size=2, max_size=15

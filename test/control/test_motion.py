@@ -186,10 +186,11 @@ def test_slow_hand_poses_and_twists_keep_a_moving_arm_within_its_limits(bench):
 
 
 def test_a_target_takes_over_from_a_trajectory_without_a_jump(bench):
+    bench.configure(target_duration=1.0)
     bench.core.trajectory(points(OTHER))
     sent = moved(bench, 50)
     bench.target(REST)
-    sent += moved(bench, 600)
+    sent += moved(bench, 200)
     assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * DT + 1e-9
     assert bench.report().message == 'holding'
 

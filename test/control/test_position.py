@@ -10,6 +10,7 @@ import pytest
 from control_bench import sample
 from exact_mae import ExactMae
 from hypothesis import given
+from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.control.command import LENGTH, TENSION, Command
@@ -43,6 +44,7 @@ def pull_in_this_posture(length, tension, command):
     return np.array([np.interp(s, column, grid) for s, column in zip(stretch, table.T)])
 
 
+@hypothesis_settings(max_examples=40)
 @given(st.lists(st.tuples(vectors(-1.0, 1.0), vectors(0.0, 260.0)), min_size=1, max_size=5),
        vectors(60.0, 190.0))  # fmt: skip
 def test_no_command_stretches_a_muscle_beyond_the_limit_even_if_no_joint_gives_way(messages, limit):

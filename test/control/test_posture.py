@@ -3,6 +3,7 @@
 
 import numpy as np
 from hypothesis import given
+from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.control.ramps import Ramp
@@ -10,6 +11,7 @@ from musculoskeletal_ae.control.ramps import Ramp
 values = st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3).map(np.array)
 
 
+@hypothesis_settings(max_examples=40)
 @given(values, values, st.floats(0.0, 3.0), st.floats(0.01, 1.0))
 def test_a_ramp_ends_at_the_goal_and_is_never_faster_than_the_limit(start, goal, duration, limit):
     ramp, before, steps = Ramp(start, goal, duration, limit), start, 0

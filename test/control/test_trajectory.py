@@ -6,6 +6,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 from hypothesis import given
+from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from robots import write_robot
 
@@ -38,6 +39,7 @@ def made(rows, order):
     return points, Trajectory.through(Setpoint.resting(MIDDLE), points)
 
 
+@hypothesis_settings(max_examples=40)
 @given(rows, st.integers(0, 2), st.floats(1.0, 5.0))
 def test_a_slowed_trajectory_passes_its_points_with_scaled_derivatives(rows, order, slower):
     points, trajectory = made(rows, order)
@@ -64,6 +66,7 @@ def test_points_at_nearly_the_same_time_are_refused():
         Trajectory.through(Setpoint.resting(MIDDLE), points)
 
 
+@hypothesis_settings(max_examples=40)
 @given(rows, st.integers(0, 2), st.floats(0.01, 0.99))
 def test_velocity_and_acceleration_are_the_derivatives(rows, order, share):
     _, trajectory = made(rows, order)
@@ -77,6 +80,7 @@ def test_velocity_and_acceleration_are_the_derivatives(rows, order, share):
     np.testing.assert_allclose(bend, at.acceleration, atol=1e-2, rtol=1e-3)
 
 
+@hypothesis_settings(max_examples=40)
 @given(rows, st.integers(0, 2))
 def test_as_many_derivatives_are_continuous_as_the_points_have(rows, order):
     _, trajectory = made(rows, order)
