@@ -3,6 +3,8 @@
 
 import signal
 from argparse import Namespace
+from contextlib import redirect_stdout
+from io import StringIO
 
 import pytest
 from graph import PATIENCE
@@ -21,6 +23,13 @@ def check(graph, *options):
     return graph.run('check_driver', *COMMON, *options)
 
 
+def check_here(graph, *options):
+    """Run check_driver in this process, and the driver in another thread; return the status."""
+    remap = ['--ros-args', '-r', f'__ns:={graph.namespace}']
+    with graph.spinning():
+        return check_driver.main([*COMMON, *options, *remap])
+
+
 def start_driver(graph, **parameters):
     graph.host(HardwareEmulator, robot='arm26', rate=RATE, **parameters)
     graph.listen(Float64MultiArray, 'muscle_states')
@@ -35,13 +44,19 @@ def ended(graph, process):
 
 def test_a_sound_driver_is_moved_by_move_after_an_announcement_and_passes(graph):
     start_driver(graph)
-    commands = graph.listen(Float64MultiArray, 'muscle_length_command')
+    printed, said = StringIO(), []
+
+    def on_command(_):
+        said.append(printed.getvalue())
+
+    graph.node.create_subscription(Float64MultiArray, 'muscle_length_command', on_command, 10)
     # On a busy machine, messages of a healthy driver may be irregular. With --wait, `check_driver`
     # repeats the check until they are regular.
-    process = check(graph, '--wait', '--seconds', '1', '--move', '--muscles', 'biceps_long')
-    graph.wait(lambda: commands, 'the first command')
-    assert 'moves now' in process.output
-    status, output = ended(graph, process)
+    with redirect_stdout(printed):
+        options = ['--wait', '--seconds', '1', '--move', '--muscles', 'biceps_long']
+        status = check_here(graph, *options)
+    assert 'moves now' in said[0]  # before the first command
+    output = printed.getvalue()
     faults = [line for line in output.splitlines() if line.startswith('fault: ')]
     assert {line.split()[1] for line in faults} <= {'latency', 'rate'}, output
     assert status == 0 or faults
@@ -113,23 +128,22 @@ def test_a_muscle_that_cannot_be_moved_is_refused_at_once(options, problem, caps
 def test_check_driver_does_not_move_an_arm_under_control(graph, capsys):
     start_driver(graph)
     graph.publisher(Float64MultiArray, 'muscle_length_command')
-    options = [*COMMON, '--seconds', '0.5', '--move']
-    with graph.spinning():
-        status = check_driver.main([*options, '--ros-args', '-r', f'__ns:={graph.namespace}'])
-    assert status == 1
+    assert check_here(graph, '--seconds', '0.5', '--move') == 1
     printed, refusal = capsys.readouterr()
     assert 'stop the controller' in refusal and 'moves now' not in printed
 
 
-def test_check_driver_stops_moving_when_a_controller_starts(graph):
+def test_check_driver_stops_moving_when_a_controller_starts(graph, capsys):
     start_driver(graph)
-    commands = graph.listen(Float64MultiArray, 'muscle_length_command')
-    process = check(graph, '--wait', '--seconds', '1', '--move')
-    graph.wait(lambda: commands, 'the first command')
-    graph.publisher(Float64MultiArray, 'muscle_length_command')
-    status, output = ended(graph, process)
-    assert status == 1
-    assert 'stop the controller' in output
+    topic, controller = 'muscle_length_command', []
+
+    def start_controller(_):
+        if not controller:
+            controller.append(graph.node.create_publisher(Float64MultiArray, topic, 10))
+
+    graph.node.create_subscription(Float64MultiArray, topic, start_controller, 10)
+    assert check_here(graph, '--wait', '--seconds', '1', '--move') == 1
+    assert controller and 'stop the controller' in capsys.readouterr().err
 
 
 def test_nodes_report_the_topics_that_they_wait_for(graph, capfd):
