@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Emulator, estimator and controller on one graph, with helpers for tests."""
 
+import signal
+
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
@@ -66,10 +68,10 @@ class ControlledArm:
             **parameters,
         )
 
-    def kill(self, process):
+    def kill(self, process, number=signal.SIGKILL):
         """Kill a node on purpose, while the others continue."""
         self.graph.processes.remove(process)
-        process.process.kill()
+        process.process.send_signal(number)
         self.graph.wait(lambda: not process.alive(), f'the end of {process.name}')
 
     def set_max_age(self, seconds):

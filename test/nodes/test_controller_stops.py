@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every stop cause on a real graph, and how the arm resumes."""
 
+import signal
+
 import numpy as np
 import pytest
 from controlled_arm import IMPATIENT, PATIENT, ControlledArm
@@ -71,9 +73,12 @@ def test_a_stop_pays_out_is_reported_and_recorded_and_ends_only_by_a_reset(
     assert {'muscle_states', 'estimated_joint_states', 'target_joint_states'} <= heard
 
 
-def test_a_killed_estimator_stops_the_arm_and_a_new_one_lets_it_resume(moving):
+def test_a_crashed_estimator_stops_the_arm_and_a_new_one_lets_it_resume(moving):
     arm = moving('estimator')
-    arm.kill(arm.estimator)
+    arm.kill(arm.estimator, signal.SIGSEGV)
+    status, output = arm.estimator.ended()
+    assert status == -signal.SIGSEGV
+    assert 'Segmentation fault' in output and 'File "' in output  # says where it happened
     arm.set_max_age(IMPATIENT)
     arm.says('stale_estimate')
     answer = reset(arm)

@@ -2,7 +2,6 @@
 """No request or message ends a node, and every request gets a response."""
 
 import math
-import signal
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -167,12 +166,3 @@ def test_the_status_line_waits_for_a_slow_start_for_a_limited_time(graph):
     status.started = None
     with pytest.raises(SystemExit, match='did not come up'):
         status._print()
-
-
-def test_a_crash_of_the_interpreter_prints_where_it_happened(graph):
-    graph.listen(DiagnosticArray, '/diagnostics', 100)
-    process = graph.start('estimator', robot='arm26')
-    graph.wait(lambda: states(graph, 'estimator'), 'the first report of the estimator')
-    status, output = graph.ended(process, signal.SIGSEGV)
-    assert status == -signal.SIGSEGV
-    assert 'Segmentation fault' in output and 'File "' in output
