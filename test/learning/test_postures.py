@@ -172,20 +172,24 @@ def test_the_jacobian_of_the_residuals_is_the_difference_quotient(arm26, resting
         column += layout.size
 
 
-def test_the_covariance_without_joint_sensors_covers_errors_common_to_all_samples(arm26):
-    inside = []
-    for seed in (0, 2, 4):  # of several seeds, these give the bodies with the largest errors
-        resting = Resting(drawn_body(arm26, 20 + seed, seed, 1.0), seed=seed)
-        observed, test = resting.observations(60), resting.observations(40)
-        body = CalibratedBody(arm26)
-        estimate = on_calibrated_body(arm26, body).estimate
-        fit = fit_body(body, blind(observed), guess=estimate(*observed.state()[1:]))
-        exact = SimpleNamespace(
-            estimate=lambda *observed, e=estimate: SimpleNamespace(theta=e(*observed))
-        )
-        tension = observed.end_tension(body.transmission)
-        covariance = estimate_covariance(exact, body, fit, tension, seed, None)
-        error = estimate(test.end_tension(body.transmission), test.length) - test.theta
-        inside.append((ellipsoids(covariance, error) <= 1.0).mean())
-    # Measured: 0.76. If all samples counted as independent, it would be 0.55.
-    assert np.mean(inside) > 0.65
+# Of several seeds, these give the bodies with the largest errors.
+@pytest.mark.parametrize(
+    'seed',
+    [
+        2,
+        pytest.param(0, marks=pytest.mark.thorough),
+        pytest.param(4, marks=pytest.mark.thorough),
+    ],
+)
+def test_the_covariance_without_joint_sensors_covers_errors_common_to_all_samples(arm26, seed):
+    resting = Resting(drawn_body(arm26, 20 + seed, seed, 1.0), seed=seed)
+    observed, test = resting.observations(60), resting.observations(40)
+    body = CalibratedBody(arm26)
+    estimate = on_calibrated_body(arm26, body).estimate
+    fit = fit_body(body, blind(observed), guess=estimate(*observed.state()[1:]))
+    exact = SimpleNamespace(estimate=lambda *observed: SimpleNamespace(theta=estimate(*observed)))
+    tension = observed.end_tension(body.transmission)
+    covariance = estimate_covariance(exact, body, fit, tension, seed, None)
+    error = estimate(test.end_tension(body.transmission), test.length) - test.theta
+    # Measured: 0.97 with seed 2, and 1.0 with the others.
+    assert (ellipsoids(covariance, error) <= 1.0).mean() > 0.8
