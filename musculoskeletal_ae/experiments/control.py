@@ -68,7 +68,7 @@ class Durations(NamedTuple):
 
 DURATIONS = Durations(5.0, 8.0, 5.0, 2.0)
 #: the same in a shortened run, whose approaches begin on the way to a start
-QUICK_DURATIONS = Durations(1.0, 3.5, 2.0, 1.0)
+QUICK_DURATIONS = Durations(0.5, 2.0, 1.0, 0.5)
 
 
 class Approaches(NamedTuple):

@@ -56,6 +56,7 @@ class GraspAndRupture:
         seed: int,
         switched_off: bool = False,
         most: int | None = None,
+        slot: float = SLOT,
     ) -> None:
         """Plan a motion, and the ruptures after it.
 
@@ -65,6 +66,7 @@ class GraspAndRupture:
             seed: Random seed of the waits before the ruptures.
             switched_off: Whether muscles are switched off instead of ruptured.
             most: Largest number of muscles to rupture; None for all of them.
+            slot: Time for each muscle [s]; it shortens the longest wait for the rupture.
         """
         count, self._switched_off = robot.muscle_count, switched_off
         self.grasp, self._motion = 0.5 * duration, duration  # [s]
@@ -72,7 +74,8 @@ class GraspAndRupture:
         self.free, self.loaded = rows_between(0.0, self.grasp), rows_between(self.grasp, duration)
         # Start with the second muscle, which the paper deactivates.
         self.order = [*range(min(1, count - 1), count), *range(min(1, count - 1))][:most]
-        self.duration = duration + SLOT * len(self.order)  # duration of the whole script [s]
+        self._slot, self._latest = slot, slot - (SLOT - LATEST_RUPTURE)  # [s]
+        self.duration = duration + slot * len(self.order)  # duration of the whole script [s]
         #: time of each muscle's rupture [s], (M,); NaN for muscles that do not rupture
         self.rupture = np.full(count, np.nan)
         #: whether each muscle carried tension when it ruptured, (M,)
@@ -112,13 +115,13 @@ class GraspAndRupture:
         if abs(time - self.grasp) < 0.5 * SAMPLE_TIME:
             arm.set_payload(PAYLOAD)
         now = time + 1e-9
-        place = int((now - self._motion) // SLOT)
+        place = int((now - self._motion) // self._slot)
         if not 0 <= place < len(self.order):
             return None
-        muscle, elapsed = self.order[place], now - self._motion - SLOT * place
+        muscle, elapsed = self.order[place], now - self._motion - self._slot * place
         if np.isnan(self.rupture[muscle]):
             carries = arm.tension[muscle] > self._robot.tension.bias[muscle] + CARRYING
-            if elapsed >= LATEST_RUPTURE or (carries and elapsed >= self._wait[muscle]):
+            if elapsed >= self._latest or (carries and elapsed >= self._wait[muscle]):
                 self.rupture[muscle], self.carried[muscle] = time, carries
                 if not self._switched_off:
                     arm.set_ruptured([self._robot.muscles[muscle]])

@@ -37,6 +37,7 @@ from musculoskeletal_ae.experiments.baselines import baseline_errors
 from musculoskeletal_ae.experiments.detection import (
     PAYLOAD,
     RUPTURE_TIME,
+    SLOT,
     DetectorOutput,
     GraspAndRupture,
     anomaly_levels,
@@ -71,7 +72,8 @@ HEALTHY_STREAM = 9500
 HEALTHY_TIME = 3600.0
 PLOT_START = 60.0  # time that plots show before the grasp [s]
 PLOT_TAIL = 3.0  # time that plots show after the repair [s]
-QUICK_RUPTURES = 1  # number of muscles that rupture in a shortened run
+#: number of muscles that rupture in a shortened run, and the time for each of them [s]
+QUICK_RUPTURES, QUICK_SLOT = 1, 10.0
 OFF_TIME = 40.0  # duration of the motion before muscles are switched off [s]
 QUICK_OFF_TIME = 10.0  # the same in a shortened run [s]
 #: times of the pictures [s], at ends of the motion's cycles without and with the payload; a
@@ -84,15 +86,15 @@ OFF_KEYS = 'detection_s', 'detected_share', 'named_share'  # keys reported for s
 def measure(study: Study, seed: int) -> Measured:
     """Measure the estimates of one individual, and the detection of its ruptured muscles."""
     robot = study.robot
-    most = QUICK_RUPTURES if study.quick else None
-    plan = GraspAndRupture(robot, study.held_out_time, seed, most=most)
+    most, slot = (QUICK_RUPTURES, QUICK_SLOT) if study.quick else (None, SLOT)
+    plan = GraspAndRupture(robot, study.held_out_time, seed, most=most, slot=slot)
     driven_by = study.network(None, 'default')
     faulty = record(study.arm(seed), driven_by, HELD_OUT_STREAM, plan.duration, plan)
     duration = 10.0 if study.quick else HEALTHY_TIME / len(study.seeds)
     stream = HEALTHY_STREAM + seed
     healthy = record(study.arm(seed), driven_by, stream, duration, grasp_and_release)
     off_time = QUICK_OFF_TIME if study.quick else OFF_TIME
-    plan_off = GraspAndRupture(robot, off_time, seed, switched_off=True, most=most)
+    plan_off = GraspAndRupture(robot, off_time, seed, switched_off=True, most=most, slot=slot)
     switched_off = record(study.arm(seed), driven_by, HELD_OUT_STREAM, plan_off.duration, plan_off)
     sliding = [directions(each.length) for each in (faulty, healthy, switched_off)]
     recordings = Recordings(plan, faulty, healthy, plan_off, switched_off, sliding)

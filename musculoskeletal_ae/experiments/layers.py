@@ -51,7 +51,7 @@ HIDDEN = {
 }
 TRAININGS = 3  # number of trainings of each layout, which differ in the random seed
 QUICK_LAYOUTS, QUICK_TRAININGS = 1, 1
-QUICK_STEPS = 600  # number of steps of a shortened initial training
+QUICK_STEPS = 100  # number of steps of a shortened initial training
 ERRORS = 'before_rad', 'after_rad'  # numbers whose range over the trainings is reported
 
 

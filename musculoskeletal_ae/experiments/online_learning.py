@@ -242,7 +242,7 @@ def exponential_fit(time: Array, error: Array) -> Array:
 
     span = float(time[-1])
     first, last = error[time < FIRST_ERRORS], error[-len(error) // 5 :]
-    guess = float(last.mean()), float(first.mean()), span / 5.0
+    guess = float(last.mean()), float(first.mean()), max(1.0, span / 5.0)
     bounds = [0.0, 0.0, 1.0], [10.0, 10.0, 10.0 * span]
     return model(time, *curve_fit(model, time, error, guess, bounds=bounds)[0])
 

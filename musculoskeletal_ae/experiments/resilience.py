@@ -64,6 +64,7 @@ LONGEST_APPROACH = 60
 SETTLING = 4  # after this time at rest, the arm has arrived [s]
 STILL = 0.02  # the arm rests if no joint moves more than this in a second [rad]
 HEALTHY_TIME = 18_000.0  # duration of healthy exploration, shared by the individuals [s]
+QUICK_HEALTHY_TIME = 5.0  # the same in a shortened run [s]
 PUSH_EVERY = 10.0  # time from one push to the next [s]
 PUSH = (10.0, 30.0)  # range of the forces of pushes [N]
 
@@ -266,7 +267,7 @@ def measure(study: Study, seed: int) -> Measured:
             reason = loop.verdicts[0][1] if loop.verdicts else 'nothing'
             row[f'dead_{sensor}'] = f'{reason}; {sensor_errors[-1]:.3f} rad'
         by_muscle[robot.muscles[m]] = row
-    duration = 10.0 if study.quick else HEALTHY_TIME / len(study.seeds)
+    duration = QUICK_HEALTHY_TIME if study.quick else HEALTHY_TIME / len(study.seeds)
     isolations = isolations_of_healthy_arm(study.arm(seed), mae, seed, duration)
     arrived = [distance for distance in distances if distance is not None]
     numbers: dict[str, Any] = {

@@ -69,9 +69,10 @@ def write(
         text = json.dumps(result, indent=1, ensure_ascii=False)
         write_whole(folder / 'result.json', f'{text}\n'.encode())
         for file, (figure, _) in drawn.items():
-            figure.savefig(folder / file, dpi=DPI, bbox_inches='tight')
-            if study.quick:
+            if study.quick:  # cutting off empty margins would take as long as drawing
+                figure.savefig(folder / file, dpi=DPI)
                 continue
+            figure.savefig(folder / file, dpi=DPI, bbox_inches='tight')
             figure.set_layout_engine('none')  # keep the layout of the PNG
             # Without a creation date, the same numbers give the same PDF.
             vector = (folder / file).with_suffix('.pdf')

@@ -59,7 +59,9 @@ ABLATED = {
 }
 #: keys of ABLATED whose effects a shortened run removes; a full run does this for every key in turn
 QUICK = ('friction',)
-QUICK_EXPLORATION = 5.0  # duration of the exploration without these effects in a shortened run [s]
+#: duration of the exploration in a shortened run [s], of individuals of the other emulator model
+#: and without these effects
+QUICK_EXPLORATION = 5.0
 ABLATION_INDIVIDUALS = 2  # number of individuals whose effects are removed
 #: label of a run with all effects and another exploration, which shows the difference between runs
 REPEATED = 'nothing: another run'
@@ -95,7 +97,8 @@ def _study_of_model(study: Study, seed: int, reality: str) -> Study:
     """
     if reality == study.reality:
         return study
-    part = replace(study, reality=reality, folder=study.folder / reality)
+    minutes = QUICK_EXPLORATION / 60.0 if study.quick else study.minutes
+    part = replace(study, reality=reality, folder=study.folder / reality, minutes=minutes)
     part.folder.mkdir(exist_ok=True)
     for preset in PRESETS:
         # Processes of other individuals write and read this file at the same time, so it has to be
