@@ -12,7 +12,10 @@ from musculoskeletal_ae.experiments.baselines import (
 from musculoskeletal_ae.robot.robot import Robot
 
 
-@pytest.fixture(scope='module', params=['arm26', 'musashi_left_arm'])
+@pytest.fixture(
+    scope='module',
+    params=['arm26', pytest.param('musashi_left_arm', marks=pytest.mark.thorough)],
+)
 def robot(request):
     return Robot.load(request.param)
 

@@ -7,15 +7,17 @@ from nominal_body import nominal_arm
 
 from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.experiments import control
-from musculoskeletal_ae.experiments.control import METHODS, QUICK_DURATIONS, protocol
+from musculoskeletal_ae.experiments.control import METHODS, Durations, protocol
 from musculoskeletal_ae.experiments.recording import ClosedLoop
+
+DURATIONS = Durations(start=1.0, end=3.5, first=2.0, second=1.0)
 
 
 @pytest.fixture(scope='module')
 def ended(arm26, trained):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(control, 'METHODS', {name: METHODS[name] for name in ('first', 'proposed')})
-        return protocol(nominal_arm(arm26), trained, seed=0, count=1)
+        return protocol(nominal_arm(arm26), trained, seed=0, count=1, durations=DURATIONS)
 
 
 def test_proposed_is_nearer_than_first_and_needs_about_the_bound(ended):
@@ -41,6 +43,6 @@ def test_a_stop_under_one_method_leaves_the_others_measured(arm26, trained, monk
     methods = ('geometric', 'first')
     monkeypatch.setattr(ClosedLoop, 'target', stopping)
     monkeypatch.setattr(control, 'METHODS', dict.fromkeys(methods, ''))
-    ended = protocol(nominal_arm(arm26), trained, seed=0, count=1, durations=QUICK_DURATIONS)
+    ended = protocol(nominal_arm(arm26), trained, seed=0, count=1, durations=DURATIONS)
     assert ended.stops == {name: int(name == 'geometric') for name in methods}
     assert all(np.isfinite(offset).all() for offset in ended.offset.values())

@@ -66,13 +66,15 @@ def test_a_muscle_that_never_carries_tension_is_ruptured_at_the_end_of_its_slot(
 
 
 def test_a_shortened_script_ruptures_only_the_first_muscles(arm26):
-    plan = GraspAndRupture(arm26, 4.0, seed=0, most=2)
+    plan = GraspAndRupture(arm26, 4.0, seed=0, most=2, slot=10.0)
     arm = Fake(arm26, arm26.tension.bias + 2.0 * CARRYING)
     arm.follow(plan, plan.duration)
     assert plan.order == plan.muscles == plan.counted == [1, 2]
     ruptured = [what[0] for _, what in arm.done if isinstance(what, tuple) and what]
     assert ruptured == [arm26.muscles[m] for m in plan.order]
-    assert plan.duration == 4.0 + 2 * SLOT
+    assert plan.duration == 4.0 + 2 * 10.0
+    for slot, rupture in zip((4.0, 14.0), plan.rupture[plan.order], strict=True):
+        assert slot < rupture < slot + 10.0 - RUPTURE_TIME
 
 
 def test_a_switched_off_muscle_is_not_ruptured_but_commanded_no_tension(arm26):

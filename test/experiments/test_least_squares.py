@@ -19,7 +19,10 @@ from musculoskeletal_ae.robot.robot import Robot
 COUNT = 50
 
 
-@pytest.fixture(scope='module', params=['arm26', 'musashi_left_arm'])
+@pytest.fixture(
+    scope='module',
+    params=['arm26', pytest.param('musashi_left_arm', marks=pytest.mark.thorough)],
+)
 def robot(request):
     return Robot.load(request.param)
 

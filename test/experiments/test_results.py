@@ -74,7 +74,7 @@ def test_plots_are_written_as_png_and_the_same_numbers_give_the_same_pdf(
     one, two, quick = (tmp_path / folder / 'sensors' for folder in ('one', 'two', 'quick'))
     assert (one / 'errors.pdf').read_bytes() == (two / 'errors.pdf').read_bytes()
     assert (one / 'errors.pdf').read_bytes().startswith(b'%PDF')
-    assert (one / 'errors.png').read_bytes() == (quick / 'errors.png').read_bytes()
+    assert (quick / 'errors.png').read_bytes().startswith(b'\x89PNG')
     assert not (quick / 'errors.pdf').exists()
 
 
