@@ -151,6 +151,10 @@ def test_publishers_that_offer_less_than_usual_are_recorded(tool, graph, tmp_pat
     graph.wait(is_recorded, 'messages of both topics in the bag')
     recorder.end(signal.SIGINT)
     assert recorder.process.returncode == 0
+    recorded = Bag.open(tmp_path / 'bag').topics[f'{graph.namespace}/{early}'].qos
+    assert [(profile.reliability.value, profile.durability.value) for profile in recorded] == [
+        (qos[early].reliability.value, qos[early].durability.value)
+    ]
 
 
 def test_messages_that_a_recorder_misses_are_counted(tool, graph, tmp_path):

@@ -933,7 +933,7 @@ def test_faults_of_the_emulated_arm_are_found(fault, checks, reported):
 POSITION_FAULTS = {
     'deaf': ('take', lambda _: np.zeros(M), 'position hold'),
     'sign of the command': ('take', lambda target: -target - 0.04, 'position ran away'),
-    'exchanged commands': ('take', exchanged, 'misplaced'),
+    'exchanged commands': ('take', exchanged, 'misplaced commands'),
     'half of the way': ('take', 'half', 'position gain'),
     'sign of T': ('publish', 'fall', 'position sign'),
     'late': ('late', 0.3, 'late'),
@@ -952,6 +952,4 @@ def test_each_fault_of_a_driver_that_follows_positions_is_detected(fault):
         value = lambda rows: np.stack([rows[0], 2.0 * home[1] - rows[1], rows[2]])  # noqa: E731
     setattr(driver, where, value)
     verdict = driver.wind((BICEPS,))
-    texts = FAULTS[what]
-    assert verdict.faults
-    assert any(fault.check == texts.check for fault in verdict.faults), str(verdict)
+    assert what in {fault.name for fault in verdict.faults}, str(verdict)
