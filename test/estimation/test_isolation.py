@@ -208,7 +208,7 @@ def test_a_suspect_cannot_be_restored_during_its_verification_which_always_ends(
     assert loop.core.cause == ''
     loop.core.restore([suspect])
     assert loop.core.body.isolated == ()
-    loop.step(healthy, 300)
+    loop.step(healthy, 100)
     assert loop.core.cause == ''
 
 

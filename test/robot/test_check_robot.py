@@ -176,7 +176,7 @@ def test_prismatic_joints_are_reported_in_newtons_and_shares_of_the_tension(tmp_
 
 
 def test_the_tool_says_sound_prints_tables_and_draws(tmp_path, capsys):
-    file, name = tmp_path / 'plot.png', 'musashi_left_arm'
+    file, name = tmp_path / 'plot.png', 'arm26'
     assert main([name, '--plot', str(file), '--postures', '40']) == 0
     printed = capsys.readouterr().out
     robot = Robot.load(name)
