@@ -56,11 +56,14 @@ def test_the_script_grasps_midway_and_ruptures_and_mends_every_muscle_once(arm26
         assert (cut - 4.0) // SLOT == (mended - 4.0) // SLOT
 
 
-def test_a_muscle_that_never_carries_tension_is_ruptured_at_the_end_of_its_slot(arm26):
-    plan = GraspAndRupture(arm26, 4.0, seed=0)
+@pytest.mark.parametrize(('slot', 'latest'), [(SLOT, LATEST_RUPTURE), (10.0, 4.0)])
+def test_a_muscle_that_never_carries_tension_is_ruptured_at_the_end_of_its_slot(
+    arm26, slot, latest
+):
+    plan = GraspAndRupture(arm26, 4.0, seed=0, slot=slot)
     Fake(arm26, arm26.tension.bias).follow(plan, plan.duration)
     assert not plan.carried.any()
-    np.testing.assert_allclose((plan.rupture - 4.0) % SLOT, LATEST_RUPTURE, atol=0.011)
+    np.testing.assert_allclose((plan.rupture - 4.0) % slot, latest, atol=0.011)
     # If no muscle carried tension, all ruptures count instead of none.
     assert plan.counted == list(range(arm26.muscle_count))
 
