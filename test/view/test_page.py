@@ -370,11 +370,18 @@ def entering(arm26, graph):
             graph.wait(page.looked_at.is_set, 'the visitor to be counted')
 
             def enter(slider: Any, *values: float) -> None:
+                received = []
+
+                async def receive(event: Any) -> None:  # called after the callback of the page
+                    if event.client is not None:
+                        received.append(event.target.value)
+
+                slider.on_update(receive)
                 change = {'type': 'GuiUpdateMessage', 'uuid': slider._impl.uuid}
                 for value in map(float, values):
                     updates = {'value': value}
                     mine.send(msgspec.msgpack.encode({**change, 'updates': updates}))
-                graph.wait(lambda: slider.value == values[-1], 'the page to receive the values')
+                graph.wait(lambda: len(received) == len(values), 'the page to receive the values')
 
             yield page, asked, enter
     finally:
