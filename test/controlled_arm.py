@@ -15,7 +15,7 @@ from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.validity import read_array, read_muscle_states
 
-RATE = 50.0  # messages a second; twice as many take almost twice the processor time [Hz]
+RATE = 50.0  # rate of the arm's messages [Hz]; 100 Hz would take twice the processor time
 RATE_LIMIT = 0.2  # rate limit of length commands [m/s]
 #: the longest legal max_age [s], so that a loaded machine does not stop the arm
 PATIENT = 10.0

@@ -203,7 +203,7 @@ class Graph:
 
     @contextmanager
     def spinning(self) -> Iterator[None]:
-        """Process messages in another thread during the block."""
+        """Let another thread process messages while the block of the `with` statement runs."""
         ended = threading.Event()
 
         def spin() -> None:

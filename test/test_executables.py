@@ -30,7 +30,8 @@ TOOLS = {
     'train': ['--robot', 'arm26', '--out', '{folder}/mae.safetensors'],
     'view': ['--robot', 'arm26', '--port', '8765'],
 }
-#: tools without ROS, on the ROS graph and with a server; all others are interrupted alike
+#: tools that every run of the tests interrupts: `train` does not use ROS, `record` does, and `view`
+#: serves a page. The other tools resemble one of them, so they are `thorough` cases.
 INTERRUPTED = 'record', 'train', 'view'
 #: nodes, with signals and their times after the start [s]: while modules are imported, while the
 #: node is constructed, and while it runs. The learner also has a process for training.

@@ -22,7 +22,7 @@ def sources(*folders: Path) -> list[Path]:
 
 
 class Imports(NamedTuple):
-    """The modules that a file imports."""
+    """Names of the modules that a Python file imports."""
 
     names: set[str]  # modules as they are named in import statements
     #: all modules, and names within modules, that the file may import when it runs, which excludes

@@ -25,7 +25,7 @@ EXTRAS = {'view': 'view', 'experiments': 'experiments', 'importing': 'experiment
 
 @cache
 def imported(file):
-    """Return the top-level modules that a file imports when it is imported."""
+    """Return the packages whose import is at the top level of a Python file."""
     names = set()
     for node in ast.parse(file.read_text('utf-8')).body:
         if isinstance(node, ast.Import):
@@ -36,7 +36,7 @@ def imported(file):
 
 
 def imported_by(files):
-    """Return the top-level modules that files import when they are imported."""
+    """Return the packages whose import is at the top level of one of several Python files."""
     return set().union(*map(imported, files))
 
 
@@ -50,7 +50,7 @@ def extra_of(file):
 
 @cache
 def modules_of(name):
-    """Return the top-level modules of an installed distribution."""
+    """Return the packages that an installed distribution contains."""
     if name == 'pin':
         return {'pinocchio'}  # the wheel has it in a folder that `pinocchio_wheel` finds
     try:
@@ -61,7 +61,7 @@ def modules_of(name):
 
 
 def brought(requirements):
-    """Return the top-level modules of the distributions that are required."""
+    """Return the packages that the required distributions contain."""
     return set().union(*(modules_of(re.split('[~<=>;]', each)[0]) for each in requirements))
 
 

@@ -73,7 +73,7 @@ class BagWriter:
     def add_topic(
         self, name: str, type_name: str, qos: Sequence[Qos] = (), schema: Schema | None = None
     ) -> None:
-        """Add a topic; the next `flush` writes it to metadata.yaml.
+        """Add a topic. It appears in metadata.yaml after the next call of `flush`.
 
         Args:
             name: Absolute name.

@@ -140,7 +140,7 @@ class Replay(Node):
         a subscriber.
 
         Raises:
-            MusculoskeletalError: If a node that the replay has to wait for does not start.
+            MusculoskeletalError: If a node of the option --wait-for does not start.
         """
         if self._lockstep is not None:
             self._lockstep.start(self._spinner, self._report_waiting)

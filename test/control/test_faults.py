@@ -106,7 +106,7 @@ def loop(settled):
     return copy.deepcopy(settled)
 
 
-#: faults under which the arm must continue, with the seconds for which each is present
+#: faults that must not stop the arm, and the duration of each [s]
 TOLERATED = {
     'drop:0.5': 1.0,
     'delay': 1.0,
@@ -118,8 +118,8 @@ TOLERATED = {
     f'overheat:{MUSCLE}': 2.5,  # 90 °C: the controller only limits the tension of this muscle
 }
 thorough = pytest.mark.thorough
-#: other faults, the seconds for which each is present, and a part of the stop cause; None if the
-#: arm may stop
+#: other faults, the duration of each [s], and a part of the stop cause that it must have. None: the
+#: arm may stop for any cause, or go on.
 OTHERS = [
     pytest.param('drop:1', 1.0, 'older than', marks=thorough),
     pytest.param(f'bias:length:{MUSCLE}:0.3', 1.0, 'muscle_states', marks=thorough),

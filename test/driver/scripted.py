@@ -21,7 +21,7 @@ PERIOD = 0.01  # time between two published messages [s]
 
 
 class RecordedArm:
-    """Returns recorded readings of an emulated arm, one for each step; it obeys no command."""
+    """Stands in for an emulated arm: replays its recorded readings, whatever is commanded."""
 
     def __init__(self, robot: Robot, readings: Sequence[Readings]) -> None:
         self.faults = Faults(robot, np.random.default_rng(0))

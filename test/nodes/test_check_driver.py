@@ -15,7 +15,7 @@ from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.robot.robot import Robot
 
-RATE = 50.0  # rate of the driver; messages at 100 Hz would take twice the processor time [Hz]
+RATE = 50.0  # rate of the driver's messages [Hz]; 100 Hz would take twice the processor time
 COMMON = ['--robot', 'arm26', '--rate', f'{RATE:g}']
 
 

@@ -48,7 +48,7 @@ def test_a_stop_pays_out_is_reported_and_recorded_and_ends_only_by_a_reset(
     refused = arm.graph.call(SetBool, 'controller/explore', request)
     assert not refused.success
     assert 'stopped' in refused.message
-    modes = arm.graph.listen(String, 'controller_mode', LATCHED)  # a late subscriber
+    modes = arm.graph.listen(String, 'controller_mode', LATCHED)  # subscribes after the stop
 
     def reported(mode):
         arm.graph.wait(lambda: modes and modes[-1].data == mode, mode)

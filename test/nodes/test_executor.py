@@ -25,7 +25,7 @@ def version(monkeypatch):
     return lambda *numbers: monkeypatch.setattr(executor, '_rclpy_version', lambda: numbers)
 
 
-# Nearly all tests of nodes use the default, `lean`.
+# Executor `lean` is the default, so nearly all other tests of nodes use it.
 @pytest.mark.parametrize('choice', ['single', pytest.param('lean', marks=pytest.mark.thorough)])
 def test_under_every_executor_a_node_counts_exceptions_goes_on_and_ends_with_status_0(
     graph, monkeypatch, choice

@@ -145,7 +145,7 @@ def state(tmp_path):
 
 @pytest.fixture
 def here(monkeypatch):
-    """Let learners in this process train in this process too."""
+    """Let learners that run in the test's process train there, too, not in another process."""
     name = 'musculoskeletal_ae.nodes.learner.TrainerProcess'
     monkeypatch.setattr(name, lambda *values, device: Trainer(*values))  # noqa: ARG005
 

@@ -78,7 +78,9 @@ class ObservedMotors(Motors):
         self.core, self.now = Estimator(ROBOT), 0.0
         self.core.use(mae)
         self.heat = self.core.heat
-        self.is_learning = True  # the estimator is not needed while the thermal model learns
+        #: whether readings go to the thermal model alone, without the estimator, which is slower;
+        #: this suffices while the model learns the constants of the modules
+        self.is_learning = True
 
     def hand_on(self):
         if self.is_learning:
