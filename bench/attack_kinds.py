@@ -25,11 +25,19 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import LENGTH_SCALE
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message
-from musculoskeletal_ae.remedy import STEPS, Step
+from musculoskeletal_ae.remedy import Step
 
 MOMENTS = 'holding', 'exploring'
 LASTING = 4.0  # duration of an attack [s]
 REPORT_TIME = 2.0  # longest time from the start of a problem to its report in the status line [s]
+#: steps that end the faults of the emulated arm
+REPAIRS = {
+    Step.REPAIR_MUSCLE,
+    Step.REPAIR_EMULATED_RUPTURE,
+    Step.REPAIR_EMULATED_FAULT,
+    Step.FREE_ARM,
+    Step.CHECK_SENSOR,
+}
 OFFSET = 0.08  # absolute value of false length offsets [m]
 
 
@@ -104,7 +112,7 @@ class Scene:
             trouble = attack.situation.trouble()
             if level != 'error' and self._goes_on(moment):
                 return
-            waits_for_cooling = Step.WAIT_UNTIL_COOL.identifier in attack.situation.steps()
+            waits_for_cooling = Step.WAIT_UNTIL_COOL in attack.situation.steps()
             self.follow_advice()
             # A hot winding cools by about 0.1 °C per second only, so extend the deadline by this
             # time.
@@ -128,8 +136,7 @@ class Scene:
     def follow_advice(self) -> None:
         """Restart silent nodes, and take all steps that the reports on /diagnostics advise."""
         attack = self.attack
-        for name in attack.situation.silent_nodes():
-            node = name.rpartition('/')[2]
+        for node in attack.situation.silent_nodes():
             attack.processes[node].kill()
             attack.start(node)
 
@@ -137,15 +144,15 @@ class Scene:
                 return node in attack.levels
 
             attack.wait(has_reported, 'the remedy helps', f'a report of {node}')
-        for identifier in attack.situation.steps():
-            self._take(STEPS[identifier])
+        for step in attack.situation.steps():
+            self._take(step)
 
     def _take(self, step: Step) -> None:
         """Do what one step of the advice on /diagnostics says, as an operator would."""
         attack = self.attack
         if step in (Step.STOP_SECOND_PUBLISHER, Step.STOP_OTHER_ROBOT):
             attack.end_strangers()
-        elif step in (Step.REPAIR_MUSCLE, Step.FREE_ARM, Step.CHECK_SENSOR):
+        elif step in REPAIRS:
             attack.set_faults([])
             self.set('hardware_emulator', 'ruptured_muscles', [''])
             attack.spin(1.0)
@@ -154,6 +161,8 @@ class Scene:
         elif step in (Step.CHECK_DRIVER, Step.CHECK_ESTIMATOR):
             for name in ('hardware_emulator', 'estimator'):
                 self.resume(name)
+        elif step is Step.RESTORE_MUSCLES:
+            attack.call(Trigger, 'estimator/restore')
         elif step is Step.CALIBRATE_LENGTHS:
             self._calibrate_lengths()
         elif step in (Step.EXPLORE, Step.EXPLORE_GENTLY):
@@ -176,7 +185,7 @@ class Scene:
         is_calibrating = True
         while is_calibrating and time.monotonic() < end:
             attack.spin(1.0)
-            is_calibrating = Step.CALIBRATE_LENGTHS.identifier in attack.situation.steps()
+            is_calibrating = Step.CALIBRATE_LENGTHS in attack.situation.steps()
 
     # -- actions of the hostile node ------------------------------------------------------------
 

@@ -169,7 +169,8 @@ class BusyLoop:
         supervisor = self.controller.supervisor
         if self.estimator.cause:
             return f'finding: {self.estimator.cause}'
-        return f'stop: {supervisor.condition}' if supervisor.is_latched else ''
+        condition = supervisor.condition
+        return f'stop: {condition.text}' if supervisor.is_latched and condition else ''
 
     def run(self, seconds: float) -> Result:
         """Run for a time [s], or until the first false finding or stop."""

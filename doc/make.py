@@ -7,7 +7,8 @@
 - `reference/parameters.md`: the parameters of all nodes
 - `reference/command_line.md`: `--help` of all scripts and executables
 - `reference/stops.md`: modes and stop causes
-- the tables of results in `README.md` and `doc/results.md`
+- the tables of results in `README.md` and `doc/results.md`, and that of conditions in
+  `reference/diagnostics.md`
 - `images/elastic_unit.png`: the series elastic element; `images/muscles.png`: an arm
 - the charts of the results in `results/`
 """
@@ -22,8 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pages
 
-from musculoskeletal_ae.control import stops_page
 from musculoskeletal_ae.experiments import plots, robustness, sensors
 from musculoskeletal_ae.experiments.results import individuals, read
 from musculoskeletal_ae.experiments.study import Measured
@@ -33,7 +34,7 @@ from musculoskeletal_ae.robot.robot import Robot
 FOLDER = Path(__file__).resolve().parent
 PACKAGE = FOLDER.parent / 'musculoskeletal_ae'
 README = FOLDER.parent / 'README.md'
-DOCUMENTS = README, FOLDER / 'results.md'
+DOCUMENTS = README, FOLDER / 'results.md', FOLDER / 'reference' / 'diagnostics.md'
 #: what a program in Python builds on, module by module
 MODULES = {
     'robot/robot.py': ['Robot'],
@@ -51,17 +52,18 @@ MODULES = {
     'mae/units.py': ['State'],
     'mae/checkpoint.py': ['load', 'save', 'from_bytes', 'to_bytes'],
     'mae/initial_training.py': ['initial_mae'],
+    'conditions.py': ['Condition', 'ConditionKind', 'Stop', 'Reaction', 'Revokes', 'from_json'],
+    'report.py': ['Report'],
     'estimation/estimator.py': ['Estimator', 'Output'],
-    'estimation/finding.py': ['Finding', 'Kind', 'Observation', 'Detector'],
+    'estimation/finding.py': ['Finding', 'Observation', 'Detector'],
     'estimation/health.py': ['HealthMonitor'],
     'signals/body_state.py': ['BodyState', 'LengthOffsets'],
     'signals/muscle_stream.py': ['MuscleStream', 'MuscleSample', 'RejectionError'],
     'signals/friction.py': ['FrictionDirection', 'Transmission'],
     'control/controller.py': ['Controller'],
     'control/supervisor.py': ['Supervisor', 'Activity', 'StopState'],
-    'control/stops.py': ['StopCause', 'Condition', 'Action', 'Clears'],
     'control/watchdog.py': ['Watchdog'],
-    'control/status.py': ['report', 'slowed'],
+    'control/status.py': ['report', 'conditions', 'slowed'],
     'control/settings.py': ['Settings'],
     'control/trajectory.py': ['Trajectory', 'Setpoint'],
     'validity.py': ['TrajectoryPoints'],
@@ -305,6 +307,7 @@ TABLES = {
     'estimates': estimates_table,
     'capabilities': capabilities_table,
     'recordings': recordings_tables,
+    'conditions': pages.conditions,
 }
 
 
@@ -326,7 +329,7 @@ PAGES = {
     'api.md': api,
     'parameters.md': parameters,
     'command_line.md': command_line,
-    'stops.md': stops_page.page,
+    'stops.md': pages.stops,
 }
 
 

@@ -1,46 +1,51 @@
 # SPDX-License-Identifier: Apache-2.0
 """Declares the steps of remedies: identifiers for programs, and texts for users.
 
-A remedy is a sequence of steps, to be taken in order. Remedies are declared with the problems: for
-stop causes in `control/stops.py`, for findings in `estimation/finding.py`. /diagnostics contains a
-remedy twice: the value `remedy` is a text for users, and `remedy steps` lists the identifiers.
+A remedy is a sequence of steps, to be taken in order. `conditions.py` states the remedy of each
+kind of condition.
 """
+
+from __future__ import annotations
 
 from collections.abc import Iterable
 from enum import Enum
 
 
 class Step(Enum):
-    """One step of a remedy; the value contains the stable identifier and the text."""
+    """One step of a remedy; the value contains the stable identifier and the text.
 
-    def __init__(self, identifier: str, text: str) -> None:
-        self.identifier, self.text = identifier, text
+    The steps of several remedies are taken in the order of `place`, which is 0 for steps that
+    remove a cause.
+    """
 
-    RESET_CONTROLLER = 'reset_controller', 'call controller/reset'
-    RESET_ESTIMATOR = 'reset_estimator', 'call estimator/reset'
-    CALIBRATE_LENGTHS = 'calibrate_lengths', 'call estimator/zero'
-    EXPLORE = 'explore', 'call controller/explore true to explore again'
-    EXPLORE_GENTLY = (
-        'explore_gently',
-        'call controller/explore true to explore again, gently until the offsets are known',
-    )
+    def __init__(self, identifier: str, text: str, place: int = 0) -> None:
+        self.identifier, self.text, self.place = identifier, text, place
+
     REPAIR_MUSCLE = 'repair_muscle', 'repair the muscle'
-    RESTORE_MUSCLES = 'restore_muscles', 'call estimator/restore'
+    REPAIR_EMULATED_RUPTURE = (
+        'repair_emulated_rupture',
+        "set ruptured_muscles of hardware_emulator to [''], or press Repair on the page",
+    )
+    REPAIR_EMULATED_FAULT = (
+        'repair_emulated_fault',
+        "set faults of hardware_emulator to ['']",
+    )
     FREE_ARM = 'free_arm', 'free the arm'
     CHECK_SENSOR = (
         'check_sensor',
         'check the named sensor, or call estimator/zero if the lengths have offsets',
     )
+    CHECK_MODULE = (
+        'check_module',
+        'check drag, cooling and tension sensor of the module; then call estimator/reset',
+    )
     CHECK_CHECKPOINT = 'check_checkpoint', 'check that the checkpoint belongs to this arm'
-    CHECK_DRIVER = (
-        'check_driver',
-        'check that the driver is running and that the computer is not overloaded',
-    )
-    CHECK_ESTIMATOR = (
-        'check_estimator',
-        'check that the estimator is running and that the computer is not overloaded',
-    )
+    CHECK_DRIVER = 'check_driver', 'check that the driver is running'
+    CHECK_RATE = 'check_rate', 'check the rate at which the driver publishes'
+    CHECK_ESTIMATOR = 'check_estimator', 'check that the estimator is running'
     CHECK_REPLAY = 'check_replay', 'check that the replay is not paused and has not ended'
+    RESTART_NODE = 'restart_node', 'see the log of the node, then restart the node or bringup.sh'
+    START_CONTROLLER = 'start_controller', 'start the controller, or publish commands'
     STOP_SECOND_PUBLISHER = (
         'stop_second_publisher',
         'stop the node that does not belong to this arm',
@@ -54,53 +59,32 @@ class Step(Enum):
         'set the parameter `checkpoint`, or start the learner',
     )
     WAIT_UNTIL_COOL = 'wait_until_cool', 'wait until all windings are below temperature_limit'
-    REPORT_LOG = 'report_log', 'report the error with the log of the controller'
+    REPORT_LOG = 'report_log', 'report the error with the log of the node'
+    FREE_DISK = 'free_disk', 'make the state directory writable, with free space'
+    RESET_EMULATOR = 'reset_emulator', 'call hardware_emulator/reset'
+    RESET_ESTIMATOR = 'reset_estimator', 'call estimator/reset', 1
+    CALIBRATE_LENGTHS = 'calibrate_lengths', 'call estimator/zero', 1
+    RESTORE_MUSCLES = 'restore_muscles', 'to use it again, call estimator/restore', 1
+    RESET_CONTROLLER = 'reset_controller', 'call controller/reset', 2
+    EXPLORE = 'explore', 'call controller/explore true to explore again', 3
+    EXPLORE_GENTLY = (
+        'explore_gently',
+        'call controller/explore true to explore gently until the offsets are known',
+        3,
+    )
+    ENABLE_LEARNING = 'enable_learning', 'call learner/enable true to learn again', 4
+
+    @classmethod
+    def named(cls, identifier: str) -> Step | None:
+        """Return the step with this identifier, or None if there is none."""
+        return _STEPS.get(identifier)
 
 
-STEPS = {step.identifier: step for step in Step}  # all steps by identifier
-REMEDY_STEPS = 'remedy steps'  # key of a value in /diagnostics
-#: remedy for an anomaly
+_STEPS = {step.identifier: step for step in Step}
+#: remedy for a fault of one muscle
 REPAIR = Step.REPAIR_MUSCLE, Step.RESET_ESTIMATOR
-#: key of a value of hardware_emulator: the parameters that cause a fault, separated by commas
-EMULATED_FAULTS = 'emulated faults'
-NO_FAULTS = 'none'  # the value EMULATED_FAULTS while no parameter causes a fault
-#: how to repair a muscle of an emulated arm, by the parameter of hardware_emulator
-EMULATED_REPAIRS = {
-    'ruptured_muscles': (
-        "set ruptured_muscles of hardware_emulator to [''], or press Repair on the page"
-    ),
-    'faults': "set faults of hardware_emulator to ['']",
-}
 
 
-def sentence(steps: Iterable[Step], emulated_faults: str = '') -> str:
-    """Return a remedy as a text for users.
-
-    Args:
-        steps: The steps of the remedy.
-        emulated_faults: The value EMULATED_FAULTS of the emulator, or ''.
-    """
-    repairs = [
-        repair for name, repair in EMULATED_REPAIRS.items() if name in emulated_faults.split(', ')
-    ]
-    how = f': {" and ".join(repairs)}' if repairs else ''
-    return '; '.join(step.text + how * (step is Step.REPAIR_MUSCLE) for step in steps)
-
-
-def identifiers(steps: Iterable[Step]) -> str:
-    """Return a remedy as the value `remedy steps` of /diagnostics."""
-    return ', '.join(step.identifier for step in steps)
-
-
-def parse(value: str) -> tuple[Step, ...]:
-    """Return the steps whose identifiers `value` lists, separated by commas.
-
-    `value` is the value `remedy steps` of /diagnostics. Unknown identifiers are ignored.
-    """
-    return tuple(STEPS[name] for name in value.split(', ') if name in STEPS)
-
-
-def table() -> str:
-    """Return all steps of remedies as a Markdown table."""
-    rows = [f'| `{step.identifier}` | {step.text} |' for step in Step]
-    return '\n'.join(['| identifier | step |', '|---|---|', *rows])
+def sentence(steps: Iterable[Step]) -> str:
+    """Return a remedy as a text for users."""
+    return '; '.join(step.text for step in steps)

@@ -1,35 +1,59 @@
 # SPDX-License-Identifier: Apache-2.0
 """Status reports for /diagnostics and for people, and numbers as readable text."""
 
+from __future__ import annotations
+
 import math
 import os
-from typing import Literal, NamedTuple
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from musculoskeletal_ae.conditions import Condition, Level, ordered, remedy_of, worst
+from musculoskeletal_ae.remedy import Step
 
 MOST_DIGITS = 17  # significant digits that identify a double
-#: key in /diagnostics that tells what a component waits for, and the values of this key if the
-#: component waits for the end of an anomaly, for known length offsets, or for muscle_states
-WAITS_FOR, ANOMALY, LENGTH_OFFSETS = 'waits for', 'anomaly', 'length_offsets'
-MUSCLE_STATES = 'muscle_states'
 #: values of `state` in the reports of a replay
 WAITING, PLAYING, PAUSED, END_OF_RECORDING = 'waiting', 'playing', 'paused', 'end_of_recording'
 #: key in the last report of a replay: names of nodes that may have missed messages
 NOT_WAITED_FOR = 'nodes not waited for'
-OVERLOADED = 'this computer is overloaded'
-Level = Literal['ok', 'warn', 'error']
 
 
 class Report(NamedTuple):
-    """Status of a component: level, one line of text and named values."""
+    """Status of a component.
 
-    level: Level
-    message: str
+    Attributes:
+        doing: What the component does, in a few words; '' if a condition states it.
+        values: Named values.
+        conditions: All conditions that are present.
+    """
+
+    doing: str
     values: dict[str, str]
+    conditions: tuple[Condition, ...] = ()
 
-    def with_warning(self, warning: str) -> 'Report':
-        """Return a report with one more warning; a report of an error is returned unchanged."""
-        if self.level == 'error':
-            return self
-        return Report('warn', f'{self.message}; {warning}', self.values)
+    @property
+    def level(self) -> Level:
+        """Level of the most urgent condition."""
+        return worst(self.conditions)
+
+    @property
+    def message(self) -> str:
+        """What the component does, and all conditions that are not only for information.
+
+        If there is neither, the message consists of the conditions for information.
+        """
+        texts = [each.text for each in ordered(self.conditions) if each.level != 'ok']
+        shown = filter(None, [self.doing, *texts])
+        return '; '.join(shown) or '; '.join(each.text for each in self.conditions)
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """The steps that end all conditions, in order."""
+        return remedy_of(self.conditions)
+
+    def with_conditions(self, conditions: Iterable[Condition]) -> Report:
+        """Return a report that also contains these conditions."""
+        return self._replace(conditions=(*self.conditions, *conditions))
 
 
 def load_text() -> str:
@@ -42,15 +66,19 @@ def is_overloaded() -> bool:
     return os.getloadavg()[0] >= 2.0 * (os.cpu_count() or 1)
 
 
-def overload_text() -> str:
-    """Return that this computer is overloaded, with its load; '' if it is not overloaded."""
-    return f'{OVERLOADED} (load {load_text()})' if is_overloaded() else ''
+def overload_note() -> str:
+    """Return that this computer is overloaded, with its load; '' if it is not overloaded.
+
+    Add the note to the text of a fault that an overload may contribute to. It is not the cause: a
+    node may have ended on a busy computer, too.
+    """
+    return f'this computer is overloaded (load {load_text()})' if is_overloaded() else ''
 
 
-def overload_advice() -> str:
-    """Return that this computer is overloaded, and what to do; '' if it is not overloaded."""
-    text = overload_text()
-    return f'{text}; stop other programs' if text else ''
+def with_load(text: str) -> str:
+    """Return a text with the load of this computer in parentheses if it is overloaded."""
+    note = overload_note()
+    return f'{text} ({note})' if note else text
 
 
 def whole(value: float, unit: str = '') -> str:

@@ -8,12 +8,11 @@ from functools import cache, lru_cache
 import numpy as np
 from exact_mae import ExactMae, rest_readings
 
-from musculoskeletal_ae.control import status
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.activities import Inputs
 from musculoskeletal_ae.control.command import LENGTH, Pull, unchanging
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
@@ -108,7 +107,7 @@ class Bench:
         self.core.use_body(self.core.stream.body.with_isolated(muscles))
 
     def stop(self):
-        self.core.stop(StopCause.OPERATOR)
+        self.core.stop(ConditionKind.OPERATOR)
 
     @property
     def follower(self):
@@ -118,15 +117,20 @@ class Bench:
     def cause(self):
         """The identifier of the stop cause, or ''."""
         condition = self.core.supervisor.condition
-        return '' if condition is None else condition.cause.identifier
+        return '' if condition is None else condition.identifier
 
     @property
     def condition(self):
         """The stop cause with its details as a text, or ''."""
-        return str(self.core.supervisor.condition or '')
+        condition = self.core.supervisor.condition
+        return '' if condition is None else condition.text
 
     def report(self):
-        return status.report(self.core, self.now)
+        return self.core.report(self.now)
+
+    def steps(self):
+        """The identifiers of the steps that the controller advises, in order."""
+        return [step.identifier for step in self.report().steps]
 
 
 @cache

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A ROS graph for tests, over DDS: it runs nodes in any process, and every wait has a deadline."""
 
+from __future__ import annotations
+
 import os
 import signal
 import subprocess
@@ -12,7 +14,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rclpy
@@ -24,9 +26,9 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64MultiArray, String, UInt8MultiArray
 
+from musculoskeletal_ae.conditions import CONDITIONS, Condition, from_json
 from musculoskeletal_ae.nodes.executor import LeanExecutor
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message
-from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 
 DEADLINE = 180.0  # longest wait on a loaded machine; then the test fails [s]
@@ -115,6 +117,20 @@ class Process:
             self.process.kill()
             self.process.wait()
         return self.process.returncode, self.output
+
+
+class Heard(NamedTuple):
+    """The last report of a node on /diagnostics."""
+
+    level: str
+    message: str
+    values: dict[str, str]
+    conditions: tuple[Condition, ...]
+
+    @property
+    def identifiers(self) -> list[str]:
+        """The identifiers of its conditions."""
+        return [each.identifier for each in self.conditions]
 
 
 class Graph:
@@ -243,15 +259,16 @@ class Graph:
         self.wait(lambda: len(messages) >= wanted, f'{count} messages on {topic}')
         return messages[-1]
 
-    def report(self, node: str) -> Report:
+    def report(self, node: str) -> Heard:
         """Return the last report on /diagnostics of a node of this namespace."""
         name = f'{self.namespace}/{node}: state'
         for message in reversed(self.received['/diagnostics']):
             for status in message.status:
                 if status.name == name:
                     values = {pair.key: pair.value for pair in status.values}
-                    return Report(LEVELS[status.level], status.message, values)
-        return Report('warn', 'not heard of', {})
+                    present = from_json(values.get(CONDITIONS, '[]'))
+                    return Heard(LEVELS[status.level], status.message, values, present)
+        return Heard('warn', 'not heard of', {}, ())
 
     def _last_diagnostics(self) -> str:
         messages = self.received['/diagnostics'][-200:]

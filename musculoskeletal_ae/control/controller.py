@@ -5,7 +5,7 @@
                                  causes ─► supervisor ┤─► limiter ─► command
                                             safe stop ┘
 
-The supervisor decides what the arm does (`supervisor`, `stops`). One object for each activity
+The supervisor decides what the arm does (`supervisor`). One object for each activity
 computes the commands (`follower`, `ramps`, `torque`, `exploration`, `calibrating`). Every command
 passes the limiter before it is published.
 
@@ -29,6 +29,8 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.conditions import ORDER, Action, Condition, ConditionKind
+from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.activities import ActivityControl, Inputs
 from musculoskeletal_ae.control.calibrating import Calibrating, gentle_limit
 from musculoskeletal_ae.control.command import LENGTH, TENSION, Command, Pull
@@ -40,13 +42,13 @@ from musculoskeletal_ae.control.planner import Plan, Planner
 from musculoskeletal_ae.control.ramps import LengthRamps, RampedTarget
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stopping import SafeStop
-from musculoskeletal_ae.control.stops import Action, Condition, StopCause
 from musculoskeletal_ae.control.supervisor import Activity, Supervisor
 from musculoskeletal_ae.control.torque import GravityCompensation, TorqueControl
 from musculoskeletal_ae.control.trajectory import Setpoint
 from musculoskeletal_ae.control.watchdog import Watchdog
 from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence, check_posture
@@ -361,7 +363,7 @@ class Controller:
             # A length calibration begins or continues. The estimate is discarded, because it was
             # computed with other offsets.
             age = self.watchdog.age
-            age.expect_later(StopCause.STALE_ESTIMATE, age.stepped_at, FIRST_ESTIMATE)
+            age.expect_later(ConditionKind.STALE_ESTIMATE, age.stepped_at, FIRST_ESTIMATE)
             self.estimate = None
         self.limiter.offsets_known = is_known
         self.supervisor.on_offsets(is_known)
@@ -381,7 +383,7 @@ class Controller:
             self._suspicion.note_anomaly(self.watchdog.age.stepped_at)
         self.watchdog.has_anomaly = detected
         if detected:
-            self.supervisor.on_event(StopCause.ANOMALY)
+            self.stop(ConditionKind.ANOMALY)
         else:
             self.supervisor.on_verified()
         self._note_suspect()
@@ -506,8 +508,8 @@ class Controller:
         condition = self.supervisor.condition
         if wanted and condition is not None:
             if self.supervisor.is_latched:
-                return f'stopped: {condition}'
-            return f'paused: {condition}: try again when the pause has ended'
+                return f'stopped: {condition.text}'
+            return f'paused: {condition.text}: try again when the pause has ended'
         if wanted and self.settings.method == 'float':
             return GUIDED
         if wanted and not (self.robot.tension_source.is_known or self.stream.body.offsets.known):
@@ -527,9 +529,9 @@ class Controller:
             self.supervisor.on_request(self.supervisor.activity)
         return ''
 
-    def stop(self, cause: StopCause, detail: str = '') -> None:
+    def stop(self, cause: ConditionKind, detail: str = '') -> None:
         """Stop the arm; the stop is latched."""
-        self.supervisor.on_event(cause, detail)
+        self.supervisor.on_event(cause.condition(detail))
 
     def reset(self, now: float) -> Condition | None:
         """End a stop and continue to the last target, unless a stop cause is present.
@@ -537,21 +539,28 @@ class Controller:
         Returns:
             The first stop cause that is present, or None if the stop has ended.
         """
-        return self.supervisor.on_reset(self.conditions(now))
+        return self.supervisor.on_reset(self.stop_conditions(now))
 
     # -- time -----------------------------------------------------------------------------------
 
-    def conditions(self, now: float) -> list[Condition]:
-        """Return the stop causes that are present, in the order of `StopCause`."""
+    def conditions(self, now: float) -> tuple[Condition, ...]:
+        """Return everything that users should know: causes of the stop, and warnings."""
+        return status.conditions(self, now)
+
+    def report(self, now: float) -> Report:
+        """Return the status for /diagnostics."""
+        return status.report(self, now)
+
+    def stop_conditions(self, now: float) -> list[Condition]:
+        """Return the stop causes that are present, in the order of `ConditionKind`."""
         present = self.watchdog.conditions(now)
         if detail := self.stream.implausible(now):
-            present.append(Condition(StopCause.IMPLAUSIBLE_MUSCLE_STATES, detail))
+            present.append(ConditionKind.IMPLAUSIBLE_MUSCLE_STATES.condition(detail))
         if detail := self._revoked_lengths(now):
-            present.append(Condition(StopCause.LENGTH_OFFSETS_REVOKED, detail))
+            present.append(ConditionKind.LENGTH_OFFSETS_REVOKED.condition(detail))
         if detail := self._estimate_problem.lasting(now):
-            present.append(Condition(StopCause.IMPLAUSIBLE_ESTIMATE, detail))
-        order = list(StopCause)
-        return sorted(present, key=lambda condition: order.index(condition.cause))
+            present.append(ConditionKind.IMPLAUSIBLE_ESTIMATE.condition(detail))
+        return sorted(present, key=lambda condition: ORDER[condition.identifier])
 
     def _revoked_lengths(self, now: float) -> str:
         """Return why the lengths are unreliable, or ''.
@@ -587,8 +596,8 @@ class Controller:
         step = self.watchdog.age.step(now, time, not self.supervisor.is_running)
         if step.has_paused:  # the arm may have moved: restart the activity from the new posture
             self.activities.entered = None
-        present = self.conditions(now)
-        stale_estimate = any(c.cause is StopCause.STALE_ESTIMATE for c in present)
+        present = self.stop_conditions(now)
+        stale_estimate = any(each.kind is ConditionKind.STALE_ESTIMATE for each in present)
         # If estimates are missing, the estimator may have restarted without the suspect.
         if stale_estimate or self._suspicion.is_lost(now):
             self.supervisor.on_suspect(False)
@@ -603,7 +612,7 @@ class Controller:
             desired = None if present else self._desired(step.dt)
             limited = self._limited(desired, dt)
             if desired is not None and limited is None:
-                self.supervisor.on_event(StopCause.COMMAND_NOT_FINITE)
+                self.stop(ConditionKind.COMMAND_NOT_FINITE)
         if not self.supervisor.is_running:
             limited = self._limited(self._stopped(present, dt), dt)
         return limited or self.limiter.command
@@ -635,7 +644,7 @@ class Controller:
         return None
 
     def _note_fault(self, error: Exception) -> None:
-        self.supervisor.on_event(StopCause.CONTROL_FAULT, f'{type(error).__name__}: {error}')
+        self.stop(ConditionKind.CONTROL_FAULT, f'{type(error).__name__}: {error}')
 
     def _step(self, control: ActivityControl, inputs: Inputs) -> Command | None:
         """Return the command of an activity, and act on the properties of the activity.
@@ -700,8 +709,8 @@ class Controller:
         # After an auto-recoverable cause has cleared, the arm waits to resume. This time does not
         # count towards the hold time.
         waits = not self.supervisor.is_latched and not present
-        causes = {condition.cause for condition in present}
-        is_fresh = StopCause.STALE_MUSCLE_STATES not in causes
+        causes = {condition.kind for condition in present}
+        is_fresh = ConditionKind.STALE_MUSCLE_STATES not in causes
         may_wind = self.supervisor.may_wind_suspect
         at_once = self.supervisor.action is Action.RELEASE_AT_ONCE
         return self.stopping.step(self.sample, 0.0 if waits else dt, is_fresh, may_wind, at_once)
@@ -782,10 +791,10 @@ class Controller:
         self._refuse_gravity_compensation()
         if self.estimate is None or self.mae is None:
             raise MessageError('no posture yet', 'wait for an estimate and a checkpoint')
-        present = self.conditions(self.watchdog.age.stepped_at)
+        present = self.stop_conditions(self.watchdog.age.stepped_at)
         condition = self.supervisor.condition or next(iter(present), None)
         if condition is not None:
-            raise MessageError('stopped', str(condition))
+            raise MessageError('stopped', condition.text)
         if not self.stream.body.offsets.known:
             remedy = 'wait for the length calibration; if none is in progress, call estimator/zero'
             raise MessageError('length offsets are unknown', remedy)

@@ -59,7 +59,7 @@ class FollowedGoal:
         core, trajectory = self._core, self._trajectory
         progress, condition = core.activities.follower.progress, core.supervisor.condition
         if condition is not None:
-            return INVALID, f'stopped: {condition}'
+            return INVALID, f'stopped: {condition.text}'
         if not core.is_following or trajectory is None:
             return (
                 INVALID,

@@ -1,19 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The controller's status: its mode, stop causes and warnings."""
+"""The controller's status: what the arm does, why it stands still, and warnings."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control import reach, stops
-from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.conditions import Condition, ConditionKind
+from musculoskeletal_ae.control import reach
 from musculoskeletal_ae.control.follower import Follower
 from musculoskeletal_ae.control.supervisor import Activity
-from musculoskeletal_ae.remedy import REMEDY_STEPS, REPAIR, Step, identifiers, sentence
+from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.description import NO_TENSION
 from musculoskeletal_ae.signals.body_state import KNOWN
+
+if TYPE_CHECKING:
+    from musculoskeletal_ae.control.controller import Controller
 
 #: fraction of the requested speed below which a slowed trajectory is reported by its duration [%]
 LEAST_SHARE = 10.0
@@ -23,20 +29,27 @@ DOING = {
     Activity.HOLDING: 'holding',
     Activity.MOVING: 'following a trajectory',
     Activity.EXPLORING: 'exploring',
-    Activity.CALIBRATING: 'exploring',
+    Activity.CALIBRATING: 'exploring gently',
     Activity.TORQUE: 'holding',
     Activity.GRAVITY_COMPENSATION: 'gravity compensation',
 }
+#: causes that usually follow from an anomaly: a faulty muscle makes estimates implausible, and
+#: implausible estimates are rejected. While the anomaly is present, they need no remedy of their
+#: own.
+CONSEQUENCES = frozenset(
+    {
+        ConditionKind.IMPLAUSIBLE_MUSCLE_STATES,
+        ConditionKind.IMPLAUSIBLE_ESTIMATE,
+        ConditionKind.STALE_ESTIMATE,
+    }
+)
+ONLY_RESET = (Step.RESET_CONTROLLER,)
 
 
 def report(core: Controller, now: float) -> Report:
-    """Return the status for /diagnostics.
+    """Return the status for /diagnostics; `now` is the time of a steady clock [s].
 
-    The message describes a stop or, without a stop, what control waits for. If control does not
-    wait either, the message contains all warnings, or states what the arm does.
-
-    The values `mode`, `stop cause`, `stop causes`, `waits for` and `remedy steps` are stable
-    identifiers for programs. The message and the values `stop` and `remedy` are texts for users.
+    The values `mode` and `stop cause` are stable identifiers for programs.
     """
     supervisor = core.supervisor
     values = {
@@ -44,83 +57,142 @@ def report(core: Controller, now: float) -> Report:
         'method': core.settings.method,
         'preset': core.settings.preset,
     }
-    warnings = _warnings(core, values)
-    condition, present = supervisor.condition, core.conditions(now)
-    if condition is not None:
-        # Name every cause that is present, with its present details, because each one prevents a
-        # reset.
-        causes = {condition.cause: condition} | {each.cause: each for each in present}
-        text = '; also '.join(map(str, causes.values()))
-        # An anomaly that has ended needs no repair.
-        of_finding = REPAIR if core.watchdog.has_anomaly else ()
-        explored = supervisor.awaits_exploration
-        settled = stops.CONSEQUENCES if supervisor.has_had_anomaly else frozenset()
-        if not core.watchdog.has_anomaly:  # what has outlasted the anomaly needs its own steps
-            settled -= {each.cause for each in present}
-        steps = stops.remedy_of(causes, explored, of_finding, settled)
-        values |= {
-            'stop cause': condition.cause.identifier,
-            stops.STOP_CAUSES: ', '.join(cause.identifier for cause in causes),
-            'stop': text,
-            'remedy': sentence(steps),
-            REMEDY_STEPS: identifiers(steps),
-        }
-        if supervisor.is_latched:
-            return Report('error', f'stopped: {text}', values)
-        return Report('warn', f'paused: {text}', values)
-    if present:
-        values['waits for'] = present[0].cause.identifier
-        return Report('warn', f'waiting: {present[0]}', values)
-    doing = DOING[supervisor.activity]
-    if supervisor.awaits_exploration:
-        step = Step.EXPLORE if core.stream.body.offsets.known else Step.EXPLORE_GENTLY
-        values |= {'remedy': step.text, REMEDY_STEPS: step.identifier}
-        warnings.insert(0, f'not exploring, mode {supervisor.mode} (to go on: {step.text})')
-    if warnings:
-        return Report('warn', '; '.join(warnings), {**values, 'doing': doing})
-    return Report('ok', doing, values)
+    if supervisor.condition is not None:
+        values['stop cause'] = supervisor.condition.identifier
+    _add_motion(core, values)
+    _add_body(core, values)
+    _add_heat(core, values)
+    # The conditions of a stop state what the arm does: it is stopped, pauses or waits.
+    doing = _doing(core) if supervisor.is_running and not core.stop_conditions(now) else ''
+    return Report(doing, values, conditions(core, now))
 
 
-def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
-    """Return all warnings, and add their details to `values`."""
-    target, robot = core.target_state, core.robot
-    warnings = []
+def _doing(core: Controller) -> str:
+    if core.estimate is None and not core.stream.body.offsets.known:
+        return 'waiting for the first estimate of the length calibration'
+    return DOING[core.supervisor.activity]
+
+
+def conditions(core: Controller, now: float) -> tuple[Condition, ...]:
+    """Return all conditions that the controller reports; `now` is as in `report`."""
+    return (*_stop(core, now), *_exploration(core), *_target(core), *_limits(core))
+
+
+def _stop(core: Controller, now: float) -> Iterator[Condition]:
+    """Yield every cause of a stop, of a pause, or of waiting before the first command."""
+    supervisor, present = core.supervisor, core.stop_conditions(now)
+    if supervisor.is_running:
+        for each in present:
+            needed = tuple(step for step in each.steps if step is not Step.RESET_CONTROLLER)
+            yield each._replace(level='warn', text=f'waiting: {each.text}', steps=needed)
+        return
+    causes = supervisor.causes(present)
+    if not supervisor.is_latched:  # the arm continues by itself
+        for each in causes:
+            yield each._replace(level='warn', text=f'paused: {each.text}', steps=())
+        return
+    for each in causes:
+        steps: tuple[Step, ...] = each.steps
+        if supervisor.ends_by_itself:
+            steps = ()
+        elif core.watchdog.has_anomaly and each.kind in CONSEQUENCES:
+            steps = ONLY_RESET
+        yield each._replace(level='error', text=f'stopped: {each.text}', steps=steps)
+
+
+def _exploration(core: Controller) -> Iterator[Condition]:
+    """Yield why the arm does not explore although it should, and what starts the exploration."""
+    supervisor = core.supervisor
+    known, resumes = core.stream.body.offsets.known, supervisor.will_resume_exploring
+    if supervisor.awaits_exploration and not resumes:
+        step = Step.EXPLORE if known else Step.EXPLORE_GENTLY
+        yield ConditionKind.NOT_EXPLORING.condition(steps=[step])
+    elif not known and supervisor.is_running and not supervisor.explores:
+        yield ConditionKind.GENTLE_ONLY.condition(subjects=_unknown_offsets(core))
+
+
+def _target(core: Controller) -> Iterator[Condition]:
+    """Yield what is not as the target demands."""
+    target, robot, kind = core.target_state, core.robot, ConditionKind
+    if target.clamped:
+        yield kind.TARGET_CLAMPED.condition(', '.join(target.clamped), target.clamped)
+    if target.effort.any() and core.settings.method in ('geometric', 'first', 'second'):
+        yield kind.EFFORT_IGNORED.condition(f'method `{core.settings.method}` does not use it')
+    follower = core.activities.follower
+    if core.is_following and follower.progress.is_moving and (slow := slowed(follower)):
+        yield kind.TRAJECTORY_SLOWED.condition(f'trajectory {slow}')
+    missing = _missing_torque(core)
+    if missing is not None and np.abs(robot.kinematics.radian * missing).max() > reach.NOTABLE:
+        yield kind.TORQUE_MISSING.condition()
+    if target.unreachable_reason:
+        yield kind.OUT_OF_REACH.condition(target.unreachable_reason)
+    if core.is_following and core.estimate is not None and follower.progress.has_fallen:
+        yield kind.ARM_FALLEN.condition(_fallen(core, core.estimate))
+
+
+def _limits(core: Controller) -> Iterator[Condition]:
+    """Yield which tensions are too high, or limited by heat."""
+    if tense := core.watchdog.overload.tense:
+        yield ConditionKind.TENSION_ABOVE_LIMIT.condition(', '.join(tense))
+    if hot := _limited_by_heat(core):
+        yield ConditionKind.TENSION_LIMITED_BY_HEAT.condition(', '.join(hot), hot)
+
+
+def _missing_torque(core: Controller) -> Array | None:
+    control = core.activities.of(core.supervisor.activity, core.settings)
+    return None if control is None else control.missing_torque
+
+
+def _unknown_offsets(core: Controller) -> list[str]:
+    unknown = np.flatnonzero(~(core.stream.body.offsets.deviation < KNOWN))
+    return [core.robot.muscles[muscle] for muscle in unknown]
+
+
+def _limited_by_heat(core: Controller) -> dict[str, float]:
+    """Return the tension limits [N] that heat lowers, by the name of the muscle."""
+    robot = core.robot
+    limits = zip(robot.muscles, core.watchdog.heat.planned, robot.tension.limit)
+    return {name: float(limit) for name, limit, largest in limits if limit < largest}
+
+
+def _add_motion(core: Controller, values: dict[str, str]) -> None:
+    robot, target = core.robot, core.target_state
     if target.clamped:
         values['target clamped at'] = ', '.join(target.clamped)
-        warnings.append(f'target clamped to the joint limits: {", ".join(target.clamped)}')
     _add_stiffness(core, values)
-    if target.effort.any() and core.settings.method in ('geometric', 'first', 'second'):
-        warnings.append(f'method `{core.settings.method}` ignores the effort of the target')
-    follower = core.activities.follower
     if core.is_following:
-        values['lag of the winches'] = f'{1000.0 * follower.winches.lag:.0f} ms'
-        if follower.progress.is_moving and (slow := slowed(follower)):
-            warnings.append(f'trajectory {slow}')
-    control = core.activities.of(core.supervisor.activity, core.settings)
-    missing = None if control is None else control.missing_torque
+        lag = core.activities.follower.winches.lag
+        values['lag of the winches'] = f'{1000.0 * lag:.0f} ms'
+    missing = _missing_torque(core)
     if missing is not None and np.abs(robot.kinematics.radian * missing).max() > reach.NOTABLE:
         each = zip(robot.joints, missing, robot.units)
         values['missing torque'] = ', '.join(f'{n} {m:.2f} {unit.torque}' for n, m, unit in each)
-        warnings.append('the target needs more torque than the muscles can exert')
-    if target.unreachable_reason:
-        warnings.append(f'out of reach: {target.unreachable_reason}')
-    if core.is_following and core.estimate is not None and follower.progress.has_fallen:
-        warnings.append(_fallen(core, core.estimate))
+
+
+def _add_body(core: Controller, values: dict[str, str]) -> None:
+    robot = core.robot
     if robot.isolated:
         values['isolated muscles'] = robot.names(robot.isolated)
     if not core.stream.body.offsets.known:
-        unknown = np.flatnonzero(~(core.stream.body.offsets.deviation < KNOWN))
-        values['unknown length offsets'] = robot.names(unknown)
-        waits = 'waits for the first estimate of the length calibration'
-        doing = waits if core.estimate is None else 'can only explore gently'
-        warnings.append(f'the length offsets are unknown, so the arm {doing}')
+        values['unknown length offsets'] = ', '.join(_unknown_offsets(core))
     if not robot.tension_source.is_known:
         values['tension'] = f'tension_source: none: {NO_TENSION}'
     elif robot.tension_source.is_current:
         values['tension'] = f'tension_source: current: {_learned(core)}'
-    if tense := core.watchdog.overload.tense:
-        warnings.append(f'too much tension: {", ".join(tense)}')
-    return warnings + _heat_warnings(core, values)
+
+
+def _add_heat(core: Controller, values: dict[str, str]) -> None:
+    robot, windings = core.robot, core.watchdog.heat.heat.core
+    is_known = np.isfinite(windings)
+    if is_known.any():
+        each = zip(robot.muscles, windings)
+        texts = (f'{n} {c:.0f} °C' if np.isfinite(c) else f'{n} unknown' for n, c in each)
+        values['temperature of windings'] = ', '.join(texts)
+    if not is_known.all():
+        names = 'any muscle' if not is_known.any() else robot.names(np.flatnonzero(~is_known))
+        values['not protected from heat'] = f'no temperature is measured for {names}'
+    if hot := _limited_by_heat(core):
+        values['tension limited by heat'] = ', '.join(f'{n} {t:.0f} N' for n, t in hot.items())
 
 
 def _learned(core: Controller) -> str:
@@ -132,25 +204,6 @@ def _learned(core: Controller) -> str:
     return 'learned scale and friction of the drives: ' + ', '.join(
         f'{name} {scale:.2f} and {friction:.0f} N' for name, scale, friction in each
     )
-
-
-def _heat_warnings(core: Controller, values: dict[str, str]) -> list[str]:
-    robot, heat = core.robot, core.watchdog.heat
-    windings = heat.heat.core
-    is_known = np.isfinite(windings)
-    if is_known.any():
-        each = zip(robot.muscles, windings)
-        texts = (f'{n} {c:.0f} °C' if np.isfinite(c) else f'{n} unknown' for n, c in each)
-        values['temperature of windings'] = ', '.join(texts)
-    if not is_known.all():
-        names = 'any muscle' if not is_known.any() else robot.names(np.flatnonzero(~is_known))
-        values['not protected from heat'] = f'no temperature is measured for {names}'
-    limits = zip(robot.muscles, heat.planned, robot.tension.limit)
-    hot = {name: limit for name, limit, largest in limits if limit < largest}
-    if not hot:
-        return []
-    values['tension limited by heat'] = ', '.join(f'{n} {t:.0f} N' for n, t in hot.items())
-    return [f'heat limits the tension of {", ".join(hot)}']
 
 
 def _add_stiffness(core: Controller, values: dict[str, str]) -> None:
@@ -194,7 +247,7 @@ def _fallen(core: Controller, estimate: Array) -> str:
     assert mae is not None  # the arm has moved, which requires a network
     joint = int(np.abs(error / robot.kinematics.radian).argmax())
     distance = f'{abs(error[joint]):.2f} {robot.units[joint].theta}'
-    text = f'the arm has fallen: {robot.joints[joint]} rests {distance} away from its target'
+    text = f'{robot.joints[joint]} rests {distance} away from its target'
     missing = reach.lacking(robot, mae, estimate)
     if not missing:
         return text

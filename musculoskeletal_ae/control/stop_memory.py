@@ -17,7 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TextIO
 
-from musculoskeletal_ae.control.stops import Condition, StopCause
+from musculoskeletal_ae.conditions import Condition, ConditionKind, stop_causes
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.files import read_text
 
@@ -47,7 +47,7 @@ class StopMemory:
         """
         self.found: Condition | None = None
         self.problem = ''
-        self._written: StopCause | None = None  # content of the file
+        self._written: ConditionKind | None = None  # content of the file
         self._is_latched = False  # whether the file has to outlive this controller
         self._next_attempt = 0.0
         self._file: Path | None = None
@@ -79,7 +79,7 @@ class StopMemory:
         self._file = file
         if exists:
             self._is_latched, self._written = True, _cause_in(file)
-            self.found = Condition(self._written, BEFORE)
+            self.found = self._written.condition(BEFORE)
 
     def note(self, stop: Condition | None) -> None:
         """Write the present latched stop to the file.
@@ -91,7 +91,7 @@ class StopMemory:
                 `restarted`.
         """
         self._is_latched = stop is not None
-        cause = StopCause.RESTARTED if stop is None else stop.cause
+        cause = ConditionKind.RESTARTED if stop is None else stop.kind
         if self._file is None or cause is self._written or time.monotonic() < self._next_attempt:
             return
         new = self._file.with_name(f'.{FILE}')
@@ -99,7 +99,8 @@ class StopMemory:
             # Write without fsync, which could delay a command by 0.1 s. If the process is killed,
             # nothing that was written is lost. A power failure may leave an empty file, which
             # counts as `restarted`.
-            new.write_text(f'{cause.identifier}\n{stop or cause.text}\n', encoding='utf-8')
+            text = cause.text if stop is None else stop.text
+            new.write_text(f'{cause.identifier}\n{text}\n', encoding='utf-8')
             new.replace(self._file)
         except OSError as error:
             self._next_attempt = time.monotonic() + RETRY_INTERVAL
@@ -120,11 +121,11 @@ class StopMemory:
         self._file = None
 
 
-def _cause_in(file: Path) -> StopCause:
+def _cause_in(file: Path) -> ConditionKind:
     """Return the stop cause in a file; `restarted` if the file states none."""
     with suppress(MusculoskeletalError):
         text = read_text(file, lambda _, problem: MusculoskeletalError(problem), LARGEST)
-        for cause in StopCause:
+        for cause in stop_causes():
             if text.partition('\n')[0] == cause.identifier:
                 return cause
-    return StopCause.RESTARTED
+    return ConditionKind.RESTARTED

@@ -12,7 +12,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import Enum
 
-from musculoskeletal_ae.control.stops import Action, Clears, Condition, StopCause
+from musculoskeletal_ae.conditions import Action, Clears, Condition, ConditionKind
+from musculoskeletal_ae.remedy import Step
 
 RESUME = 0.2  # time without a cause after which a paused arm continues [s]
 
@@ -100,7 +101,8 @@ class Supervisor:
         self.awaits_exploration = False
         self.state = StopState.RUNNING
         self.condition: Condition | None = None
-        self._causes: set[StopCause] = set()  # all latching causes since the stop began
+        #: the latching causes since the stop began, with their newest details
+        self._causes: dict[ConditionKind, Condition] = {}
         self._clear_for = 0.0  # time without a cause [s]
 
     @property
@@ -121,18 +123,49 @@ class Supervisor:
     @property
     def may_wind_suspect(self) -> bool:
         """Whether a suspect muscle may be wound in; False if an operator has stopped the arm."""
-        return self.state is StopState.VERIFYING and StopCause.OPERATOR not in self._causes
-
-    @property
-    def has_had_anomaly(self) -> bool:
-        """Whether an anomaly is or was a cause of the present stop."""
-        return StopCause.ANOMALY in self._causes
+        return self.state is StopState.VERIFYING and ConditionKind.OPERATOR not in self._causes
 
     @property
     def action(self) -> Action:
         """The action of the present stop: the most severe one of all its causes."""
-        reported = () if self.condition is None else (self.condition.cause,)
-        return max((cause.action for cause in (*self._causes, *reported)), default=Action.HOLD)
+        reported = () if self.condition is None else (self.condition.kind,)
+        return max((kind.action for kind in (*self._causes, *reported)), default=Action.HOLD)
+
+    @property
+    def will_resume_exploring(self) -> bool:
+        """Whether an interrupted exploration goes on by itself when this stop has ended."""
+        return self.explored and self.ends_by_itself
+
+    @property
+    def ends_by_itself(self) -> bool:
+        """Whether this latched stop ends without a reset, when the verification has ended."""
+        return self.state is StopState.RESUMING or (
+            self.state is StopState.VERIFYING and self._is_verifiable
+        )
+
+    @property
+    def _is_verifiable(self) -> bool:
+        return all(kind.clears is Clears.VERIFICATION for kind in self._causes)
+
+    def causes(self, present: Sequence[Condition]) -> list[Condition]:
+        """Return all causes of the present stop: those that began it, and those that keep it.
+
+        A cause that is not present any more keeps the stop if only a reset ends it. Its remedy is
+        then the reset alone, unless it was a single event.
+
+        Args:
+            present: The causes that are present, with their newest details.
+        """
+        if self.condition is None:
+            return []
+        causes = {self.condition.kind: self.condition}
+        causes |= {kind: each for kind, each in self._causes.items() if kind.clears is Clears.RESET}
+        ended = {
+            kind: each._replace(steps=(Step.RESET_CONTROLLER,))
+            for kind, each in causes.items()
+            if kind.stop is not None and not kind.stop.is_event
+        }
+        return list({**causes, **ended, **{each.kind: each for each in present}}.values())
 
     @property
     def explores(self) -> bool:
@@ -174,15 +207,15 @@ class Supervisor:
 
     # -- stops ----------------------------------------------------------------------------------
 
-    def on_event(self, cause: StopCause, detail: str = '') -> None:
+    def on_event(self, condition: Condition) -> None:
         """Stop because of a single event, such as a call of controller/stop."""
-        self._take([Condition(cause, detail)])
+        self._take([condition])
 
     def on_conditions(self, present: Sequence[Condition], elapsed: float, released: bool) -> None:
         """Update the stop state from all causes that are present.
 
         Args:
-            present: The causes with their details, in the order of `StopCause`.
+            present: The causes with their details, in the order of `ConditionKind`.
             elapsed: Time since the last call [s].
             released: Whether `hold_time` is over and the arm is released.
         """
@@ -211,8 +244,7 @@ class Supervisor:
 
     def on_verified(self) -> None:
         """Resume if a verification has ended the anomaly and no cause needs a reset."""
-        verifiable = all(cause.clears is Clears.VERIFICATION for cause in self._causes)
-        self._fire(Event.VERIFIED if verifiable else Event.VERIFIED_IN_VAIN)
+        self._fire(Event.VERIFIED if self._is_verifiable else Event.VERIFIED_IN_VAIN)
 
     def on_reset(self, present: Sequence[Condition]) -> Condition | None:
         """End the stop, and return None; if a cause is still present, return the first one instead.
@@ -226,7 +258,7 @@ class Supervisor:
         return None
 
     def _take(self, conditions: Sequence[Condition]) -> None:
-        latching = [each for each in conditions if each.cause.clears is not Clears.CONDITION]
+        latching = [each for each in conditions if each.kind.clears is not Clears.CONDITION]
         if not latching:
             if self.is_running:
                 self.condition = conditions[0]
@@ -235,7 +267,7 @@ class Supervisor:
         if not self.is_latched:
             self.condition = latching[0]
             self._causes.clear()
-        self._causes |= {each.cause for each in latching}
+        self._causes |= {each.kind: each for each in latching}
         self._fire(Event.LATCHING_CAUSE)
 
     def _fire(self, event: Event) -> None:
@@ -254,7 +286,7 @@ class Supervisor:
             self.awaits_exploration = self.awaits_exploration or self.explores
             self.activity = AFTER_A_STOP.get(self.activity, self.activity)
             if self.condition is not None:  # an auto-recoverable cause has become latched
-                self._causes.add(self.condition.cause)
+                self._causes[self.condition.kind] = self.condition
 
 
 def diagram() -> str:

@@ -18,8 +18,8 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.awake_clock import AwakeClock
+from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.control.stops import Condition, StopCause
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.heat import Heat
@@ -37,7 +37,7 @@ OVERHEATED = 20.0  # excess over temperature_limit at which the arm stops [°C]
 OVERLOAD = 1.1
 OVERLOAD_TIME = 0.2  # time after which an overload stops the arm [s]
 
-MUSCLE_STATES, ESTIMATE = StopCause.STALE_MUSCLE_STATES, StopCause.STALE_ESTIMATE
+MUSCLE_STATES, ESTIMATE = ConditionKind.STALE_MUSCLE_STATES, ConditionKind.STALE_ESTIMATE
 
 
 class Step(NamedTuple):
@@ -64,22 +64,22 @@ class DataAge:
         """Return the time `now` of the steady clock minus the controller's own pauses [s]."""
         return self._awake.at(now)
 
-    def received(self, cause: StopCause, now: float) -> float:
+    def received(self, kind: ConditionKind, now: float) -> float:
         """Record that data was received; return the time since the previous data [s].
 
-        The result is 0 for the first data. `cause` is the stop cause that occurs when this data is
+        The result is 0 for the first data. `kind` is the stop cause that occurs when this data is
         too old.
         """
-        awake, before = self.awake(now), self._came_at[cause]
-        self._came_at[cause] = awake
+        awake, before = self.awake(now), self._came_at[kind]
+        self._came_at[kind] = awake
         return max(awake - before, 0.0) if before > -math.inf else 0.0
 
-    def expect_later(self, cause: StopCause, now: float, within: float) -> None:
+    def expect_later(self, kind: ConditionKind, now: float, within: float) -> None:
         """Allow a pause of some data: its age counts only from `within` [s] after `now`.
 
-        `cause` is the stop cause that occurs when this data is too old.
+        `kind` is the stop cause that occurs when this data is too old.
         """
-        self._came_at[cause] = self.awake(now) + within
+        self._came_at[kind] = self.awake(now) + within
 
     def stale(self, now: float, max_age: float) -> list[Condition]:
         """Return a stop condition for each kind of data that is older than `max_age` [s].
@@ -88,8 +88,8 @@ class DataAge:
         """
         allowed = max_age / min(max(self.pace, SLOWEST), 1.0)
         return [
-            Condition(cause, f'older than {allowed:.3g} s')
-            for cause, came_at in self._came_at.items()
+            kind.condition(f'older than {allowed:.3g} s')
+            for kind, came_at in self._came_at.items()
             if self.awake(now) - came_at > allowed
         ]
 
@@ -168,8 +168,9 @@ class Overload:
         if self._sent_at + age - self._since[m] <= OVERLOAD_TIME:
             return []
         level = f'{self._level[m]:.0f} N for {OVERLOAD_TIME:g} s'
-        detail = f'tension of {self._robot.muscles[m]} above {level}'
-        return [Condition(StopCause.OVERLOAD, detail)]
+        muscle = self._robot.muscles[m]
+        detail = f'tension of {muscle} above {level}'
+        return [ConditionKind.OVERLOAD.condition(detail, [muscle])]
 
 
 class HeatLimit:
@@ -223,7 +224,7 @@ class HeatLimit:
             return []
         warm, most = distinct(winding[m], highest)
         detail = f'{robot.muscles[m]} {warm} °C, limit {most} °C'
-        return [Condition(StopCause.OVERHEATED, detail)]
+        return [ConditionKind.OVERHEATED.condition(detail, [robot.muscles[m]])]
 
 
 class Watchdog:
@@ -260,14 +261,14 @@ class Watchdog:
         self.age.received(ESTIMATE, now)
 
     def conditions(self, now: float) -> list[Condition]:
-        """Return the stop causes that are present, in the order of `StopCause`."""
+        """Return the stop causes that are present, in the order of `ConditionKind`."""
         present = []
         if not self.has_checkpoint:
-            present.append(Condition(StopCause.NO_CHECKPOINT))
+            present.append(ConditionKind.NO_CHECKPOINT.condition())
         if self.has_anomaly:
-            present.append(Condition(StopCause.ANOMALY))
+            present.append(ConditionKind.ANOMALY.condition())
         if self.second_publisher:
-            present.append(Condition(StopCause.SECOND_PUBLISHER, self.second_publisher))
+            present.append(ConditionKind.SECOND_PUBLISHER.condition(self.second_publisher))
         settings = self._settings
         present += self.overload.conditions(now)
         present += self.heat.conditions(self._robot, settings.temperature_limit)

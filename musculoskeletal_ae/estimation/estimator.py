@@ -23,17 +23,12 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation import status
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
 from musculoskeletal_ae.estimation.detectors.joint_disagreement import GAP_LEARNED, GAP_YOUNG
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
-from musculoskeletal_ae.estimation.finding import (
-    REVOKING,
-    REVOKING_ONE,
-    Finding,
-    Kind,
-    Observation,
-)
+from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.length_calibration import (
     LengthCalibration,
@@ -44,7 +39,6 @@ from musculoskeletal_ae.estimation.module_commands import ModuleCommands
 from musculoskeletal_ae.estimation.repair_check import RepairCheck
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.estimation.state_estimator import Estimate, StateEstimator
-from musculoskeletal_ae.estimation.status import SILENCE
 from musculoskeletal_ae.estimation.suspects import SuspectHandling
 from musculoskeletal_ae.estimation.verification import LONGEST
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -64,6 +58,7 @@ LONGEST_PERIOD = 0.1
 #: the pause is unknown: the driver may have received no commands, or the whole computer may have
 #: stood still. By default, the controller stops the arm after the same time (`max_age`).
 INTERRUPTION = 0.2
+SILENCE = 1.0  # restart the filter of the contact estimator after a pause of this length [s]
 JOINTS_AGE = 0.05  # age up to which measured joint angles are used with a message [s]
 SHIFTED = 0.02  # change of an estimated length offset above which it is published again [m]
 
@@ -163,10 +158,10 @@ class Estimator:
         finding = self.suspects.finding
         if finding is None or self.suspects.verification is not None:
             return ()
-        is_repaired = finding.kind is Kind.SLACK_TENDON or self.suspects.has_suspect_jumped
-        if finding.remedy == REPAIR and is_repaired and self._has_wrong_length(finding.muscle):
+        is_repaired = finding.kind is ConditionKind.SLACK_TENDON or self.suspects.has_suspect_jumped
+        if finding.kind.steps == REPAIR and is_repaired and self._has_wrong_length(finding.muscle):
             return (Step.CALIBRATE_LENGTHS,)
-        return finding.remedy
+        return finding.kind.steps
 
     @property
     def advice(self) -> str:
@@ -363,9 +358,13 @@ class Estimator:
         start = middle if self.output is None else self.output.state.theta
         return posture_of_marker(self.robot, pose, start)
 
-    def report(self, now: float) -> Report:
+    def report(self, _: float) -> Report:
         """Return the status for /diagnostics."""
-        return status.report(self, now)
+        return status.report(self)
+
+    def conditions(self, _: float) -> tuple[Condition, ...]:
+        """Return everything that users should know about the body."""
+        return status.conditions(self)
 
     def _take(self, take: Callable[[], MuscleSample], now: float) -> Output | None:
         try:
@@ -474,7 +473,7 @@ class Estimator:
             MusculoskeletalError: If the suspect may not be used yet.
         """
         suspected, offsets = self.suspects.finding, self.body.offsets
-        if suspected is None or suspected.remedy != REPAIR or suspected.muscle in isolating:
+        if suspected is None or suspected.kind.steps != REPAIR or suspected.muscle in isolating:
             return
         if problem := self._problem_of(suspected.muscle):
             raise MusculoskeletalError(f'{problem}; then call estimator/reset again')
@@ -533,10 +532,9 @@ class Estimator:
         if is_repair:
             self.health.reset()  # evidence from before the repair is no longer valid
             return False
-        revokes = finding.kind in REVOKING and finding.muscle not in self.body.isolated
+        revokes = finding.kind.revokes is not None and finding.muscle not in self.body.isolated
         if revokes and self.body.offsets.known:
-            is_one = finding.kind in REVOKING_ONE
-            muscles = (finding.muscle,) if is_one else None
+            muscles = (finding.muscle,) if finding.is_of_one_length else None
             self._use_body(self.body.with_offsets(self.body.offsets.revoked(muscles)))
         is_latched = before is None and self.suspects.finding is not None
         if is_latched:

@@ -6,46 +6,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from enum import Enum
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.conditions import ConditionKind, Revokes
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.estimation.state_estimator import Estimate, estimate_of
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
-from musculoskeletal_ae.remedy import REPAIR, Step
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
-
-
-class Kind(Enum):
-    """Kinds of findings. The values are published in /diagnostics."""
-
-    RESIDUAL_DISTANCE = 'residual_distance'
-    SLACK_TENDON = 'slack_tendon'
-    JAMMED_MODULE = 'jammed_module'
-    SENSOR_FROZEN = 'sensor_frozen'
-    LENGTH_JUMP = 'length_jump'
-    LENGTHS_JUMPED = 'lengths_jumped'
-    LENGTH_DISAGREES = 'length_disagrees'
-    LENGTHS_DISAGREE = 'lengths_disagree'
-    JOINT_SENSORS_DISAGREE = 'joint_sensors_disagree'
-    THERMAL_DRIFT = 'thermal_drift'
-    VALUES_MISSING = 'values_missing'
-
-
-#: findings of one unreliable length; they revoke its offset unless the muscle is isolated
-REVOKING_ONE = frozenset({Kind.LENGTH_JUMP, Kind.LENGTH_DISAGREES})
-#: findings of unreliable lengths; those of several lengths revoke all length offsets
-REVOKING = REVOKING_ONE | {Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE}
-
-
-#: remedies of findings that do not end with the repair of one muscle
-_REMEDIES = {
-    Kind.JOINT_SENSORS_DISAGREE: (Step.CHECK_SENSOR, Step.RESET_ESTIMATOR),
-    **dict.fromkeys(REVOKING, (Step.CALIBRATE_LENGTHS,)),
-}
 
 
 @dataclass(frozen=True)
@@ -55,18 +25,18 @@ class Finding:
     Attributes:
         muscle: Index of the muscle. If the fault is of several muscles or of a joint sensor, it is
             the index of one muscle whose readings the fault affects.
-        kind: Kind of the fault.
+        kind: Kind of the fault. Its declaration states the consequence and the remedy.
         evidence: The evidence as a text for users.
     """
 
     muscle: int
-    kind: Kind
+    kind: ConditionKind
     evidence: str
 
     @property
-    def remedy(self) -> tuple[Step, ...]:
-        """The steps by which a user ends the anomaly, if no verification of the muscle ends it."""
-        return _REMEDIES.get(self.kind, REPAIR)
+    def is_of_one_length(self) -> bool:
+        """Whether the length of a single muscle is wrong."""
+        return self.kind.revokes is Revokes.ONE
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The estimator's status on /diagnostics."""
+"""The estimator's status: what is wrong with the body, and what it knows of it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from musculoskeletal_ae.remedy import REMEDY_STEPS, identifiers, sentence
-from musculoskeletal_ae.report import MUSCLE_STATES, WAITS_FOR, Report
+from musculoskeletal_ae.conditions import Condition, ConditionKind
+from musculoskeletal_ae.estimation.verification import LONGEST
+from musculoskeletal_ae.remedy import REPAIR, Step
+from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.signals.body_state import KNOWN
 
 if TYPE_CHECKING:
@@ -16,24 +19,17 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.mae.mae import Mae
 
 UNKNOWN_TENSION = 'unknown: tension_source is none'
-#: key of the names of the isolated muscles with their faults, such as 'biceps (ruptured)'
-ISOLATION = 'isolated muscles with faults'
-CALIBRATION = 'calibration'  # key of what a length calibration needs: one of the next two values
-GENTLE_MOTION, STANDING = 'gentle_motion', 'standing'
-#: time without a message after which the status is a warning, and after which the filter of the
-#: contact estimator starts again [s]
-SILENCE = 1.0
 
 
-def report(core: Estimator, now: float) -> Report:
-    """Return the status of an estimator; `now` is the time of a steady clock [s].
+def report(core: Estimator) -> Report:
+    """Return the status of an estimator.
 
-    The values `state`, `finding` and `verification` are identifiers for programs, and `last
-    outcome` is one of `verification.Outcome`.
+    The value `verification` is an identifier for programs, and `last outcome` is one of
+    `verification.Outcome`.
     """
-    mae = core.state.mae
+    mae, present = core.state.mae, conditions(core)
     if mae is None:
-        return Report('warn', 'waiting for a checkpoint', {'state': 'no_checkpoint'})
+        return Report('', {}, present)
     values = {
         **_network(core, mae),
         **_suspects(core),
@@ -42,32 +38,66 @@ def report(core: Estimator, now: float) -> Report:
         **_offsets(core),
         **_familiarity(core),
     }
-    if core.suspects.finding is not None:
-        text = f'anomaly detected: {core.cause}; {core.advice}'
-        return Report('error', text, {**values, 'state': 'anomaly'})
-    if now - core.stepped_at > SILENCE:
-        waits = {'state': 'no_muscle_states', WAITS_FOR: MUSCLE_STATES}
-        return Report('warn', 'no muscle_states', values | waits)
     if core.calibration is not None:
-        progress = core.calibration.progress
-        text = f'calibrating the lengths: {progress}'
-        values[CALIBRATION] = STANDING if core.calibration.is_standing else GENTLE_MOTION
-        if core.calibration.problem:
-            values['calibration problem'] = core.calibration.problem
-        return Report('warn', text, {**values, 'state': 'calibrating'})
+        return Report('calibrating the lengths', values, present)
     calibrated = '' if core.health.residual.is_calibrated else ', uncalibrated'
-    if core.heat.changed:
-        changes = (
-            f'the module of {core.robot.muscles[muscle]} {change}'
-            for muscle, change in core.heat.changed.items()
-        )
-        text = f'thermal drift: {"; ".join(changes)}'
-        return Report('warn', text, {**values, 'state': 'thermal_drift'})
-    if core.body.isolated:
-        isolated = core.robot.names(core.body.isolated)
-        text = f'estimating{calibrated} without {isolated}'
-        return Report('warn', text, {**values, 'state': 'isolated'})
-    return Report('ok', f'estimating{calibrated}', {**values, 'state': 'estimating'})
+    return Report(f'estimating{calibrated}', values, present)
+
+
+def conditions(core: Estimator) -> tuple[Condition, ...]:
+    """Return all conditions of the body and of the network."""
+    present = [*_finding(core), *_changed_modules(core), *_isolated(core), *_unknown_offsets(core)]
+    if core.state.mae is None:
+        present.append(ConditionKind.NO_CHECKPOINT.condition(steps=[Step.PROVIDE_CHECKPOINT]))
+    return tuple(present)
+
+
+def _finding(core: Estimator) -> Iterator[Condition]:
+    """Yield the latched finding. While its muscle is being verified, it ends by itself."""
+    finding = core.suspects.finding
+    if finding is None:
+        return
+    muscle = core.robot.muscles[finding.muscle]
+    detail = f'{muscle}: {finding.evidence}'
+    if core.suspects.verification is not None:
+        detail += f' (it is being verified, which ends by itself within {LONGEST:g} s)'
+    yield finding.kind.condition(detail, [muscle], level='error', steps=core.remedy)
+
+
+def _changed_modules(core: Estimator) -> Iterator[Condition]:
+    for muscle, change in core.heat.changed.items():
+        name = core.robot.muscles[muscle]
+        yield ConditionKind.MODULE_CHANGED.condition(f'the module of {name} {change}', [name])
+
+
+def _isolated(core: Estimator) -> Iterator[Condition]:
+    """Yield each isolated muscle, except a suspect that is isolated only to be verified."""
+    verification = core.suspects.verification
+    for muscle in core.body.isolated:
+        if verification is not None and verification.muscle == muscle:
+            continue
+        name, fault = core.robot.muscles[muscle], core.suspects.faults.get(muscle)
+        detail = name if fault is None else f'{name} ({fault})'
+        first = () if fault is None else (Step.REPAIR_MUSCLE,)
+        steps = [*first, Step.RESTORE_MUSCLES]
+        yield ConditionKind.MUSCLE_ISOLATED.condition(detail, [name], steps=steps)
+
+
+def _unknown_offsets(core: Estimator) -> Iterator[Condition]:
+    """Yield the muscles with unknown length offsets, and how a running calibration proceeds."""
+    offsets, calibration = core.body.offsets, core.calibration
+    if offsets.known:
+        return
+    names = [core.robot.muscles[m] for m in np.flatnonzero(~(offsets.deviation < KNOWN))]
+    detail, finding = ', '.join(names), core.suspects.finding
+    steps: tuple[Step, ...] = (Step.CALIBRATE_LENGTHS,)
+    if calibration is not None:
+        detail = f'{detail}; calibrating: {calibration.progress}'
+        steps = (Step.CHECK_SENSOR, Step.CALIBRATE_LENGTHS) if calibration.problem else ()
+    elif finding is not None and finding.kind.steps == REPAIR:
+        steps = ()  # the lengths are calibrated after the repair
+    kind = ConditionKind.LENGTH_OFFSETS_UNKNOWN
+    yield kind.condition(detail, names, steps=steps)
 
 
 def _network(core: Estimator, mae: Mae) -> dict[str, str]:
@@ -85,24 +115,11 @@ def _suspects(core: Estimator) -> dict[str, str]:
     suspects, values = core.suspects, dict[str, str]()
     if core.body.isolated:
         values['isolated muscles'] = core.robot.names(core.body.isolated)
-        values[ISOLATION] = ', '.join(_isolation(core, muscle) for muscle in core.body.isolated)
-    values['finding'] = 'none' if suspects.finding is None else suspects.finding.kind.value
-    if suspects.finding is not None:
-        values['evidence'] = suspects.finding.evidence
-        if steps := core.remedy:
-            values['remedy'] = sentence(steps)
-            values[REMEDY_STEPS] = identifiers(steps)
     values['verification'] = 'none' if suspects.verification is None else 'running'
     if suspects.last_verdict is not None:
         values['last verified'] = suspects.last_verification
         values['last outcome'] = suspects.last_verdict[1].outcome.value
     return values
-
-
-def _isolation(core: Estimator, muscle: int) -> str:
-    """Return the name of an isolated muscle, with its fault if a verification has found one."""
-    name, fault = core.robot.muscles[muscle], core.suspects.faults.get(muscle)
-    return name if fault is None else f'{name} ({fault})'
 
 
 def _residuals(core: Estimator) -> dict[str, str]:
@@ -138,9 +155,6 @@ def _contact(core: Estimator) -> dict[str, str]:
 
 def _offsets(core: Estimator) -> dict[str, str]:
     offsets, values = core.body.offsets, dict[str, str]()
-    if not offsets.known:
-        unknown = np.flatnonzero(~(offsets.deviation < KNOWN))
-        values['unknown length offsets'] = core.robot.names(unknown)
     if not offsets.offset.any():
         return values
     rows = zip(core.robot.muscles, 1e3 * offsets.offset, 1e3 * offsets.deviation)

@@ -38,7 +38,8 @@ a muscle is being verified, it cannot be restored.
 
 from collections.abc import Iterable
 
-from musculoskeletal_ae.estimation.finding import REVOKING, REVOKING_ONE, Finding, Kind
+from musculoskeletal_ae.conditions import Reaction
+from musculoskeletal_ae.estimation.finding import Finding
 from musculoskeletal_ae.estimation.settings import ISOLATE, Detection
 from musculoskeletal_ae.estimation.verification import (
     ModuleLaw,
@@ -52,8 +53,6 @@ from musculoskeletal_ae.robot.robot import Robot
 
 ACQUITTALS = 2  # number of suspects verified as healthy after which the next one is not verified
 WITHIN = 60.0  # time during which a suspect verified as healthy counts [s]
-#: kinds of findings after which no muscle is isolated, because the named one may be healthy
-OF_SEVERAL = frozenset({Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE, Kind.JOINT_SENSORS_DISAGREE})
 
 
 class SuspectHandling:
@@ -108,7 +107,7 @@ class SuspectHandling:
         """
         isolated, muscle = tuple(isolated), finding.muscle
         isolates = self.settings.on_anomaly == ISOLATE
-        if finding.kind is Kind.VALUES_MISSING:
+        if finding.kind.reaction is Reaction.ISOLATE_AT_ONCE:
             if not isolates or muscle in isolated:
                 return isolated
             self.last_verdict = muscle, Verdict(Outcome.VALUES_MISSING)
@@ -118,13 +117,14 @@ class SuspectHandling:
             self.has_suspect_jumped = True
             return isolated
         if self.finding is not None:
-            if finding.kind in REVOKING and self.finding.kind not in REVOKING:
+            if finding.kind.revokes is not None and self.finding.kind.revokes is None:
                 isolated = self.clear(isolated)  # the earlier finding is based on wrong lengths
                 self.finding = finding
             return isolated
         self.finding = finding
         recent = [time for time in self._acquitted if now - time < WITHIN]
-        if not isolates or finding.kind in OF_SEVERAL or len(recent) >= ACQUITTALS:
+        may_isolate = isolates and finding.kind.reaction is Reaction.ISOLATE
+        if not may_isolate or len(recent) >= ACQUITTALS:
             return isolated
         self.verification = Verification(muscle, self._law(muscle))
         return (*isolated, muscle)
@@ -136,9 +136,9 @@ class SuspectHandling:
         its repair.
         """
         suspected = self.finding
-        if suspected is None or suspected.remedy != REPAIR:
+        if suspected is None or suspected.kind.steps != REPAIR:
             return False
-        return finding.kind in REVOKING_ONE and finding.muscle == suspected.muscle
+        return finding.is_of_one_length and finding.muscle == suspected.muscle
 
     def _law(self, muscle: int) -> ModuleLaw:
         robot, bias = self._robot, float(self._robot.description.tension.bias[muscle])

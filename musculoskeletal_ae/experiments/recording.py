@@ -132,7 +132,7 @@ class ClosedLoop:
         """Raise a MusculoskeletalError if the controller has stopped."""
         condition = self.core.supervisor.condition
         if condition is not None:
-            raise MusculoskeletalError(f'control stopped: {condition}')
+            raise MusculoskeletalError(f'control stopped: {condition.text}')
 
     def target(self, theta: Array) -> None:
         """Set the target θ [rad] (D,)."""

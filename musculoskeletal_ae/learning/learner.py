@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.conditions import Condition
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
 from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR, SampleCollector
@@ -31,7 +32,7 @@ from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.learning.keeper import CheckpointKeeper
 from musculoskeletal_ae.learning.offset_check import OffsetCheck
 from musculoskeletal_ae.learning.offset_history import HELD_TIME, OffsetHistory
-from musculoskeletal_ae.learning.report import learner_report
+from musculoskeletal_ae.learning.report import learner_conditions, learner_report
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.scheduler import LEAST_BLIND, UpdateScheduler
 from musculoskeletal_ae.learning.settings import DEFAULT, STEPS, Settings
@@ -450,14 +451,10 @@ class Learner:
         return self.scheduler.last_update
 
     @property
-    def trouble(self) -> str:
-        """Why learning is not possible or results are not on disk, or ''."""
-        jumped = ''
+    def has_unsettled_jump(self) -> bool:
+        """Whether lengths have jumped without a reaction of the estimator."""
         has_jumped = self.collector.has_jumped and self.body.offsets.known
-        if has_jumped and not self.collector.is_anomaly:
-            jumped = 'learning is paused because lengths have jumped; call estimator/zero'
-        troubles = self.trainer.trouble, self.keeper.trouble, self.offset_check.problem, jumped
-        return '; '.join(filter(None, troubles))
+        return has_jumped and not self.collector.is_anomaly
 
     @property
     def idle_time(self) -> float:
@@ -469,6 +466,10 @@ class Learner:
             return 0.0
         return self._polled_at - self._progress_at
 
-    def report(self) -> Report:
+    def report(self, _: float = 0.0) -> Report:
         """Return the learner's status for /diagnostics."""
         return learner_report(self)
+
+    def conditions(self, _: float) -> tuple[Condition, ...]:
+        """Return why nothing is learned, or what is learned is not kept."""
+        return learner_conditions(self)

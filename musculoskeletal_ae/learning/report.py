@@ -3,52 +3,61 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.learning.calibration import is_calibrated, is_learned
-from musculoskeletal_ae.learning.collector import NO_MESSAGES
 from musculoskeletal_ae.learning.job import Update
-from musculoskeletal_ae.report import (
-    ANOMALY,
-    LENGTH_OFFSETS,
-    MUSCLE_STATES,
-    WAITS_FOR,
-    Level,
-    Report,
-)
+from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.learning.learner import Learner
 
-LONGEST_IDLE = 5.0  # time without a usable message after which the status is a warning [s]
+LONGEST_IDLE = 5.0  # report a learner that has received no usable message for this time [s]
 
 
 def learner_report(learner: Learner) -> Report:
     """Return the status of a learner."""
-    level: Level = 'warn'
-    waits_for = {}
-    if trouble := learner.trouble:
-        level, message = 'error', trouble
-    elif learner.checkpoint is None:
-        message = 'waiting for a checkpoint: set the parameter `checkpoint`'
-    elif not learner.enabled:
-        message = 'stopped by learner/enable; call it with true to resume'
-    elif not learner.body.offsets.known:
-        message = 'waiting for a length calibration; if none is in progress, call estimator/zero'
-        waits_for = {WAITS_FOR: LENGTH_OFFSETS}
-    elif not learner.offset_check.is_believed:
-        message = 'checking new length offsets against muscle_states'
-    elif learner.collector.is_anomaly:
-        message = 'paused by an anomaly until its suspect is verified or estimator/reset is called'
-        waits_for = {WAITS_FOR: ANOMALY}
-    elif (idle_time := learner.idle_time) > LONGEST_IDLE:
-        message = f'no usable data for {idle_time:.0f} s: {learner.collector.obstacle}'
-        if learner.collector.obstacle == NO_MESSAGES:
-            waits_for = {WAITS_FOR: MUSCLE_STATES}
-    else:
-        level, message = 'ok', 'learning'
-    return Report(level, message, {**_values(learner), 'state': message, **waits_for})
+    present = learner_conditions(learner)
+    return Report('' if present else 'learning', _values(learner), present)
+
+
+def learner_conditions(learner: Learner) -> tuple[Condition, ...]:
+    """Return why a learner does not learn, or does not keep what it has learned."""
+    return (*_failures(learner), *_obstacles(learner))
+
+
+def _failures(learner: Learner) -> Iterator[Condition]:
+    kind = ConditionKind
+    if problem := learner.trainer.trouble:
+        yield kind.TRAINING_FAILED.condition(problem)
+    if problem := learner.keeper.trouble:
+        yield kind.STATE_NOT_SAVED.condition(problem)
+    if problem := learner.offset_check.problem:
+        yield kind.OFFSETS_NOT_BELIEVED.condition(problem)
+    if learner.has_unsettled_jump:
+        yield kind.LENGTHS_NOT_LEARNED.condition()
+
+
+def _obstacles(learner: Learner) -> Iterator[Condition]:
+    kind, offsets = ConditionKind, learner.body.offsets
+    if learner.checkpoint is None:
+        yield kind.NO_CHECKPOINT.condition(steps=[Step.PROVIDE_CHECKPOINT])
+    if not learner.enabled:
+        yield kind.LEARNING_DISABLED.condition()
+    if not offsets.known:
+        yield kind.LEARNING_WAITS.condition('the length offsets are unknown')
+    elif not learner.offset_check.is_believed and not learner.offset_check.problem:
+        yield kind.LEARNING_WAITS.condition('new length offsets are being checked')
+    if learner.collector.is_anomaly:
+        yield kind.LEARNING_WAITS.condition('there is an anomaly')
+    can_learn = learner.enabled and offsets.known and not learner.collector.is_anomaly
+    if can_learn and learner.idle_time > LONGEST_IDLE:
+        detail = f'no usable data for {learner.idle_time:.0f} s: {learner.collector.obstacle}'
+        yield kind.NOTHING_TO_LEARN.condition(detail)
 
 
 def _values(learner: Learner) -> dict[str, str]:

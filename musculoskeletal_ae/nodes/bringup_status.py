@@ -8,6 +8,7 @@ joint_states, estimated_joint_states, anomaly, /diagnostics → stdout. This nod
 import math
 import sys
 import time
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,19 @@ from rclpy.executors import ExternalShutdownException
 from std_msgs.msg import Float64
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
-from musculoskeletal_ae.nodes.situation import LARGEST_AGE, Situation, figures
-from musculoskeletal_ae.report import OVERLOADED, Report, overload_text
+from musculoskeletal_ae.nodes.situation import LARGEST_AGE, Situation, figures, nodes_in_graph
+from musculoskeletal_ae.report import (
+    END_OF_RECORDING,
+    NOT_WAITED_FOR,
+    WAITING,
+    Report,
+    overload_note,
+    with_load,
+)
 
 #: time after the first estimate during which problems are not shown, because most of them end by
 #: themselves while the nodes start [s]
@@ -45,13 +54,12 @@ class BringupStatus(Shell):
         self.measured: tuple[float, Array | None] = -math.inf, None
         self.errors: list[float] = []
         self.anomalies: list[float] = []
-        self.situation = Situation(
-            self.get_namespace(), expects_replay=self.parameter('end_with_replay')
-        )
+        self.situation = Situation(self.get_namespace(), lambda: nodes_in_graph(self))
         self.last_known = [math.nan, math.nan]  # last estimation error and A in a status line
         self.started: float | None = None
         self.ended: float | None = None  # when the end of the recording was first reported [s]
-        #: the last line before the first estimate, and whether it named an overload
+        self.ended_report = math.inf  # arrival of that report, as `Situation.heard_at` counts [s]
+        #: the last line before the first estimate without the load, and whether it had a load
         self.waiting = '', False
         self.waiting_since = -math.inf  # when it was printed [s]
         self.printed_hint = ''
@@ -74,20 +82,23 @@ class BringupStatus(Shell):
         if (measured := self.theta) is not None:
             self.errors.append(float(np.linalg.norm(np.nan_to_num(theta - measured))))
 
-    def report(self) -> Report:
-        """Return a report on the whole arm, with the level of the worst node."""
+    def conditions(self) -> Iterable[Condition]:
+        """Yield the conditions of the whole arm, so that the level is that of the worst node."""
+        yield from super().conditions()
+        yield from (each.condition for each in self.situation.conditions())
+
+    def status(self) -> Report:
+        """Return whether all nodes are OK."""
         self.situation.tick()
-        return Report(self.situation.level(), self.situation.trouble() or 'all nodes are OK', {})
+        return Report('' if self.situation.trouble() else 'all nodes are OK', {})
 
     def _print(self) -> None:
         now = time.monotonic()
         self.situation.tick()
         if self.started is None and not self.anomalies:
             if 0.0 < self.patience < now - self.begun:
-                advice = '; '.join(filter(None, [overload_text(), 'see the logs of the nodes']))
-                sys.exit(
-                    f'the system did not come up: no estimate within {self.patience:g} s; {advice}'
-                )
+                what = with_load(f'no estimate within {self.patience:g} s')
+                sys.exit(f'the system did not come up: {what}; see the logs of the nodes')
             self._end_with_replay()
             self._print_waiting(now)
             return
@@ -102,37 +113,72 @@ class BringupStatus(Shell):
 
     def _end_with_replay(self) -> None:
         """End the node, if it is to end with the recording and `replay` has reported its end."""
-        if not (self.parameter('end_with_replay') and self.situation.has_recording_ended):
+        if not (self.parameter('end_with_replay') and self._has_recording_ended):
             return
         if self.started is None:
-            reason = self.situation.why_no_estimate()
+            reason = self._why_no_estimate()
             sys.exit(f'the recording brought no estimate: {reason}; see the logs of the nodes')
-        self.ended = self.ended or time.monotonic()
-        if not self.situation.has_last_report and time.monotonic() - self.ended < LAST_REPORT_WAIT:
+        if self.ended is None:
+            self.ended = time.monotonic()
+            self.ended_report = self.situation.heard_at('replay')
+        # The learner reports what it has learned from the last messages.
+        has_last_report = self.situation.heard_at('learner') > self.ended_report
+        is_waiting = self.situation.has_learner and not has_last_report
+        if is_waiting and time.monotonic() - self.ended < LAST_REPORT_WAIT:
             return
-        if learned := self.situation.learned():
+        if learned := self._learned():
             print(f'-- {printable(learned)}', flush=True)
         raise ExternalShutdownException
 
+    @property
+    def _has_recording_ended(self) -> bool:
+        return self.situation.values('replay').get('state') == END_OF_RECORDING
+
+    def _why_replay_waits(self) -> str:
+        """Return what the replay waits for before it begins to play, or ''."""
+        if self.situation.values('replay').get('state') != WAITING:
+            return ''
+        return ', '.join(
+            each.condition.text
+            for each in self.situation.conditions()
+            if each.condition.identifier == ConditionKind.REPLAY_STANDS.identifier
+        )
+
+    def _why_no_estimate(self) -> str:
+        """Return the last rejected message of the estimator; without one, all problems."""
+        rejected = self.situation.values('estimator').get('last rejected', '')
+        return f'rejected {rejected}' if rejected else self.situation.trouble()
+
+    def _learned(self) -> str:
+        """Return from how many samples of a recording the learner has learned; '' without one.
+
+        If nodes may have missed messages, the text says so, with the remedy.
+        """
+        if not self.situation.has_learner:
+            return ''
+        samples = self.situation.count('samples')
+        postures = 'resting posture' if samples == '1' else 'resting postures'
+        text = f'learned from {samples} {postures} of the recording'
+        if lost := self.situation.values('replay').get(NOT_WAITED_FOR):
+            text += with_load(
+                f'; {lost} may have missed messages, because the replay got no answer: see their '
+                'logs, and play the recording again, or use train --from-bag, which loses none'
+            )
+        return text
+
     def _print_waiting(self, now: float) -> None:
         """Print that there is no estimate yet, and why; again if the reason has changed."""
-        line = 'waiting for the first estimate'
         # Most problems end by themselves while the nodes start.
         is_settled = now - self.begun >= SETTLING
-        waiting_replay = self.situation.replay_waits()
-        reason = self.situation.why_no_estimate() if is_settled else waiting_replay
-        if reason:
-            line += f': {reason}'
-        overload = overload_text() if is_settled else ''
-        if OVERLOADED in line:  # a node has already said so
-            overload = ''
+        reason = self._why_no_estimate() if is_settled else self._why_replay_waits()
+        line = ': '.join(filter(None, ['waiting for the first estimate', reason]))
         # The load itself changes all the time, which is no reason to print the line again.
-        waiting = line, bool(overload)
-        is_new = waiting_replay not in self.waiting[0]
+        is_new = bool(waits := self._why_replay_waits()) and waits not in self.waiting[0]
         is_due = is_new or now - self.waiting_since >= WAITING_INTERVAL
-        if waiting != self.waiting and is_due:
-            self.waiting, self.waiting_since = waiting, now
-            print(printable('; '.join(filter(None, [line, overload]))), flush=True)
+        note = overload_note() if is_settled else ''
+        if (line, bool(note)) != self.waiting and is_due:
+            self.waiting, self.waiting_since = (line, bool(note)), now
+            print(printable('; '.join(filter(None, [line, note]))), flush=True)
 
     def _print_line(self, running_time: float) -> None:
         means = [sum(v) / len(v) if v else math.nan for v in (self.errors, self.anomalies)]
@@ -141,12 +187,13 @@ class BringupStatus(Shell):
         self.last_known = [
             old if math.isnan(new) else new for new, old in zip(means, self.last_known)
         ]
-        if situation.has_recording_ended:  # no further messages are expected
+        if self._has_recording_ended:  # no further messages are expected
             means = self.last_known
         known = figures(self.theta is not None, means[0], means[1], unit)
         self.errors, self.anomalies = [], []
         line = f'{running_time:6.0f} s  {known}'
-        line += f'  samples {situation.samples or 0}  checkpoints {situation.checkpoints or 0}'
+        samples, checkpoints = situation.count('samples'), situation.count('checkpoints')
+        line += f'  samples {samples}  checkpoints {checkpoints}'
         parts = line, situation.unexplored(), situation.trouble()
         self._print_hint()
         print(printable('  '.join(filter(None, parts))), flush=True)

@@ -8,6 +8,7 @@ follow_joint_trajectory, where control_msgs is installed.
 """
 
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -23,13 +24,13 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from musculoskeletal_ae.bags.topics import topics_with
+from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller as Core
 from musculoskeletal_ae.control.method_choice import check_method
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
-from musculoskeletal_ae.control.stop_memory import StopMemory
-from musculoskeletal_ae.control.stops import LAST, StopCause
+from musculoskeletal_ae.control.stop_memory import BEFORE, StopMemory
 from musculoskeletal_ae.estimation.verification import LONGEST
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.messages import (
@@ -45,7 +46,7 @@ from musculoskeletal_ae.nodes.sources import AUTHORS
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.reception import Stamps, Streams
-from musculoskeletal_ae.remedy import REPAIR, sentence
+from musculoskeletal_ae.remedy import Step, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.validity import (
@@ -70,12 +71,12 @@ class Controller(Shell):
         self.core = Core(self.robot, seed=self.parameter('seed'))
         self.memory = StopMemory(self.state_directory())
         if self.memory.found is not None:
-            self.core.stop(*self.memory.found)
+            self.core.stop(self.memory.found.kind, BEFORE)
         self.recording: StopRecording = StopRecording(
             self.resolve_topic_name, topics=topics_with(self.motors.settings)
         )
         #: cause of the latched stop after its recording has begun; None otherwise
-        self.recorded: StopCause | None = None
+        self.recorded: ConditionKind | None = None
         self.logged: list[str] = []
         self.mode = self.create_publisher(String, 'controller_mode', LATCHED)
         self.published_mode = ''
@@ -92,7 +93,7 @@ class Controller(Shell):
         for name in parameters_of(Settings):
             self.follow_parameter(name, partial(self._configure, name), checks.get(name))
         self.follow_accepted_checkpoints(
-            self.core.use, lambda reason: self.core.stop(StopCause.UNFIT_CHECKPOINT, reason)
+            self.core.use, lambda reason: self.core.stop(ConditionKind.UNFIT_CHECKPOINT, reason)
         )
         self.needed.add('muscle_states', 'estimated_joint_states')
         self.follow_offsets(self._use_body)
@@ -194,7 +195,8 @@ class Controller(Shell):
         warn = self.get_logger().warning
         if not self.core.supervisor.is_running:
             condition = self.core.supervisor.condition
-            warn(f'stopped ({condition}): the arm moves to the target after controller/reset')
+            why = '' if condition is None else f' ({condition.text})'
+            warn(f'stopped{why}: the arm moves to the target after controller/reset')
         target = self.core.target_state
         if target.unreachable_reason:
             warn(f'out of reach: {target.unreachable_reason}')
@@ -261,31 +263,28 @@ class Controller(Shell):
         if reason := self.core.explore(request.data):
             raise MusculoskeletalError(reason)
         condition = self.core.supervisor.condition
-        holding = 'holding' if condition is None else f'stopped: {condition}'
+        holding = 'holding' if condition is None else f'stopped: {condition.text}'
         return 'exploring' if request.data else holding
 
     def _stop(self, _: Trigger.Request) -> str:
-        self.core.stop(StopCause.OPERATOR)
+        self.core.stop(ConditionKind.OPERATOR)
         self._remember_stop()
         return 'stopped; call controller/reset to continue'
 
     def _reset(self, _: Trigger.Request) -> str:
         present = self.core.reset(time.monotonic())
         if present is not None:
-            if present.cause is StopCause.ANOMALY and self.core.stopping.suspect is not None:
+            is_anomaly = present.kind is ConditionKind.ANOMALY
+            if is_anomaly and self.core.stopping.suspect is not None:
                 raise MusculoskeletalError(
-                    f'refused: {present}; the muscle is being verified; wait until this has ended, '
-                    f'within {LONGEST:g} s; the arm then moves on by itself, unless another stop '
-                    'cause needs a reset'
+                    f'refused: {present.text}; the muscle is being verified; wait until this has '
+                    f'ended, within {LONGEST:g} s; the arm then moves on by itself, unless another '
+                    'stop cause needs a reset'
                 )
-            if present.cause is StopCause.ANOMALY:
-                # The steps depend on the finding, which only the estimator knows.
-                unless = 'unless the estimator reports another `remedy` on /diagnostics'
-                remedy = f'{sentence(REPAIR)}, {unless}'
-            else:
-                remedy = sentence(step for step in present.cause.steps if step not in LAST)
+            first = [step for step in present.steps if step is not Step.RESET_CONTROLLER]
+            remedy = 'see the remedy of the estimator' if is_anomaly else sentence(first)
             again = f'call controller/reset again {LIMITS.settled:g} s after the cause has ended'
-            raise MusculoskeletalError(f'refused: {present}; {remedy}; {again}')
+            raise MusculoskeletalError(f'refused: {present.text}; {remedy}; {again}')
         return 'moving to the last target, if there is one; call controller/explore to explore'
 
     def _watch(self) -> None:
@@ -317,7 +316,7 @@ class Controller(Shell):
         supervisor = self.core.supervisor
         mode = supervisor.mode
         if supervisor.condition is not None:
-            mode = f'{mode}:{supervisor.condition.cause.identifier}'
+            mode = f'{mode}:{supervisor.condition.identifier}'
         if mode != self.published_mode:
             self.published_mode = mode
             self.mode.publish(String(data=mode))
@@ -333,18 +332,20 @@ class Controller(Shell):
         if not supervisor.is_latched or supervisor.condition is None:
             self.recorded = None
         elif self.recorded is None:
-            self.recorded = supervisor.condition.cause
-            self.recording.save(str(supervisor.condition), self.parameter('stop_recordings'))
+            self.recorded = supervisor.condition.kind
+            self.recording.save(supervisor.condition.text, self.parameter('stop_recordings'))
 
-    def report(self) -> Report:
-        """Return the diagnostic report, and log stops and joint stiffness when they change."""
-        report = status.report(self.core, time.monotonic())
+    def conditions(self) -> Iterable[Condition]:
+        """Yield the conditions of the core, and that a stop cannot be kept."""
+        yield from super().conditions()
+        if problem := self.memory.problem:
+            yield ConditionKind.STOP_NOT_KEPT.condition(problem)
+
+    def status(self) -> Report:
+        """Return what the controller does; log stops and joint stiffness when they change."""
+        report = self.core.report(time.monotonic())
         if kept := self.recording.problem or self.recording.saved:
             report.values['last stop'] = str(kept)
-        if problem := self.memory.problem:
-            report.values['stop that is not kept'] = problem
-            if report.level == 'ok':
-                report = report.with_warning(problem)
         if left_out := self.recording.left_out:
             report.values['messages too large for a stop recording'] = str(left_out)
         stopped = [] if self.core.supervisor.is_running else [report.message]

@@ -2,15 +2,16 @@
 """Publishes a node's state on /diagnostics, with message rates and rejected messages."""
 
 import secrets
-from collections import Counter
 from collections.abc import Mapping
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
+from musculoskeletal_ae.conditions import CONDITIONS, ordered, to_json
 from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.reception import Reception
+from musculoskeletal_ae.remedy import sentence
 from musculoskeletal_ae.report import Report
 
 MANY_REPORTS = QoSProfile(depth=50)  # QoS of /diagnostics, on which all nodes of the graph report
@@ -30,7 +31,6 @@ class Diagnostics:
         """
         self._node, self._reception, self._hardware = node, reception, hardware
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._ignored_before = Counter[str]()
         self.status_name = f'{node.get_fully_qualified_name()}: state'
         #: random text that distinguishes this node from another node of the same name
         self.identity = secrets.token_hex(8)
@@ -43,25 +43,25 @@ class Diagnostics:
             rates: Rate at which the node uses messages [Hz], by topic.
         """
         rejected = self._reception.rejected
-        values = {**report.values, 'identity': self.identity}
+        values = {'doing': report.doing} if report.doing else {}
+        values |= {**report.values, 'identity': self.identity}
         values |= {f'{topic} rate': f'{rate:.1f} Hz' for topic, rate in rates.items()}
         values['rejected'] = str(sum(rejected.values()))
         values |= {f'rejected {reason}': str(n) for reason, n in rejected.items()}
         if self._reception.last_rejected:
             values['last rejected'] = self._reception.last_rejected
         values |= {f'ignored {part}': str(n) for part, n in self._reception.ignored.items()}
-        if refusal := self._reception.refusal:
-            values['refused'] = refusal
-            report = report.with_warning(f'refused {refusal}')
-        if newly_ignored := self._reception.ignored - self._ignored_before:
-            self._ignored_before = self._reception.ignored.copy()
-            report = report.with_warning(f'ignored {", ".join(newly_ignored)}')
+        present = ordered(report.conditions)
+        if steps := report.steps:
+            values['remedy'] = sentence(steps)
+        listed = [KeyValue(key=CONDITIONS, value=to_json(present))] if present else []
         status = DiagnosticStatus(
             level=getattr(DiagnosticStatus, report.level.upper()),
             name=self.status_name,
             message=printable(report.message),
             hardware_id=self._hardware,
-            values=[KeyValue(key=key, value=printable(value)) for key, value in values.items()],
+            values=[KeyValue(key=key, value=printable(value)) for key, value in values.items()]
+            + listed,
         )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._node.get_clock().now().to_msg()

@@ -6,6 +6,7 @@ muscle_states, robot_description, hardware_emulator/markers; on request marker_p
 """
 
 import time
+from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
@@ -19,11 +20,11 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
+from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.arm import Arm, Markers
 from musculoskeletal_ae.nodes.messages import RELIABLE, serve
-from musculoskeletal_ae.remedy import EMULATED_FAULTS, EMULATED_REPAIRS, NO_FAULTS
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.robot.kinematics import body_frames
@@ -140,20 +141,22 @@ class HardwareEmulator(Arm):
             return []
         return draw_arm(self.robot, arm.theta, arm.tension, arm.route_points())
 
-    def report(self) -> Report:
-        """Return the diagnostic report."""
-        hottest = np.fmax.reduce(self.reading.temperature)  # NaN only if all temperatures are NaN
-        faults = [name for name in EMULATED_REPAIRS if any(self.parameter(name))]
-        values = {
-            'hottest module': f'{hottest:.1f} °C',
-            'real-time factor': f'{self.pace:.2f}',
-            EMULATED_FAULTS: ', '.join(faults) or NO_FAULTS,
-        }
+    def conditions(self) -> Iterable[Condition]:
+        """Yield what is wrong with the emulation, and which faults it imitates."""
+        yield from super().conditions()
+        kind = ConditionKind
         if self.arm.has_diverged:
-            problem = 'the simulation diverged under excessive forces'
-            return Report('error', f'{problem}; call hardware_emulator/reset', values)
-        if self.arm.safe:
-            problem = 'the modules are in their safe state, because no commands arrive'
-            remedy = 'start the controller, or publish commands'
-            return Report('warn', f'{problem}; {remedy}', values)
-        return Report('ok', 'following commands', values)
+            yield kind.EMULATION_DIVERGED.condition()
+        elif self.arm.safe:
+            yield kind.MODULES_IN_SAFE_STATE.condition()
+        if ruptured := list(filter(None, self.parameter('ruptured_muscles'))):
+            yield kind.EMULATED_RUPTURE.condition(', '.join(ruptured), ruptured)
+        if faults := list(filter(None, self.parameter('faults'))):
+            yield kind.EMULATED_FAULT.condition(', '.join(faults))
+
+    def status(self) -> Report:
+        """Return what the emulated arm does, with its values."""
+        hottest = np.fmax.reduce(self.reading.temperature)  # NaN only if all temperatures are NaN
+        values = {'hottest module': f'{hottest:.1f} °C', 'real-time factor': f'{self.pace:.2f}'}
+        is_obeying = not (self.arm.has_diverged or self.arm.safe)
+        return Report('following commands' if is_obeying else '', values)

@@ -6,6 +6,7 @@ isolated_muscles, muscle_length_zeros → mae_checkpoint.
 """
 
 import time
+from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
@@ -13,6 +14,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
+from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.learning import learner
 from musculoskeletal_ae.learning.settings import Settings
@@ -23,7 +25,6 @@ from musculoskeletal_ae.nodes.node_parameters import naming_parameter
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.sources import SEVERAL, LinkSensors, publishers_of
 from musculoskeletal_ae.parameters import parameters_of
-from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.validity import read_imu
 
@@ -53,7 +54,6 @@ class Learner(Shell):
         )
         self.publisher = self.create_publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
         self.sources.watch('mae_checkpoint')
-        self.troubled = False
         core = self.core
         self._begin()
         # These setters replace what was learned, which cannot be undone. The function in the third
@@ -155,9 +155,6 @@ class Learner(Shell):
         data = self.core.poll(self.now())
         if data is not None:
             self.publisher.publish(bytes_message(data))
-        if bool(self.core.trouble) != self.troubled:  # report a change without delay
-            self.troubled = not self.troubled
-            self._report()
 
     def clock_jumped_back(self) -> None:
         """Discard messages that have not become part of a sample yet."""
@@ -168,10 +165,11 @@ class Learner(Shell):
         publishers = publishers_of(self, self.full_name(IMU))
         self.accelerometers.look(publishers, time.monotonic())
 
-    def report(self) -> Report:
-        """Return the diagnostic report."""
-        report, problem = self.core.report(), self.accelerometers.problem
-        return report.with_warning(f'{IMU} is not used: {problem}') if problem else report
+    def conditions(self) -> Iterable[Condition]:
+        """Yield the conditions of the core, and why accelerometers are not used."""
+        yield from super().conditions()
+        if problem := self.accelerometers.problem:
+            yield ConditionKind.ACCELEROMETERS_UNCLEAR.condition(problem, [IMU])
 
     def destroy_node(self) -> None:
         """End the training process, then destroy the node."""

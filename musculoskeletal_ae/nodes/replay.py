@@ -32,6 +32,7 @@ from musculoskeletal_ae.bags.playback import (
 )
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, DIAGNOSTICS, latched_topics, select
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.diagnostics import MANY_REPORTS, PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.lockstep import Lockstep
@@ -50,7 +51,7 @@ from musculoskeletal_ae.report import (
     PLAYING,
     WAITING,
     Report,
-    overload_text,
+    with_load,
 )
 from musculoskeletal_ae.signals.motor_interface import STATES
 from musculoskeletal_ae.stop_signals import STOP, Reaction
@@ -195,7 +196,8 @@ class Replay(Node):
         if self._lockstep is not None and time.monotonic() > self._next_report:
             self._next_report = time.monotonic() + PERIOD
             waiting = f'waiting until {" and ".join(self._lockstep.missing())} can receive'
-            self._diagnostics.tell(Report('ok', waiting, {'state': WAITING}), {})
+            stands = (ConditionKind.REPLAY_STANDS.condition(waiting),)
+            self._diagnostics.tell(Report('', {'state': WAITING}, stands), {})
             if waiting != self._printed:
                 self._printed = waiting
                 print(waiting, file=sys.stderr, flush=True)
@@ -206,7 +208,8 @@ class Replay(Node):
         if self._lockstep is not None:
             self._lockstep.step(self._stop, self._spinner)
             values[NOT_WAITED_FOR] = ', '.join(self._lockstep.lost)
-        self._diagnostics.tell(Report('ok', 'end of the recording', values), {})
+        stands = (ConditionKind.REPLAY_STANDS.condition('end of the recording'),)
+        self._diagnostics.tell(Report('', values, stands), {})
         end = time.monotonic() + ACKNOWLEDGE_TIME
         for publisher in self._publisher.values():
             left = max(0.0, end - time.monotonic())
@@ -247,17 +250,17 @@ class Replay(Node):
     def _report(self, now: float) -> Report:
         """Return the status during playback; `now` is the time of the steady clock [s]."""
         state = PAUSED if self._timeline.paused else PLAYING
-        report = Report('ok', state, {'position': self._position(), 'state': state})
+        report = Report(state, {'position': self._position(), 'state': state})
+        if state == PAUSED:
+            report = report.with_conditions([ConditionKind.REPLAY_STANDS.condition(PAUSED)])
         # Only the lockstep keeps playback back for a long time.
         before, self._reported = self._reported, (now, self._done())
         speed = (self._reported[1] - before[1]) / max(now - before[0], 1e-3)
         is_slow = 0.0 < speed < SLOW * self._rate and before[0] > self._seek_time
         if state == PAUSED or self._lockstep is None or not is_slow:
             return report
-        cause = overload_text() or 'they are slow'
-        return report.with_warning(
-            f'at {speed / self._rate:.0%} of the wanted speed, because it waits for nodes: {cause}'
-        )
+        detail = f'at {speed / self._rate:.0%} of the wanted speed, because it waits for nodes'
+        return report.with_conditions([ConditionKind.REPLAY_SLOW.condition(with_load(detail))])
 
     def _tick(self) -> None:
         """Publish the recorded time on /clock, if enabled and due.

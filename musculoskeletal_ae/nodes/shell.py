@@ -6,10 +6,11 @@ Tools that are nodes, such as `replay` and `view`, do not use it.
 
 from __future__ import annotations
 
+import math
 import os
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import wraps
@@ -32,6 +33,7 @@ from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.awake_clock import AwakeClock
+from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.exceptions import (
     CheckpointError,
@@ -55,12 +57,11 @@ from musculoskeletal_ae.nodes.sources import (
     CLOCK,
     LOOK_PERIOD,
     MOTOR_COMMAND,
-    SEVERAL,
     Sources,
     Twins,
 )
-from musculoskeletal_ae.reception import Reception
-from musculoskeletal_ae.remedy import REMEDY_STEPS, Step
+from musculoskeletal_ae.reception import SHOWN, Reception
+from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
@@ -128,6 +129,7 @@ class Shell(Node):
         self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
         warn = self.get_logger().warning
         self._awake = AwakeClock(LONGEST_LOOK)
+        self._rates: dict[str, float] = {}  # rates of the last periodic report [Hz], by topic
         self._reception = Reception(
             lambda text: warn(f'{text} (counted in /diagnostics)'),
             lambda: self._awake.at(time.monotonic()),
@@ -149,8 +151,10 @@ class Shell(Node):
             raw=True,
         )
         self.create_timer(LOOK_PERIOD, self._look_around, clock=STEADY)
-        self.create_timer(PERIOD, self._report, clock=STEADY)
-        self._fault = ''
+        self.create_timer(PERIOD, self._report_periodically, clock=STEADY)
+        self._fault = '', -math.inf  # the last internal error, and its time [s]
+        #: identifiers, levels and subjects of the conditions in the last report
+        self._reported: frozenset[tuple[str, str, tuple[str, ...]]] = frozenset()
         self.checkpoint_version: int | None = None  # version of the network in use
         self.needed = NeededTopics(self, self.full_name, self._reception)
         backward = JumpThreshold(
@@ -163,8 +167,30 @@ class Shell(Node):
     # -- methods for subclasses to override -----------------------------------------------------
 
     def report(self) -> Report:
-        """Return the diagnostic report; by default the report of the core, if there is one."""
-        return self.core.report(time.monotonic()) if self.core else Report('ok', 'running', {})
+        """Return the diagnostic report, with all conditions."""
+        return self.status()._replace(conditions=tuple(self.conditions()))
+
+    def status(self) -> Report:
+        """Return what the node does, with its values; by default those of the core, if any."""
+        return self.core.report(time.monotonic()) if self.core else Report('running', {})
+
+    def conditions(self) -> Iterable[Condition]:
+        """Yield all conditions that this node reports; an overriding method adds its own."""
+        now, kind = time.monotonic(), ConditionKind
+        if self.core:
+            yield from self.core.conditions(now)
+        yield from self.needed.conditions()
+        if intruders := self.intruders:
+            remedy = self.sources.remedy()
+            steps = [Step.STOP_SECOND_PUBLISHER]
+            yield kind.SECOND_PUBLISHER.condition(f'{intruders}; {remedy}', steps=steps)
+        if refusal := self._reception.refusal:
+            yield kind.REQUEST_REFUSED.condition(refusal)
+        if ignored := self._reception.recently_ignored:
+            yield kind.PART_IGNORED.condition(', '.join(ignored))
+        fault, at = self._fault
+        if now - at < SHOWN:
+            yield kind.INTERNAL_ERROR.condition(fault)
 
     def clock_jumped_back(self) -> None:
         """Discard buffers, rates and filters after the ROS clock has jumped back.
@@ -188,7 +214,7 @@ class Shell(Node):
             error: The exception.
         """
         if source == TIMER:  # no message caused it
-            self._fault = f'internal error: {type(error).__name__}: {error}'
+            self._fault = f'{type(error).__name__}: {error}', time.monotonic()
         if self._reception.reject_error(source, error):
             self.get_logger().error(printable(traceback.format_exc()))
 
@@ -444,6 +470,7 @@ class Shell(Node):
         self.sources.watch(CLOCK)  # `use_sim_time` may be set at any time
         self.sources.look()
         self.on_intruders(self.intruders)
+        self._report_changes()
 
     @property
     def intruders(self) -> str:
@@ -563,24 +590,36 @@ class Shell(Node):
 
     # -- diagnostics ----------------------------------------------------------------------------
 
+    def _report_periodically(self) -> None:
+        self._rates = self._reception.take_rates()
+        self.needed.take_rates(self._rates)
+        self._report()
+
+    def _report_changes(self) -> None:
+        """Report at once if other conditions are present than in the last report."""
+        try:
+            present = _signs(self.conditions())
+        except Exception as error:  # noqa: BLE001 - the error has to be reported
+            self.on_callback_error(TIMER, error)
+            return
+        if present != self._reported:
+            self._report()
+
     def _report(self) -> None:
         try:
             report = self.report()
         except Exception as error:  # noqa: BLE001 - the error has to be reported
             self.on_callback_error(TIMER, error)
-            report = Report('error', self._fault, {})
+            report = Report('', {}, (ConditionKind.INTERNAL_ERROR.condition(self._fault[0]),))
         if self.checkpoint_version is not None:
             report.values.setdefault('checkpoint version', str(self.checkpoint_version))
-        if self._fault:
-            values = {**report.values, 'fault': self._fault}
-            report, self._fault = Report('error', self._fault, values), ''
-        if (intruders := self.intruders) and report.level != 'error':
-            text = f'{SEVERAL}: {intruders}; {self.sources.remedy()}'
-            steps = Step.STOP_SECOND_PUBLISHER.identifier
-            values = {**report.values, SEVERAL: intruders, REMEDY_STEPS: steps}
-            report = Report('error', text, values)
-        rates = self._reception.take_rates()
-        self._diagnostics.tell(self.needed.checked(report, rates), rates)
+        self._reported = _signs(report.conditions)
+        self._diagnostics.tell(report, self._rates)
+
+
+def _signs(conditions: Iterable[Condition]) -> frozenset[tuple[str, str, tuple[str, ...]]]:
+    """Return what distinguishes conditions, without the values in their texts."""
+    return frozenset((each.identifier, each.level, each.subjects) for each in conditions)
 
 
 def _recorded(

@@ -8,6 +8,7 @@ command holds until the next command; before the first command, muscles are at T
 ignores muscle_tension_command, and its modules stay at 25 °C.
 """
 
+from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
@@ -15,10 +16,12 @@ import numpy as np
 from sensor_msgs.msg import JointState
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.arm import Arm, Markers
 from musculoskeletal_ae.nodes.messages import RELIABLE
 from musculoskeletal_ae.nodes.sources import MOTOR_COMMAND
+from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
@@ -104,8 +107,12 @@ class Sim(Arm):
         """Continue the simulation from the new time, with an unchanged state of the arm."""
         self.ticked = self.get_clock().now()
 
-    def report(self) -> Report:
-        """Return the diagnostic report."""
+    def conditions(self) -> Iterable[Condition]:
+        """Yield that there is no network yet."""
+        yield from super().conditions()
         if self.arm is None:
-            return Report('warn', 'waiting for a checkpoint', {})
-        return self.arm.report()
+            yield ConditionKind.NO_CHECKPOINT.condition(steps=[Step.PROVIDE_CHECKPOINT])
+
+    def status(self) -> Report:
+        """Return what the simulated arm does, with its values."""
+        return Report('', {}) if self.arm is None else self.arm.report()

@@ -36,7 +36,7 @@ from musculoskeletal_ae.nodes import diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, joint_message
 from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, message_class, run_tool, start_ros
-from musculoskeletal_ae.nodes.situation import LARGEST_AGE, Situation, figures
+from musculoskeletal_ae.nodes.situation import LARGEST_AGE, Situation, figures, nodes_in_graph
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
@@ -96,7 +96,7 @@ class View(Node):
         self.page = page.Page(robot, *address, options.read_only, request)
         for note in self.page.scene.notes:
             self.get_logger().warning(f'mesh omitted: {printable(note)}')
-        self.situation = Situation(self.get_namespace())
+        self.situation = Situation(self.get_namespace(), lambda: nodes_in_graph(self))
         self.reception = Reception(lambda text: self.get_logger().warning(text))
         hardware = robot.description.directory.name
         self.diagnostics = diagnostics.Diagnostics(self, self.reception, hardware)
@@ -184,7 +184,7 @@ class View(Node):
             if (now := time.monotonic()) >= self.reported_at + diagnostics.PERIOD:
                 self.reported_at = now
                 state = 'viewed' if is_viewed else 'the page has no visitors'
-                self.diagnostics.tell(Report('ok', state, {}), self.reception.take_rates())
+                self.diagnostics.tell(Report(state, {}), self.reception.take_rates())
             self.page.send_entries()
             while not self.requests.empty():  # also after the last visitor has left
                 what, *value = self.requests.get()
@@ -228,7 +228,7 @@ class View(Node):
             self._look()
 
     def _kinds(self) -> Ints:
-        suspects = [self.situation.suspect] * self.situation.detected
+        suspects = list(self.situation.suspects)
         groups = self._places(suspects), self._isolated(), self._places(self.ruptured)
         kinds = np.zeros(self.robot.muscle_count, dtype=int)
         for kind, muscles in enumerate(groups, 1):  # the numbers are values of `body.Kind`
@@ -246,21 +246,21 @@ class View(Node):
         if {'measured', 'estimated'} <= posture.keys():
             error = float(np.linalg.norm(posture['measured'] - posture['estimated']))
         anomaly = math.nan if anomaly is None else anomaly
-        distance = '' if math.isnan(situation.distance) else f'  d {situation.distance:.0f}'
-        learned = f'samples {situation.samples or 0} · networks {situation.checkpoints or 0}'
+        distance = situation.number('estimator', 'd')
+        shown_distance = '' if math.isnan(distance) else f'  d {distance:.0f}'
+        counts = situation.count('samples'), situation.count('checkpoints')
+        learned = f'samples {counts[0]} · networks {counts[1]}'
         lines = [
             figures('measured' in posture, error, anomaly, self.robot.kinematics.distance_unit)
-            + distance,
+            + shown_distance,
             f'{learned} · {situation.doing or "–"}',
             f'waiting for {self.motors.state_topic}' if states is None else situation.hint(),
         ]
         trouble = self.page.with_buttons(situation.trouble())
-        isolated = f'isolated: {self.robot.names(self._isolated())}'
-        is_shown = 'isolated: ' in trouble or situation.is_verifying
-        if len(self._isolated()) and not is_shown:
-            lines.append(isolated)
+        if len(isolated := self._isolated()):
+            lines.append(f'isolated: {self.robot.names(isolated)}')
         shown = np.full((2, self.robot.muscle_count), np.nan) if states is None else states[1:]
-        values = error, anomaly, situation.distance, situation.limit
+        values = error, anomaly, distance, situation.number('estimator', 'd limit')
         now, is_urgent = time.monotonic(), situation.level() == 'error'
         self.page.tell([*filter(None, lines)], trouble, shown, now, values, is_urgent)
         self._show_reset_outcome()

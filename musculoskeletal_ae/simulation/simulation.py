@@ -158,10 +158,10 @@ class Simulation:
             values['external wrench'] = f'{np.round(wrench, 3).tolist()} N, N·m'
         if limits := self.limits():
             # This is not a warning, because an exploring healthy arm often reaches its limits.
-            return Report('ok', f'at the limit: {", ".join(limits)}', values)
+            return Report(f'at the limit: {", ".join(limits)}', values)
         commanded = np.isfinite(command).all()
         waiting = self.robot.actuation.choose('resting at T_bias', 'holding its lengths')
-        return Report('ok', 'following commands' if commanded else waiting, values)
+        return Report('following commands' if commanded else waiting, values)
 
     def _advance(self, h: float) -> None:
         # Callers may assign any array, but the compiled code requires this type and order.

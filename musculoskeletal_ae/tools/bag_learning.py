@@ -241,7 +241,7 @@ def anomaly_in(
         if finding is None:
             continue
         muscle = robot.muscles[finding.muscle]
-        text = f'an anomaly ({muscle}: {finding.kind.value}) begins {at:.1f} s after the start'
+        text = f'an anomaly ({muscle}: {finding.kind.identifier}) begins {at:.1f} s after the start'
         if row:
             before = error(mae, recording.first(row))
             text += f'; until then the error is {before:.4f} {robot.kinematics.distance_unit}'
@@ -318,7 +318,7 @@ def learn(
             learner.anomaly(True)
             stop = stop or (
                 f'learning stopped {at:.1f} s after the start: an anomaly begins there '
-                f'({learner.robot.muscles[finding.muscle]}: {finding.kind.value})'
+                f'({learner.robot.muscles[finding.muscle]}: {finding.kind.identifier})'
             )
         learner.muscles(states, at)
         learner.poll(at)

@@ -42,6 +42,7 @@ BUTTONS = {
     'call estimator/restore': RESTORE,
     'call estimator/zero': CALIBRATE,
     'call controller/explore true to explore again': EXPLORE,
+    'call controller/explore true': EXPLORE,
     'call controller/explore': EXPLORE,
 }
 PUSH_STIFFNESS = 200.0  # force on the hand per distance by which the mouse drags it [N/m]

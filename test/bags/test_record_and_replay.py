@@ -243,7 +243,9 @@ def test_a_replay_publishes_its_position_and_follows_requests_until_sigterm(tool
     graph.wait(lambda: positions, 'the position of the replay')
     where, whole = read_array(positions[-1], 1, 2)  # the timeline of the page reads it like this
     assert where == pytest.approx(start * length, abs=1e-6) and whole == pytest.approx(length)
-    graph.wait(lambda: graph.report('replay').message == 'paused', 'the report of the replay')
+    graph.wait(
+        lambda: 'replay_stands' in graph.report('replay').identifiers, 'the report of the replay'
+    )
     good, reason = graph.set_parameter('replay', 'position', 0.5 * length)
     assert good, reason
     graph.wait(

@@ -244,7 +244,7 @@ def a_rupture_is_shown_and_a_dead_node_named(graph, arm, run):
     detected = graph.listen(Bool, f'{arm}/anomaly_detected', LATCHED)
     assert graph.set_parameter(emulator, 'ruptured_muscles', ['brachialis'])[0]
     graph.wait(lambda: detected and detected[-1].data, 'the detection')
-    line = run.wait_for_output('ANOMALY: brachialis')
+    line = run.wait_for_output(': brachialis: ')
     assert 'repair the muscle' in line and 'estimator/reset' in line
     assert graph.set_parameter(emulator, 'ruptured_muscles', [''])[0]
     graph.wait(

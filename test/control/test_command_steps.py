@@ -16,10 +16,10 @@ from exact_mae import ExactMae
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, rule
 
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import METHODS
-from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.signals.body_state import LengthOffsets
@@ -125,7 +125,7 @@ class Arm(RuleBasedStateMachine):
 
     @rule()
     def stop(self):
-        self.core.stop(StopCause.OPERATOR)
+        self.core.stop(ConditionKind.OPERATOR)
         self.has_stopped = True
 
     @rule()

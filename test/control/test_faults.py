@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import FIRST_ESTIMATE, Controller
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.faults import KINDS
 from musculoskeletal_ae.estimation.estimator import Estimator
@@ -204,7 +204,7 @@ def test_the_services_of_a_length_calibration_may_follow_each_other_at_once(loop
     if moves:
         loop.controller.explore(True)
     else:
-        loop.controller.stop(StopCause.LENGTH_OFFSETS_REVOKED)
+        loop.controller.stop(ConditionKind.LENGTH_OFFSETS_REVOKED)
     loop.run(1.0)
     loop.estimator.calibrate_lengths()
     loop.controller.use_body(loop.estimator.body)

@@ -4,10 +4,9 @@
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.control import status
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.calibrating import SPEED, gentle_limit
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import LengthOffsets
@@ -66,7 +65,7 @@ def test_a_target_waits_until_the_length_offsets_are_known(loop):
     loop.core.target(dict.fromkeys(loop.arm.robot.joints, (0.5, 0.0)))
     loop.run(0.5)
     assert not loop.commands
-    assert 'length offsets are unknown' in status.report(loop.core, loop.now).message
+    assert 'length offsets are unknown' in loop.core.report(loop.now).message
     loop.know(loop.offset)
     loop.run(0.5)
     assert loop.commands
@@ -106,13 +105,13 @@ def test_a_length_calibration_moves_the_arm_only_after_its_first_estimate_even_a
     loop.has_estimates = False
     before = loop.commands[-1]
     loop.run(0.5)
-    loop.core.stop(StopCause.OPERATOR)
+    loop.core.stop(ConditionKind.OPERATOR)
     loop.run(0.1)
     assert loop.core.reset(loop.now) is None
     loop.core.explore(True)
     loop.run(0.5)
     np.testing.assert_array_equal(loop.commands[-110:], np.tile(before, (110, 1)))
-    assert 'waits for the first estimate' in status.report(loop.core, loop.now).message
+    assert 'waiting for the first estimate' in loop.core.report(loop.now).message
     loop.has_estimates = True
     loop.run(0.5)
     assert np.abs(loop.commands[-1] - before).max() > 0.001

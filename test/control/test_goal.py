@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from control_bench import DT, OTHER, REST, ROBOT, Bench
 
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.goal import (
     BEYOND_GOAL,
     BEYOND_PATH,
@@ -15,7 +16,6 @@ from musculoskeletal_ae.control.goal import (
     FollowedGoal,
     read_tolerances,
 )
-from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.validity import TrajectoryPoints
 
@@ -108,7 +108,7 @@ def test_what_ends_the_trajectory_ends_the_goal(event):
     elif event == 'target':
         followed.bench.target(REST)
     elif event == 'stop':
-        core.stop(StopCause.OPERATOR)
+        core.stop(ConditionKind.OPERATOR)
     else:
         followed.bench.configure(method='tension')
     (code, reported), steps = followed.run()

@@ -10,6 +10,7 @@ from control_bench import OTHER, REST, ROBOT, Bench, values
 from exact_mae import ExactMae, rest_readings
 from robots import write_robot
 
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control import reach
 from musculoskeletal_ae.control.assumed_friction import FRICTION
 from musculoskeletal_ae.control.command import LENGTH, TENSION
@@ -19,7 +20,6 @@ from musculoskeletal_ae.control.reach import lacking
 from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.control.slowness import slowness
 from musculoskeletal_ae.control.stopping import LARGEST_RISE, PAYING_OUT
-from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.control.tension_plan import TURNING
 from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
@@ -452,7 +452,7 @@ def test_exploration_resumes_whichever_finding_of_the_muscle_stopped_the_arm_fir
     bench.core.explore(True)
     bench.step(20)
     if stopped_before:
-        bench.core.stop(StopCause.IMPLAUSIBLE_MUSCLE_STATES, 'length jumped')
+        bench.core.stop(ConditionKind.IMPLAUSIBLE_MUSCLE_STATES, 'length jumped')
         bench.step(5)
     bench.core.anomaly(True)
     bench.isolate([0])

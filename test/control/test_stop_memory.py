@@ -5,11 +5,11 @@ import shutil
 
 import pytest
 
+from musculoskeletal_ae.conditions import ConditionKind, stop_causes
 from musculoskeletal_ae.control.stop_memory import FILE, StopMemory
-from musculoskeletal_ae.control.stops import Condition, StopCause
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
-STOP = Condition(StopCause.OPERATOR)
+STOP = ConditionKind.OPERATOR.condition()
 
 
 def killed(directory):
@@ -22,7 +22,7 @@ def found(directory):
     """Return the stop cause with which the next controller begins, or None without a stop."""
     memory = StopMemory(directory)
     memory.close()
-    return memory.found and memory.found.cause
+    return memory.found and memory.found.kind
 
 
 def test_a_controller_that_never_commanded_the_arm_leaves_nothing(tmp_path):
@@ -30,12 +30,12 @@ def test_a_controller_that_never_commanded_the_arm_leaves_nothing(tmp_path):
     assert found(tmp_path / 'arm') is None
 
 
-@pytest.mark.parametrize('cause', StopCause)
+@pytest.mark.parametrize('cause', stop_causes())
 def test_every_latched_stop_outlives_a_kill_and_a_proper_end(tmp_path, cause):
     arm = tmp_path / 'arm'
     memory = StopMemory(arm)
     memory.note(None)
-    memory.note(Condition(cause, 'a detail\nof two lines'))
+    memory.note(cause.condition('a detail\nof two lines'))
     assert found(killed(arm)) is cause
     memory.close()
     assert found(arm) is cause
@@ -46,7 +46,7 @@ def test_a_killed_controller_counts_as_a_stop_and_a_proper_end_does_not(tmp_path
     arm = tmp_path / 'arm'
     memory = StopMemory(arm)
     memory.note(None)
-    assert found(killed(arm)) is StopCause.RESTARTED
+    assert found(killed(arm)) is ConditionKind.RESTARTED
     memory.close()
     assert found(arm) is None
 
@@ -66,7 +66,7 @@ def test_a_reset_ends_a_stop_for_the_next_controller_too(tmp_path):
 @pytest.mark.parametrize('data', [b'', b'\xff\x00', b'no_such_cause\n', b'x' * 20_000])
 def test_a_damaged_file_counts_as_a_stop(tmp_path, data):
     (tmp_path / FILE).write_bytes(data)
-    assert found(tmp_path) is StopCause.RESTARTED
+    assert found(tmp_path) is ConditionKind.RESTARTED
 
 
 def test_a_second_controller_of_the_same_arm_is_refused(tmp_path):
@@ -75,7 +75,7 @@ def test_a_second_controller_of_the_same_arm_is_refused(tmp_path):
     with pytest.raises(MusculoskeletalError, match='in use by a controller; stop that controller'):
         StopMemory(tmp_path)
     first.close()
-    assert found(tmp_path) is StopCause.OPERATOR
+    assert found(tmp_path) is ConditionKind.OPERATOR
 
 
 @pytest.mark.parametrize('name', ['file/arm', 'nul\0'])

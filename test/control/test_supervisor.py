@@ -6,7 +6,7 @@ import pytest
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from musculoskeletal_ae.control.stops import Clears, Condition, StopCause
+from musculoskeletal_ae.conditions import Clears, ConditionKind, stop_causes
 from musculoskeletal_ae.control.supervisor import (
     RESUME,
     TRANSITIONS,
@@ -16,8 +16,8 @@ from musculoskeletal_ae.control.supervisor import (
     Supervisor,
 )
 
-ANOMALY, OPERATOR = Condition(StopCause.ANOMALY), Condition(StopCause.OPERATOR)
-STALE = Condition(StopCause.STALE_MUSCLE_STATES)
+ANOMALY, OPERATOR = ConditionKind.ANOMALY.condition(), ConditionKind.OPERATOR.condition()
+STALE = ConditionKind.STALE_MUSCLE_STATES.condition()
 STEP = 0.01  # time step [s]
 
 
@@ -67,12 +67,12 @@ def test_the_arm_explores_again_once_the_suspect_is_verified():
     assert not supervisor.is_running
 
 
-@pytest.mark.parametrize('cause', [c for c in StopCause if c.clears is Clears.RESET])
+@pytest.mark.parametrize('cause', [each for each in stop_causes() if each.clears is Clears.RESET])
 def test_a_verification_does_not_end_a_stop_that_needs_a_reset(cause):
     supervisor = exploring()
     wait(supervisor, ANOMALY)
     supervisor.on_suspect(True)
-    supervisor.on_event(cause)
+    supervisor.on_event(cause.condition())
     supervisor.on_verified()
     wait(supervisor, seconds=10.0)
     assert supervisor.mode == 'stopped'
@@ -86,12 +86,6 @@ def test_a_target_during_a_stop_is_held_after_it_and_exploration_does_not_come_b
     supervisor.on_verified()
     wait(supervisor)
     assert supervisor.mode == 'holding'
-
-
-def test_every_cause_has_an_identifier_a_text_and_a_remedy():
-    identifiers = [cause.identifier for cause in StopCause]
-    assert len(set(identifiers)) == len(identifiers)
-    assert all(cause.text and cause.remedy and cause.condition for cause in StopCause)
 
 
 class Arm(RuleBasedStateMachine):
@@ -111,9 +105,9 @@ class Arm(RuleBasedStateMachine):
         self.supervisor.on_request(activity)
         self.may_start = False
 
-    @rule(causes=st.lists(st.sampled_from(list(StopCause)), max_size=3))
+    @rule(causes=st.lists(st.sampled_from(stop_causes()), max_size=3))
     def conditions(self, causes):
-        self.present = [Condition(cause) for cause in causes]
+        self.present = [cause.condition() for cause in causes]
 
     @rule(released=st.booleans(), steps=st.integers(1, 40))
     def time_passes(self, released, steps):
@@ -127,11 +121,11 @@ class Arm(RuleBasedStateMachine):
             )
             self.check()
 
-    @rule(cause=st.sampled_from(list(StopCause)))
+    @rule(cause=st.sampled_from(stop_causes()))
     def event(self, cause):
         self.before = self.supervisor.state
-        self.note([Condition(cause)])
-        self.supervisor.on_event(cause)
+        self.note([cause.condition()])
+        self.supervisor.on_event(cause.condition())
         self.may_start = False
 
     @rule(known=st.booleans())
@@ -162,7 +156,7 @@ class Arm(RuleBasedStateMachine):
     def note(self, conditions):
         if self.supervisor.is_running:
             self.latched_by.clear()
-        self.latched_by |= {c.cause for c in conditions if c.cause.clears is not Clears.CONDITION}
+        self.latched_by |= {c.kind for c in conditions if c.kind.clears is not Clears.CONDITION}
 
     @invariant()
     def check(self):
@@ -175,7 +169,7 @@ class Arm(RuleBasedStateMachine):
             assert all(c.clears is Clears.VERIFICATION for c in self.latched_by)
         # There is a cause exactly while the arm is stopped, and every cause has a remedy.
         assert (supervisor.condition is None) == supervisor.is_running
-        assert supervisor.is_running or supervisor.condition.cause.remedy
+        assert supervisor.is_running or supervisor.condition.steps
         # A latched stop ends exploration and motion, which then need a new request.
         assert not (supervisor.is_latched and supervisor.activity is Activity.MOVING)
         assert not (supervisor.is_latched and supervisor.explores)

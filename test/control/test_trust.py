@@ -324,7 +324,7 @@ def test_the_age_limit_grows_with_a_slow_clock_and_never_shrinks(pace, gap, late
 
 
 def causes(bench):
-    return [condition.cause.identifier for condition in bench.core.conditions(bench.now)]
+    return [each.identifier for each in bench.core.stop_conditions(bench.now)]
 
 
 @pytest.mark.parametrize('is_confirmed', [True, False])

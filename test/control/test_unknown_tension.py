@@ -8,11 +8,10 @@ import pytest
 from exact_mae import ExactMae
 from robots import write_robot
 
-from musculoskeletal_ae.control import status
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.command import LENGTH
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import METHODS, Settings
-from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
@@ -94,7 +93,7 @@ def test_the_arm_reaches_a_target_by_lengths_alone_and_reports_missing_tensions(
     assert loop.core.supervisor.is_running
     assert np.abs(loop.arm.theta - THETA).max() < 0.15
     assert loop.core.limiter.command.kind == LENGTH
-    values = status.report(loop.core, loop._now).values
+    values = loop.core.report(loop._now).values
     assert 'heat limit' in values['tension'] and 'contact' in values['tension']
 
 
@@ -115,7 +114,7 @@ def test_no_command_runs_further_ahead_of_a_module_than_its_release(loop):
 def test_a_stop_pays_out_the_stated_length(loop):
     core = loop.core
     before = core.limiter.command.value.copy()
-    core.stop(StopCause.OPERATOR)
+    core.stop(ConditionKind.OPERATOR)
     loop.wait(3.0)
     paid_out = core.limiter.command.value - before
     most = np.minimum(ROBOT.actuation.release, core.limiter.longest - before)

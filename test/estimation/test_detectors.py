@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE, IN_A_ROW, NORM
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME
-from musculoskeletal_ae.estimation.finding import Kind, observe
+from musculoskeletal_ae.estimation.finding import observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.mae.units import State
@@ -85,7 +86,7 @@ def test_an_anomaly_takes_five_messages_in_a_row(
     assert watched.findings(healthy) == [None]
     *before, finding = watched.findings(wound, IN_A_ROW)
     assert not any(before)
-    assert (finding.muscle, finding.kind) == (1, Kind.RESIDUAL_DISTANCE)
+    assert (finding.muscle, finding.kind) == (1, ConditionKind.RESIDUAL_DISTANCE)
     assert finding.evidence.startswith(named)
 
 
@@ -107,7 +108,7 @@ def test_a_muscle_without_its_commanded_tension_is_an_anomaly(robot, mae, watch,
         watched.demand = robot.actuation.demanded(slack.length, slack.length - 0.003)
     findings = watched.findings(slack, messages)
     assert findings[0] is None
-    assert (findings[-1].muscle, findings[-1].kind) == (2, Kind.SLACK_TENDON)
+    assert (findings[-1].muscle, findings[-1].kind) == (2, ConditionKind.SLACK_TENDON)
 
 
 def test_a_muscle_that_is_paid_out_to_no_tension_is_no_anomaly(robot, mae, watch, slack):
@@ -134,7 +135,7 @@ def test_shortening_by_motion_of_the_arm_does_not_count_as_slack_taken_up(robot,
         watched.demand = robot.actuation.demanded(each, each - 0.01)
         _, _, finding = watched.step((tension, each), State(at, tension, each))
         kinds.add(finding and finding.kind)
-    assert kinds == ({None} if moves else {None, Kind.SLACK_TENDON})
+    assert kinds == ({None} if moves else {None, ConditionKind.SLACK_TENDON})
 
 
 @pytest.mark.parametrize(
@@ -194,7 +195,7 @@ def test_a_winch_that_does_not_follow_its_command_is_jammed(robot, mae, watch, w
         if kind == 'length':
             watched.demand = robot.actuation.demanded(length, length - (reported - 30.0) / 1e4)
         _, _, finding = watched.step((tension, length), state)
-        if finding is not None and finding.kind is Kind.JAMMED_MODULE:
+        if finding is not None and finding.kind is ConditionKind.JAMMED_MODULE:
             findings.append((n, finding.muscle))
     assert findings
     assert {muscle for _, muscle in findings} == {3}

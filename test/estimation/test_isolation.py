@@ -16,6 +16,7 @@ from musculoskeletal_ae.estimation.verification import (
     Verification,
 )
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.remedy import REPAIR
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 
@@ -118,9 +119,9 @@ def test_a_ruptured_muscle_is_isolated_at_once_and_stays_isolated(loop, robot, h
     assert loop.core.cause.startswith(robot.muscles[2])
     assert loop.core.body.isolated == loop.core.mae.isolated == (2,)
     assert robot.isolated == ()  # other objects use this robot too, so it must not change
-    values = loop.core.report(loop.now).values
-    assert values['finding'] in ('residual_distance', 'slack_tendon')
-    assert values['verification'] == 'running' and 'remedy steps' not in values
+    (finding,) = loop.core.conditions(loop.now)
+    assert finding.identifier in ('residual_distance', 'slack_tendon') and not finding.steps
+    assert finding.subjects == (robot.muscles[2],) and 'ends by itself' in finding.text
     loop.command[2] -= 0.003
     loop.step(cut, 100)
     assert loop.core.cause == ''
@@ -133,9 +134,9 @@ def test_a_ruptured_muscle_is_isolated_at_once_and_stays_isolated(loop, robot, h
                                   before)  # fmt: skip
     report = loop.core.report(loop.now)
     assert report.level == 'warn'
-    assert report.values['isolated muscles'] == robot.muscles[2]
-    assert report.values['isolated muscles with faults'] == f'{robot.muscles[2]} (ruptured)'
-    assert report.values['finding'] == report.values['verification'] == 'none'
+    (isolated,) = report.conditions
+    assert isolated.identifier == 'muscle_isolated' and isolated.subjects == (robot.muscles[2],)
+    assert isolated.text == f'isolated: {robot.muscles[2]} (ruptured)'
     assert report.values['last outcome'] == 'ruptured'
     loop.step(healthy, 30)  # the muscle is repaired
     loop.core.isolate(())
@@ -190,8 +191,7 @@ def test_without_a_verification_the_report_names_the_remedy(loop, healthy, cut):
     loop.step(healthy, 30)
     loop.step(cut, 20)
     report = loop.core.report(loop.now)
-    assert report.values['remedy steps'] == 'repair_muscle, reset_estimator'
-    assert report.message.endswith('repair the muscle; call estimator/reset')
+    assert report.steps == REPAIR
 
 
 def test_a_suspect_cannot_be_restored_during_its_verification_which_always_ends(loop, healthy, cut):
@@ -224,11 +224,9 @@ def test_another_muscle_can_be_restored_during_a_verification(loop, healthy, cut
 def test_an_anomaly_without_a_verification_always_has_a_remedy(loop, healthy, cut):
     loop.step(healthy, 30)
     loop.step(cut, 20)
-    assert 'remedy' not in loop.core.report(loop.now).values
+    assert not loop.core.report(loop.now).steps
     loop.core.isolate(())  # the suspect is in use again, without a verdict
-    report = loop.core.report(loop.now)
-    assert report.values['verification'] == 'none'
-    assert report.values['remedy steps'] == 'repair_muscle, reset_estimator'
+    assert loop.core.report(loop.now).steps == REPAIR
 
 
 def test_a_sensor_that_stands_still_while_the_arm_moves_is_detected(robot, calibrated, healthy):

@@ -183,17 +183,17 @@ def test_another_network_or_isolated_muscle_starts_the_length_calibration_again(
         _, tension, length = moment(now)
         estimator.step(states(tension, length + OFFSET), now, now)
     reported = str(estimator.report(4.0))
-    assert re.search('calibrating the lengths: [1-4] of', reported)
+    assert re.search('calibrating: [1-4] of', reported)
     estimator.isolate(())
     assert str(estimator.report(4.0)) == reported
     estimator.use(mae)  # any call of `use` counts as another network
-    assert 'calibrating the lengths: 0 of' in str(estimator.report(4.0))
+    assert 'calibrating: 0 of' in str(estimator.report(4.0))
     for now in np.arange(4.0, 8.0, 0.05):
         _, tension, length = moment(now)
         estimator.step(states(tension, length + OFFSET), now, now)
-    assert re.search('calibrating the lengths: [1-4] of', str(estimator.report(8.0)))
+    assert re.search('calibrating: [1-4] of', str(estimator.report(8.0)))
     estimator.isolate((3,))
-    assert 'calibrating the lengths: 0 of' in str(estimator.report(8.0))
+    assert 'calibrating: 0 of' in str(estimator.report(8.0))
 
 
 def test_lengths_that_no_posture_explains_call_for_joint_sensors_or_a_known_posture(

@@ -7,10 +7,11 @@ from copy import deepcopy
 import numpy as np
 import pytest
 
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.finding import Kind
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.remedy import REPAIR, Step
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 
 DT = 0.02
@@ -97,9 +98,9 @@ def ruptured(request, ruptured_once):
 @pytest.mark.parametrize(
     ('jump', 'on_anomaly', 'kind'),
     [
-        (SEVERAL, 'stop', Kind.LENGTHS_JUMPED),
-        (SEVERAL, 'isolate', Kind.LENGTHS_JUMPED),
-        (ONE, 'stop', Kind.LENGTH_JUMP),
+        (SEVERAL, 'stop', ConditionKind.LENGTHS_JUMPED),
+        (SEVERAL, 'isolate', ConditionKind.LENGTHS_JUMPED),
+        (ONE, 'stop', ConditionKind.LENGTH_JUMP),
     ],
 )
 def test_a_jump_of_lengths_revokes_the_offsets_until_a_calibration(
@@ -114,7 +115,7 @@ def test_a_jump_of_lengths_revokes_the_offsets_until_a_calibration(
     assert arm.core.body.isolated == ()
     with pytest.raises(MusculoskeletalError, match='estimator/zero'):
         arm.core.reset()
-    assert 'estimator/zero' in arm.core.report(arm.time).message
+    assert Step.CALIBRATE_LENGTHS in arm.core.report(arm.time).steps
     arm.core.calibrate_lengths()
     assert arm.kind is None
     assert not arm.offsets.is_suspect
@@ -158,7 +159,7 @@ def test_lengths_that_drift_are_found_by_joint_sensors(moved):
         moved.off = 0.06 * share * SIGNS
         moved.go(0.1)
     moved.go(2.0)
-    assert moved.kind is Kind.LENGTHS_DISAGREE
+    assert moved.kind is ConditionKind.LENGTHS_DISAGREE
     assert moved.offsets.is_suspect
 
 
@@ -166,14 +167,14 @@ def test_lengths_that_are_off_at_the_start_are_found_by_joint_sensors(robot, mae
     arm = MovingArm(robot, mae)
     arm.off = 2.0 * SEVERAL
     arm.go(4.0)
-    assert arm.kind is Kind.LENGTHS_DISAGREE
+    assert arm.kind is ConditionKind.LENGTHS_DISAGREE
 
 
 def test_a_ruptured_tendon_is_not_taken_for_a_wrong_length_while_no_commands_arrive(
     ruptured_once,
 ):
     """The module winds in the ruptured tendon, and the finding names only this muscle."""
-    assert ruptured_once.kind is Kind.SLACK_TENDON
+    assert ruptured_once.kind is ConditionKind.SLACK_TENDON
     assert ruptured_once.core.suspects.finding.muscle == 2
     assert 'repair' in ruptured_once.core.advice
     assert ruptured_once.offsets.known
@@ -188,7 +189,7 @@ def test_the_repair_of_a_suspect_keeps_the_offsets(ruptured):
     before = ruptured.offsets
     repair(ruptured)
     assert ruptured.core.suspects.has_suspect_jumped
-    assert ruptured.kind is Kind.SLACK_TENDON
+    assert ruptured.kind is ConditionKind.SLACK_TENDON
     assert ruptured.core.advice == 'repair the muscle; call estimator/reset'
     assert ruptured.offsets is before
     ruptured.core.reset()
@@ -219,8 +220,8 @@ def test_after_a_repair_with_another_zero_the_reset_is_refused_until_a_calibrati
     repair(ruptured, zero)
     with pytest.raises(MusculoskeletalError, match=r'(shorter|longer) than.*estimator/zero'):
         ruptured.core.reset()
-    assert ruptured.kind is Kind.SLACK_TENDON
-    assert ruptured.core.report(ruptured.time).values['remedy steps'] == 'calibrate_lengths'
+    assert ruptured.kind is ConditionKind.SLACK_TENDON
+    assert ruptured.core.report(ruptured.time).steps == (Step.CALIBRATE_LENGTHS,)
     ruptured.core.calibrate_lengths()
     assert ruptured.kind is None
 
@@ -234,14 +235,14 @@ def test_joint_sensors_find_a_wrong_zero_after_a_reset_right_after_the_repair(ru
     ruptured.core.reset()
     assert ruptured.kind is None
     ruptured.go(3.0)
-    assert ruptured.kind is Kind.LENGTH_DISAGREES
+    assert ruptured.kind is ConditionKind.LENGTH_DISAGREES
     assert ruptured.offsets.suspect == (2,)
 
 
 def test_a_joint_sensor_that_all_lengths_outvote_is_named_and_the_offsets_stay(moved):
     moved.joint_off = np.array([0.0, 1.0])
     moved.go(4.0)
-    assert moved.kind is Kind.JOINT_SENSORS_DISAGREE
+    assert moved.kind is ConditionKind.JOINT_SENSORS_DISAGREE
     assert moved.robot.joints[1] in moved.core.cause
     assert moved.offsets.known
     moved.joint_off[:] = 0.0
@@ -331,7 +332,7 @@ def test_one_wrong_length_revokes_no_other_offset(moved, on_anomaly, isolated):
     while moved.kind is None:
         moved.go(0.1)
         assert moved.time < 20.0
-    assert moved.kind is Kind.LENGTH_DISAGREES
+    assert moved.kind is ConditionKind.LENGTH_DISAGREES
     assert moved.core.body.isolated == isolated
     assert moved.offsets.suspect == (() if isolated else (2,))
 
@@ -344,7 +345,7 @@ def test_the_winch_of_a_suspect_that_comes_back_slowly_revokes_nothing(ruptured)
         if length == -0.2:
             with pytest.raises(MusculoskeletalError, match=r'shorter than.*estimator/reset again'):
                 ruptured.core.reset()
-    assert ruptured.kind is Kind.SLACK_TENDON
+    assert ruptured.kind is ConditionKind.SLACK_TENDON
     ruptured.core.reset()
     ruptured.go(3.0, sensors=ruptured.has_sensors)
     assert ruptured.kind is None
@@ -363,8 +364,7 @@ def test_a_reset_right_after_the_jump_of_a_repair_is_refused_until_the_jump_is_o
 
 
 def test_a_reset_without_a_repair_is_refused_but_the_suspect_can_be_isolated(ruptured):
-    steps = ruptured.core.report(ruptured.time).values['remedy steps']
-    assert steps == 'repair_muscle, reset_estimator'
+    assert ruptured.core.report(ruptured.time).steps == REPAIR
     with pytest.raises(MusculoskeletalError, match=r'no tension|shorter'):
         ruptured.core.reset()
     ruptured.core.reset(isolating=[2])

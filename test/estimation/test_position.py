@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from exact_mae import rest_readings
 
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.detectors.jammed_module import JAM_TIME, JammedPosition
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME, StretchedTendon
-from musculoskeletal_ae.estimation.finding import Kind, observe
+from musculoskeletal_ae.estimation.finding import observe
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.estimation.verification import Outcome, PositionLaw, Verification
 from musculoskeletal_ae.robot.description import with_modules
@@ -44,7 +45,7 @@ def test_only_a_tendon_that_has_to_pull_and_does_not_is_ruptured(mae, shorter, i
     assert findings[0] is None
     assert (findings[-1] is not None) == is_found
     if is_found:
-        assert (findings[-1].muscle, findings[-1].kind) == (MUSCLE, Kind.SLACK_TENDON)
+        assert (findings[-1].muscle, findings[-1].kind) == (MUSCLE, ConditionKind.SLACK_TENDON)
 
 
 LENGTHS_WRONG = 0.02 * np.array([1, -1, 1, -1, 1, -1])  # errors of the network's lengths [m]

@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.finding import Kind, observe
+from musculoskeletal_ae.estimation.finding import observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.settings import Detection
 
@@ -42,7 +43,7 @@ def noticed(robot, mae, slack):
             demand, tension = robot.actuation.demanded(length, length - 0.003), slack.tension
             finding = health.step(observe(mae, length, tension, tension, DT, demand, state))
             if finding is not None:
-                assert (finding.muscle, finding.kind) == (MUSCLE, Kind.SLACK_TENDON)
+                assert (finding.muscle, finding.kind) == (MUSCLE, ConditionKind.SLACK_TENDON)
                 return n * DT
         return np.inf
 
@@ -91,7 +92,7 @@ def test_the_distance_waits_for_slack_but_not_for_a_rupture(
         demand = robot.actuation.demanded(length, length - 0.003)
         finding = health.step(observe(calibrated, length, tension, tension, DT, demand))
         kinds.append(finding and finding.kind)
-    assert (Kind.RESIDUAL_DISTANCE in kinds[:50]) == found
+    assert (ConditionKind.RESIDUAL_DISTANCE in kinds[:50]) == found
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,13 @@
 
 import pytest
 
-from musculoskeletal_ae.estimation.finding import Finding, Kind
+from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation.finding import Finding
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.estimation.suspects import ACQUITTALS, WITHIN, SuspectHandling
 from musculoskeletal_ae.estimation.verification import Outcome, Verdict
 
-DISTANCE = Finding(1, Kind.RESIDUAL_DISTANCE, 'd = 9')
+DISTANCE = Finding(1, ConditionKind.RESIDUAL_DISTANCE, 'd = 9')
 
 
 @pytest.fixture
@@ -21,12 +22,12 @@ def suspects(robot):
 @pytest.mark.parametrize(
     ('kind', 'on_anomaly', 'latched', 'isolated', 'verified'),
     [
-        (Kind.SLACK_TENDON, 'stop', True, (), False),
-        (Kind.SLACK_TENDON, 'isolate', True, (2,), True),
-        (Kind.LENGTH_JUMP, 'stop', True, (), False),
-        (Kind.LENGTH_JUMP, 'isolate', True, (2,), True),
-        (Kind.VALUES_MISSING, 'stop', False, (), False),
-        (Kind.VALUES_MISSING, 'isolate', False, (2,), False),
+        (ConditionKind.SLACK_TENDON, 'stop', True, (), False),
+        (ConditionKind.SLACK_TENDON, 'isolate', True, (2,), True),
+        (ConditionKind.LENGTH_JUMP, 'stop', True, (), False),
+        (ConditionKind.LENGTH_JUMP, 'isolate', True, (2,), True),
+        (ConditionKind.VALUES_MISSING, 'stop', False, (), False),
+        (ConditionKind.VALUES_MISSING, 'isolate', False, (2,), False),
     ],
 )
 def test_the_consequences_of_each_finding(suspects, kind, on_anomaly, latched, isolated, verified):
@@ -38,25 +39,28 @@ def test_the_consequences_of_each_finding(suspects, kind, on_anomaly, latched, i
 
 def test_the_first_finding_stays_latched(suspects, robot):
     isolated = suspects.take(DISTANCE, (), 0.0)
-    assert suspects.take(Finding(3, Kind.JAMMED_MODULE, ''), isolated, 1.0) == isolated
+    assert suspects.take(Finding(3, ConditionKind.JAMMED_MODULE, ''), isolated, 1.0) == isolated
     assert suspects.finding is DISTANCE
     assert suspects.cause == f'{robot.muscles[1]}: d = 9'
 
 
-@pytest.mark.parametrize('kind', [Kind.RESIDUAL_DISTANCE, Kind.SLACK_TENDON, Kind.SENSOR_FROZEN])
+@pytest.mark.parametrize(
+    'kind',
+    [ConditionKind.RESIDUAL_DISTANCE, ConditionKind.SLACK_TENDON, ConditionKind.SENSOR_FROZEN],
+)
 @pytest.mark.parametrize(
     'jump',
     [
-        Finding(1, Kind.LENGTH_JUMP, ''),  # of the suspect
-        Finding(2, Kind.LENGTH_JUMP, ''),
-        Finding(1, Kind.LENGTHS_JUMPED, ''),
+        Finding(1, ConditionKind.LENGTH_JUMP, ''),  # of the suspect
+        Finding(2, ConditionKind.LENGTH_JUMP, ''),
+        Finding(1, ConditionKind.LENGTHS_JUMPED, ''),
     ],
 )
 def test_only_a_jump_of_the_suspect_alone_is_explained_by_its_repair(suspects, kind, jump):
     suspects.settings = Detection(on_anomaly='stop')
     finding = Finding(1, kind, '')
     suspects.take(finding, (), 0.0)
-    is_repair = jump == Finding(1, Kind.LENGTH_JUMP, '')
+    is_repair = jump == Finding(1, ConditionKind.LENGTH_JUMP, '')
     assert suspects.explains(jump) == is_repair
     suspects.take(jump, (), 1.0)
     assert suspects.finding is (finding if is_repair else jump)
@@ -66,7 +70,7 @@ def test_only_a_jump_of_the_suspect_alone_is_explained_by_its_repair(suspects, k
 def test_the_fault_of_an_isolated_muscle_is_known_until_the_muscle_is_restored(suspects):
     isolated = suspects.take(DISTANCE, (), 0.0)
     isolated = suspects.conclude(Verdict(Outcome.RUPTURED), isolated, 1.0)
-    isolated = suspects.take(Finding(2, Kind.VALUES_MISSING, ''), isolated, 2.0)
+    isolated = suspects.take(Finding(2, ConditionKind.VALUES_MISSING, ''), isolated, 2.0)
     outcomes = {muscle: fault.outcome for muscle, fault in suspects.faults.items()}
     assert outcomes == {1: Outcome.RUPTURED, 2: Outcome.VALUES_MISSING}
     suspects.on_isolated([2])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from nominal_body import nominal_arm
 
-from musculoskeletal_ae.control.stops import StopCause
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.experiments import control
 from musculoskeletal_ae.experiments.control import METHODS, Durations, protocol
 from musculoskeletal_ae.experiments.recording import ClosedLoop
@@ -38,7 +38,7 @@ def test_a_stop_under_one_method_leaves_the_others_measured(arm26, trained, monk
     def stopping(loop, theta):
         target(loop, theta)
         if loop.core.settings.method == 'geometric':
-            loop.core.stop(StopCause.OPERATOR)
+            loop.core.stop(ConditionKind.OPERATOR)
 
     methods = ('geometric', 'first')
     monkeypatch.setattr(ClosedLoop, 'target', stopping)

@@ -12,7 +12,8 @@ import pytest
 from musculoskeletal_ae import progress_bar
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.streams import Pairs
-from musculoskeletal_ae.estimation.finding import Finding, Kind
+from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation.finding import Finding
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.checkpoint import load
@@ -224,7 +225,7 @@ def test_an_anomaly_in_a_held_out_recording_is_reported_with_the_error_before_it
 
         def step(self, _):
             self.count += 1
-            return Finding(2, Kind.SLACK_TENDON, '') if self.count > 300 else None
+            return Finding(2, ConditionKind.SLACK_TENDON, '') if self.count > 300 else None
 
     count = 500
     theta = np.tile(0.5 * (arm26.lower + arm26.upper), (count, 1))
@@ -236,7 +237,8 @@ def test_an_anomaly_in_a_held_out_recording_is_reported_with_the_error_before_it
     learner = Learner(arm26, initial)
     assert 'learning stopped 3.0 s after the start: an anomaly' in learn(learner, recording)
     text = anomaly_in(arm26, recording, initial, 'default')
-    assert f'({arm26.muscles[2]}: {Kind.SLACK_TENDON.value}) begins 3.0 s after the start' in text
+    found = f'({arm26.muscles[2]}: {ConditionKind.SLACK_TENDON.identifier})'
+    assert f'{found} begins 3.0 s after the start' in text
     assert f'until then the error is {error(initial, recording.first(300)):.4f} rad' in text
 
 

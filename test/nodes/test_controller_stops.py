@@ -10,10 +10,11 @@ from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.control.stops import StopCause
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.messages import LATCHED
 from musculoskeletal_ae.nodes.stop_recording import FILE
+from musculoskeletal_ae.remedy import Step
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -1.0])
 
@@ -56,7 +57,7 @@ def test_a_stop_pays_out_is_reported_and_recorded_and_ends_only_by_a_reset(
     reported('stopped:operator_stop')
     values = arm.state().values
     assert (values['mode'], values['stop cause']) == ('stopped', 'operator_stop')
-    assert values['remedy'] == 'call controller/reset'
+    assert arm.state().steps[0] is Step.RESET_CONTROLLER
     files = arm.graph.wait(
         lambda: [f for f in tmp_path.glob(f'stop_*/{FILE}') if f.stat().st_size], 'the recording'
     )
@@ -145,7 +146,7 @@ def test_an_anomaly_stops_the_arm_until_estimator_and_controller_are_reset(movin
     arm.says('anomaly_detected')
     answer = reset(arm)
     assert not answer.success
-    assert 'anomaly' in answer.message
+    assert 'the estimator has found a fault' in answer.message
     assert arm.graph.set_parameter('estimator', 'anomaly_threshold', 0.0)[0]
     assert not reset(arm).success
     assert arm.graph.call(Trigger, 'estimator/reset').success
@@ -166,7 +167,7 @@ def test_an_unfit_accepted_checkpoint_stops_the_controller(graph, trained_file):
     before, supervisor = controller.core.mae, controller.core.supervisor
     graph.send_network(b'not a checkpoint', 'accepted_checkpoint')
     graph.wait(lambda: supervisor.is_latched, 'the stop')
-    assert supervisor.condition.cause is StopCause.UNFIT_CHECKPOINT
+    assert supervisor.condition.kind is ConditionKind.UNFIT_CHECKPOINT
     assert controller.core.mae is before
 
 

@@ -13,6 +13,7 @@ from visualization_msgs.msg import MarkerArray
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
+from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.validity import read_muscle_states
 
 
@@ -86,11 +87,11 @@ def test_a_muscle_is_ruptured_and_repaired_at_run_time(arm, arm26):
     assert arm.set_parameter('hardware_emulator', 'ruptured_muscles', [name])[0]
     before = rows(arm, arm26)
     assert before[1, 3] == 0.0
-    assert arm.emulator.report().values['emulated faults'] == 'ruptured_muscles'
+    assert Step.REPAIR_EMULATED_RUPTURE in arm.emulator.report().steps
     arm.wait(lambda: rows(arm, arm26)[0, 3] < before[0, 3] - 0.01, 'winding in')
     assert arm.set_parameter('hardware_emulator', 'ruptured_muscles', [''])[0]
     arm.wait(lambda: rows(arm, arm26)[1, 3] > 15.0, 'tension')
-    assert arm.emulator.report().values['emulated faults'] == 'none'
+    assert Step.REPAIR_EMULATED_RUPTURE not in arm.emulator.report().steps
 
 
 def test_payload_offset_and_wrench_act(arm, arm26):

@@ -26,14 +26,17 @@ def test_a_refused_command_is_shown_for_some_seconds_with_its_reason(graph, monk
         ('target_twist', TwistStamped(), "wrong frame: ''; expected"),
     ):
         graph.publisher(type(message), topic).publish(message)
-        texts = f'refused {topic}: ', reason
+        texts = f'refused: {topic}: ', reason
 
         def shown(texts=texts):
             report = graph.report('controller')
             return report if all(text in report.message for text in texts) else None
 
         assert graph.wait(shown, f'the refusal of {topic}').level == 'warn'
-    graph.wait(lambda: 'refused' not in graph.report('controller').values, 'the end of the report')
+    graph.wait(
+        lambda: 'request_refused' not in graph.report('controller').identifiers,
+        'the end of the report',
+    )
 
 
 def test_a_publisher_whose_quality_of_service_does_not_fit_is_reported(graph):
@@ -45,7 +48,7 @@ def test_a_publisher_whose_quality_of_service_does_not_fit_is_reported(graph):
     texts = set()
 
     def shown():
-        texts.add(graph.report('controller').message.partition('; refused ')[2])
+        texts.add(graph.report('controller').message)
         return any('publish it reliable' in text for text in texts)
 
     graph.wait(shown, 'the report of an unreliable publisher')

@@ -95,7 +95,7 @@ def test_a_repeated_estimate_grows_old(graph, arm26, trained_file):
         joints.publish(repeated)
         present = controller.core.watchdog.conditions(controller.core.watchdog.age.stepped_at)
         return controller.core.estimate is not None and any(
-            condition.cause.identifier == 'stale_estimate' for condition in present
+            condition.identifier == 'stale_estimate' for condition in present
         )
 
     graph.wait(is_stale, 'the data to become stale')

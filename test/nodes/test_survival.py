@@ -19,6 +19,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 from type_description_interfaces.srv import GetTypeDescription
 
+from musculoskeletal_ae.conditions import CONDITIONS
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.nodes.bringup_status import BringupStatus
 from musculoskeletal_ae.nodes.controller import Controller
@@ -130,6 +131,9 @@ def test_no_request_or_clock_ends_a_node(graph, kind):
     assert all(value.isprintable() for value in values.values())
 
 
+SHOUTED = r'[{"identifier": "a", "level": "error", "text": "\u001b[2J\u009b1m"}]'
+
+
 def test_escape_sequences_in_messages_do_not_reach_the_terminal(graph, capsys):
     status = graph.host(BringupStatus, robot='arm26')
     shouting = [
@@ -138,19 +142,21 @@ def test_escape_sequences_in_messages_do_not_reach_the_terminal(graph, capsys):
             values=[
                 KeyValue(key='samples', value='\x1b]0;owned\x07'),
                 KeyValue(key='mode', value='stopped'),
-                KeyValue(key='stop', value='\x1b[2J\x9b1m'),
+                KeyValue(key=CONDITIONS, value=SHOUTED),
             ],
         )
         for name in ('controller', 'learner')
     ]
     publisher = graph.publisher(DiagnosticArray, '/diagnostics')
     publisher.publish(DiagnosticArray(status=shouting))
-    graph.wait(lambda: status.situation.samples, 'the message')
+    graph.wait(lambda: status.situation.has_learner, 'the message')
     status.anomalies.append(0.0)
     status.started = 1.0  # so long ago that the status line no longer waits for the nodes
     status._print()
     printed = capsys.readouterr().out
-    assert 'STOPPED' in printed and all(line.isprintable() for line in printed.splitlines())
+    assert 'ERROR: controller' in printed and all(
+        line.isprintable() for line in printed.splitlines()
+    )
     assert str(MessageError('wrong', '\x1b[2J\ud800')).isprintable()
     with pytest.raises(MusculoskeletalError) as refusal:
         graph.host(Controller, robot='arm26\x1b[2J')

@@ -21,10 +21,10 @@ from robots import write_robot
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, String
 
-from musculoskeletal_ae.control.stops import StopCause
+from musculoskeletal_ae.conditions import stop_causes
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import LATCHED
-from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.remedy import Step, sentence
 
 pytest.importorskip('viser', reason='./bringup.sh --view installs what the page needs')
 
@@ -155,8 +155,8 @@ def test_a_plot_has_a_scale_of_round_numbers(largest, top):
 def test_remedies_name_the_buttons_of_the_page(arm26):
     page = Page(arm26, '127.0.0.1', free_port(), False, lambda *_: None)
     try:
-        for cause in StopCause:
-            text = page.with_buttons(f'{cause.remedy}; {Step.EXPLORE.text}')
+        for cause in stop_causes():
+            text = page.with_buttons(sentence((*cause.steps, Step.EXPLORE)))
             assert 'call ' not in text and 'press "Explore"' in text
             assert text.count('Reset after a stop') <= 1
     finally:
@@ -258,7 +258,7 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         page.press('Explore')
         see('exploring')
         page.press('Rupture')
-        see('ANOMALY: ')
+        see('ERROR: estimator: ')
         assert detected[-1].data
         # The page must refuse this as long as the muscle is ruptured, because the arm would stop
         # again.

@@ -8,7 +8,8 @@ hardly disturbs the estimate. The other muscles show whether the muscle moves.
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Observation
+from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
@@ -81,7 +82,9 @@ class FrozenSensor(Detector):
         self._longest = max(predicted, self._longest)
         if self._longest - self._shortest <= MOVED:
             return None
-        return Finding(muscle, Kind.SENSOR_FROZEN, 'a sensor is frozen while the arm moves')
+        return Finding(
+            muscle, ConditionKind.SENSOR_FROZEN, 'a sensor is frozen while the arm moves'
+        )
 
     def _stop_observing(self) -> None:
         self._reduced_mae = None

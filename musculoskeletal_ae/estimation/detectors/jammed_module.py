@@ -18,7 +18,8 @@ do not reveal the fault.
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Observation
+from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -69,7 +70,9 @@ class JammedModule(Detector):
         if self._time.max() < JAM_TIME or not observation.lengths_known:
             return None
         muscle = int(self._time.argmax())
-        return Finding(muscle, Kind.JAMMED_MODULE, 'its winch does not follow the commands')
+        return Finding(
+            muscle, ConditionKind.JAMMED_MODULE, 'its winch does not follow the commands'
+        )
 
     def _is_far(self, observation: Observation) -> Bools | None:
         """Return which modules are far from the commanded tension, (M,); None without a command."""

@@ -29,7 +29,8 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Observation
+from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
@@ -225,7 +226,9 @@ class JointDisagreement(Detector):
         muscle = int(np.abs(change).argmax())
         if self._is_ruptured(muscle, observation.sample, change, largest):
             short = f'{-1e3 * change[muscle]:.0f} mm shorter than at the measured posture'
-            return Finding(muscle, Kind.SLACK_TENDON, f'it has no tension although it is {short}')
+            return Finding(
+                muscle, ConditionKind.SLACK_TENDON, f'it has no tension although it is {short}'
+            )
         tension = observation.sample.bone_tension
         jacobian = self._mae.muscle_jacobian(observation.measured, tension)
         jacobian = jacobian * self._used[:, None]
@@ -237,14 +240,16 @@ class JointDisagreement(Detector):
         )
         if np.linalg.norm(unexplained) > UNEXPLAINED * np.linalg.norm(change):
             is_alone = self._others_agree(muscle, change, largest)
-            kind = Kind.LENGTH_DISAGREES if is_alone else Kind.LENGTHS_DISAGREE
+            kind = ConditionKind.LENGTH_DISAGREES if is_alone else ConditionKind.LENGTHS_DISAGREE
             return Finding(muscle, kind, f'its {evidence}')
         j = int(np.abs(shift / self._robot.kinematics.radian).argmax())
         offset = f'{shift[j]:.2f} {self._robot.units[j].theta}'
         cause = (
             f'the lengths look as if joint sensor {self._robot.joints[j]} had an offset of {offset}'
         )
-        return Finding(muscle, Kind.JOINT_SENSORS_DISAGREE, f"{cause}: the muscle's {evidence}")
+        return Finding(
+            muscle, ConditionKind.JOINT_SENSORS_DISAGREE, f"{cause}: the muscle's {evidence}"
+        )
 
     def _others_agree(self, muscle: int, change: Array, largest: Largest) -> bool:
         """Return whether the lengths of all muscles but one agree with the measured posture."""

@@ -6,7 +6,8 @@ rejects messages with a jump. If the new lengths persist, messages are accepted 
 accepted sample names the muscles whose lengths have jumped.
 """
 
-from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Observation
+from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 
 
 class LengthJump(Detector):
@@ -23,7 +24,7 @@ class LengthJump(Detector):
 def finding_of(jumped: tuple[int, ...]) -> Finding:
     """Return the finding for one or several muscles whose lengths have jumped."""
     if len(jumped) == 1:
-        return Finding(jumped[0], Kind.LENGTH_JUMP, 'its length jumped')
+        return Finding(jumped[0], ConditionKind.LENGTH_JUMP, 'its length jumped')
     others = '1 other length' if len(jumped) == 2 else f'{len(jumped) - 1} other lengths'
     evidence = f'its length and {others} jumped'
-    return Finding(jumped[0], Kind.LENGTHS_JUMPED, evidence)
+    return Finding(jumped[0], ConditionKind.LENGTHS_JUMPED, evidence)

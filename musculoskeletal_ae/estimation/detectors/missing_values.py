@@ -10,7 +10,8 @@ import math
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind
+from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation.finding import Detector, Finding
 from musculoskeletal_ae.robot.robot import Robot
 
 SILENT = 0.15  # time with NaN for the same muscle after which it is reported [s]
@@ -39,4 +40,6 @@ class MissingValues(Detector):
         self._muscle, self._last = muscle, now
         if muscle is None or now - self._since < SILENT:
             return None
-        return Finding(muscle, Kind.VALUES_MISSING, 'a sensor reports NaN instead of a number')
+        return Finding(
+            muscle, ConditionKind.VALUES_MISSING, 'a sensor reports NaN instead of a number'
+        )

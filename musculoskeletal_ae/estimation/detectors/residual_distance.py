@@ -32,8 +32,9 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.detectors.slack_tendon import SlackTendon
-from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Observation
+from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, residuals
@@ -153,7 +154,7 @@ class ResidualDistance(Detector):
             candidates = is_slack if slack_count else self._robot.used
             suspect = self._least_likely(sample.bone_tension, sample.length, candidates)
         self.reading = Reading(distance, suspect)
-        return Finding(suspect, Kind.RESIDUAL_DISTANCE, evidence) if evidence else None
+        return Finding(suspect, ConditionKind.RESIDUAL_DISTANCE, evidence) if evidence else None
 
     def unfamiliarity(self, theta: Array) -> float:
         """Return how far a posture is from the nearest one in which the network was calibrated.

@@ -30,7 +30,8 @@ from collections import deque
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Observation
+from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.estimation.length_errors import LengthErrors, Prediction
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.mae.mae import Mae
@@ -115,7 +116,9 @@ class SlackTendon(Detector):
             return None
         muscle = int(np.argmax(np.where(is_dead, self._slack_time, 0.0)))
         return Finding(
-            muscle, Kind.SLACK_TENDON, 'it has no tension although the command demands tension'
+            muscle,
+            ConditionKind.SLACK_TENDON,
+            'it has no tension although the command demands tension',
         )
 
     def _demand(self, observation: Observation) -> Array | None:
@@ -188,7 +191,7 @@ class StretchedTendon(SlackTendon):
         if self._slack_time.max() < DEAD_TIME - 1e-9:
             return None
         muscle = int(self._slack_time.argmax())
-        return Finding(muscle, Kind.SLACK_TENDON, 'it is stretched, but has no tension')
+        return Finding(muscle, ConditionKind.SLACK_TENDON, 'it is stretched, but has no tension')
 
     @property
     def _slack_tension(self) -> Array:

@@ -8,7 +8,8 @@ in /diagnostics, and the arm is not stopped.
 
 from collections.abc import Iterable
 
-from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Observation
+from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.signals.heat import Heat
 
 COOL = 60.0  # largest temperature of a cool winding [°C]
@@ -28,5 +29,5 @@ class ThermalDrift(Detector):
         """Report a module with changed thermal constants and a hot winding, or return None."""
         for muscle, change in self._heat.changed.items():
             if self._heat.core[muscle] > COOL:
-                return Finding(muscle, Kind.THERMAL_DRIFT, f'its module {change}')
+                return Finding(muscle, ConditionKind.HOT_MODULE_CHANGED, f'its module {change}')
         return None

@@ -1,0 +1,803 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Declares everything that can be wrong with a running arm, in one table.
+
+A *condition* is a fact that a user should know: a fault, a stop, or something that a node waits
+for. The node that owns a fact reports it as long as it is true, and no other node infers it. A node
+reports all conditions that are present; none hides another. They travel on /diagnostics as the
+value `conditions` (`to_json`), and readers sort and print them.
+
+`ConditionKind` declares every kind with its text, its remedy and its consequence. The reference
+pages on stops and on diagnostics are generated from this table.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from enum import Enum, IntEnum
+from itertools import chain
+from typing import Literal, NamedTuple, cast, get_args
+
+from musculoskeletal_ae.exceptions import printable
+from musculoskeletal_ae.remedy import REPAIR, Step
+
+#: ok: for information only, because another condition or the user has caused it
+Level = Literal['ok', 'warn', 'error']
+LEVELS: tuple[Level, ...] = get_args(Level)
+CONDITIONS = 'conditions'  # key of the value in /diagnostics
+
+
+class Action(IntEnum):
+    """Action of a stop; if several causes are present, the most severe action applies."""
+
+    #: keep the last command, because the cause may clear; after `hold_time`, the same as RELEASE
+    HOLD = 1
+    #: keep the last command for `hold_time` in any case, then pay out every muscle to T_bias
+    RELEASE = 2
+    #: pay out at once until every muscle is at T_bias
+    RELEASE_AT_ONCE = 3
+
+
+class Clears(Enum):
+    """How a stop ends."""
+
+    #: auto-recoverable until the arm is released; afterwards only by a reset
+    CONDITION = 'when the condition clears within hold_time, else on controller/reset'
+    #: by the estimator's verification of the suspect muscle, or by a reset
+    VERIFICATION = 'when a verification of the suspect muscle ends, else on controller/reset'
+    #: only by a reset
+    RESET = 'on controller/reset'
+
+
+class Stop(NamedTuple):
+    """Consequence of a stop cause: what the controller does, and how the stop ends."""
+
+    action: Action
+    clears: Clears
+    is_event: bool = False  # whether the cause is a single event; otherwise it lasts or clears
+
+    def __str__(self) -> str:
+        return f'{self.action.name.lower().replace("_", " ")}; ends {self.clears.value}'
+
+
+class Reaction(Enum):
+    """Consequence of a finding: what the estimator does about it."""
+
+    WARN = 'reports it'
+    STOP = 'raises anomaly_detected, which stops the arm'
+    ISOLATE = (
+        'raises anomaly_detected, which stops the arm; with `on_anomaly: isolate`, isolates and '
+        'verifies the muscle'
+    )
+    ISOLATE_AT_ONCE = 'with `on_anomaly: isolate`, isolates the muscle without a stop'
+
+    def __str__(self) -> str:
+        return self.value
+
+
+class Revokes(Enum):
+    """Which length offsets become unreliable because of a finding."""
+
+    ONE = 'that of the muscle, unless it is isolated'
+    ALL = 'all'
+
+
+class Declaration(NamedTuple):
+    """Declaration of a kind of condition."""
+
+    identifier: str  # stable name for programs
+    owner: str  # the nodes that report it
+    level: Level
+    when: str  # when it is present
+    text: str  # what happened, for users
+    steps: tuple[Step, ...] = ()  # the remedy
+    stop: Stop | None = None  # consequence of a stop cause
+    reaction: Reaction | None = None  # consequence of a finding
+    revokes: Revokes | None = None  # length offsets that a finding revokes
+
+
+_RESET, _VERIFICATION, _CONDITION = Clears.RESET, Clears.VERIFICATION, Clears.CONDITION
+_ALL = 'every node'
+
+
+class ConditionKind(Enum):
+    """All kinds of conditions. Readers print the conditions of one level in this order.
+
+    If several stop causes begin together, `stop cause` of the controller is the first one here.
+    """
+
+    def __init__(  # the fields of `Declaration`
+        self,
+        identifier: str,
+        owner: str,
+        level: Level,
+        when: str,
+        text: str,
+        steps: tuple[Step, ...],
+        stop: Stop | None,
+        reaction: Reaction | None,
+        revokes: Revokes | None,
+    ) -> None:
+        self.identifier, self.owner, self.level = identifier, owner, level
+        self.when, self.text, self.steps = when, text, steps
+        self.stop, self.reaction, self.revokes = stop, reaction, revokes
+
+    @property
+    def action(self) -> Action:
+        """Action of a stop cause."""
+        assert self.stop is not None, self
+        return self.stop.action
+
+    @property
+    def clears(self) -> Clears:
+        """How the stop ends that a stop cause has caused."""
+        assert self.stop is not None, self
+        return self.stop.clears
+
+    # -- nodes and topics -----------------------------------------------------------------------
+
+    NODE_ENDED = Declaration(
+        'node_ended',
+        'the status line and the page',
+        'error',
+        'a node of the arm that has reported before is not in the ROS graph any more',
+        'the node has ended',
+        (Step.RESTART_NODE,),
+    )
+    NODE_SILENT = Declaration(
+        'node_silent',
+        'the status line and the page',
+        'error',
+        'a node of the arm that has reported before has not reported for 2 s',
+        'the node does not report',
+        (Step.RESTART_NODE,),
+    )
+    INTERNAL_ERROR = Declaration(
+        'internal_error',
+        _ALL,
+        'error',
+        'an exception has escaped a timer of the node in the last 10 s',
+        'internal error',
+        (Step.REPORT_LOG,),
+    )
+    SECOND_PUBLISHER = Declaration(
+        'second_publisher',
+        _ALL,
+        'error',
+        'another node publishes a topic of the driver, the estimator, the learner or the '
+        'controller, or has the name of this node',
+        'several publishers',
+        (Step.STOP_SECOND_PUBLISHER, Step.RESET_CONTROLLER),
+        Stop(Action.RELEASE, _RESET),
+    )
+    SILENT_TOPIC = Declaration(
+        'silent_topic',
+        _ALL,
+        'error',
+        '`muscle_states` or `estimated_joint_states` is published or was received, but no usable '
+        'message has arrived for 1 s',
+        'silent topic',
+        (Step.CHECK_DRIVER,),
+    )
+    MISSING_TOPIC = Declaration(
+        'missing_topic',
+        _ALL,
+        'warn',
+        'a topic that the node needs has no publisher, and no usable message has arrived yet',
+        'waiting for a topic',
+    )
+    SLOW_TOPIC = Declaration(
+        'slow_topic',
+        'estimator',
+        'warn',
+        'for 3 s, `muscle_states` have come at less than 40 % of the parameter `rate`',
+        'messages come too slowly',
+        (Step.CHECK_RATE,),
+    )
+    ACCELEROMETERS_UNCLEAR = Declaration(
+        'accelerometers_unclear',
+        'learner',
+        'warn',
+        '`imu` has more publishers than there are links of which messages arrive',
+        'imu is not used',
+        (Step.STOP_SECOND_PUBLISHER,),
+    )
+
+    # -- emulated arm ---------------------------------------------------------------------------
+
+    EMULATION_DIVERGED = Declaration(
+        'emulation_diverged',
+        'hardware_emulator',
+        'error',
+        'the emulated arm has left the range in which it can be simulated',
+        'the simulation diverged under excessive forces',
+        (Step.RESET_EMULATOR,),
+    )
+    MODULES_IN_SAFE_STATE = Declaration(
+        'modules_in_safe_state',
+        'hardware_emulator',
+        'warn',
+        'the emulated modules receive no commands',
+        'the modules are in their safe state, because no commands arrive',
+        (Step.START_CONTROLLER,),
+    )
+    EMULATED_RUPTURE = Declaration(
+        'emulated_rupture',
+        'hardware_emulator',
+        'ok',
+        'the parameter `ruptured_muscles` of the emulator names muscles',
+        'the emulator ruptures muscles',
+        (Step.REPAIR_EMULATED_RUPTURE,),
+    )
+    EMULATED_FAULT = Declaration(
+        'emulated_fault',
+        'hardware_emulator',
+        'ok',
+        'the parameter `faults` of the emulator names faults',
+        'the emulator imitates faults',
+        (Step.REPAIR_EMULATED_FAULT,),
+    )
+
+    # -- the body: findings of the detectors ----------------------------------------------------
+
+    SLACK_TENDON = Declaration(
+        'slack_tendon',
+        'estimator',
+        'error',
+        'a tendon carries no tension although it should',
+        'slack tendon',
+        REPAIR,
+        reaction=Reaction.ISOLATE,
+    )
+    JAMMED_MODULE = Declaration(
+        'jammed_module',
+        'estimator',
+        'error',
+        'a muscle module does not follow its commands',
+        'jammed module',
+        REPAIR,
+        reaction=Reaction.ISOLATE,
+    )
+    SENSOR_FROZEN = Declaration(
+        'sensor_frozen',
+        'estimator',
+        'error',
+        'a length or tension sensor repeats one reading',
+        'frozen sensor',
+        REPAIR,
+        reaction=Reaction.ISOLATE,
+    )
+    RESIDUAL_DISTANCE = Declaration(
+        'residual_distance',
+        'estimator',
+        'error',
+        'tensions and lengths disagree with the learned body by more than on the healthy arm',
+        'the readings do not fit the learned body',
+        REPAIR,
+        reaction=Reaction.ISOLATE,
+    )
+    LENGTH_JUMP = Declaration(
+        'length_jump',
+        'estimator',
+        'error',
+        'the length of one muscle has jumped',
+        'the length has jumped',
+        (Step.CALIBRATE_LENGTHS,),
+        reaction=Reaction.ISOLATE,
+        revokes=Revokes.ONE,
+    )
+    LENGTHS_JUMPED = Declaration(
+        'lengths_jumped',
+        'estimator',
+        'error',
+        'the lengths of several muscles have jumped',
+        'several lengths have jumped',
+        (Step.CALIBRATE_LENGTHS,),
+        reaction=Reaction.STOP,
+        revokes=Revokes.ALL,
+    )
+    LENGTH_DISAGREES = Declaration(
+        'length_disagrees',
+        'estimator',
+        'error',
+        'the length of one muscle disagrees with the joint sensors',
+        'the length disagrees with the joint sensors',
+        (Step.CALIBRATE_LENGTHS,),
+        reaction=Reaction.ISOLATE,
+        revokes=Revokes.ONE,
+    )
+    LENGTHS_DISAGREE = Declaration(
+        'lengths_disagree',
+        'estimator',
+        'error',
+        'the lengths of several muscles disagree with the joint sensors',
+        'several lengths disagree with the joint sensors',
+        (Step.CALIBRATE_LENGTHS,),
+        reaction=Reaction.STOP,
+        revokes=Revokes.ALL,
+    )
+    JOINT_SENSORS_DISAGREE = Declaration(
+        'joint_sensors_disagree',
+        'estimator',
+        'error',
+        'a joint sensor disagrees with the lengths of all muscles',
+        'a joint sensor disagrees with the lengths',
+        (Step.CHECK_SENSOR, Step.RESET_ESTIMATOR),
+        reaction=Reaction.STOP,
+    )
+    VALUES_MISSING = Declaration(
+        'values_missing',
+        'estimator',
+        'error',
+        'the length or the tension of a muscle has been NaN for a while',
+        'values are missing',
+        REPAIR,
+        reaction=Reaction.ISOLATE_AT_ONCE,
+    )
+    HOT_MODULE_CHANGED = Declaration(
+        'thermal_drift',
+        'estimator',
+        'error',
+        'the constants of the thermal model of a hot module have changed',
+        'thermal drift',
+        REPAIR,
+        reaction=Reaction.ISOLATE,
+    )
+    MODULE_CHANGED = Declaration(
+        'module_changed',
+        'estimator',
+        'warn',
+        'the constants of the thermal model of a cool module have changed',
+        'a module has changed',
+        (Step.CHECK_MODULE,),
+        reaction=Reaction.WARN,
+    )
+
+    # -- the body: isolated muscles, length offsets, network ------------------------------------
+
+    MUSCLE_ISOLATED = Declaration(
+        'muscle_isolated',
+        'estimator',
+        'warn',
+        'a muscle is isolated, and is not being verified',
+        'isolated',
+        (Step.RESTORE_MUSCLES,),
+    )
+    LENGTH_OFFSETS_UNKNOWN = Declaration(
+        'length_offsets_unknown',
+        'estimator, controller',
+        'warn',
+        'the length offsets of muscles are unknown or have been revoked',
+        'length offsets unknown',
+        (Step.CALIBRATE_LENGTHS,),
+    )
+
+    # -- why the arm stands still ---------------------------------------------------------------
+
+    OPERATOR = Declaration(
+        'operator_stop',
+        'controller',
+        'error',
+        'controller/stop was called',
+        'controller/stop was called',
+        (Step.RESET_CONTROLLER,),
+        Stop(Action.RELEASE, _RESET, is_event=True),
+    )
+    RESTARTED = Declaration(
+        'restarted',
+        'controller',
+        'error',
+        'the previous controller of this arm was killed or has crashed while it commanded the arm',
+        'the previous controller did not end properly',
+        (Step.RESET_CONTROLLER,),
+        Stop(Action.RELEASE, _RESET, is_event=True),
+    )
+    CONTROL_FAULT = Declaration(
+        'control_fault',
+        'controller',
+        'error',
+        'an exception escaped the computation of a command',
+        'internal error of the controller',
+        (Step.REPORT_LOG, Step.RESET_CONTROLLER),
+        Stop(Action.RELEASE, _RESET, is_event=True),
+    )
+    COMMAND_NOT_FINITE = Declaration(
+        'command_not_finite',
+        'controller',
+        'error',
+        'a computed command contains NaN or infinity',
+        'the computed command is not finite',
+        (Step.REPORT_LOG, Step.RESET_CONTROLLER),
+        Stop(Action.RELEASE, _RESET, is_event=True),
+    )
+    UNFIT_CHECKPOINT = Declaration(
+        'unfit_checkpoint',
+        'controller',
+        'error',
+        'a checkpoint was published that does not fit the robot',
+        'unfit checkpoint',
+        (Step.STOP_OTHER_ROBOT, Step.RESET_CONTROLLER),
+        Stop(Action.RELEASE, _RESET, is_event=True),
+    )
+    NO_CHECKPOINT = Declaration(
+        'no_checkpoint',
+        'estimator, controller, learner, sim',
+        'warn',
+        'the node has no network yet',
+        'no checkpoint',
+        (Step.PROVIDE_CHECKPOINT, Step.RESET_CONTROLLER),
+        Stop(Action.RELEASE, _RESET),
+    )
+    ANOMALY = Declaration(
+        'anomaly_detected',
+        'controller',
+        'error',
+        'anomaly_detected is true; the estimator reports the finding',
+        'the estimator has found a fault',
+        (Step.RESET_CONTROLLER,),
+        Stop(Action.RELEASE, _VERIFICATION),
+    )
+    LENGTH_OFFSETS_REVOKED = Declaration(
+        'length_offsets_revoked',
+        'controller',
+        'error',
+        'lengths jumped or disagree with joint sensors, and are not calibrated again yet',
+        'the lengths are unreliable',
+        (Step.CALIBRATE_LENGTHS, Step.RESET_CONTROLLER),
+        Stop(Action.RELEASE, _RESET),
+    )
+    IMPLAUSIBLE_MUSCLE_STATES = Declaration(
+        'implausible_muscle_states',
+        'controller',
+        'error',
+        'muscle_states were implausible for 0.1 s',
+        'muscle_states are implausible',
+        (Step.CHECK_SENSOR, Step.RESET_CONTROLLER),
+        Stop(Action.RELEASE, _VERIFICATION),
+    )
+    IMPLAUSIBLE_ESTIMATE = Declaration(
+        'implausible_estimate',
+        'controller',
+        'error',
+        'estimated_joint_states were implausible for 0.1 s',
+        'the estimate is implausible',
+        (Step.CHECK_CHECKPOINT, Step.CALIBRATE_LENGTHS, Step.RESET_CONTROLLER),
+        Stop(Action.RELEASE, _VERIFICATION),
+    )
+    OVERLOAD = Declaration(
+        'overload',
+        'controller',
+        'error',
+        'a tension is above 1.1 × tension.limit for 0.2 s although its muscle is paid out',
+        'overload',
+        (Step.FREE_ARM, Step.RESET_CONTROLLER),
+        Stop(Action.RELEASE_AT_ONCE, _VERIFICATION),
+    )
+    OVERHEATED = Declaration(
+        'overheated',
+        'controller',
+        'error',
+        'a winding is 20 °C above temperature_limit, or heat limits all muscles to T_bias',
+        'overheated',
+        (Step.WAIT_UNTIL_COOL, Step.RESET_CONTROLLER),
+        Stop(Action.RELEASE, _RESET),
+    )
+    STALE_MUSCLE_STATES = Declaration(
+        'stale_muscle_states',
+        'controller',
+        'error',
+        'muscle_states are older than max_age',
+        'muscle_states are too old',
+        (Step.CHECK_DRIVER, Step.RESET_CONTROLLER),
+        Stop(Action.HOLD, _CONDITION),
+    )
+    STALE_ESTIMATE = Declaration(
+        'stale_estimate',
+        'controller',
+        'error',
+        'estimated_joint_states are older than max_age',
+        'estimated_joint_states are too old',
+        (Step.CHECK_ESTIMATOR, Step.RESET_CONTROLLER),
+        Stop(Action.HOLD, _CONDITION),
+    )
+
+    # -- control --------------------------------------------------------------------------------
+
+    GENTLE_ONLY = Declaration(
+        'gentle_only',
+        'controller',
+        'warn',
+        'the arm does not move, because its length offsets are unknown',
+        'while the length offsets are unknown, the arm can only explore gently',
+        (Step.EXPLORE_GENTLY,),
+    )
+    NOT_EXPLORING = Declaration(
+        'not_exploring',
+        'controller',
+        'warn',
+        'a stop has ended the exploration, or it was refused at the start',
+        'the exploration does not go on by itself',
+        (Step.EXPLORE,),
+    )
+    TARGET_CLAMPED = Declaration(
+        'target_clamped',
+        'controller',
+        'warn',
+        'the target of a joint exceeded its limits and was moved to the limit',
+        'target clamped to the joint limits',
+    )
+    EFFORT_IGNORED = Declaration(
+        'effort_ignored',
+        'controller',
+        'warn',
+        'the target has efforts, which the control method does not use',
+        'the effort of the target is ignored',
+    )
+    TRAJECTORY_SLOWED = Declaration(
+        'trajectory_slowed',
+        'controller',
+        'warn',
+        'the muscle modules are too slow for the requested trajectory',
+        'trajectory slowed',
+    )
+    TORQUE_MISSING = Declaration(
+        'torque_missing',
+        'controller',
+        'warn',
+        'the target needs more torque than the muscles can exert',
+        'the target needs more torque than the muscles can exert',
+    )
+    OUT_OF_REACH = Declaration(
+        'out_of_reach',
+        'controller',
+        'warn',
+        'the muscles cannot hold the target, or the hand cannot reach it',
+        'out of reach',
+    )
+    ARM_FALLEN = Declaration(
+        'arm_fallen',
+        'controller',
+        'warn',
+        'the arm rests far from a target at which it has arrived before',
+        'the arm has fallen',
+    )
+    TENSION_ABOVE_LIMIT = Declaration(
+        'tension_above_limit',
+        'controller',
+        'warn',
+        'a tension is above 1.1 × tension.limit',
+        'too much tension',
+    )
+    TENSION_LIMITED_BY_HEAT = Declaration(
+        'tension_limited_by_heat',
+        'controller',
+        'warn',
+        'the temperature of a winding limits the tension of its muscle',
+        'heat limits the tension',
+    )
+    STOP_NOT_KEPT = Declaration(
+        'stop_not_kept',
+        'controller',
+        'warn',
+        'the file that keeps a stop for the next controller cannot be written',
+        'the stop is not kept',
+    )
+
+    # -- learning -------------------------------------------------------------------------------
+
+    TRAINING_FAILED = Declaration(
+        'training_failed',
+        'learner',
+        'error',
+        'the training process has ended or does not answer',
+        'no updates are made',
+    )
+    STATE_NOT_SAVED = Declaration(
+        'state_not_saved',
+        'learner',
+        'error',
+        'samples and network cannot be saved',
+        'the learned state is not on disk',
+        (Step.FREE_DISK,),
+    )
+    OFFSETS_NOT_BELIEVED = Declaration(
+        'offsets_not_believed',
+        'learner',
+        'error',
+        'new length offsets disagree with the messages',
+        'the length offsets are not believed',
+        (Step.CALIBRATE_LENGTHS,),
+    )
+    LENGTHS_NOT_LEARNED = Declaration(
+        'lengths_not_learned',
+        'learner',
+        'error',
+        'lengths have jumped, and the estimator has not calibrated them again yet',
+        'nothing is learned, because lengths have jumped',
+        (Step.CALIBRATE_LENGTHS,),
+    )
+    LEARNING_DISABLED = Declaration(
+        'learning_disabled',
+        'learner',
+        'warn',
+        'learner/enable was called with false',
+        'learning was stopped by learner/enable',
+        (Step.ENABLE_LEARNING,),
+    )
+    LEARNING_WAITS = Declaration(
+        'learning_waits',
+        'learner',
+        'ok',
+        'learning waits for the end of an anomaly or of a length calibration',
+        'learning is paused',
+    )
+    NOTHING_TO_LEARN = Declaration(
+        'nothing_to_learn',
+        'learner',
+        'warn',
+        'no message was usable for 5 s',
+        'nothing to learn from',
+    )
+
+    # -- requests and recordings ----------------------------------------------------------------
+
+    REQUEST_REFUSED = Declaration(
+        'request_refused',
+        _ALL,
+        'warn',
+        'a request was refused in the last 10 s',
+        'refused',
+    )
+    PART_IGNORED = Declaration(
+        'part_ignored',
+        _ALL,
+        'warn',
+        'a part of a message was not used in the last 10 s',
+        'ignored',
+    )
+    REPLAY_STANDS = Declaration(
+        'replay_stands',
+        'replay',
+        'warn',
+        'the replay waits for nodes, is paused, or has ended',
+        'the recording is not being played',
+    )
+    REPLAY_SLOW = Declaration(
+        'replay_slow',
+        'replay',
+        'warn',
+        'playback waits for nodes and runs at less than 90 % of the wanted speed',
+        'the recording is played slowly',
+    )
+
+    def condition(
+        self,
+        detail: str = '',
+        subjects: Iterable[str] = (),
+        *,
+        level: Level | None = None,
+        steps: Iterable[Step] | None = None,
+    ) -> Condition:
+        """Return a condition of this kind.
+
+        Args:
+            detail: Values and names that the text states.
+            subjects: Names of the muscles, joints, topics or nodes that are concerned.
+            level: Level of this condition, if it differs from the declared one.
+            steps: Remedy of this condition, if it differs from the declared one.
+        """
+        return Condition(
+            self.identifier,
+            self.level if level is None else level,
+            f'{self.text}: {detail}' if detail else self.text,
+            self.steps if steps is None else tuple(steps),
+            tuple(subjects),
+        )
+
+
+KINDS = {kind.identifier: kind for kind in ConditionKind}  # all kinds by identifier
+ORDER = {identifier: place for place, identifier in enumerate(KINDS)}
+
+
+class Condition(NamedTuple):
+    """A condition that is present.
+
+    Attributes:
+        identifier: Identifier of its kind, for programs.
+        level: How urgent it is.
+        text: What is the case, for users. It can be read alone.
+        steps: What ends it, in this order; () if it ends by itself.
+        subjects: Names of the muscles, joints, topics or nodes that it concerns.
+    """
+
+    identifier: str
+    level: Level
+    text: str
+    steps: tuple[Step, ...] = ()
+    subjects: tuple[str, ...] = ()
+
+    @property
+    def kind(self) -> ConditionKind:
+        """The declaration of this kind of condition."""
+        return KINDS[self.identifier]
+
+
+def ordered(conditions: Iterable[Condition]) -> tuple[Condition, ...]:
+    """Return conditions in the order in which users read them: by level, then as declared."""
+    return tuple(
+        sorted(
+            conditions,
+            key=lambda each: (-LEVELS.index(each.level), ORDER.get(each.identifier, len(ORDER))),
+        )
+    )
+
+
+def worst(conditions: Iterable[Condition]) -> Level:
+    """Return the level of the most urgent condition; 'ok' without conditions."""
+    levels = (each.level for each in conditions)
+    return max(levels, key=LEVELS.index, default='ok')
+
+
+def remedy_of(conditions: Iterable[Condition]) -> tuple[Step, ...]:
+    """Return the steps that end all these conditions, each step once.
+
+    A reset of the controller comes after the steps that remove causes, and an exploration after the
+    reset (`Step.place`).
+    """
+    steps = dict.fromkeys(chain.from_iterable(each.steps for each in conditions))
+    return tuple(sorted(steps, key=lambda step: step.place))
+
+
+def to_json(conditions: Iterable[Condition]) -> str:
+    """Return conditions as the value `conditions` of /diagnostics: a JSON list of objects."""
+    rows = [
+        {
+            'identifier': each.identifier,
+            'level': each.level,
+            'text': printable(each.text),
+            'steps': [step.identifier for step in each.steps],
+            'subjects': [printable(subject) for subject in each.subjects],
+        }
+        for each in conditions
+    ]
+    return json.dumps(rows, ensure_ascii=False, separators=(',', ':'))
+
+
+def from_json(value: str) -> tuple[Condition, ...]:
+    """Return the conditions that a value `conditions` of /diagnostics contains.
+
+    Any node may publish on /diagnostics. Entries that are not conditions are left out, and so are
+    unknown steps.
+    """
+    try:
+        rows = json.loads(value)
+    except (ValueError, RecursionError):
+        return ()
+    conditions = []
+    for row in rows if isinstance(rows, list) else []:
+        if not isinstance(row, dict) or row.get('level') not in LEVELS:
+            continue
+        identifier, text = row.get('identifier'), row.get('text')
+        if not (isinstance(identifier, str) and isinstance(text, str)):
+            continue
+        steps = (Step.named(name) for name in _strings(row.get('steps')))
+        conditions.append(
+            Condition(
+                identifier,
+                cast(Level, row['level']),
+                text,
+                tuple(step for step in steps if step is not None),
+                _strings(row.get('subjects')),
+            )
+        )
+    return tuple(conditions)
+
+
+def _strings(value: object) -> tuple[str, ...]:
+    items = value if isinstance(value, list) else []
+    return tuple(item for item in items if isinstance(item, str))
+
+
+def stop_causes() -> list[ConditionKind]:
+    """Return the kinds that stop the arm."""
+    return [kind for kind in ConditionKind if kind.stop is not None]
