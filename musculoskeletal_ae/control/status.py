@@ -13,7 +13,6 @@ from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.remedy import REMEDY_STEPS, REPAIR, Step, identifiers, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.description import NO_TENSION
-from musculoskeletal_ae.signals.body_state import KNOWN
 
 #: fraction of the requested speed below which a slowed trajectory is reported by its duration [%]
 LEAST_SHARE = 10.0
@@ -109,8 +108,7 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
     if robot.isolated:
         values['isolated muscles'] = robot.names(robot.isolated)
     if not core.stream.body.offsets.known:
-        unknown = np.flatnonzero(~(core.stream.body.offsets.deviation < KNOWN))
-        values['unknown length offsets'] = robot.names(unknown)
+        values['unknown length offsets'] = robot.names(core.stream.body.offsets.not_known)
         waits = 'waits for the first estimate of the length calibration'
         doing = waits if core.estimate is None else 'can only explore gently'
         warnings.append(f'the length offsets are unknown, so the arm {doing}')

@@ -24,11 +24,11 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation import status
+from musculoskeletal_ae.estimation.calibration_check import CalibrationCheck
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
 from musculoskeletal_ae.estimation.detectors.joint_disagreement import GAP_LEARNED, GAP_YOUNG
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
 from musculoskeletal_ae.estimation.finding import (
-    REVOKING,
     REVOKING_ONE,
     Finding,
     Kind,
@@ -39,6 +39,7 @@ from musculoskeletal_ae.estimation.length_calibration import (
     LengthCalibration,
     check_stated_posture,
 )
+from musculoskeletal_ae.estimation.length_trust import EVIDENCE_OF, Evidence, LengthTrust
 from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
 from musculoskeletal_ae.estimation.repair_check import RepairCheck
@@ -97,12 +98,14 @@ class Estimator:
     Attributes:
         robot: The nominal body, with all muscles.
         body: Isolated muscles and length offsets.
+        trust: Decides which length offsets are known.
         stream: Converts messages into samples.
         heat: Thermal models of the muscle modules.
         state: The state estimator.
         health: The detectors.
         suspects: The latched finding and its verification.
         calibration: The running length calibration, or None.
+        check: Checks the offsets that the calibration finds.
         contact: The contact estimator.
         sample: The last sample; None before the first.
         output: Results of the last message with an estimate; None before the first, and from the
@@ -113,21 +116,24 @@ class Estimator:
             a network [s].
     """
 
-    def __init__(self, robot: Robot, preset: str = 'default') -> None:
+    def __init__(self, robot: Robot, preset: str = 'default', first_generation: int = 1) -> None:
         """Start without a network.
 
         Args:
             robot: The nominal body.
             preset: Name of the preset that provides the detectors.
+            first_generation: Generation of the first change of the length offsets.
         """
         self.robot = robot
-        self.body = BodyState.healthy(robot.muscle_count)
+        self.trust = LengthTrust(robot.muscle_count, first_generation)
+        self.body = BodyState(self.trust.offsets)
         self.stream = MuscleStream(robot, self.body)
         self.heat = Heat(robot)
         self.state = StateEstimator()
         self.health = HealthMonitor(robot, preset, heat=self.heat)
         self.suspects = SuspectHandling(robot)
         self.calibration: LengthCalibration | None = None
+        self.check = CalibrationCheck()
         self.contact = ContactEstimator(robot)
         self.sample: MuscleSample | None = None
         self.output: Output | None = None
@@ -135,8 +141,6 @@ class Estimator:
         self.stepped_at = -math.inf
         #: posture stated for the last length calibration [rad]; () without one
         self._stated_posture: tuple[float, ...] = ()
-        self._jumps = 0  # number of length jumps handled so far
-        self._valid_offsets = self.body.offsets  # the last known offsets
         self._commands = ModuleCommands()
         self._measured: tuple[float, Array | None] = -math.inf, None  # time and measured θ
         #: whether `mae.isolated` of a new network decides which muscles are isolated; this ends
@@ -163,7 +167,8 @@ class Estimator:
         finding = self.suspects.finding
         if finding is None or self.suspects.verification is not None:
             return ()
-        is_repaired = finding.kind is Kind.SLACK_TENDON or self.suspects.has_suspect_jumped
+        is_moved = self.trust.evidence[finding.muscle] is Evidence.MOVED
+        is_repaired = finding.kind is Kind.SLACK_TENDON or is_moved
         if finding.remedy == REPAIR and is_repaired and self._has_wrong_length(finding.muscle):
             return (Step.CALIBRATE_LENGTHS,)
         return finding.remedy
@@ -201,7 +206,7 @@ class Estimator:
         self.state.use(mae, isolated)
         self._use_body(self.body.with_isolated(isolated))
         if self.calibration is not None:
-            self.calibration = LengthCalibration(self.robot, reduced, self.calibration.posture)
+            self._begin_calibration(reduced)
 
     def keep_isolated(self) -> None:
         """Keep the present isolated muscles even if another network is used later."""
@@ -221,9 +226,16 @@ class Estimator:
             self.use(self.state.complete_mae)
         self.health.reset()
 
-    def forget_offsets(self) -> None:
-        """Consider the length offsets unknown until the next length calibration."""
-        self._use_body(self.body.with_offsets(LengthOffsets.unknown(self.robot.muscle_count)))
+    def distrust_lengths(self, evidence: Evidence, offset: Array | None = None) -> None:
+        """Consider the length offsets unknown until the next length calibration.
+
+        Args:
+            evidence: Why they are unknown.
+            offset: Offsets that are used meanwhile [m], (M,); 0 by default.
+        """
+        unknown = LengthOffsets.unknown(self.robot.muscle_count)
+        offset = unknown.offset if offset is None else offset
+        self._note(evidence, found=LengthOffsets(offset, unknown.deviation))
 
     def calibrate_lengths(self, posture: tuple[float, ...] = ()) -> None:
         """Start a length calibration, while the arm stands in a posture or moves gently.
@@ -247,9 +259,8 @@ class Estimator:
                 'known posture; hold the arm still and set the parameter zero_posture'
             )
         self._stated_posture = posture
-        stated = np.array(posture) if posture else None
-        self.calibration = LengthCalibration(self.robot, self.mae, stated)
-        self.forget_offsets()
+        self._begin_calibration(self.mae)
+        self.distrust_lengths(Evidence.CALIBRATING)
         self.health.residual.forget_reading()
         self.output = None
         self.contact.reset()
@@ -298,10 +309,10 @@ class Estimator:
                 confirm the lengths.
         """
         self._check_suspect(tuple(isolating))
-        if self.body.offsets.is_suspect:
+        if self.body.offsets.revoked:
             if not self.health.joints.agrees:
                 raise MusculoskeletalError(f'{self.cause}; {self.advice}')
-            self._use_body(self.body.with_offsets(self._valid_offsets))
+            self._note(Evidence.AGREES)
         self.health.accept(range(self.robot.muscle_count))
         self._clear(self.suspects.clear(self.body.isolated))
 
@@ -375,7 +386,8 @@ class Estimator:
                 self._handle(self.health.read(error.states, self.body.used, now), now)
             raise
         self._handle(self.health.read(sample.newest, self.body.used, now), now)
-        self._handle_jump(now)
+        if sample.jumped:
+            self._handle_jump(sample.jumped, now)
         before, self.sample = self.sample, sample
         elapsed = sent_apart = 0.0
         if before is not None:
@@ -436,9 +448,17 @@ class Estimator:
 
     # -- findings, verification and calibration -------------------------------------------------
 
+    def _note(
+        self,
+        evidence: Evidence,
+        muscles: Iterable[int] | None = None,
+        found: LengthOffsets | None = None,
+    ) -> None:
+        """Decide by new evidence on length offsets, and use the result (`LengthTrust.take`)."""
+        if self.trust.take(evidence, muscles, found):
+            self._use_body(self.body.with_offsets(self.trust.offsets))
+
     def _use_body(self, body: BodyState) -> None:
-        if body.offsets.known:
-            self._valid_offsets = body.offsets
         self.body = body
         self.stream.use_body(body)
 
@@ -449,20 +469,16 @@ class Estimator:
             return None
         return theta
 
-    def _handle_jump(self, now: float) -> None:
+    def _handle_jump(self, jumped: tuple[int, ...], now: float) -> None:
         """Respond to a jump of lengths in two cases in which the detector `LengthJump` does not.
 
         During a length calibration, the calibration starts again. Without a network, the jump is
         latched as a finding.
         """
-        if self.stream.displaced.jumps == self._jumps:
-            return
-        self._jumps = self.stream.displaced.jumps
-        jumped = tuple(sorted(self.stream.displaced.muscles))
         if self.calibration is not None:
             # Start again, because readings before and after the jump have different offsets.
             self.calibrate_lengths(self._stated_posture)
-        elif self.mae is None and self.body.offsets.known and jumped:
+        elif self.mae is None and self.body.offsets.known:
             self._handle(finding_of(jumped), now)
 
     def _check_suspect(self, isolating: Iterable[int]) -> None:
@@ -473,15 +489,13 @@ class Estimator:
         Raises:
             MusculoskeletalError: If the suspect may not be used yet.
         """
-        suspected, offsets = self.suspects.finding, self.body.offsets
+        suspected = self.suspects.finding
         if suspected is None or suspected.remedy != REPAIR or suspected.muscle in isolating:
             return
         if problem := self._problem_of(suspected.muscle):
             raise MusculoskeletalError(f'{problem}; then call estimator/reset again')
-        if self.suspects.has_suspect_jumped and offsets.known:
-            # The other nodes trust the length again because its offset is published with a larger
-            # standard deviation (`follow_offsets`).
-            self._use_body(self.body.with_offsets(offsets.confirmed(suspected.muscle)))
+        if self.trust.evidence[suspected.muscle] is Evidence.MOVED:
+            self._note(Evidence.CONFIRMED, [suspected.muscle])
 
     def _problem_of(self, muscle: int) -> str:
         """Return why a muscle must not be used yet, or '' if it may be used."""
@@ -531,13 +545,12 @@ class Estimator:
         if set(isolated) != set(self.body.isolated):
             self.isolate(isolated)
         if is_repair:
+            self._note(Evidence.MOVED, [finding.muscle])
             self.health.reset()  # evidence from before the repair is no longer valid
             return False
-        revokes = finding.kind in REVOKING and finding.muscle not in self.body.isolated
-        if revokes and self.body.offsets.known:
-            is_one = finding.kind in REVOKING_ONE
-            muscles = (finding.muscle,) if is_one else None
-            self._use_body(self.body.with_offsets(self.body.offsets.revoked(muscles)))
+        evidence = EVIDENCE_OF.get(finding.kind)
+        if evidence is not None and finding.muscle not in self.body.isolated:
+            self._note(evidence, [finding.muscle] if finding.kind in REVOKING_ONE else None)
         is_latched = before is None and self.suspects.finding is not None
         if is_latched:
             self._follows_network = False
@@ -565,6 +578,11 @@ class Estimator:
             self.isolate(isolated)
         self.health.reset()
 
+    def _begin_calibration(self, mae: Mae) -> None:
+        stated = np.array(self._stated_posture) if self._stated_posture else None
+        self.calibration = LengthCalibration(self.robot, mae, stated)
+        self.check = CalibrationCheck()
+
     def _calibrate(
         self, calibration: LengthCalibration, sample: MuscleSample, dt: float, now: float
     ) -> LengthOffsets | None:
@@ -578,11 +596,17 @@ class Estimator:
         guess = calibration.offsets
         if guess is None or (calibration.is_standing and not calibration.is_done):
             return None  # nothing is estimated while the arm stands in the stated posture
+        is_found = calibration.is_done and not self.check.has_begun
+        if is_found:
+            self.check.has_begun = True
+            self.health.reset()  # evidence from lengths with other offsets is no longer valid
         # Publish the first and the last estimate, and any other only after a substantial change.
         difference = np.abs(guess.offset - self.body.offsets.offset).max()
-        if guess.known or self.output is None or difference > SHIFTED:
-            self._use_body(self.body.with_offsets(guess))
-        if calibration.is_done:
+        if is_found or self.output is None or difference > SHIFTED:
+            self._note(Evidence.CALIBRATING, found=guess)
+        unmeasured_time = now - self._measured[0]
+        if calibration.is_done and self.check.step(dt, unmeasured_time, self.health.joints.agrees):
+            self._note(Evidence.CALIBRATED)
             self.calibration = None
             self.health.reset()
         return guess

@@ -9,7 +9,6 @@ import numpy as np
 
 from musculoskeletal_ae.remedy import REMEDY_STEPS, identifiers, sentence
 from musculoskeletal_ae.report import MUSCLE_STATES, WAITS_FOR, Report
-from musculoskeletal_ae.signals.body_state import KNOWN
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.estimator import Estimator
@@ -50,10 +49,12 @@ def report(core: Estimator, now: float) -> Report:
         return Report('warn', 'no muscle_states', values | waits)
     if core.calibration is not None:
         progress = core.calibration.progress
+        if core.check.problem:
+            progress = f'{progress}; {core.check.problem}'
         text = f'calibrating the lengths: {progress}'
         values[CALIBRATION] = STANDING if core.calibration.is_standing else GENTLE_MOTION
-        if core.calibration.problem:
-            values['calibration problem'] = core.calibration.problem
+        if problem := core.calibration.problem or core.check.problem:
+            values['calibration problem'] = problem
         return Report('warn', text, {**values, 'state': 'calibrating'})
     calibrated = '' if core.health.residual.is_calibrated else ', uncalibrated'
     if core.heat.changed:
@@ -139,8 +140,10 @@ def _contact(core: Estimator) -> dict[str, str]:
 def _offsets(core: Estimator) -> dict[str, str]:
     offsets, values = core.body.offsets, dict[str, str]()
     if not offsets.known:
-        unknown = np.flatnonzero(~(offsets.deviation < KNOWN))
-        values['unknown length offsets'] = core.robot.names(unknown)
+        values['unknown length offsets'] = core.robot.names(offsets.not_known)
+        doubts = core.trust.doubts.items()
+        each = (f'{core.robot.names(muscles)}: {why.value}' for why, muscles in doubts)
+        values['doubts about lengths'] = '; '.join(each)
     if not offsets.offset.any():
         return values
     rows = zip(core.robot.muscles, 1e3 * offsets.offset, 1e3 * offsets.deviation)

@@ -37,8 +37,6 @@ def learner_report(learner: Learner) -> Report:
     elif not learner.body.offsets.known:
         message = 'waiting for a length calibration; if none is in progress, call estimator/zero'
         waits_for = {WAITS_FOR: LENGTH_OFFSETS}
-    elif not learner.offset_check.is_believed:
-        message = 'checking new length offsets against muscle_states'
     elif learner.collector.is_anomaly:
         message = 'paused by an anomaly until its suspect is verified or estimator/reset is called'
         waits_for = {WAITS_FOR: ANOMALY}
