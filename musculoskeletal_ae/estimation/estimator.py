@@ -24,7 +24,7 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation import status
-from musculoskeletal_ae.estimation.calibration_check import CalibrationCheck
+from musculoskeletal_ae.estimation.checked_calibration import CheckedCalibration
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
 from musculoskeletal_ae.estimation.detectors.joint_disagreement import GAP_LEARNED, GAP_YOUNG
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
@@ -35,10 +35,6 @@ from musculoskeletal_ae.estimation.finding import (
     Observation,
 )
 from musculoskeletal_ae.estimation.health import HealthMonitor
-from musculoskeletal_ae.estimation.length_calibration import (
-    LengthCalibration,
-    check_stated_posture,
-)
 from musculoskeletal_ae.estimation.length_trust import EVIDENCE_OF, Evidence, LengthTrust
 from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
@@ -56,7 +52,6 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 from musculoskeletal_ae.signals.heat import Heat
-from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
 #: largest time between two messages that detectors count [s]; a longer pause counts as this time
@@ -66,7 +61,6 @@ LONGEST_PERIOD = 0.1
 #: stood still. By default, the controller stops the arm after the same time (`max_age`).
 INTERRUPTION = 0.2
 JOINTS_AGE = 0.05  # age up to which measured joint angles are used with a message [s]
-SHIFTED = 0.02  # change of an estimated length offset above which it is published again [m]
 
 
 class Output(NamedTuple):
@@ -105,7 +99,6 @@ class Estimator:
         health: The detectors.
         suspects: The latched finding and its verification.
         calibration: The running length calibration, or None.
-        check: Checks the offsets that the calibration finds.
         contact: The contact estimator.
         sample: The last sample; None before the first.
         output: Results of the last message with an estimate; None before the first, and from the
@@ -132,15 +125,12 @@ class Estimator:
         self.state = StateEstimator()
         self.health = HealthMonitor(robot, preset, heat=self.heat)
         self.suspects = SuspectHandling(robot)
-        self.calibration: LengthCalibration | None = None
-        self.check = CalibrationCheck()
+        self.calibration: CheckedCalibration | None = None
         self.contact = ContactEstimator(robot)
         self.sample: MuscleSample | None = None
         self.output: Output | None = None
         self.measured: Array | None = None
         self.stepped_at = -math.inf
-        #: posture stated for the last length calibration [rad]; () without one
-        self._stated_posture: tuple[float, ...] = ()
         self._commands = ModuleCommands()
         self._measured: tuple[float, Array | None] = -math.inf, None  # time and measured θ
         #: whether `mae.isolated` of a new network decides which muscles are isolated; this ends
@@ -167,11 +157,13 @@ class Estimator:
         finding = self.suspects.finding
         if finding is None or self.suspects.verification is not None:
             return ()
-        is_moved = self.trust.evidence[finding.muscle] is Evidence.MOVED
+        muscle, check = finding.muscle, self._repair_check
+        is_moved = self.trust.evidence[muscle] is Evidence.MOVED
         is_repaired = finding.kind is Kind.SLACK_TENDON or is_moved
-        if finding.remedy == REPAIR and is_repaired and self._has_wrong_length(finding.muscle):
-            return (Step.CALIBRATE_LENGTHS,)
-        return finding.remedy
+        if finding.remedy != REPAIR or not is_repaired or check is None:
+            return finding.remedy
+        is_wrong = check.is_taut_with_wrong_length(muscle)
+        return (Step.CALIBRATE_LENGTHS,) if is_wrong else finding.remedy
 
     @property
     def advice(self) -> str:
@@ -206,7 +198,8 @@ class Estimator:
         self.state.use(mae, isolated)
         self._use_body(self.body.with_isolated(isolated))
         if self.calibration is not None:
-            self._begin_calibration(reduced)
+            posture = self.calibration.posture
+            self.calibration = CheckedCalibration(self.robot, reduced, posture)
 
     def keep_isolated(self) -> None:
         """Keep the present isolated muscles even if another network is used later."""
@@ -247,19 +240,7 @@ class Estimator:
             MusculoskeletalError: If there is no network, if the posture is not valid, or if no
                 posture is stated for a robot whose tensions are unknown.
         """
-        if self.mae is None:
-            raise MusculoskeletalError(
-                'a length calibration requires a checkpoint; set the parameter `checkpoint`, or '
-                'start the learner'
-            )
-        check_stated_posture(self.robot, posture)
-        if not posture and not self.robot.tension_source.is_known:
-            raise MusculoskeletalError(
-                'without tensions (tension_source: none), lengths can be calibrated only in a '
-                'known posture; hold the arm still and set the parameter zero_posture'
-            )
-        self._stated_posture = posture
-        self._begin_calibration(self.mae)
+        self.calibration = CheckedCalibration(self.robot, self.mae, posture)
         self.distrust_lengths(Evidence.CALIBRATING)
         self.health.residual.forget_reading()
         self.output = None
@@ -292,7 +273,7 @@ class Estimator:
                 f'itself within {LONGEST:g} s; wait until anomaly_detected is false, then call '
                 'estimator/restore again if the muscle is still isolated'
             )
-        if problems := list(filter(None, map(self._problem_of, restored))):
+        if problems := list(filter(None, map(self._repair_problem, restored))):
             again = 'then call estimator/restore again'
             raise MusculoskeletalError(f'{"; ".join(problems)}; {again}')
         self.isolate(muscle for muscle in self.body.isolated if muscle not in restored)
@@ -477,7 +458,7 @@ class Estimator:
         """
         if self.calibration is not None:
             # Start again, because readings before and after the jump have different offsets.
-            self.calibrate_lengths(self._stated_posture)
+            self.calibrate_lengths(self.calibration.posture)
         elif self.mae is None and self.body.offsets.known:
             self._handle(finding_of(jumped), now)
 
@@ -492,43 +473,27 @@ class Estimator:
         suspected = self.suspects.finding
         if suspected is None or suspected.remedy != REPAIR or suspected.muscle in isolating:
             return
-        if problem := self._problem_of(suspected.muscle):
+        if problem := self._repair_problem(suspected.muscle):
             raise MusculoskeletalError(f'{problem}; then call estimator/reset again')
         if self.trust.evidence[suspected.muscle] is Evidence.MOVED:
             self._note(Evidence.CONFIRMED, [suspected.muscle])
 
-    def _problem_of(self, muscle: int) -> str:
+    def _repair_problem(self, muscle: int) -> str:
         """Return why a muscle must not be used yet, or '' if it may be used."""
-        check = self._repair_check()
-        if check is None:
-            return ''
-        if muscle in self.stream.jumping:
-            return (
-                f'the length of {self.robot.muscles[muscle]} has just jumped; wait for '
-                f'{LIMITS.settled:g} s'
-            )
-        demand = self._commands.demand(self.robot, check.sample.length, self.stepped_at)
-        return check.problem(muscle, demand, self._length_limit)
-
-    def _has_wrong_length(self, muscle: int) -> bool:
-        """Return whether a muscle is taut and at rest, but has a wrong length."""
-        check = self._repair_check()
-        if check is None or muscle in self.stream.jumping:
-            return False
-        return check.is_taut_with_wrong_length(muscle, self._length_limit)
-
-    def _repair_check(self) -> RepairCheck | None:
-        """Return a check of the newest readings, or None before the first and without a network."""
-        sample, mae = self.sample, self.state.complete_mae
-        if sample is None or mae is None:
-            return None
-        return RepairCheck(self.robot, mae, sample, self.body.isolated, self.measured)
+        check = self._repair_check
+        return '' if check is None else check.problem(muscle)
 
     @property
-    def _length_limit(self) -> float:
-        """Largest deviation of a length that fits the posture [m]."""
+    def _repair_check(self) -> RepairCheck | None:
+        """A check of the newest readings; None before the first and without a network."""
+        sample, mae, body = self.sample, self.state.complete_mae, self.body
+        if sample is None or mae is None:
+            return None
         limits = GAP_LEARNED if self.health.residual.is_calibrated else GAP_YOUNG
-        return float(np.max(limits.single)) if self.body.offsets.known else math.inf
+        limit = float(np.max(limits.single)) if body.offsets.known else math.inf
+        demand = self._commands.demand(self.robot, sample.length, self.stepped_at)
+        jumping, theta = self.stream.jumping, self.measured
+        return RepairCheck(self.robot, mae, sample, body.isolated, theta, demand, jumping, limit)
 
     def _handle(self, finding: Finding | None, now: float) -> bool:
         """Latch a finding and isolate its muscle, as its kind and the settings require.
@@ -578,35 +543,19 @@ class Estimator:
             self.isolate(isolated)
         self.health.reset()
 
-    def _begin_calibration(self, mae: Mae) -> None:
-        stated = np.array(self._stated_posture) if self._stated_posture else None
-        self.calibration = LengthCalibration(self.robot, mae, stated)
-        self.check = CalibrationCheck()
-
     def _calibrate(
-        self, calibration: LengthCalibration, sample: MuscleSample, dt: float, now: float
+        self, calibration: CheckedCalibration, sample: MuscleSample, dt: float, now: float
     ) -> LengthOffsets | None:
         """Continue the length calibration, and return the newest estimate of the offsets.
 
-        The result is None before the first estimate. If the arm stands in a stated posture, it is
-        None until the calibration is complete.
+        The result is None before the first estimate.
         """
-        measured = self._measured_theta(now)
-        calibration.step(sample.model_tension, sample.length_read, dt, measured)
-        guess = calibration.offsets
-        if guess is None or (calibration.is_standing and not calibration.is_done):
-            return None  # nothing is estimated while the arm stands in the stated posture
-        is_found = calibration.is_done and not self.check.has_begun
-        if is_found:
-            self.check.has_begun = True
-            self.health.reset()  # evidence from lengths with other offsets is no longer valid
-        # Publish the first and the last estimate, and any other only after a substantial change.
-        difference = np.abs(guess.offset - self.body.offsets.offset).max()
-        if is_found or self.output is None or difference > SHIFTED:
-            self._note(Evidence.CALIBRATING, found=guess)
-        unmeasured_time = now - self._measured[0]
-        if calibration.is_done and self.check.step(dt, unmeasured_time, self.health.joints.agrees):
-            self._note(Evidence.CALIBRATED)
+        theta, unmeasured_time = self._measured_theta(now), now - self._measured[0]
+        agrees = self.health.joints.agrees
+        evidence = calibration.step(sample, dt, theta, unmeasured_time, agrees)
+        if evidence is not None:
+            self._note(evidence, found=calibration.offsets)
+        if evidence is Evidence.CALIBRATED:
             self.calibration = None
             self.health.reset()
-        return guess
+        return calibration.offsets

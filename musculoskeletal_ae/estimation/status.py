@@ -49,12 +49,10 @@ def report(core: Estimator, now: float) -> Report:
         return Report('warn', 'no muscle_states', values | waits)
     if core.calibration is not None:
         progress = core.calibration.progress
-        if core.check.problem:
-            progress = f'{progress}; {core.check.problem}'
         text = f'calibrating the lengths: {progress}'
         values[CALIBRATION] = STANDING if core.calibration.is_standing else GENTLE_MOTION
-        if problem := core.calibration.problem or core.check.problem:
-            values['calibration problem'] = problem
+        if core.calibration.problem:
+            values['calibration problem'] = core.calibration.problem
         return Report('warn', text, {**values, 'state': 'calibrating'})
     calibrated = '' if core.health.residual.is_calibrated else ', uncalibrated'
     if core.heat.changed:
