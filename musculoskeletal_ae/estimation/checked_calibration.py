@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """A length calibration from its start until its offsets count as known.
 
-`LengthCalibration` rejects offsets that do not explain the lengths and tensions. It cannot notice
-that the arm does not stand in the stated posture. Joint sensors can: `JointDisagreement` compares
-them with the lengths, by the same limits by which it would revoke the offsets later. The offsets
-that the calibration has found therefore count as known only when the joint sensors agree. Without
-joint sensors, they count as known at once.
+`LengthCalibration` rejects offsets that do not explain the lengths and tensions. If an arm stands
+still, some offsets explain its readings even if it does not stand in the stated posture. They then
+count as known only if the joint sensors, where there are any, measure the stated posture.
 """
 
 from __future__ import annotations
+
+from collections import deque
 
 import numpy as np
 
@@ -25,15 +25,12 @@ from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 SHIFTED = 0.02  # use an estimated offset if it differs by more than this from the one in use [m]
-MEASURED = 1.0  # count joints as measured up to this time after the last measured angles [s]
-#: wait for this time before the joint sensors are compared with the offsets [s], because
-#: `JointDisagreement` uses the median of the lengths over the last second
-SETTLED = 1.2
-PATIENCE = 4.0  # report a problem if the joint sensors have not agreed after this time [s]
-DISAGREES = (
-    'the calibrated lengths disagree with the joint sensors; check the joint sensors and '
-    'zero_posture, then call estimator/zero again'
-)
+#: Reject a stated posture if a joint sensor differs by more than this [rad]; for prismatic joints
+#: times `kinematics.radian` [m]. A larger difference is due to a wrong posture or a faulty sensor.
+STATED_ERROR = 0.2
+#: compare the stated posture with the median of this number of measured postures, at least and at
+#: most
+LEAST, MOST = 10, 100
 
 
 class CheckedCalibration:
@@ -66,12 +63,13 @@ class CheckedCalibration:
                 'without tensions (tension_source: none), lengths can be calibrated only in a '
                 'known posture; hold the arm still and set the parameter zero_posture'
             )
-        self.posture = posture
+        self.posture, self._robot = posture, robot
         stated = np.array(posture) if posture else None
         self._calibration = LengthCalibration(robot, mae, stated)
         self._used: Array | None = None  # offsets in use [m], (M,); None before the first estimate
-        self._found_time = 0.0  # time since the calibration has found offsets [s]
-        self._problem = ''  # why these do not count as known
+        #: θ measured last while the arm stands [rad], (D,) each
+        self._measured: deque[Array] = deque(maxlen=MOST)
+        self._problem = ''  # why the stated posture is not that of the arm
 
     @property
     def is_standing(self) -> bool:
@@ -83,10 +81,10 @@ class CheckedCalibration:
         """The newest estimate of the offsets; None before the first.
 
         While the arm stands in a stated posture, nothing is estimated until the calibration has
-        found the offsets.
+        found the offsets and the joint sensors agree with the posture.
         """
         is_too_early = self.is_standing and not self._calibration.is_done
-        return None if is_too_early else self._calibration.offsets
+        return None if is_too_early or self._problem else self._calibration.offsets
 
     @property
     def progress(self) -> str:
@@ -98,43 +96,47 @@ class CheckedCalibration:
         """Why the calibration does not end although it has enough data, or ''."""
         return self._calibration.problem or self._problem
 
-    def step(
-        self,
-        sample: MuscleSample,
-        dt: float,
-        theta: Array | None,
-        unmeasured_time: float,
-        agrees: bool,
-    ) -> Evidence | None:
+    def step(self, sample: MuscleSample, dt: float, theta: Array | None) -> Evidence | None:
         """Continue the calibration by one message.
 
         Args:
             sample: The readings.
             dt: Time since the previous message [s].
             theta: Measured joint angles [rad], (D,), or None if they were not measured.
-            unmeasured_time: Time since joint angles were last measured [s]; infinite without joint
-                sensors.
-            agrees: Whether the lengths agree with the joint sensors.
 
         Returns:
             CALIBRATING if `offsets` are to be used from now on, CALIBRATED if they also count as
             known, which ends the calibration, or None.
         """
+        if self._problem:
+            return None
+        if self.is_standing and theta is not None:
+            self._measured.append(theta)
         self._calibration.step(sample.model_tension, sample.length_read, dt, theta)
         offsets = self.offsets
         if offsets is None:
             return None
-        used, is_found = self._used, self._calibration.is_done
-        has_just_been_found = is_found and self._found_time == 0.0
-        if is_found:
-            self._found_time += dt
-            is_measured = unmeasured_time < MEASURED
-            if not is_measured or (agrees and self._found_time > SETTLED):
-                return Evidence.CALIBRATED
-            self._problem = DISAGREES if self._found_time > PATIENCE else ''
-        # Use the first and the last estimate, and any other only after a substantial change.
-        has_shifted = used is None or np.abs(offsets.offset - used).max() > SHIFTED
-        if has_shifted or has_just_been_found:
+        if self._calibration.is_done:
+            self._problem = self._posture_problem()
+            return None if self._problem else Evidence.CALIBRATED
+        # Use the first estimate, and any other only after a substantial change.
+        if self._used is None or np.abs(offsets.offset - self._used).max() > SHIFTED:
             self._used = offsets.offset
             return Evidence.CALIBRATING
         return None
+
+    def _posture_problem(self) -> str:
+        """Return why the arm does not stand in the stated posture, as a text for users, or ''."""
+        if len(self._measured) < LEAST:
+            return ''
+        measured, kinematics = np.median(self._measured, axis=0), self._robot.kinematics
+        difference = np.abs(measured - self.posture) / kinematics.radian
+        j = int(difference.argmax())
+        if difference[j] <= STATED_ERROR:
+            return ''
+        unit, legal = self._robot.units[j].theta, STATED_ERROR * kinematics.radian[j]
+        return (
+            f'zero_posture states {self.posture[j]:.2f} {unit} for {self._robot.joints[j]}, but '
+            f'its sensor measures {measured[j]:.2f} {unit} (legal: a difference of at most '
+            f'{legal:g} {unit}); correct zero_posture or the sensor, and call estimator/zero again'
+        )

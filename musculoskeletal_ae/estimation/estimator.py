@@ -550,9 +550,7 @@ class Estimator:
 
         The result is None before the first estimate.
         """
-        theta, unmeasured_time = self._measured_theta(now), now - self._measured[0]
-        agrees = self.health.joints.agrees
-        evidence = calibration.step(sample, dt, theta, unmeasured_time, agrees)
+        evidence = calibration.step(sample, dt, self._measured_theta(now))
         if evidence is not None:
             self._note(evidence, found=calibration.offsets)
         if evidence is Evidence.CALIBRATED:
