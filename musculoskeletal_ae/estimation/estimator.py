@@ -9,7 +9,8 @@
                          └────────────── isolated muscles ──────────────────────────────┘
 
 The body state consists of the isolated muscles and the length offsets. When they change, only the
-estimator creates a new body state, which its node publishes. During a length calibration, only the
+estimator creates a new body state, which its node publishes. `length_trust.py` decides which length
+offsets are known; the other parts provide evidence. During a length calibration, only the
 detectors that do not need lengths report findings. `suspects.py` describes the sequence from a
 rupture to resuming.
 """
