@@ -277,6 +277,7 @@ class Estimator:
         if problems := list(filter(None, map(self._repair_problem, restored))):
             again = 'then call estimator/restore again'
             raise MusculoskeletalError(f'{"; ".join(problems)}; {again}')
+        self._confirm(restored)
         self.isolate(muscle for muscle in self.body.isolated if muscle not in restored)
 
     def reset(self, isolating: Iterable[int] = ()) -> None:
@@ -476,8 +477,12 @@ class Estimator:
             return
         if problem := self._repair_problem(suspected.muscle):
             raise MusculoskeletalError(f'{problem}; then call estimator/reset again')
-        if self.trust.evidence[suspected.muscle] is Evidence.MOVED:
-            self._note(Evidence.CONFIRMED, [suspected.muscle])
+        self._confirm([suspected.muscle])
+
+    def _confirm(self, muscles: Iterable[int]) -> None:
+        """Confirm the offsets of repaired muscles, if their lengths have changed in the repair."""
+        moved = [muscle for muscle in muscles if self.trust.evidence[muscle] is Evidence.MOVED]
+        self._note(Evidence.CONFIRMED, moved)
 
     def _repair_problem(self, muscle: int) -> str:
         """Return why a muscle must not be used yet, or '' if it may be used."""
