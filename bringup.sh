@@ -417,7 +417,8 @@ elif [ -z "$bag" ]; then
     sed -un 's/^\[WARN\][^:]*: \(reality .*\)/-- \1/p' &
 fi
 
-[ $combined = true ] || start_node estimator
+kept_in estimator
+[ $combined = true ] || start_node estimator "${kept[@]}"
 start_node sim
 if [ $learner = true ]; then
   kept_in learner

@@ -209,6 +209,7 @@ class Attack:
         saved = f'state_directory:={self.folder / (log or "state")}'
         own = {
             'controller': ['max_age:=1.0', 'explore:=true', saved],
+            'estimator': [saved],
             'learner': [saved],
             'hardware_emulator': ['marker_pose_rate:=10.0'],
         }

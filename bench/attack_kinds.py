@@ -26,6 +26,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import LENGTH_SCALE
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message
 from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.signals.body_state import LengthOffsets
 
 MOMENTS = 'holding', 'exploring'
 LASTING = 4.0  # duration of an attack [s]
@@ -228,9 +229,9 @@ class Scene:
 def _zeros(scene: Scene, offset: float, deviation: float) -> Float64MultiArray:
     muscles = scene.attack.robot.muscle_count
     sign = np.where(np.arange(muscles) % 2, 1.0, -1.0)
-    return array_message(
-        np.array([sign * offset, np.full(muscles, deviation)]), 'quantity', 'muscle'
-    )
+    offsets = LengthOffsets(sign * offset, np.full(muscles, deviation))
+    false = replace(offsets, generation=scene.rng.randrange(1, 2**50))
+    return array_message(false.rows, 'quantity', 'muscle')
 
 
 def zeros_unknown_then_false(scene: Scene) -> None:

@@ -57,7 +57,7 @@ MODULES = {
     'estimation/estimator.py': ['Estimator', 'Output'],
     'estimation/finding.py': ['Finding', 'Observation', 'Detector'],
     'estimation/health.py': ['HealthMonitor'],
-    'signals/body_state.py': ['BodyState', 'LengthOffsets'],
+    'signals/body_state.py': ['BodyState', 'LengthOffsets', 'Trust'],
     'signals/muscle_stream.py': ['MuscleStream', 'MuscleSample', 'RejectionError'],
     'signals/friction.py': ['FrictionDirection', 'Transmission'],
     'control/controller.py': ['Controller'],

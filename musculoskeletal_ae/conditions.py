@@ -372,6 +372,23 @@ class ConditionKind(Enum):
         (Step.CALIBRATE_LENGTHS,),
     )
 
+    LENGTH_CALIBRATION_STUCK = Declaration(
+        'length_calibration_stuck',
+        'estimator',
+        'warn',
+        'a length calibration has enough data, but no offsets that it may believe',
+        'the length calibration does not end',
+        (Step.CHECK_SENSOR, Step.CALIBRATE_LENGTHS),
+    )
+    OFFSETS_NOT_SAVED = Declaration(
+        'length_offsets_not_saved',
+        'estimator',
+        'warn',
+        'the file that keeps the length offsets for the next estimator cannot be written',
+        'the length offsets are not on disk',
+        (Step.FREE_DISK,),
+    )
+
     # -- why the arm stands still ---------------------------------------------------------------
 
     OPERATOR = Declaration(
@@ -599,14 +616,6 @@ class ConditionKind(Enum):
         'samples and network cannot be saved',
         'the learned state is not on disk',
         (Step.FREE_DISK,),
-    )
-    OFFSETS_NOT_BELIEVED = Declaration(
-        'offsets_not_believed',
-        'learner',
-        'error',
-        'new length offsets disagree with the messages',
-        'the length offsets are not believed',
-        (Step.CALIBRATE_LENGTHS,),
     )
     LENGTHS_NOT_LEARNED = Declaration(
         'lengths_not_learned',

@@ -5,7 +5,7 @@ import heapq
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from musculoskeletal_ae.bags.topics import NO_MOTORS, interface_topics
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
+from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
 from musculoskeletal_ae.signals.message_delay import MessageDelay
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
@@ -147,7 +147,7 @@ class _ArmStreams:
         self.had_offsets: list[bool] = []
         muscles = robot.muscle_count
         self._isolated = _Stream((muscles,), self._isolated_mask)
-        self._offsets = _Stream((2, muscles), lambda message, _: read_array(message, 2, muscles))
+        self._offsets = _Stream((ROWS, muscles), self._offset_rows)
         self.by_topic = {
             'joint_states': _Stream((robot.joint_count,), self._posture),
             'muscle_states': _Stream((3, muscles), self._muscle_states),
@@ -174,6 +174,13 @@ class _ArmStreams:
 
     def _command(self, message: Any, _: _Arrival) -> Array:
         return read_array(message, 1, self._robot.muscle_count)
+
+    def _offset_rows(self, message: Any, _: _Arrival) -> Array:
+        muscles = self._robot.muscle_count
+        if len(message.data) == 2 * muscles:  # recorded with version 0.1.0: without trust
+            offsets = LengthOffsets(*read_array(message, 2, muscles))
+            return replace(offsets, generation=len(self._offsets.values) + 1).rows
+        return LengthOffsets.of_rows(read_array(message, ROWS, muscles)).rows
 
     def _isolated_mask(self, message: Any, _: _Arrival) -> Array:
         indices = self._robot.muscle_indices(read_names(message))
@@ -353,9 +360,10 @@ def _body_at(time: float, before: BodyState, isolated: _Stream, offsets: _Stream
         # Number of messages with offsets so far. If the first one has known offsets, it was
         # published before the bag began, but the recorder received it a little late.
         number = int(np.searchsorted(offsets.times, time, side='right'))
-        if number == 0 and LengthOffsets(*offsets.values[0]).known:
+        if number == 0 and LengthOffsets.of_rows(offsets.values[0]).known:
             number = 1
-        newest = offsets.values[number - 1] if number else np.zeros_like(offsets.values[0])
-        if not (newest == [body.offsets.offset, body.offsets.deviation]).all():
-            body = body.with_offsets(LengthOffsets(*newest))
+        if number:
+            newest = LengthOffsets.of_rows(offsets.values[number - 1])
+            if newest.generation != body.offsets.generation:
+                body = body.with_offsets(newest)
     return body

@@ -359,7 +359,7 @@ class Controller:
         is_known = body.offsets.known
         if is_known != before.known or (body.offsets.offset != before.offset).any():
             self.activities.leave()
-        if not is_known and not body.offsets.is_suspect:
+        if not is_known and not body.offsets.revoked:
             # A length calibration begins or continues. The estimate is discarded, because it was
             # computed with other offsets.
             age = self.watchdog.age
@@ -570,7 +570,7 @@ class Controller:
         anomaly, the arm is stopped, and the estimator decides whether a jump is due to a repair.
         """
         stream = self.stream
-        if muscles := stream.body.offsets.suspect:
+        if muscles := stream.body.offsets.revoked:
             names = '' if len(muscles) == self.robot.muscle_count else self.robot.names(muscles)
             of_muscles = f' of {names}' if names else ''
             return f'the estimator has revoked the length offsets{of_muscles}'

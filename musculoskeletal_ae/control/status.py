@@ -16,7 +16,6 @@ from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.description import NO_TENSION
-from musculoskeletal_ae.signals.body_state import KNOWN
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.control.controller import Controller
@@ -108,7 +107,9 @@ def _exploration(core: Controller) -> Iterator[Condition]:
         step = Step.EXPLORE if known else Step.EXPLORE_GENTLY
         yield ConditionKind.NOT_EXPLORING.condition(steps=[step])
     elif not known and supervisor.is_running and not supervisor.explores:
-        yield ConditionKind.GENTLE_ONLY.condition(subjects=_unknown_offsets(core))
+        unknown = core.stream.body.offsets.not_known
+        names = [core.robot.muscles[muscle] for muscle in unknown]
+        yield ConditionKind.GENTLE_ONLY.condition(subjects=names)
 
 
 def _target(core: Controller) -> Iterator[Condition]:
@@ -143,11 +144,6 @@ def _missing_torque(core: Controller) -> Array | None:
     return None if control is None else control.missing_torque
 
 
-def _unknown_offsets(core: Controller) -> list[str]:
-    unknown = np.flatnonzero(~(core.stream.body.offsets.deviation < KNOWN))
-    return [core.robot.muscles[muscle] for muscle in unknown]
-
-
 def _limited_by_heat(core: Controller) -> dict[str, float]:
     """Return the tension limits [N] that heat lowers, by the name of the muscle."""
     robot = core.robot
@@ -174,7 +170,7 @@ def _add_body(core: Controller, values: dict[str, str]) -> None:
     if robot.isolated:
         values['isolated muscles'] = robot.names(robot.isolated)
     if not core.stream.body.offsets.known:
-        values['unknown length offsets'] = ', '.join(_unknown_offsets(core))
+        values['unknown length offsets'] = robot.names(core.stream.body.offsets.not_known)
     if not robot.tension_source.is_known:
         values['tension'] = f'tension_source: none: {NO_TENSION}'
     elif robot.tension_source.is_current:

@@ -9,7 +9,8 @@
                          └────────────── isolated muscles ──────────────────────────────┘
 
 The body state consists of the isolated muscles and the length offsets. When they change, only the
-estimator creates a new body state, which its node publishes. During a length calibration, only the
+estimator creates a new body state, which its node publishes. `length_trust.py` decides which length
+offsets are known; the other parts provide evidence. During a length calibration, only the
 detectors that do not need lengths report findings. `suspects.py` describes the sequence from a
 rupture to resuming.
 """
@@ -25,15 +26,13 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation import status
+from musculoskeletal_ae.estimation.checked_calibration import CheckedCalibration
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
 from musculoskeletal_ae.estimation.detectors.joint_disagreement import GAP_LEARNED, GAP_YOUNG
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
 from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.health import HealthMonitor
-from musculoskeletal_ae.estimation.length_calibration import (
-    LengthCalibration,
-    check_stated_posture,
-)
+from musculoskeletal_ae.estimation.length_trust import EVIDENCE_OF, Evidence, LengthTrust
 from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
 from musculoskeletal_ae.estimation.repair_check import RepairCheck
@@ -49,7 +48,6 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 from musculoskeletal_ae.signals.heat import Heat
-from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
 #: largest time between two messages that detectors count [s]; a longer pause counts as this time
@@ -60,7 +58,6 @@ LONGEST_PERIOD = 0.1
 INTERRUPTION = 0.2
 SILENCE = 1.0  # restart the filter of the contact estimator after a pause of this length [s]
 JOINTS_AGE = 0.05  # age up to which measured joint angles are used with a message [s]
-SHIFTED = 0.02  # change of an estimated length offset above which it is published again [m]
 
 
 class Output(NamedTuple):
@@ -92,6 +89,7 @@ class Estimator:
     Attributes:
         robot: The nominal body, with all muscles.
         body: Isolated muscles and length offsets.
+        trust: Decides which length offsets are known.
         stream: Converts messages into samples.
         heat: Thermal models of the muscle modules.
         state: The state estimator.
@@ -108,30 +106,28 @@ class Estimator:
             a network [s].
     """
 
-    def __init__(self, robot: Robot, preset: str = 'default') -> None:
+    def __init__(self, robot: Robot, preset: str = 'default', first_generation: int = 1) -> None:
         """Start without a network.
 
         Args:
             robot: The nominal body.
             preset: Name of the preset that provides the detectors.
+            first_generation: Generation of the first change of the length offsets.
         """
         self.robot = robot
-        self.body = BodyState.healthy(robot.muscle_count)
+        self.trust = LengthTrust(robot.muscle_count, first_generation)
+        self.body = BodyState(self.trust.offsets)
         self.stream = MuscleStream(robot, self.body)
         self.heat = Heat(robot)
         self.state = StateEstimator()
         self.health = HealthMonitor(robot, preset, heat=self.heat)
         self.suspects = SuspectHandling(robot)
-        self.calibration: LengthCalibration | None = None
+        self.calibration: CheckedCalibration | None = None
         self.contact = ContactEstimator(robot)
         self.sample: MuscleSample | None = None
         self.output: Output | None = None
         self.measured: Array | None = None
         self.stepped_at = -math.inf
-        #: posture stated for the last length calibration [rad]; () without one
-        self._stated_posture: tuple[float, ...] = ()
-        self._jumps = 0  # number of length jumps handled so far
-        self._valid_offsets = self.body.offsets  # the last known offsets
         self._commands = ModuleCommands()
         self._measured: tuple[float, Array | None] = -math.inf, None  # time and measured θ
         #: whether `mae.isolated` of a new network decides which muscles are isolated; this ends
@@ -158,10 +154,13 @@ class Estimator:
         finding = self.suspects.finding
         if finding is None or self.suspects.verification is not None:
             return ()
-        is_repaired = finding.kind is ConditionKind.SLACK_TENDON or self.suspects.has_suspect_jumped
-        if finding.kind.steps == REPAIR and is_repaired and self._has_wrong_length(finding.muscle):
-            return (Step.CALIBRATE_LENGTHS,)
-        return finding.kind.steps
+        muscle, check = finding.muscle, self._repair_check
+        is_moved = self.trust.evidence[muscle] is Evidence.MOVED
+        is_repaired = finding.kind is ConditionKind.SLACK_TENDON or is_moved
+        if finding.kind.steps != REPAIR or not is_repaired or check is None:
+            return finding.kind.steps
+        is_wrong = check.is_taut_with_wrong_length(muscle)
+        return (Step.CALIBRATE_LENGTHS,) if is_wrong else finding.kind.steps
 
     @property
     def advice(self) -> str:
@@ -196,7 +195,8 @@ class Estimator:
         self.state.use(mae, isolated)
         self._use_body(self.body.with_isolated(isolated))
         if self.calibration is not None:
-            self.calibration = LengthCalibration(self.robot, reduced, self.calibration.posture)
+            posture = self.calibration.posture
+            self.calibration = CheckedCalibration(self.robot, reduced, posture)
 
     def keep_isolated(self) -> None:
         """Keep the present isolated muscles even if another network is used later."""
@@ -216,9 +216,16 @@ class Estimator:
             self.use(self.state.complete_mae)
         self.health.reset()
 
-    def forget_offsets(self) -> None:
-        """Consider the length offsets unknown until the next length calibration."""
-        self._use_body(self.body.with_offsets(LengthOffsets.unknown(self.robot.muscle_count)))
+    def distrust_lengths(self, evidence: Evidence, offset: Array | None = None) -> None:
+        """Consider the length offsets unknown until the next length calibration.
+
+        Args:
+            evidence: Why they are unknown.
+            offset: Offsets that are used meanwhile [m], (M,); 0 by default.
+        """
+        unknown = LengthOffsets.unknown(self.robot.muscle_count)
+        offset = unknown.offset if offset is None else offset
+        self._note(evidence, found=LengthOffsets(offset, unknown.deviation))
 
     def calibrate_lengths(self, posture: tuple[float, ...] = ()) -> None:
         """Start a length calibration, while the arm stands in a posture or moves gently.
@@ -230,21 +237,8 @@ class Estimator:
             MusculoskeletalError: If there is no network, if the posture is not valid, or if no
                 posture is stated for a robot whose tensions are unknown.
         """
-        if self.mae is None:
-            raise MusculoskeletalError(
-                'a length calibration requires a checkpoint; set the parameter `checkpoint`, or '
-                'start the learner'
-            )
-        check_stated_posture(self.robot, posture)
-        if not posture and not self.robot.tension_source.is_known:
-            raise MusculoskeletalError(
-                'without tensions (tension_source: none), lengths can be calibrated only in a '
-                'known posture; hold the arm still and set the parameter zero_posture'
-            )
-        self._stated_posture = posture
-        stated = np.array(posture) if posture else None
-        self.calibration = LengthCalibration(self.robot, self.mae, stated)
-        self.forget_offsets()
+        self.calibration = CheckedCalibration(self.robot, self.mae, posture)
+        self.distrust_lengths(Evidence.CALIBRATING)
         self.health.residual.forget_reading()
         self.output = None
         self.contact.reset()
@@ -276,9 +270,10 @@ class Estimator:
                 f'itself within {LONGEST:g} s; wait until anomaly_detected is false, then call '
                 'estimator/restore again if the muscle is still isolated'
             )
-        if problems := list(filter(None, map(self._problem_of, restored))):
+        if problems := list(filter(None, map(self._repair_problem, restored))):
             again = 'then call estimator/restore again'
             raise MusculoskeletalError(f'{"; ".join(problems)}; {again}')
+        self._confirm(restored)
         self.isolate(muscle for muscle in self.body.isolated if muscle not in restored)
 
     def reset(self, isolating: Iterable[int] = ()) -> None:
@@ -293,10 +288,10 @@ class Estimator:
                 confirm the lengths.
         """
         self._check_suspect(tuple(isolating))
-        if self.body.offsets.is_suspect:
+        if self.body.offsets.revoked:
             if not self.health.joints.agrees:
                 raise MusculoskeletalError(f'{self.cause}; {self.advice}')
-            self._use_body(self.body.with_offsets(self._valid_offsets))
+            self._note(Evidence.AGREES)
         self.health.accept(range(self.robot.muscle_count))
         self._clear(self.suspects.clear(self.body.isolated))
 
@@ -374,7 +369,8 @@ class Estimator:
                 self._handle(self.health.read(error.states, self.body.used, now), now)
             raise
         self._handle(self.health.read(sample.newest, self.body.used, now), now)
-        self._handle_jump(now)
+        if sample.jumped:
+            self._handle_jump(sample.jumped, now)
         before, self.sample = self.sample, sample
         elapsed = sent_apart = 0.0
         if before is not None:
@@ -435,9 +431,17 @@ class Estimator:
 
     # -- findings, verification and calibration -------------------------------------------------
 
+    def _note(
+        self,
+        evidence: Evidence,
+        muscles: Iterable[int] | None = None,
+        found: LengthOffsets | None = None,
+    ) -> None:
+        """Decide by new evidence on length offsets, and use the result (`LengthTrust.take`)."""
+        if self.trust.take(evidence, muscles, found):
+            self._use_body(self.body.with_offsets(self.trust.offsets))
+
     def _use_body(self, body: BodyState) -> None:
-        if body.offsets.known:
-            self._valid_offsets = body.offsets
         self.body = body
         self.stream.use_body(body)
 
@@ -448,20 +452,16 @@ class Estimator:
             return None
         return theta
 
-    def _handle_jump(self, now: float) -> None:
+    def _handle_jump(self, jumped: tuple[int, ...], now: float) -> None:
         """Respond to a jump of lengths in two cases in which the detector `LengthJump` does not.
 
         During a length calibration, the calibration starts again. Without a network, the jump is
         latched as a finding.
         """
-        if self.stream.displaced.jumps == self._jumps:
-            return
-        self._jumps = self.stream.displaced.jumps
-        jumped = tuple(sorted(self.stream.displaced.muscles))
         if self.calibration is not None:
             # Start again, because readings before and after the jump have different offsets.
-            self.calibrate_lengths(self._stated_posture)
-        elif self.mae is None and self.body.offsets.known and jumped:
+            self.calibrate_lengths(self.calibration.posture)
+        elif self.mae is None and self.body.offsets.known:
             self._handle(finding_of(jumped), now)
 
     def _check_suspect(self, isolating: Iterable[int]) -> None:
@@ -472,48 +472,34 @@ class Estimator:
         Raises:
             MusculoskeletalError: If the suspect may not be used yet.
         """
-        suspected, offsets = self.suspects.finding, self.body.offsets
+        suspected = self.suspects.finding
         if suspected is None or suspected.kind.steps != REPAIR or suspected.muscle in isolating:
             return
-        if problem := self._problem_of(suspected.muscle):
+        if problem := self._repair_problem(suspected.muscle):
             raise MusculoskeletalError(f'{problem}; then call estimator/reset again')
-        if self.suspects.has_suspect_jumped and offsets.known:
-            # The other nodes trust the length again because its offset is published with a larger
-            # standard deviation (`follow_offsets`).
-            self._use_body(self.body.with_offsets(offsets.confirmed(suspected.muscle)))
+        self._confirm([suspected.muscle])
 
-    def _problem_of(self, muscle: int) -> str:
+    def _confirm(self, muscles: Iterable[int]) -> None:
+        """Confirm the offsets of repaired muscles, if their lengths have changed in the repair."""
+        moved = [muscle for muscle in muscles if self.trust.evidence[muscle] is Evidence.MOVED]
+        self._note(Evidence.CONFIRMED, moved)
+
+    def _repair_problem(self, muscle: int) -> str:
         """Return why a muscle must not be used yet, or '' if it may be used."""
-        check = self._repair_check()
-        if check is None:
-            return ''
-        if muscle in self.stream.jumping:
-            return (
-                f'the length of {self.robot.muscles[muscle]} has just jumped; wait for '
-                f'{LIMITS.settled:g} s'
-            )
-        demand = self._commands.demand(self.robot, check.sample.length, self.stepped_at)
-        return check.problem(muscle, demand, self._length_limit)
-
-    def _has_wrong_length(self, muscle: int) -> bool:
-        """Return whether a muscle is taut and at rest, but has a wrong length."""
-        check = self._repair_check()
-        if check is None or muscle in self.stream.jumping:
-            return False
-        return check.is_taut_with_wrong_length(muscle, self._length_limit)
-
-    def _repair_check(self) -> RepairCheck | None:
-        """Return a check of the newest readings, or None before the first and without a network."""
-        sample, mae = self.sample, self.state.complete_mae
-        if sample is None or mae is None:
-            return None
-        return RepairCheck(self.robot, mae, sample, self.body.isolated, self.measured)
+        check = self._repair_check
+        return '' if check is None else check.problem(muscle)
 
     @property
-    def _length_limit(self) -> float:
-        """Largest deviation of a length that fits the posture [m]."""
+    def _repair_check(self) -> RepairCheck | None:
+        """A check of the newest readings; None before the first and without a network."""
+        sample, mae, body = self.sample, self.state.complete_mae, self.body
+        if sample is None or mae is None:
+            return None
         limits = GAP_LEARNED if self.health.residual.is_calibrated else GAP_YOUNG
-        return float(np.max(limits.single)) if self.body.offsets.known else math.inf
+        limit = float(np.max(limits.single)) if body.offsets.known else math.inf
+        demand = self._commands.demand(self.robot, sample.length, self.stepped_at)
+        jumping, theta = self.stream.jumping, self.measured
+        return RepairCheck(self.robot, mae, sample, body.isolated, theta, demand, jumping, limit)
 
     def _handle(self, finding: Finding | None, now: float) -> bool:
         """Latch a finding and isolate its muscle, as its kind and the settings require.
@@ -530,12 +516,12 @@ class Estimator:
         if set(isolated) != set(self.body.isolated):
             self.isolate(isolated)
         if is_repair:
+            self._note(Evidence.MOVED, [finding.muscle])
             self.health.reset()  # evidence from before the repair is no longer valid
             return False
-        revokes = finding.kind.revokes is not None and finding.muscle not in self.body.isolated
-        if revokes and self.body.offsets.known:
-            muscles = (finding.muscle,) if finding.is_of_one_length else None
-            self._use_body(self.body.with_offsets(self.body.offsets.revoked(muscles)))
+        evidence = EVIDENCE_OF.get(finding.kind)
+        if evidence is not None and finding.muscle not in self.body.isolated:
+            self._note(evidence, [finding.muscle] if finding.is_of_one_length else None)
         is_latched = before is None and self.suspects.finding is not None
         if is_latched:
             self._follows_network = False
@@ -564,23 +550,16 @@ class Estimator:
         self.health.reset()
 
     def _calibrate(
-        self, calibration: LengthCalibration, sample: MuscleSample, dt: float, now: float
+        self, calibration: CheckedCalibration, sample: MuscleSample, dt: float, now: float
     ) -> LengthOffsets | None:
         """Continue the length calibration, and return the newest estimate of the offsets.
 
-        The result is None before the first estimate. If the arm stands in a stated posture, it is
-        None until the calibration is complete.
+        The result is None before the first estimate.
         """
-        measured = self._measured_theta(now)
-        calibration.step(sample.model_tension, sample.length_read, dt, measured)
-        guess = calibration.offsets
-        if guess is None or (calibration.is_standing and not calibration.is_done):
-            return None  # nothing is estimated while the arm stands in the stated posture
-        # Publish the first and the last estimate, and any other only after a substantial change.
-        difference = np.abs(guess.offset - self.body.offsets.offset).max()
-        if guess.known or self.output is None or difference > SHIFTED:
-            self._use_body(self.body.with_offsets(guess))
-        if calibration.is_done:
+        evidence = calibration.step(sample, dt, self._measured_theta(now))
+        if evidence is not None:
+            self._note(evidence, found=calibration.offsets)
+        if evidence is Evidence.CALIBRATED:
             self.calibration = None
             self.health.reset()
-        return guess
+        return calibration.offsets

@@ -3,6 +3,7 @@
 
 A muscle must not be used again while one of these problems is present:
 
+    the length has just jumped      its new level is not accepted yet
     a reading is NaN                the sensor is faulty
     T < slack_share · T_ref         the tendon is slack although the command demands tension T_ref
     |l − l'| > limit                the length does not fit the posture
@@ -16,7 +17,7 @@ l'; the controller winds it in.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -36,18 +37,17 @@ class RepairCheck(NamedTuple):
     sample: MuscleSample  # the readings
     isolated: Iterable[int]  # indices of the muscles that do not indicate the posture
     theta: Array | None  # θ from joint sensors [rad], (D,), or None without them
+    demand: Array | None  # tensions that the newest command demands [N], (M,); None if unknown
+    jumping: Collection[int]  # indices of the muscles whose lengths have just jumped
+    limit: float  # largest |l − l'| [m]; infinite while the length offsets are unknown
 
-    def problem(self, muscle: int, demand: Array | None, limit: float) -> str:
-        """Return why a muscle must not be used yet, as a text for users; '' if it may be used.
-
-        Args:
-            muscle: Index of the muscle.
-            demand: Tensions that the newest command demands [N], (M,); None if they are unknown.
-            limit: Largest |l − l'| [m]; infinite while the length offsets are unknown.
-        """
-        robot, sample = self.robot, self.sample
+    def problem(self, muscle: int) -> str:
+        """Return why a muscle must not be used yet, as a text for users; '' if it may be used."""
+        robot, sample, demand, limit = self.robot, self.sample, self.demand, self.limit
         name, tension = robot.muscles[muscle], float(sample.motor_tension[muscle])
         is_known = robot.tension_source.is_known
+        if muscle in self.jumping:
+            return f'the length of {name} has just jumped; wait for {LIMITS.settled:g} s'
         if np.isnan(sample.length[muscle]) or (is_known and np.isnan(tension)):
             return f'{name}: a sensor reports NaN instead of a number; repair it'
         bias = float(robot.tension.bias[muscle])
@@ -67,16 +67,13 @@ class RepairCheck(NamedTuple):
             'estimator/zero if the length stays wrong'
         )
 
-    def is_taut_with_wrong_length(self, muscle: int, limit: float) -> bool:
+    def is_taut_with_wrong_length(self, muscle: int) -> bool:
         """Return whether a muscle is not slack, but its length does not fit the posture.
 
         Its tendon is then not ruptured. Unless its winch is still moving, the length has an offset.
-
-        Args:
-            muscle: Index of the muscle.
-            limit: Largest |l − l'| [m]; infinite while the length offsets are unknown.
         """
-        return not self._is_slack(muscle) and abs(self._length_error(muscle)) > limit
+        is_settled = muscle not in self.jumping and not self._is_slack(muscle)
+        return is_settled and abs(self._length_error(muscle)) > self.limit
 
     def _is_slack(self, muscle: int) -> bool:
         bias = float(self.robot.tension.bias[muscle])

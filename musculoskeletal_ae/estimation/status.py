@@ -12,7 +12,6 @@ from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation.verification import LONGEST
 from musculoskeletal_ae.remedy import REPAIR, Step
 from musculoskeletal_ae.report import Report
-from musculoskeletal_ae.signals.body_state import KNOWN
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.estimator import Estimator
@@ -84,20 +83,21 @@ def _isolated(core: Estimator) -> Iterator[Condition]:
 
 
 def _unknown_offsets(core: Estimator) -> Iterator[Condition]:
-    """Yield the muscles with unknown length offsets, and how a running calibration proceeds."""
-    offsets, calibration = core.body.offsets, core.calibration
-    if offsets.known:
-        return
-    names = [core.robot.muscles[m] for m in np.flatnonzero(~(offsets.deviation < KNOWN))]
-    detail, finding = ', '.join(names), core.suspects.finding
+    """Yield which length offsets are unknown, with the evidence, and how a calibration proceeds."""
+    kind, calibration, finding = ConditionKind, core.calibration, core.suspects.finding
     steps: tuple[Step, ...] = (Step.CALIBRATE_LENGTHS,)
     if calibration is not None:
-        detail = f'{detail}; calibrating: {calibration.progress}'
-        steps = (Step.CHECK_SENSOR, Step.CALIBRATE_LENGTHS) if calibration.problem else ()
+        steps = ()
     elif finding is not None and finding.kind.steps == REPAIR:
         steps = ()  # the lengths are calibrated after the repair
-    kind = ConditionKind.LENGTH_OFFSETS_UNKNOWN
-    yield kind.condition(detail, names, steps=steps)
+    for evidence, muscles in core.trust.doubts.items():
+        names = [core.robot.muscles[muscle] for muscle in muscles]
+        detail = f'{", ".join(names)}: {evidence.value}'
+        if calibration is not None:
+            detail = f'{detail}; calibrating: {calibration.progress}'
+        yield kind.LENGTH_OFFSETS_UNKNOWN.condition(detail, names, steps=steps)
+    if calibration is not None and calibration.problem:
+        yield kind.LENGTH_CALIBRATION_STUCK.condition(calibration.problem)
 
 
 def _network(core: Estimator, mae: Mae) -> dict[str, str]:

@@ -31,9 +31,9 @@ consequences:
 
 A muscle may be repaired while its finding is latched, and the repair may make its length jump, or
 its winch may take seconds to come back. A wrong length of this muscle alone therefore neither
-replaces the finding nor makes its length offset unreliable. `Estimator.reset` checks whether the
-length agrees with the rest of the arm, and so does `Estimator.restore` for isolated muscles. While
-a muscle is being verified, it cannot be restored.
+replaces the finding nor revokes its length offset (`Evidence.MOVED`). `Estimator.reset` checks
+whether the length agrees with the rest of the arm, and so does `Estimator.restore` for isolated
+muscles. While a muscle is being verified, it cannot be restored.
 """
 
 from collections.abc import Iterable
@@ -65,8 +65,6 @@ class SuspectHandling:
         last_verdict: Index of the last verified suspect, or of a muscle isolated without a
             verification, and its verdict; None before the first.
         faults: Verdicts on the isolated muscles that turned out to be faulty, by index.
-        has_suspect_jumped: Whether the length of the suspect has jumped, or has become wrong in
-            another way, since the finding, as after a repair.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -76,7 +74,6 @@ class SuspectHandling:
         self.verification: Verification | None = None
         self.last_verdict: tuple[int, Verdict] | None = None
         self.faults: dict[int, Verdict] = {}
-        self.has_suspect_jumped = False
         self._acquitted: list[float] = []  # times at which suspects were verified as healthy [s]
 
     @property
@@ -114,7 +111,6 @@ class SuspectHandling:
             self.faults[muscle] = self.last_verdict[1]
             return (*isolated, muscle)
         if self.explains(finding):
-            self.has_suspect_jumped = True
             return isolated
         if self.finding is not None:
             if finding.kind.revokes is not None and self.finding.kind.revokes is None:
@@ -170,7 +166,6 @@ class SuspectHandling:
         """
         suspect = None if self.verification is None else self.verification.muscle
         self.finding = self.verification = None
-        self.has_suspect_jumped = False
         return tuple(muscle for muscle in isolated if muscle != suspect)
 
     def on_isolated(self, isolated: Iterable[int]) -> None:

@@ -30,7 +30,6 @@ from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, un
 from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR, SampleCollector
 from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.learning.keeper import CheckpointKeeper
-from musculoskeletal_ae.learning.offset_check import OffsetCheck
 from musculoskeletal_ae.learning.offset_history import HELD_TIME, OffsetHistory
 from musculoskeletal_ae.learning.report import learner_conditions, learner_report
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
@@ -115,7 +114,6 @@ class Learner:
         )
         self.keeper = CheckpointKeeper(robot, samples, directory, own_preset.validates_updates)
         saved = self.keeper.load()
-        self.offset_check = OffsetCheck(self.body.offsets)
         self.offset_history = OffsetHistory(samples, self.body.offsets.offset)
         self._time = -math.inf  # time of the last message [s]
         self._jumps = 0  # number of jumps of lengths so far
@@ -183,7 +181,7 @@ class Learner:
         self._time, self._jumps = time, jumps
         if paired is None or not (self.enabled and self.body.offsets.known):
             return
-        if not self._believes_offsets(paired):
+        if self.collector.has_jumped:  # since the last calibration of the lengths
             return
         measured = None if paired.theta is None else paired.theta[: self.robot.joint_count]
         self.keeper.observe(paired.message, paired.dt, self.collector.is_anomaly, measured)
@@ -191,22 +189,8 @@ class Learner:
             self.offset_history.accepted(time)
             self._note_new_samples()
 
-    def _believes_offsets(self, paired: Paired[MuscleSample]) -> bool:
-        """Compare the length offsets with a message; return whether they are plausible.
-
-        Offsets are not plausible if a length has jumped since their calibration.
-        """
-        check, measured = self.offset_check, paired.theta
-        was_believed = check.is_believed
-        theta = None if measured is None else measured[: self.robot.joint_count]
-        if not self.collector.has_jumped and not self.collector.is_anomaly:
-            check.step(self.keeper.mae, paired.message, theta, paired.dt)
-        if check.is_believed and not was_believed:
-            self._believe_offsets()
-        return check.is_believed and not self.collector.has_jumped
-
-    def _believe_offsets(self) -> None:
-        """Accept the present length offsets, because they agree with the messages.
+    def _use_known_offsets(self) -> None:
+        """Use length offsets that the estimator has just declared known.
 
         Samples that were taken under wrong offsets are dropped or corrected (`offset_history`).
         """
@@ -262,13 +246,12 @@ class Learner:
             self.keeper.reset()
         self.collector.use_body(body)
         if has_changed:
-            self.offset_check.use(offsets)
-            if offsets.is_suspect:
+            if offsets.revoked:
                 self.offset_history.revoke(self._time)
                 self.collector.healthy.forget_newest(HELD_TIME)
                 self.keeper.store()  # also saves which samples are held back
-            elif self.offset_check.is_believed:
-                self._believe_offsets()
+            elif offsets.known:
+                self._use_known_offsets()
         self.keeper.isolate(body.isolated)
         self.keeper.forget_messages()
 

@@ -21,10 +21,11 @@ from collections import deque
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.offset_check import CALIBRATION_SPREAD
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.limits import LIMITS
 
+#: largest difference between two correct calibrations of the same arm [m]
+CALIBRATION_SPREAD = 0.008
 HELD_TIME = 5.0  # time before a finding in which samples may be wrong [s]
 #: smallest jump of a length between two messages that is always detected [m]
 DETECTED_JUMP = LIMITS.step + LIMITS.speed * LIMITS.longest_step
@@ -71,7 +72,7 @@ class OffsetHistory:
         self._is_revoked = True
 
     def use(self, offset: Array) -> None:
-        """Use plausible offsets [m] (M,) from now on.
+        """Use known offsets [m] (M,) from now on.
 
         If they equal the previous offsets, samples that were held back are used again. Otherwise
         these samples are dropped. If the previous offsets were wrong from the start, all samples

@@ -36,8 +36,6 @@ def _failures(learner: Learner) -> Iterator[Condition]:
         yield kind.TRAINING_FAILED.condition(problem)
     if problem := learner.keeper.trouble:
         yield kind.STATE_NOT_SAVED.condition(problem)
-    if problem := learner.offset_check.problem:
-        yield kind.OFFSETS_NOT_BELIEVED.condition(problem)
     if learner.has_unsettled_jump:
         yield kind.LENGTHS_NOT_LEARNED.condition()
 
@@ -50,8 +48,6 @@ def _obstacles(learner: Learner) -> Iterator[Condition]:
         yield kind.LEARNING_DISABLED.condition()
     if not offsets.known:
         yield kind.LEARNING_WAITS.condition('the length offsets are unknown')
-    elif not learner.offset_check.is_believed and not learner.offset_check.problem:
-        yield kind.LEARNING_WAITS.condition('new length offsets are being checked')
     if learner.collector.is_anomaly:
         yield kind.LEARNING_WAITS.condition('there is an anomaly')
     can_learn = learner.enabled and offsets.known and not learner.collector.is_anomaly

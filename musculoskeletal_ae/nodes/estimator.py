@@ -11,6 +11,7 @@ checkpoints, and by the detector that compares them with the lengths.
 """
 
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -22,9 +23,12 @@ from std_msgs.msg import Bool, Float64, Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.estimation.estimator import Output
 from musculoskeletal_ae.estimation.length_calibration import check_stated_posture
+from musculoskeletal_ae.estimation.length_trust import Evidence
+from musculoskeletal_ae.estimation.offset_memory import OffsetMemory
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
@@ -55,7 +59,11 @@ class Estimator(Shell):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('estimator', **options)
-        self.core = Core(self.robot, self.parameter('preset'))
+        self.memory = OffsetMemory(self.state_directory(), self.robot.muscles)
+        found = self.memory.found
+        # The time distinguishes the decisions of this estimator from those of an earlier one.
+        generation = max(time.time_ns() // 1_000_000, 0 if found is None else found.generation + 1)
+        self.core = Core(self.robot, self.parameter('preset'), generation)
         # After a restart of this node, the learner's first network determines which muscles are
         # isolated. `keep_isolated` ensures that later networks do not change that.
         self.candidates = Candidates(self, self._use, self.core.keep_isolated)
@@ -73,8 +81,9 @@ class Estimator(Shell):
         self.muscles_to_isolate: tuple[int, ...] = ()  # value of the parameter isolate_muscles
         self.follow_parameter('zero_posture', self._on_posture)
         if self.parameter('zero_at_start'):
-            # Forget the offsets, so that no node uses the lengths before they are calibrated.
-            self.core.forget_offsets()
+            self.core.distrust_lengths(Evidence.NOT_CALIBRATED)
+        elif found is not None:
+            self.core.distrust_lengths(Evidence.RESTARTED, found.offset)
         self.follow_parameter('isolate_muscles', self._on_isolate_muscles)
         self.candidates.follow()
         if self.parameter('isolate_muscles'):
@@ -121,8 +130,7 @@ class Estimator(Shell):
             # them.
             self.published_isolated = None
         self._publish_isolated()
-        waits_for_network = not self.core.body.offsets.known and self.core.calibration is None
-        if waits_for_network:
+        if Evidence.NOT_CALIBRATED in self.core.trust.evidence:  # it waits for the first network
             self.core.calibrate_lengths(self.posture)
 
     def _configure(self, name: str, value: float) -> None:
@@ -291,8 +299,14 @@ class Estimator(Shell):
         if offsets is not self.published_offsets:
             self.published_offsets, self.body = offsets, self.core.body
             self.candidates.validator.forget()
-            rows = np.stack([offsets.offset, offsets.deviation])
-            self.offsets.publish(array_message(rows, 'quantity', 'muscle'))
+            self.offsets.publish(array_message(offsets.rows, 'quantity', 'muscle'))
+            self.memory.note(offsets)
+
+    def conditions(self) -> Iterable[Condition]:
+        """Yield the conditions of the core, and that the length offsets cannot be saved."""
+        yield from super().conditions()
+        if problem := self.memory.problem:
+            yield ConditionKind.OFFSETS_NOT_SAVED.condition(problem)
 
     def _lines(self) -> list[Line]:
         output = self.core.output

@@ -46,8 +46,9 @@ NETWORK = {**SHARED, 'checkpoint': CHECKPOINT, 'preset': PRESET}
 
 STATE_DIRECTORY = Parameter(
     'auto',
-    'directory in which the learner saves its samples and network, and the controller its latched '
-    'stop (auto: below XDG_STATE_HOME; empty: nothing is saved)',
+    'directory in which the learner saves its samples and network, the controller its latched '
+    'stop, and the estimator its length offsets (auto: below XDG_STATE_HOME; empty: nothing is '
+    'saved)',
 )
 
 ALL_NODES = '/**'  # name of the section for all nodes in a parameter file
@@ -78,6 +79,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'zero_at_start': Parameter(
             False, 'calibrate length offsets at the start, for winches without absolute encoders'
         ),
+        'state_directory': STATE_DIRECTORY,
         **parameters_of(Detection),
         'isolate_muscles': Parameter(
             ('',),

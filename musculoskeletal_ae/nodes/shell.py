@@ -12,7 +12,6 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import wraps
 from inspect import iscoroutinefunction
 from pathlib import Path
@@ -37,7 +36,6 @@ from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.exceptions import (
     CheckpointError,
-    MessageError,
     MusculoskeletalError,
     printable,
 )
@@ -64,7 +62,7 @@ from musculoskeletal_ae.reception import SHOWN, Reception
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
+from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
 from musculoskeletal_ae.signals.message_delay import MessageDelay
 from musculoskeletal_ae.signals.motor_interface import STATES, MotorInterface
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
@@ -82,7 +80,6 @@ if TYPE_CHECKING:  # a slow import, because it loads the bag writer
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 TIMER = 'Timer'  # source of an exception that escaped a timer's callback
 LONGEST_LOOK = 0.3  # if more time passes between two checks of the graph, the node was paused [s]
-MOST_OFFSET = 10.0  # largest offset of a length sensor [m]
 #: remedies for incompatible QoS, by the side that states the policy and by policy
 QOS_REMEDIES = {
     ('publisher offers', QoSPolicyKind.RELIABILITY): 'publish it reliable',
@@ -518,37 +515,18 @@ class Shell(Node):
         self.listen(kind, STATES, take, SENSOR)
 
     def follow_offsets(self, changed: Callable[[], object]) -> None:
-        """Update `body` with the estimator's length offsets; call `changed` after each update.
+        """Update `body` with the estimator's length offsets; call `changed` after each decision.
 
-        Offsets that the estimator has determined are *known*. A calibration makes them unknown
-        before it changes them. If known offsets change to other known offsets at once, the
-        estimator has restarted and has lost the result of its last calibration. The offsets in
-        `body` are then unknown until the estimator has calibrated again.
-
-        If known offsets are published again without a change, nothing happens, unless a standard
-        deviation has grown: the estimator has then checked the offsets after a repair.
+        A decision may be received several times, because the topic is latched. It is used once.
         """
-        previous = LengthOffsets.unknown(self.robot.muscle_count)
 
         def take(rows: Array) -> None:
-            nonlocal previous
-            if np.abs(rows[0]).max() > MOST_OFFSET or rows[1].min() < 0.0:
-                expected = f'offsets within ±{MOST_OFFSET:g} m and standard deviations >= 0'
-                detail = f'expected {expected}, got {rows.tolist()}'
-                raise MessageError('impossible offsets', detail)
-            offsets, before = LengthOffsets(*rows), previous
-            previous = offsets
-            if before.known and offsets.known:
-                is_same = bool((offsets.offset == before.offset).all())
-                if is_same and not (offsets.deviation > before.deviation).any():
-                    return
-                if not is_same:
-                    unknown = LengthOffsets.unknown(len(offsets.offset))
-                    offsets = replace(unknown, offset=offsets.offset)
-            self.body = self.body.with_offsets(offsets)
-            changed()
+            offsets = LengthOffsets.of_rows(rows)
+            if offsets.generation != self.body.offsets.generation:
+                self.body = self.body.with_offsets(offsets)
+                changed()
 
-        self.follow_muscles('muscle_length_zeros', take, 2, LATCHED)
+        self.follow_muscles('muscle_length_zeros', take, ROWS, LATCHED)
 
     def follow_isolated(self, changed: Callable[[], object]) -> None:
         """Update `body` with the estimator's isolated muscles; call `changed` after each update."""

@@ -9,27 +9,57 @@ object with the next version number.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.exceptions import MessageError
 
-UNKNOWN = 1.0  # standard deviation of an unknown length offset [m]
-SUSPECT = 2.0  # standard deviation of a length offset that a fault has revoked [m]
-KNOWN = 0.05  # standard deviation below which a length offset counts as known [m]
+#: Standard deviation of an offset that nothing has determined [m]. Offsets that are constructed
+#: without a trust count as known if their standard deviation is smaller.
+UNKNOWN = 1.0
+MOST_OFFSET = 10.0  # reject messages with a larger offset of a length sensor [m]
+ROWS = 4  # number of rows in a message on `muscle_length_zeros`
 
-#: standard deviation that a length offset gains when it is confirmed after a repair [m]
-CONFIRMED = 0.01
+
+class Trust(IntEnum):
+    """Whether the length offset of a muscle may be used, as published in `muscle_length_zeros`.
+
+    The estimator decides this in `estimation/length_trust.py`, and all other nodes follow it.
+    """
+
+    KNOWN = 0
+    UNKNOWN = 1  # not determined since the start, or being determined by a length calibration
+    REVOKED = 2  # was known until a finding of the estimator contradicted it
 
 
 @dataclass(frozen=True)
 class LengthOffsets:
-    """Length offsets, which are subtracted from sensor values, and their uncertainty."""
+    """Length offsets, which are subtracted from sensor values, and whether they may be trusted.
 
-    offset: Array  # o [m], (M,)
-    deviation: Array  # standard deviation [m], (M,)
+    Attributes:
+        offset: o [m], (M,).
+        deviation: Standard deviation of o [m], (M,). An offset that was revoked keeps the one that
+            it had.
+        trust: Value of `Trust` for each muscle, (M,).
+        generation: Number of the estimator's decision. The estimator raises it whenever it changes
+            or confirms an offset, and never uses a number again, even after a restart. 0 stands for
+            the assumption that every node starts with: the offsets are zero.
+    """
+
+    offset: Array
+    deviation: Array
+    trust: Ints = field(default_factory=lambda: np.zeros(0, dtype=int))
+    generation: int = 0
+
+    def __post_init__(self) -> None:
+        """Complete a missing trust."""
+        if len(self.trust) != len(self.offset):
+            is_known = self.deviation < UNKNOWN
+            object.__setattr__(self, 'trust', np.where(is_known, Trust.KNOWN, Trust.UNKNOWN))
 
     @classmethod
     def none(cls, muscle_count: int) -> LengthOffsets:
@@ -41,42 +71,51 @@ class LengthOffsets:
         """Return unknown offsets."""
         return cls(np.zeros(muscle_count), np.full(muscle_count, UNKNOWN))
 
+    @classmethod
+    def of_rows(cls, rows: Array) -> LengthOffsets:
+        """Return the offsets of a message: offset, standard deviation, trust, generation, (4, M).
+
+        Raises:
+            MessageError: If a value is illegal.
+        """
+        offset, deviation, trust, generation = rows
+        is_legal = (
+            np.abs(offset).max() <= MOST_OFFSET
+            and deviation.min() >= 0.0
+            and np.isin(trust, list(Trust)).all()
+            and (generation == generation[0]).all()
+            and generation[0] >= 0.0
+            and generation[0] == round(generation[0])
+        )
+        if not is_legal:
+            legal = (
+                f'offsets within ±{MOST_OFFSET:g} m, standard deviations >= 0, a trust of '
+                f'{", ".join(f"{each:d}" for each in Trust)}, and the same whole number >= 0 as '
+                'the generation of all muscles'
+            )
+            raise MessageError('impossible offsets', f'expected {legal}, got {rows.tolist()}')
+        return cls(offset, deviation, trust.astype(int), int(generation[0]))
+
+    @property
+    def rows(self) -> Array:
+        """The content of a message on `muscle_length_zeros`, (4, M)."""
+        generation = np.full(len(self.offset), float(self.generation))
+        return np.stack([self.offset, self.deviation, self.trust.astype(float), generation])
+
     @cached_property
     def known(self) -> bool:
         """Whether the offsets of all muscles are known."""
-        return bool((self.deviation < KNOWN).all())
+        return not self.not_known
 
     @cached_property
-    def is_suspect(self) -> bool:
-        """Whether a fault has revoked known offsets."""
-        return bool((self.deviation >= SUSPECT).any())
+    def not_known(self) -> tuple[int, ...]:
+        """Indices of the muscles whose offsets are unknown or revoked."""
+        return tuple(np.flatnonzero(self.trust != Trust.KNOWN).tolist())
 
-    @property
-    def suspect(self) -> tuple[int, ...]:
-        """Indices of the muscles whose offsets a fault has revoked."""
-        return tuple(np.flatnonzero(self.deviation >= SUSPECT).tolist())
-
-    def confirmed(self, muscle: int) -> LengthOffsets:
-        """Return the same offsets after the offset of one muscle was confirmed.
-
-        The standard deviation of this offset grows, because the repair may have changed the offset
-        slightly.
-        """
-        deviation = self.deviation.copy()
-        deviation[muscle] = min(np.hypot(deviation[muscle], CONFIRMED), 0.9 * KNOWN)
-        return LengthOffsets(self.offset, deviation)
-
-    def revoked(self, muscles: Iterable[int] | None = None) -> LengthOffsets:
-        """Return the same offsets; those of some muscles are marked as suspect.
-
-        They remain suspect until the next length calibration.
-
-        Args:
-            muscles: Indices of these muscles; None for all muscles.
-        """
-        deviation = self.deviation.copy()
-        deviation[range(len(deviation)) if muscles is None else list(muscles)] = SUSPECT
-        return LengthOffsets(self.offset, deviation)
+    @cached_property
+    def revoked(self) -> tuple[int, ...]:
+        """Indices of the muscles whose offsets a finding has revoked."""
+        return tuple(np.flatnonzero(self.trust == Trust.REVOKED).tolist())
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
@@ -10,6 +12,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import LengthOffsets
 
 
 @pytest.fixture(scope='module')
@@ -87,10 +90,15 @@ def test_invalid_messages_are_left_out_and_counted_by_reason(arm, robot, tmp_pat
     assert_array_equal(result.joints.values[1], arm.theta[0])
 
 
-def test_lengths_count_from_their_zeros_and_not_while_these_are_sought(arm, robot, tmp_path):
-    offset, surely = np.linspace(-0.08, 0.08, robot.muscle_count), np.full(robot.muscle_count, 1e-3)
-    for at, zeros, spread in ((0.5, 0.0 * offset, surely + 1.0), (1.0, offset, surely)):
-        arm.add('/muscle_length_zeros', ARRAY, at - 0.001, array([zeros, spread]))
+@pytest.mark.parametrize('is_old', [False, True], ids=['with trust', 'of version 0.1.0'])
+def test_lengths_count_from_their_zeros_and_not_while_these_are_sought(
+    arm, robot, tmp_path, is_old
+):
+    offset = np.linspace(-0.08, 0.08, robot.muscle_count)
+    sought, found = LengthOffsets.unknown(len(offset)), LengthOffsets(offset, 0.0 * offset)
+    for generation, (at, offsets) in enumerate([(0.5, sought), (1.0, found)], 1):
+        rows = replace(offsets, generation=generation).rows
+        arm.add('/muscle_length_zeros', ARRAY, at - 0.001, array(rows[:2] if is_old else rows))
     result = streams(arm, robot, tmp_path)
     assert result.rejected == {'/muscle_states: length offsets unknown': 50}
     assert_allclose(result.muscles.time, [*arm.time[:50], *arm.time[100:]], atol=1e-9)

@@ -281,7 +281,7 @@ def test_a_muscle_whose_length_jumps_is_isolated_as_a_suspect_if_suspects_are_is
     assert rejected > 50
     assert core.body.isolated == ((jumped,) if suspected else ())
     assert core.cause
-    assert core.body.offsets.is_suspect != suspected
+    assert bool(core.body.offsets.revoked) != suspected
 
 
 @pytest.mark.parametrize('scale', [1.0, 0.1])

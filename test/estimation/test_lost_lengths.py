@@ -6,9 +6,11 @@ from copy import deepcopy
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.estimation.length_trust import Evidence
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.remedy import REPAIR, Step
@@ -111,14 +113,14 @@ def test_a_jump_of_lengths_revokes_the_offsets_until_a_calibration(
     arm.off = jump
     arm.go(2.0, sensors=False)
     assert arm.kind is kind
-    assert arm.offsets.is_suspect
+    assert arm.offsets.revoked
     assert arm.core.body.isolated == ()
     with pytest.raises(MusculoskeletalError, match='estimator/zero'):
         arm.core.reset()
     assert Step.CALIBRATE_LENGTHS in arm.core.report(arm.time).steps
     arm.core.calibrate_lengths()
     assert arm.kind is None
-    assert not arm.offsets.is_suspect
+    assert not arm.offsets.revoked
     assert not arm.offsets.known
 
 
@@ -128,7 +130,7 @@ def test_a_jump_without_a_network_is_not_forgotten(robot, mae):
     arm.go(1.0)
     arm.off = SEVERAL
     arm.go(2.0)
-    assert arm.offsets.is_suspect
+    assert arm.offsets.revoked
 
 
 def test_a_jump_during_the_length_calibration_begins_it_again(robot, mae):
@@ -151,7 +153,10 @@ def test_offsets_are_those_of_before_once_joint_sensors_agree_with_the_lengths(m
     moved.go(3.0)
     moved.core.reset()
     assert moved.kind is None
-    assert moved.offsets is before
+    assert moved.offsets.known
+    assert_array_equal(moved.offsets.offset, before.offset)
+    assert_array_equal(moved.offsets.deviation, before.deviation)
+    assert moved.offsets.generation > before.generation
 
 
 def test_lengths_that_drift_are_found_by_joint_sensors(moved):
@@ -160,7 +165,7 @@ def test_lengths_that_drift_are_found_by_joint_sensors(moved):
         moved.go(0.1)
     moved.go(2.0)
     assert moved.kind is ConditionKind.LENGTHS_DISAGREE
-    assert moved.offsets.is_suspect
+    assert moved.offsets.revoked
 
 
 def test_lengths_that_are_off_at_the_start_are_found_by_joint_sensors(robot, mae):
@@ -188,7 +193,7 @@ def repair(arm, zero=0.0):
 def test_the_repair_of_a_suspect_keeps_the_offsets(ruptured):
     before = ruptured.offsets
     repair(ruptured)
-    assert ruptured.core.suspects.has_suspect_jumped
+    assert ruptured.core.trust.evidence[2] is Evidence.MOVED
     assert ruptured.kind is ConditionKind.SLACK_TENDON
     assert ruptured.core.advice == 'repair the muscle; call estimator/reset'
     assert ruptured.offsets is before
@@ -196,9 +201,9 @@ def test_the_repair_of_a_suspect_keeps_the_offsets(ruptured):
     ruptured.go(3.0, sensors=ruptured.has_sensors)
     assert ruptured.kind is None
     assert ruptured.offsets.known
-    np.testing.assert_array_equal(ruptured.offsets.offset, before.offset)
-    # The same offset is published with a larger standard deviation. This change tells the other
-    # nodes to trust the length again.
+    assert_array_equal(ruptured.offsets.offset, before.offset)
+    # The next generation tells the other nodes that the estimator has confirmed the length.
+    assert ruptured.offsets.generation > before.generation
     grown = ruptured.offsets.deviation > before.deviation
     assert np.flatnonzero(grown).tolist() == [2]
     assert not ruptured.core.stream.displaced.muscles
@@ -209,7 +214,7 @@ def test_a_jump_of_another_muscle_during_a_repair_revokes_the_offsets(ruptured, 
     repair(ruptured)
     ruptured.off = jump
     ruptured.go(2.0, sensors=ruptured.has_sensors)
-    assert ruptured.offsets.is_suspect
+    assert ruptured.offsets.revoked
     assert ruptured.core.advice == 'call estimator/zero'
     with pytest.raises(MusculoskeletalError, match='estimator/zero'):
         ruptured.core.reset()
@@ -230,13 +235,13 @@ def test_after_a_repair_with_another_zero_the_reset_is_refused_until_a_calibrati
 def test_joint_sensors_find_a_wrong_zero_after_a_reset_right_after_the_repair(ruptured):
     """Only the joint sensors reveal the error, and the reset comes before they have been read."""
     ruptured.off, ruptured.tense = 0.07 * np.eye(6)[2], np.ones(6)
-    while not ruptured.core.suspects.has_suspect_jumped:
+    while ruptured.core.trust.evidence[2] is not Evidence.MOVED:
         ruptured.go(DT)
     ruptured.core.reset()
     assert ruptured.kind is None
     ruptured.go(3.0)
     assert ruptured.kind is ConditionKind.LENGTH_DISAGREES
-    assert ruptured.offsets.suspect == (2,)
+    assert ruptured.offsets.revoked == (2,)
 
 
 def test_a_joint_sensor_that_all_lengths_outvote_is_named_and_the_offsets_stay(moved):
@@ -334,7 +339,7 @@ def test_one_wrong_length_revokes_no_other_offset(moved, on_anomaly, isolated):
         assert moved.time < 20.0
     assert moved.kind is ConditionKind.LENGTH_DISAGREES
     assert moved.core.body.isolated == isolated
-    assert moved.offsets.suspect == (() if isolated else (2,))
+    assert moved.offsets.revoked == (() if isolated else (2,))
 
 
 def test_the_winch_of_a_suspect_that_comes_back_slowly_revokes_nothing(ruptured):
@@ -371,3 +376,20 @@ def test_a_reset_without_a_repair_is_refused_but_the_suspect_can_be_isolated(rup
     ruptured.core.isolate([2])
     ruptured.go(3.0, sensors=ruptured.has_sensors)
     assert ruptured.kind is None
+
+
+@pytest.mark.parametrize('is_right', [True, False], ids=['right', 'wrong'])
+@pytest.mark.parametrize('sensors', [True, False], ids=['joint sensors', 'no joint sensors'])
+def test_offsets_of_a_wrongly_stated_posture_are_not_believed_if_joint_sensors_contradict(
+    robot, moved, sensors, is_right
+):
+    moved.off, moved.posture = SEVERAL, 0.5 * (robot.lower + robot.upper)
+    stated = moved.posture + (0.02 if is_right else 0.2) * (robot.upper - robot.lower)
+    moved.time += 2.0  # the modules and the joint sensors were switched off
+    moved.core.clock_jumped_back()
+    moved.core.calibrate_lengths(tuple(stated))
+    moved.go(4.0, sensors)
+    assert moved.offsets.known == (is_right or not sensors)
+    assert moved.kind is None
+    message = moved.core.report(moved.time).message
+    assert ('but its sensor measures' in message) != moved.offsets.known

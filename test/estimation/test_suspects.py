@@ -64,7 +64,6 @@ def test_only_a_jump_of_the_suspect_alone_is_explained_by_its_repair(suspects, k
     assert suspects.explains(jump) == is_repair
     suspects.take(jump, (), 1.0)
     assert suspects.finding is (finding if is_repair else jump)
-    assert suspects.has_suspect_jumped == is_repair
 
 
 def test_the_fault_of_an_isolated_muscle_is_known_until_the_muscle_is_restored(suspects):

@@ -28,6 +28,7 @@ from musculoskeletal_ae.nodes.sources import (
     Twins,
 )
 from musculoskeletal_ae.reception import Stamps
+from musculoskeletal_ae.signals.body_state import Trust
 
 FIRST, SECOND = Publisher('/estimator', b'1'), Publisher('/estimator', b'2')
 
@@ -122,7 +123,7 @@ STRANGE = {
     'muscle_length_zeros': (
         Float64MultiArray,
         lambda robot: array_message(
-            np.array([np.full(robot.muscle_count, 0.08), np.full(robot.muscle_count, 1e-3)]),
+            np.outer([0.08, 1e-3, Trust.KNOWN, 99.0], np.ones(robot.muscle_count)),
             'quantity',
             'muscle',
         ),

@@ -118,7 +118,7 @@ def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_n
 
 def test_impossible_length_offsets_are_refused(graph, trained_file):
     controller = graph.host(Controller, robot='arm26', checkpoint=trained_file)
-    zeros = np.zeros((2, 6))
+    zeros = np.zeros((4, 6))
     zeros[0] = 1e17
     latched = graph.publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
     latched.publish(array_message(zeros, 'quantity', 'muscle'))

@@ -13,10 +13,11 @@ from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
+from musculoskeletal_ae.signals.body_state import LengthOffsets, Trust
 
 
 @pytest.mark.parametrize('stands', [True, False], ids=['stated posture', 'gentle motion'])
-def test_length_offsets_are_found_and_reach_every_node(
+def test_length_offsets_are_found_and_reach_every_node_until_the_estimator_restarts(
     graph, trained_file, tmp_path, monkeypatch, stands
 ):
     monkeypatch.setattr(length_calibration, 'ENOUGH_WITH_ANGLES', 2.0)
@@ -47,45 +48,45 @@ def test_length_offsets_are_found_and_reach_every_node(
         assert not any('length' in reason for reason in other.rejected)
     assert controller.core.stream.body.offsets.known and controller.core.supervisor.is_running
     assert not node.core.cause
+    found = node.body.offsets.offset
+    graph.end(node)
+    restarted = graph.host(Estimator, **common)
+    others = [controller, learner]
+    graph.wait(lambda: not any(n.body.offsets.known for n in others), 'the loss of the offsets')
+    for other in (restarted, *others):
+        np.testing.assert_array_equal(other.body.offsets.offset, found)
+    assert restarted.core.calibration is None  # `zero_posture` need not be the present posture
+    assert 'restarted' in restarted.report().message
 
 
-def test_length_offsets_of_a_restarted_estimator_are_unknown_until_it_finds_them(
-    graph, trained_file
-):
+def test_every_decision_of_the_estimator_is_used_once_and_as_it_states(graph, trained_file):
     controller = graph.host(Controller, robot='arm26', checkpoint=trained_file)
     estimator = graph.publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
+    uses, use = [], controller.core.use_body
 
-    def reported(offset, deviation):
-        rows = np.array([np.full(6, offset), np.full(6, deviation)])
-        estimator.publish(array_message(rows, 'quantity', 'muscle'))
+    def noted(body):
+        uses.append(body.offsets.generation)
+        use(body)
 
-    def known(expected):
-        graph.wait(
-            lambda: (
-                controller.body.offsets.known
-                == controller.core.stream.body.offsets.known
-                == expected
-            ),
-            'the length offsets',
-        )
+    controller.core.use_body = noted
 
-    reported(0.05, 0.0)
-    graph.wait(lambda: controller.body.offsets.offset.all(), 'the length offsets')
-    # A restarted estimator publishes these offsets, but they contradict the earlier ones.
-    reported(0.0, 0.0)
-    known(False)
-    reported(0.0, 0.0)
-    graph.spin(0.3)
-    known(False)
-    reported(0.01, 1.0)
-    graph.wait(lambda: controller.body.offsets.offset.all(), 'the uncertain length offsets')
-    reported(0.05, 0.001)
-    known(True)
-    # After the repair of a muscle, the estimator confirms the offsets with a larger deviation.
-    before = controller.core.stream.body.offsets
-    reported(0.05, 0.01)
-    graph.wait(lambda: controller.core.stream.body.offsets is not before, 'the confirmed offsets')
-    known(True)
+    def reported(generation, offset, deviation, trust):
+        trusts = np.full(6, trust)
+        offsets = LengthOffsets(np.full(6, offset), np.full(6, deviation), trusts, generation)
+        estimator.publish(array_message(offsets.rows, 'quantity', 'muscle'))
+        graph.wait(lambda: controller.body.offsets.generation == generation, 'the decision')
+        assert controller.core.stream.body.offsets.known == (trust is Trust.KNOWN)
+        np.testing.assert_array_equal(controller.body.offsets.rows, offsets.rows)
+
+    reported(2, 0.05, 0.0, Trust.KNOWN)
+    reported(2, 0.05, 0.0, Trust.KNOWN)
+    # The estimator has restarted. Its sensors are absolute, so its offsets are known at once.
+    reported(1, 0.0, 0.0, Trust.KNOWN)
+    reported(3, 0.05, 1e-3, Trust.REVOKED)
+    reported(4, 0.01, 1.0, Trust.UNKNOWN)
+    reported(5, 0.05, 1e-3, Trust.KNOWN)
+    reported(6, 0.05, 1e-3, Trust.KNOWN)  # the estimator has confirmed the offsets
+    assert uses == [2, 1, 3, 4, 5, 6]
 
 
 def test_zero_at_start_begins_the_length_calibration_for_every_node(graph, trained_file):

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
+from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets, Trust
 from musculoskeletal_ae.signals.friction import Transmission
 from musculoskeletal_ae.signals.limits import LIMITS, longest_lengths
 from musculoskeletal_ae.signals.message_delay import MessageDelay
@@ -19,6 +19,7 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionErro
 ROBOT = Robot.load('arm26')
 M = ROBOT.muscle_count
 HEALTHY = BodyState.healthy(M)
+REVOKED = LengthOffsets(np.zeros(M), np.zeros(M), np.full(M, Trust.REVOKED))
 PERIOD = 0.01  # period of the messages [s]
 
 
@@ -157,7 +158,7 @@ def test_lengths_that_jump_together_are_all_named_and_displaced_until_new_offset
     assert jump_together(stream) == [0, 1, 2]
     assert stream.displaced.muscles == {0, 1, 2}
     assert not stream.displaced.is_unseen
-    stream.use_body(HEALTHY.with_offsets(HEALTHY.offsets.revoked()))
+    stream.use_body(HEALTHY.with_offsets(REVOKED))
     assert stream.displaced.muscles == {0, 1, 2}
     stream.use_body(HEALTHY.with_offsets(LengthOffsets.unknown(M)))
     assert not stream.displaced.muscles

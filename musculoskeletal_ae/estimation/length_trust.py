@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Decides which length offsets may be trusted: the only place where evidence becomes trust.
+
+Detectors, the length calibration, the joint sensors, the check of a repaired muscle and a restart
+provide evidence. `TRANSITIONS` has the trust that follows from each of them. The estimator
+publishes the result on `muscle_length_zeros`, and all other nodes follow it.
+
+    start ── ASSUMED ───────────────────────────► KNOWN ── JUMPED, DISAGREES ──► REVOKED
+    start ── NOT_CALIBRATED, RESTARTED ─► UNKNOWN ── CALIBRATED ─► KNOWN ◄── AGREES ── REVOKED
+    any ──── CALIBRATING ───────────────► UNKNOWN
+    KNOWN ── MOVED, then CONFIRMED ─────► KNOWN
+
+The estimator itself knows that it has restarted, because it saves its offsets (`offset_memory`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from enum import Enum
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.signals.body_state import LengthOffsets, Trust
+
+#: Add this standard deviation to an offset that is confirmed after a repair [m], because the repair
+#: may have changed it slightly.
+CONFIRMED = 0.01
+
+
+class Evidence(Enum):
+    """What decided last about the length offset of a muscle; the value is a text for users."""
+
+    ASSUMED = 'assumed to be 0'
+    NOT_CALIBRATED = 'not calibrated since the start'
+    RESTARTED = 'not calibrated since the estimator was restarted'
+    CALIBRATING = 'being calibrated'
+    CALIBRATED = 'calibrated'
+    JUMPED = 'revoked because the length jumped'
+    DISAGREES = 'revoked because lengths disagree with the joint sensors'
+    AGREES = 'confirmed by the joint sensors'
+    MOVED = 'changed while the muscle was repaired; not checked yet'
+    CONFIRMED = 'checked after the repair of the muscle'
+
+
+class Transition(NamedTuple):
+    """How evidence changes the trust in the offset of a muscle."""
+
+    before: frozenset[Trust]  # values of the trust that change; evidence in any other is ignored
+    after: Trust
+
+
+_ANY, _UNKNOWN = frozenset(Trust), frozenset({Trust.UNKNOWN})
+_KNOWN, _REVOKED = frozenset({Trust.KNOWN}), frozenset({Trust.REVOKED})
+
+#: what follows from each evidence; nothing leads back to the assumption of the start
+TRANSITIONS = {
+    Evidence.NOT_CALIBRATED: Transition(_ANY, Trust.UNKNOWN),
+    Evidence.RESTARTED: Transition(_ANY, Trust.UNKNOWN),
+    Evidence.CALIBRATING: Transition(_ANY, Trust.UNKNOWN),
+    Evidence.CALIBRATED: Transition(_UNKNOWN, Trust.KNOWN),
+    Evidence.JUMPED: Transition(_KNOWN, Trust.REVOKED),
+    Evidence.DISAGREES: Transition(_KNOWN, Trust.REVOKED),
+    Evidence.AGREES: Transition(_REVOKED, Trust.KNOWN),
+    Evidence.MOVED: Transition(_KNOWN, Trust.KNOWN),
+    Evidence.CONFIRMED: Transition(_KNOWN, Trust.KNOWN),
+}
+
+
+#: evidence that a finding provides
+EVIDENCE_OF = {
+    ConditionKind.LENGTH_JUMP: Evidence.JUMPED,
+    ConditionKind.LENGTHS_JUMPED: Evidence.JUMPED,
+    ConditionKind.LENGTH_DISAGREES: Evidence.DISAGREES,
+    ConditionKind.LENGTHS_DISAGREE: Evidence.DISAGREES,
+}
+
+
+class LengthTrust:
+    """The length offsets of an arm, with the trust in each of them and the evidence for it.
+
+    Attributes:
+        offsets: The offsets and their trust, as the estimator publishes them.
+        evidence: For each muscle, the evidence that decided last.
+    """
+
+    def __init__(self, muscle_count: int, first_generation: int = 1) -> None:
+        """Assume that the length sensors are absolute, so that all offsets are zero.
+
+        Args:
+            muscle_count: Number of muscles M.
+            first_generation: Generation of the first decision; larger than those of all decisions
+                before a restart.
+        """
+        self.offsets = LengthOffsets.none(muscle_count)
+        self.evidence = [Evidence.ASSUMED] * muscle_count
+        self._generation = first_generation
+
+    def take(
+        self,
+        evidence: Evidence,
+        muscles: Iterable[int] | None = None,
+        found: LengthOffsets | None = None,
+    ) -> bool:
+        """Decide by new evidence; return whether this has changed an offset or a trust.
+
+        Each change is a new decision with the next generation.
+
+        Args:
+            evidence: The evidence.
+            muscles: Indices of the muscles that it concerns; None for all muscles.
+            found: Offsets and standard deviations that replace the present ones; None to keep them.
+        """
+        transition, previous = TRANSITIONS[evidence], self.offsets
+        candidates = range(len(self.evidence)) if muscles is None else muscles
+        concerned = [m for m in candidates if previous.trust[m] in transition.before]
+        for muscle in concerned:
+            self.evidence[muscle] = evidence
+        rows = previous.rows
+        if found is not None:
+            rows[:2, concerned] = found.rows[:2, concerned]
+        if evidence is Evidence.CONFIRMED:
+            rows[1, concerned] = np.hypot(rows[1, concerned], CONFIRMED)
+        rows[2, concerned] = transition.after
+        if (rows == previous.rows).all():
+            return False
+        offset, deviation, trust, _ = rows
+        self.offsets = LengthOffsets(offset, deviation, trust.astype(int), self._generation)
+        self._generation += 1
+        return True
+
+    @property
+    def doubts(self) -> dict[Evidence, tuple[int, ...]]:
+        """Why offsets are not known: the evidence, with the indices of its muscles."""
+        doubts = dict[Evidence, tuple[int, ...]]()
+        for muscle in self.offsets.not_known:
+            evidence = self.evidence[muscle]
+            doubts[evidence] = (*doubts.get(evidence, ()), muscle)
+        return doubts

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Evidence becomes trust in length offsets in one place, and each decision has its own number."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation.length_trust import (
+    EVIDENCE_OF,
+    TRANSITIONS,
+    Evidence,
+    LengthTrust,
+)
+from musculoskeletal_ae.signals.body_state import LengthOffsets, Trust
+
+M = 4
+FOUND = LengthOffsets(np.linspace(-0.08, 0.08, M), np.full(M, 1e-3))
+TAKEN = [evidence for evidence in Evidence if evidence is not Evidence.ASSUMED]
+MUSCLES = st.none() | st.sets(st.integers(0, M - 1))
+
+
+def calibrated():
+    trust = LengthTrust(M, first_generation=7)
+    trust.take(Evidence.CALIBRATING, found=FOUND)
+    trust.take(Evidence.CALIBRATED)
+    return trust
+
+
+def test_every_evidence_has_a_transition_and_every_revoking_finding_is_evidence():
+    assert set(TRANSITIONS) == set(TAKEN)
+    assert set(EVIDENCE_OF) == {kind for kind in ConditionKind if kind.revokes is not None}
+
+
+@given(st.lists(st.tuples(st.sampled_from(TAKEN), MUSCLES)))
+def test_only_a_calibration_or_joint_sensors_end_a_revocation(events):
+    trust = calibrated()
+    trust.take(Evidence.JUMPED, [2])
+    revoked = True
+    for evidence, muscles in events:
+        concerns = muscles is None or 2 in muscles
+        trust.take(evidence, muscles)
+        is_calibration = TRANSITIONS[evidence].after is Trust.UNKNOWN
+        revoked &= not (concerns and (is_calibration or evidence is Evidence.AGREES))
+        if revoked:
+            assert trust.offsets.trust[2] == Trust.REVOKED
+            assert trust.evidence[2] is Evidence.JUMPED
+            assert 2 in trust.doubts[Evidence.JUMPED]
+
+
+@given(st.lists(st.tuples(st.sampled_from(TAKEN), MUSCLES)))
+def test_the_generation_rises_exactly_when_something_that_is_published_changes(events):
+    trust = calibrated()
+    for evidence, muscles in events:
+        before = trust.offsets
+        has_changed = trust.take(evidence, muscles)
+        assert has_changed == (trust.offsets is not before)
+        assert (trust.offsets.generation > before.generation) == has_changed
+        assert (trust.offsets.rows[:3] != before.rows[:3]).any() == has_changed
+
+
+def test_a_revoked_offset_keeps_its_value_and_its_deviation_until_it_is_known_again():
+    trust = calibrated()
+    before = trust.offsets
+    trust.take(Evidence.DISAGREES)
+    assert trust.offsets.revoked == tuple(range(M))
+    trust.take(Evidence.AGREES)
+    np.testing.assert_array_equal(trust.offsets.rows[:3], before.rows[:3])
+
+
+def test_an_offset_that_moved_in_a_repair_is_published_again_only_when_it_is_confirmed():
+    trust = calibrated()
+    before = trust.offsets
+    assert not trust.take(Evidence.MOVED, [1])
+    assert trust.offsets is before
+    assert trust.take(Evidence.CONFIRMED, [1])
+    grown = np.flatnonzero(trust.offsets.deviation > before.deviation)
+    assert grown.tolist() == [1]
+    assert trust.offsets.known
+
+
+@pytest.mark.parametrize('evidence', [Evidence.RESTARTED, Evidence.NOT_CALIBRATED])
+def test_offsets_that_are_unknown_at_the_start_stay_unknown_until_a_calibration(evidence):
+    trust = LengthTrust(M)
+    trust.take(evidence, found=LengthOffsets(FOUND.offset, np.ones(M)))
+    for other in (Evidence.JUMPED, Evidence.AGREES, Evidence.CONFIRMED, Evidence.MOVED):
+        trust.take(other)
+        assert trust.offsets.not_known == tuple(range(M))
+    trust.take(Evidence.CALIBRATED, found=FOUND)
+    assert trust.offsets.known
