@@ -34,6 +34,7 @@ from musculoskeletal_ae.control.calibrating import Calibrating, gentle_limit
 from musculoskeletal_ae.control.command import LENGTH, TENSION, Command, Pull
 from musculoskeletal_ae.control.exploration import Exploration, Exploring
 from musculoskeletal_ae.control.follower import Follower
+from musculoskeletal_ae.control.holding import HoldingCheck
 from musculoskeletal_ae.control.limiter import CommandLimiter
 from musculoskeletal_ae.control.method_choice import by_follower, check_method
 from musculoskeletal_ae.control.planner import Plan, Planner
@@ -220,6 +221,7 @@ class Controller:
         self.activities = Activities(robot, self.settings, seed)
         self.limiter = CommandLimiter(robot, self.settings)
         self.stopping = SafeStop(robot, self.settings, self.limiter)
+        self.holding = HoldingCheck(robot)
         self.sent_at = 0.0  # time of the last publication [s]; set by the caller
         self._estimate_problem = Persistence()
         self._jumped_at = math.inf  # time of the last jump of lengths [s]
@@ -606,7 +608,17 @@ class Controller:
                 self.supervisor.on_event(StopCause.COMMAND_NOT_FINITE)
         if not self.supervisor.is_running:
             limited = self._limited(self._stopped(present, dt), dt)
+        self.holding.step(self._held_posture, self.estimate, step.dt)
         return limited or self.limiter.command
+
+    @property
+    def _held_posture(self) -> Array | None:
+        """The posture [rad], (D,), that the arm claims to hold; None while it claims none."""
+        activity, target = self.supervisor.activity, self.target_state
+        control = self.activities.of(activity, self.settings)
+        is_holding = activity in (Activity.HOLDING, Activity.TORQUE) and self.supervisor.is_running
+        has_arrived = is_holding and control is not None and control.has_arrived
+        return target.theta if has_arrived and not target.effort.any() else None
 
     def _desired(self, dt: float) -> Command | None:
         """Return the command of the present activity, or None if there is none.

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import reach, stops
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.follower import Follower
+from musculoskeletal_ae.control.holding import away_text
 from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.remedy import REMEDY_STEPS, REPAIR, Step, identifiers, sentence
 from musculoskeletal_ae.report import Report
@@ -104,8 +104,10 @@ def _warnings(core: Controller, values: dict[str, str]) -> list[str]:
         warnings.append('the target needs more torque than the muscles can exert')
     if target.unreachable_reason:
         warnings.append(f'out of reach: {target.unreachable_reason}')
-    if core.is_following and core.estimate is not None and follower.progress.has_fallen:
-        warnings.append(_fallen(core, core.estimate))
+    if farthest := core.holding.farthest:
+        values['distance from the target'] = farthest
+    if core.holding.is_away and core.mae is not None and core.estimate is not None:
+        warnings.append(away_text(core.holding, robot, core.mae, core.estimate))
     if robot.isolated:
         values['isolated muscles'] = robot.names(robot.isolated)
     if not core.stream.body.offsets.known:
@@ -181,21 +183,3 @@ def slowed(follower: Follower) -> str:
             'the muscle modules'
         )
     return f'slowed to {share:.0f} % of its speed because of the limits of the muscle modules'
-
-
-def _fallen(core: Controller, estimate: Array) -> str:
-    """Return a text for users about an arm that could not stay at its target.
-
-    The text states the joint that is farthest from its target, the distance, and the torque that
-    the muscles lack in the estimated posture `estimate` [rad], (D,).
-    """
-    mae, robot = core.mae, core.robot
-    error = core.activities.follower.progress.error
-    assert mae is not None  # the arm has moved, which requires a network
-    joint = int(np.abs(error / robot.kinematics.radian).argmax())
-    distance = f'{abs(error[joint]):.2f} {robot.units[joint].theta}'
-    text = f'the arm has fallen: {robot.joints[joint]} rests {distance} away from its target'
-    missing = reach.lacking(robot, mae, estimate)
-    if not missing:
-        return text
-    return f'{text}; in this posture, the muscles lack {missing}; lift the arm by hand'

@@ -12,6 +12,7 @@ from musculoskeletal_ae.estimation.detectors.frozen_sensor import FrozenSensor
 from musculoskeletal_ae.estimation.detectors.joint_disagreement import JointDisagreement
 from musculoskeletal_ae.estimation.detectors.length_jump import LengthJump
 from musculoskeletal_ae.estimation.detectors.missing_values import MissingValues
+from musculoskeletal_ae.estimation.detectors.saturated_sensor import SaturatedSensor
 from musculoskeletal_ae.estimation.detectors.thermal_drift import ThermalDrift
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.estimation.settings import Detection
@@ -27,6 +28,7 @@ class HealthMonitor:
     Attributes:
         residual: The detector of the residual distance, which also names the most suspect muscle.
         joints: The detector of lengths that disagree with joint sensors.
+        saturation: The detector of saturated tension sensors, which stops nothing.
         settings: Settings of the detectors.
     """
 
@@ -49,6 +51,7 @@ class HealthMonitor:
         chosen = preset_named(preset)
         self.residual, by_physics = chosen.residual_detectors(robot, self.settings)
         self.joints = JointDisagreement(robot)
+        self.saturation = SaturatedSensor(robot)
         self._detectors: list[Detector] = [
             LengthJump(),
             MissingValues(robot),
@@ -56,6 +59,7 @@ class HealthMonitor:
             self.residual,
             self.joints,
             FrozenSensor(robot),
+            self.saturation,
             ThermalDrift(heat or Heat(robot)),
         ]
 

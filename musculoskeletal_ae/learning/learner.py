@@ -28,6 +28,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
 from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR, SampleCollector
 from musculoskeletal_ae.learning.job import Update
+from musculoskeletal_ae.learning.joint_stops import LARGEST_OFFSET
 from musculoskeletal_ae.learning.keeper import CheckpointKeeper
 from musculoskeletal_ae.learning.offset_check import OffsetCheck
 from musculoskeletal_ae.learning.offset_history import HELD_TIME, OffsetHistory
@@ -354,7 +355,7 @@ class Learner:
         mae = self.scheduler.finish(update)
         for muscle, newest in update.changed:
             self._forget(muscle, newest)
-        if self.keeper.is_accepted(mae):
+        if not self.sensor_problem and self.keeper.is_accepted(mae):
             self.keeper.use(mae)
 
     def _forget(self, muscle: int, newest: int = 0) -> None:
@@ -450,14 +451,38 @@ class Learner:
         return self.scheduler.last_update
 
     @property
+    def sensor_problem(self) -> str:
+        """Why the last update is refused: a joint sensor cannot have the estimated offset; or ''.
+
+        Samples with wrong angles, or lengths with wrong offsets, lead to such an offset.
+        """
+        if self.last_update is None or self.last_update.sensor_offset.size == 0:
+            return ''
+        offset, radian = self.last_update.sensor_offset, self.robot.kinematics.radian
+        implausible = np.flatnonzero(np.abs(offset) > LARGEST_OFFSET * radian)
+        if implausible.size == 0:
+            return ''
+        each = ', '.join(
+            f'{self.robot.joints[j]} ({offset[j]:.2f} {self.robot.units[j].theta}, largest '
+            f'{LARGEST_OFFSET * radian[j]:.2f})'
+            for j in implausible
+        )
+        return (
+            'the result of learning is not used: it contains a larger offset than a joint sensor '
+            f'can have: {each}; check the sensors and the length offsets; then set the parameter '
+            '`fresh` of the learner to true, because its samples are wrong'
+        )
+
+    @property
     def trouble(self) -> str:
         """Why learning is not possible or results are not on disk, or ''."""
         jumped = ''
         has_jumped = self.collector.has_jumped and self.body.offsets.known
         if has_jumped and not self.collector.is_anomaly:
             jumped = 'learning is paused because lengths have jumped; call estimator/zero'
-        troubles = self.trainer.trouble, self.keeper.trouble, self.offset_check.problem, jumped
-        return '; '.join(filter(None, troubles))
+        offsets = self.offset_check.problem
+        parts = self.trainer.trouble, self.keeper.trouble, offsets, jumped, self.sensor_problem
+        return '; '.join(filter(None, parts))
 
     @property
     def idle_time(self) -> float:
