@@ -26,6 +26,7 @@ class Kind(Enum):
     SLACK_TENDON = 'slack_tendon'
     JAMMED_MODULE = 'jammed_module'
     SENSOR_FROZEN = 'sensor_frozen'
+    SENSOR_SATURATED = 'sensor_saturated'
     LENGTH_JUMP = 'length_jump'
     LENGTHS_JUMPED = 'lengths_jumped'
     LENGTH_DISAGREES = 'length_disagrees'

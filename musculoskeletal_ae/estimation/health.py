@@ -28,7 +28,6 @@ class HealthMonitor:
     Attributes:
         residual: The detector of the residual distance, which also names the most suspect muscle.
         joints: The detector of lengths that disagree with joint sensors.
-        saturation: The detector of saturated tension sensors, which stops nothing.
         settings: Settings of the detectors.
     """
 
@@ -51,7 +50,6 @@ class HealthMonitor:
         chosen = preset_named(preset)
         self.residual, by_physics = chosen.residual_detectors(robot, self.settings)
         self.joints = JointDisagreement(robot)
-        self.saturation = SaturatedSensor(robot)
         self._detectors: list[Detector] = [
             LengthJump(),
             MissingValues(robot),
@@ -59,7 +57,7 @@ class HealthMonitor:
             self.residual,
             self.joints,
             FrozenSensor(robot),
-            self.saturation,
+            SaturatedSensor(robot),
             ThermalDrift(heat or Heat(robot)),
         ]
 

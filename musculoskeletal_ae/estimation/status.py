@@ -63,8 +63,6 @@ def report(core: Estimator, now: float) -> Report:
         )
         text = f'thermal drift: {"; ".join(changes)}'
         return Report('warn', text, {**values, 'state': 'thermal_drift'})
-    if core.health.saturation.saturated:
-        return Report('warn', core.health.saturation.text, {**values, 'state': 'saturated'})
     if core.mounting.tilt is not None:
         return Report('warn', core.mounting.tilt.text, {**values, 'state': 'other_mounting'})
     if core.body.isolated:

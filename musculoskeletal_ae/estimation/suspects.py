@@ -20,6 +20,9 @@ consequences:
 
     values_missing          is never latched. With `on_anomaly: isolate` the muscle is isolated
                             without a verification, because a sensor that reports NaN is faulty.
+    sensor_saturated        With `on_anomaly: isolate` the muscle is isolated without a verification
+                            and without a stop: a verification demands less tension than that at
+                            which the sensor saturates.
     lengths_jumped          concern several muscles, none of which is isolated. The length offsets
     lengths_disagree        become unreliable, and the finding stays latched until the next length
                             calibration, or until a reset while joint sensors agree with the
@@ -54,6 +57,13 @@ ACQUITTALS = 2  # number of suspects verified as healthy after which the next on
 WITHIN = 60.0  # time during which a suspect verified as healthy counts [s]
 #: kinds of findings after which no muscle is isolated, because the named one may be healthy
 OF_SEVERAL = frozenset({Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE, Kind.JOINT_SENSORS_DISAGREE})
+
+
+#: findings that leave no doubt which muscle is faulty: it is isolated without a verification
+CERTAIN = {
+    Kind.VALUES_MISSING: Outcome.VALUES_MISSING,
+    Kind.SENSOR_SATURATED: Outcome.SENSOR_SATURATED,
+}
 
 
 class SuspectHandling:
@@ -108,12 +118,12 @@ class SuspectHandling:
         """
         isolated, muscle = tuple(isolated), finding.muscle
         isolates = self.settings.on_anomaly == ISOLATE
-        if finding.kind is Kind.VALUES_MISSING:
-            if not isolates or muscle in isolated:
-                return isolated
-            self.last_verdict = muscle, Verdict(Outcome.VALUES_MISSING)
+        if finding.kind in CERTAIN and isolates and muscle not in isolated:
+            self.last_verdict = muscle, Verdict(CERTAIN[finding.kind])
             self.faults[muscle] = self.last_verdict[1]
             return (*isolated, muscle)
+        if finding.kind is Kind.VALUES_MISSING:
+            return isolated
         if self.explains(finding):
             self.has_suspect_jumped = True
             return isolated

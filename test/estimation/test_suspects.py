@@ -27,6 +27,8 @@ def suspects(robot):
         (Kind.LENGTH_JUMP, 'isolate', True, (2,), True),
         (Kind.VALUES_MISSING, 'stop', False, (), False),
         (Kind.VALUES_MISSING, 'isolate', False, (2,), False),
+        (Kind.SENSOR_SATURATED, 'stop', True, (), False),
+        (Kind.SENSOR_SATURATED, 'isolate', False, (2,), False),
     ],
 )
 def test_the_consequences_of_each_finding(suspects, kind, on_anomaly, latched, isolated, verified):
