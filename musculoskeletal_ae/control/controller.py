@@ -226,6 +226,8 @@ class Controller:
         self._estimate_problem = Persistence()
         self._jumped_at = math.inf  # time of the last jump of lengths [s]
         self._suspicion = Suspicion()
+        #: newest muscle states before a pause of the controller; None once newer ones have arrived
+        self._sample_before_pause: MuscleSample | None = None
         if self.settings.method == 'float':
             self.supervisor.on_request(Activity.GRAVITY_COMPENSATION)
 
@@ -588,7 +590,11 @@ class Controller:
         time = now if time is None else time
         step = self.watchdog.age.step(now, time, not self.supervisor.is_running)
         if step.has_paused:  # the arm may have moved: restart the activity from the new posture
-            self.activities.entered = None
+            self.activities.entered, self._sample_before_pause = None, self.sample
+        if self._sample_before_pause is not None and self.sample is not self._sample_before_pause:
+            assert self.sample is not None
+            self.limiter.restart(self.sample)
+            self._sample_before_pause = None
         present = self.conditions(now)
         stale_estimate = any(c.cause is StopCause.STALE_ESTIMATE for c in present)
         # If estimates are missing, the estimator may have restarted without the suspect.
@@ -609,6 +615,8 @@ class Controller:
         if not self.supervisor.is_running:
             limited = self._limited(self._stopped(present, dt), dt)
         self.holding.step(self._held_posture, self.estimate, step.dt)
+        if self._sample_before_pause is not None:
+            return None  # the modules may have paid out; the last command would jerk the arm
         return limited or self.limiter.command
 
     @property
