@@ -45,7 +45,7 @@ from musculoskeletal_ae.control.stops import Action, Condition, StopCause
 from musculoskeletal_ae.control.supervisor import Activity, Supervisor
 from musculoskeletal_ae.control.torque import GravityCompensation, TorqueControl
 from musculoskeletal_ae.control.trajectory import Setpoint
-from musculoskeletal_ae.control.watchdog import Watchdog
+from musculoskeletal_ae.control.watchdog import OWN_PAUSE, Watchdog
 from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -226,8 +226,8 @@ class Controller:
         self._estimate_problem = Persistence()
         self._jumped_at = math.inf  # time of the last jump of lengths [s]
         self._suspicion = Suspicion()
-        #: newest muscle states before a pause of the controller; None once newer ones have arrived
-        self._sample_before_pause: MuscleSample | None = None
+        #: number of messages after which the filtered muscle states are newer than the last pause
+        self._awaited_samples = 0
         if self.settings.method == 'float':
             self.supervisor.on_request(Activity.GRAVITY_COMPENSATION)
 
@@ -314,6 +314,11 @@ class Controller:
         if sample.jumped:
             self._jumped_at = now
         self.watchdog.take_sample(sample, now)
+        # Messages that had waited during a pause show how the arm was before it.
+        if self._awaited_samples and sample.delay <= OWN_PAUSE:
+            self._awaited_samples -= 1
+            if not self._awaited_samples:
+                self.limiter.restart(sample)
 
     def estimated(self, theta: Array, now: float, is_new: bool = True) -> None:
         """Check the estimated posture θ [rad], (D,), and use it for control from now on.
@@ -590,11 +595,7 @@ class Controller:
         time = now if time is None else time
         step = self.watchdog.age.step(now, time, not self.supervisor.is_running)
         if step.has_paused:  # the arm may have moved: restart the activity from the new posture
-            self.activities.entered, self._sample_before_pause = None, self.sample
-        if self._sample_before_pause is not None and self.sample is not self._sample_before_pause:
-            assert self.sample is not None
-            self.limiter.restart(self.sample)
-            self._sample_before_pause = None
+            self.activities.entered, self._awaited_samples = None, WINDOW
         present = self.conditions(now)
         stale_estimate = any(c.cause is StopCause.STALE_ESTIMATE for c in present)
         # If estimates are missing, the estimator may have restarted without the suspect.
@@ -615,7 +616,7 @@ class Controller:
         if not self.supervisor.is_running:
             limited = self._limited(self._stopped(present, dt), dt)
         self.holding.step(self._held_posture, self.estimate, step.dt)
-        if self._sample_before_pause is not None:
+        if self._awaited_samples:
             return None  # the modules may have paid out; the last command would jerk the arm
         return limited or self.limiter.command
 
