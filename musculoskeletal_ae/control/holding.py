@@ -25,7 +25,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: report a joint that rests further than this away from its target [rad]; for prismatic joints
 #: times `kinematics.RACK` [m]
-AWAY = 0.3
+AWAY = 0.5
 LASTING = 5.0  # report it after this time [s]
 #: what may be the cause where nothing more is known
 POSSIBLE_CAUSES = (
