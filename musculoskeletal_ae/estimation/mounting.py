@@ -70,7 +70,8 @@ class Tilt(NamedTuple):
         return (
             'the base is mounted otherwise than in robot.urdf: the tensions show that gravity acts '
             f'along ({x:.1f}, {y:.1f}, {z:.1f}) of the root link, about {self.angle:.0f}° away '
-            'from the direction in robot.urdf'
+            'from the direction in robot.urdf; mount the base as robot.urdf states, or correct '
+            'robot.urdf; then call estimator/reset'
         )
 
 

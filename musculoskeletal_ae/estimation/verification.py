@@ -103,7 +103,7 @@ _TEXTS = {
     Outcome.NOT_WOUND_IN: 'not verified, because it was not wound in',
     Outcome.TENSION_UNKNOWN: 'not verified, because its tension is unknown (tension_source: none)',
     Outcome.VALUES_MISSING: 'a sensor reports NaN instead of a number',
-    Outcome.SENSOR_SATURATED: 'its tension sensor saturates below the tension limit',
+    Outcome.SENSOR_SATURATED: 'its tension sensor saturates or is frozen',
 }
 
 

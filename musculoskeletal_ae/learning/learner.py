@@ -353,9 +353,11 @@ class Learner:
             self.scheduler.note_news()
             return
         mae = self.scheduler.finish(update)
+        if self.sensor_problem:
+            return
         for muscle, newest in update.changed:
             self._forget(muscle, newest)
-        if not self.sensor_problem and self.keeper.is_accepted(mae):
+        if self.keeper.is_accepted(mae):
             self.keeper.use(mae)
 
     def _forget(self, muscle: int, newest: int = 0) -> None:

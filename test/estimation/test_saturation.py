@@ -20,7 +20,9 @@ def watched(robot, sense, seconds=40.0):
         tension = 110.0 + 70.0 * np.clip(1.5 * np.sin(n * DT + phase), -1.0, 1.0)
         reading = sense(tension, rng, n)
         sample = SimpleNamespace(
-            newest=np.array([reading, reading, reading]), usable=np.ones(len(reading), dtype=bool)
+            newest=np.array([reading, reading, reading]),
+            length=np.zeros(len(reading)),
+            usable=np.ones(len(reading), dtype=bool),
         )
         if finding := detector.step(SimpleNamespace(sample=sample, dt=DT)):
             return finding
@@ -46,6 +48,20 @@ def test_a_sensor_that_saturates_below_the_limit_is_found_with_its_value(robot):
     finding = watched(robot, clipped(150.0))
     assert (finding.muscle, finding.kind) == (SATURATED, Kind.SENSOR_SATURATED)
     assert '150 N' in finding.evidence
+
+
+def test_a_constant_reading_while_the_module_winds_in_is_found_at_once(robot):
+    detector, rng = SaturatedSensor(robot), np.random.default_rng(0)
+    length, usable = np.zeros(robot.muscle_count), np.ones(robot.muscle_count, dtype=bool)
+    for n in range(2100):
+        reading = noisy(np.full(robot.muscle_count, 80.0 + 0.02 * n), rng, n)
+        if n >= 2000:
+            reading[SATURATED] = 120.0
+            length = length - 2e-4 * (np.arange(robot.muscle_count) == SATURATED)
+        sample = SimpleNamespace(newest=np.array(3 * [reading]), length=length, usable=usable)
+        finding = detector.step(SimpleNamespace(sample=sample, dt=DT))
+        assert finding is None or n >= 2050
+    assert 'winds in' in finding.evidence
 
 
 def still(tension, rng, n):

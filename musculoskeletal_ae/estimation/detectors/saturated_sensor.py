@@ -5,9 +5,13 @@
 
 The readings of a working sensor contain noise, also where a motor can pull no harder. Readings that
 stay exactly the same, although this sensor's readings usually vary, are therefore clipped: by the
-sensor, its amplifier or the driver. A muscle is reported if its readings have been clipped twice at
-the same value, were lower in between, and have not been higher. A frozen sensor is not lower in
-between (`frozen_sensor.py`). Drivers whose readings often repeat are not checked, and neither are
+sensor, its amplifier or the driver. A muscle is reported in two cases:
+
+- Its readings have been clipped twice at the same value, were lower in between, and have not been
+  higher. A frozen sensor is not lower in between (`frozen_sensor.py`).
+- Its reading stays the same although its module winds in. The sensor may then also be frozen.
+
+Drivers whose readings often repeat are not checked, and neither are
 messages that repeat the readings of most muscles, as those of a simulator without noise at rest.
 Values near T_bias are not checked, because an ideal module may hold exactly T_bias.
 
@@ -23,6 +27,8 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Kind, Observation
 from musculoskeletal_ae.robot.robot import Robot
 
+WINDING_TIME = 0.5  # report a module that winds in after its reading was the same for this long [s]
+WOUND = 0.005  # and after it has wound in by this length meanwhile [m]
 LASTING = 0.15  # count a visit to a value after the reading has stayed exactly there this long [s]
 VISITS = 2  # report a muscle after this number of visits at the same value
 SAME = 2e-3  # two visits are at the same value if they differ by less than this share of it
@@ -52,6 +58,7 @@ class SaturatedSensor(Detector):
         count = self._robot.muscle_count
         self._before: Array = np.full(count, np.nan)  # reading of the previous message [N]
         self._unchanged: Array = np.zeros(count)  # time without a change of the reading [s]
+        self._length: Array = np.zeros(count)  # l when the reading changed last [m]
         self._beyond: Array = np.zeros(count)  # time for which the reading has been higher [s]
         self._value: Array = np.full(count, np.nan)  # value of the last visit [N]
         self._visits: Ints = np.zeros(count, dtype=np.int64)
@@ -67,6 +74,7 @@ class SaturatedSensor(Detector):
         self._highest = np.fmax(self._highest, np.minimum(reading, self._before))
         self._before = reading
         self._unchanged = (self._unchanged + dt) * is_same
+        self._length = np.where(is_same, self._length, sample.length)
         is_below = ~(reading >= (1.0 - SAME) * self._highest)
         self._varying += dt / MEMORY * is_below * (~is_same - self._varying)
         self._has_left |= reading < (1.0 - BELOW) * value
@@ -79,6 +87,13 @@ class SaturatedSensor(Detector):
         self._visits = np.where(new, 1, self._visits + again) * ~is_wrong
         self._value = np.where(is_wrong, np.nan, np.where(new, reading, value))
         self._has_left = (self._has_left & ~(again | new)) | is_wrong
+        wound = is_clipped & (self._unchanged >= WINDING_TIME)
+        wound &= self._length - sample.length > WOUND
+        if wound.any():
+            muscle = int(wound.argmax())
+            text = f'its tension stays at exactly {reading[muscle]:.0f} N while its module winds in'
+            evidence = f'{text}: the sensor saturates or is frozen'
+            return Finding(muscle, Kind.SENSOR_SATURATED, evidence)
         if self._visits.max() < VISITS:
             return None
         muscle = int(self._visits.argmax())
