@@ -36,7 +36,7 @@ BELOW = 0.1  # count another visit only after the reading was lower by this shar
 #: forget a value after the reading has been higher for this long [s]; a spike is shorter
 BEYOND = 0.05
 #: share of the messages in which a reading below the highest ones differs from the previous one
-VARYING = 0.7
+VARYING = 0.5
 MEMORY = 10.0  # time constant of this share [s]
 LEAST = 1.5  # lowest T_sat, relative to T_bias
 
