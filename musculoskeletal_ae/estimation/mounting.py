@@ -46,8 +46,8 @@ MOVED = 0.2
 AT_STOP = 0.12
 MEMORY = 100.0  # number of postures after which the weight of a posture has decreased to 1/e
 ENOUGH = 30  # number of postures from which the evidence is judged
-CERTAIN = 15.0  # report another direction of gravity from this evidence on
-CLEARED = 5.0  # end the report when the evidence is below this value
+CERTAIN = 25.0  # report another direction of gravity from this evidence on
+CLEARED = 8.0  # end the report when the evidence is below this value
 
 
 class Tilt(NamedTuple):
