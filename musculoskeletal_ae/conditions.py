@@ -69,7 +69,11 @@ class Reaction(Enum):
         'raises anomaly_detected, which stops the arm; with `on_anomaly: isolate`, isolates and '
         'verifies the muscle'
     )
-    ISOLATE_AT_ONCE = 'with `on_anomaly: isolate`, isolates the muscle without a stop'
+    ISOLATE_AT_ONCE = (
+        'raises anomaly_detected, which stops the arm; with `on_anomaly: isolate`, isolates the '
+        'muscle without a stop and without a verification instead'
+    )
+    ISOLATE_ONLY = 'with `on_anomaly: isolate`, isolates the muscle without a stop'
 
     def __str__(self) -> str:
         return self.value
@@ -332,6 +336,16 @@ class ConditionKind(Enum):
         'the length or the tension of a muscle has been NaN for a while',
         'values are missing',
         REPAIR,
+        reaction=Reaction.ISOLATE_ONLY,
+    )
+    SENSOR_SATURATED = Declaration(
+        'sensor_saturated',
+        'estimator',
+        'error',
+        'a tension sensor cannot read more than a value below tension.limit, so that the arm may '
+        'pull more than it reads',
+        'saturated tension sensor',
+        (Step.REPAIR_SENSOR, Step.RESET_ESTIMATOR),
         reaction=Reaction.ISOLATE_AT_ONCE,
     )
     HOT_MODULE_CHANGED = Declaration(
@@ -387,6 +401,15 @@ class ConditionKind(Enum):
         'the file that keeps the length offsets for the next estimator cannot be written',
         'the length offsets are not on disk',
         (Step.FREE_DISK,),
+    )
+
+    OTHER_MOUNTING = Declaration(
+        'other_mounting',
+        'estimator',
+        'warn',
+        'the tensions of an arm that has learned show another direction of gravity than robot.urdf',
+        'the base is mounted otherwise than in robot.urdf',
+        (Step.CORRECT_MOUNTING, Step.RESET_ESTIMATOR),
     )
 
     # -- why the arm stands still ---------------------------------------------------------------
@@ -571,12 +594,14 @@ class ConditionKind(Enum):
         'the muscles cannot hold the target, or the hand cannot reach it',
         'out of reach',
     )
-    ARM_FALLEN = Declaration(
-        'arm_fallen',
+    AWAY_FROM_TARGET = Declaration(
+        'away_from_target',
         'controller',
         'warn',
-        'the arm rests far from a target at which it has arrived before',
-        'the arm has fallen',
+        'for 5 s after the end of a motion, a joint has rested more than 0.5 rad away from its '
+        'target, according to the estimate',
+        'the arm is not at its target',
+        (Step.CHECK_LOAD,),
     )
     TENSION_ABOVE_LIMIT = Declaration(
         'tension_above_limit',
@@ -616,6 +641,15 @@ class ConditionKind(Enum):
         'samples and network cannot be saved',
         'the learned state is not on disk',
         (Step.FREE_DISK,),
+    )
+    SENSOR_OFFSET_IMPOSSIBLE = Declaration(
+        'sensor_offset_impossible',
+        'learner',
+        'error',
+        'an update has found an offset of a joint sensor above 0.35 rad, and is not used',
+        'the result of learning is not used, because it contains a larger offset than a joint '
+        'sensor can have',
+        (Step.CHECK_SENSOR, Step.LEARN_AFRESH),
     )
     LENGTHS_NOT_LEARNED = Declaration(
         'lengths_not_learned',

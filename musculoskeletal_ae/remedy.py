@@ -35,6 +35,18 @@ class Step(Enum):
         'check_sensor',
         'check the named sensor, or call estimator/zero if the lengths have offsets',
     )
+    REPAIR_SENSOR = (
+        'repair_sensor',
+        'replace the tension sensor, or set tension.limit below what it can read',
+    )
+    CHECK_LOAD = (
+        'check_load',
+        'check payload, contacts, isolated muscles and mounting; lift the arm by hand',
+    )
+    CORRECT_MOUNTING = (
+        'correct_mounting',
+        'mount the base as robot.urdf states, or correct robot.urdf',
+    )
     CHECK_MODULE = (
         'check_module',
         'check drag, cooling and tension sensor of the module; then call estimator/reset',
@@ -61,6 +73,11 @@ class Step(Enum):
     WAIT_UNTIL_COOL = 'wait_until_cool', 'wait until all windings are below temperature_limit'
     REPORT_LOG = 'report_log', 'report the error with the log of the node'
     FREE_DISK = 'free_disk', 'make the state directory writable, with free space'
+    LEARN_AFRESH = (
+        'learn_afresh',
+        'set the parameter fresh of the learner to true, because its samples are wrong',
+        1,
+    )
     RESET_EMULATOR = 'reset_emulator', 'call hardware_emulator/reset'
     RESET_ESTIMATOR = 'reset_estimator', 'call estimator/reset', 1
     CALIBRATE_LENGTHS = 'calibrate_lengths', 'call estimator/zero', 1

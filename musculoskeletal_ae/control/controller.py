@@ -36,6 +36,7 @@ from musculoskeletal_ae.control.calibrating import Calibrating, gentle_limit
 from musculoskeletal_ae.control.command import LENGTH, TENSION, Command, Pull
 from musculoskeletal_ae.control.exploration import Exploration, Exploring
 from musculoskeletal_ae.control.follower import Follower
+from musculoskeletal_ae.control.holding import HoldingCheck
 from musculoskeletal_ae.control.limiter import CommandLimiter
 from musculoskeletal_ae.control.method_choice import by_follower, check_method
 from musculoskeletal_ae.control.planner import Plan, Planner
@@ -45,7 +46,7 @@ from musculoskeletal_ae.control.stopping import SafeStop
 from musculoskeletal_ae.control.supervisor import Activity, Supervisor
 from musculoskeletal_ae.control.torque import GravityCompensation, TorqueControl
 from musculoskeletal_ae.control.trajectory import Setpoint
-from musculoskeletal_ae.control.watchdog import Watchdog
+from musculoskeletal_ae.control.watchdog import OWN_PAUSE, Watchdog
 from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.report import Report
@@ -222,10 +223,13 @@ class Controller:
         self.activities = Activities(robot, self.settings, seed)
         self.limiter = CommandLimiter(robot, self.settings)
         self.stopping = SafeStop(robot, self.settings, self.limiter)
+        self.holding = HoldingCheck(robot)
         self.sent_at = 0.0  # time of the last publication [s]; set by the caller
         self._estimate_problem = Persistence()
         self._jumped_at = math.inf  # time of the last jump of lengths [s]
         self._suspicion = Suspicion()
+        #: number of messages after which the filtered muscle states are newer than the last pause
+        self._awaited_samples = 0
         if self.settings.method == 'float':
             self.supervisor.on_request(Activity.GRAVITY_COMPENSATION)
 
@@ -312,6 +316,11 @@ class Controller:
         if sample.jumped:
             self._jumped_at = now
         self.watchdog.take_sample(sample, now)
+        # Messages that had waited during a pause show how the arm was before it.
+        if self._awaited_samples and sample.delay <= OWN_PAUSE:
+            self._awaited_samples -= 1
+            if not self._awaited_samples:
+                self.limiter.restart(sample)
 
     def estimated(self, theta: Array, now: float, is_new: bool = True) -> None:
         """Check the estimated posture θ [rad], (D,), and use it for control from now on.
@@ -595,7 +604,7 @@ class Controller:
         time = now if time is None else time
         step = self.watchdog.age.step(now, time, not self.supervisor.is_running)
         if step.has_paused:  # the arm may have moved: restart the activity from the new posture
-            self.activities.entered = None
+            self.activities.entered, self._awaited_samples = None, WINDOW
         present = self.stop_conditions(now)
         stale_estimate = any(each.kind is ConditionKind.STALE_ESTIMATE for each in present)
         # If estimates are missing, the estimator may have restarted without the suspect.
@@ -615,7 +624,19 @@ class Controller:
                 self.stop(ConditionKind.COMMAND_NOT_FINITE)
         if not self.supervisor.is_running:
             limited = self._limited(self._stopped(present, dt), dt)
+        self.holding.step(self._held_posture, self.estimate, step.dt)
+        if self._awaited_samples:
+            return None  # the modules may have paid out; the last command would jerk the arm
         return limited or self.limiter.command
+
+    @property
+    def _held_posture(self) -> Array | None:
+        """The posture [rad], (D,), that the arm claims to hold; None while it claims none."""
+        activity, target = self.supervisor.activity, self.target_state
+        control = self.activities.of(activity, self.settings)
+        is_holding = activity in (Activity.HOLDING, Activity.TORQUE) and self.supervisor.is_running
+        has_arrived = is_holding and control is not None and control.has_arrived
+        return target.theta if has_arrived and not target.effort.any() else None
 
     def _desired(self, dt: float) -> Command | None:
         """Return the command of the present activity, or None if there is none.

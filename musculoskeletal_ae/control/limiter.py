@@ -113,6 +113,15 @@ class CommandLimiter:
         """Largest possible muscle lengths [m], (M,); infinite while the offsets are unknown."""
         return self.slack_length if self.offsets_known else np.full_like(self.slack_length, np.inf)
 
+    def restart(self, sample: MuscleSample) -> None:
+        """Replace the last command by one that keeps the present tensions, if there is one."""
+        if self.command is None:
+            return
+        kind, self.command, self._last_length = self.command.kind, None, None
+        self.command = self.last(kind, sample)
+        if kind == LENGTH:
+            self._last_length = self.command.value, 0.0
+
     def shift(self, offset: Array) -> None:
         """Convert the last commands to new length offsets, which are larger by `offset` [m], (M,).
 

@@ -113,6 +113,11 @@ class LengthRamps:
         """Return whether the duration of the last goal will be over dt [s] from now."""
         return self._remaining - dt <= 0.0 and not self._goals
 
+    @property
+    def is_over(self) -> bool:
+        """Whether the last goal has been approached for its whole duration, and is now held."""
+        return self._goal is not None and self.is_over_after(0.0)
+
     def start_from(self, command: Array) -> None:
         """Continue from a command [m], (M,), and discard all goals."""
         self._command, self._ramp, self._goal = command.copy(), None, None
@@ -203,6 +208,11 @@ class RampedTarget(ActivityControl):
 
     def leave(self) -> None:
         """End the activity; the target is kept for the next time."""
+
+    @property
+    def has_arrived(self) -> bool:
+        """Whether the movement to the target has ended."""
+        return self.ramps.is_over
 
     @property
     def missing_torque(self) -> Array | None:

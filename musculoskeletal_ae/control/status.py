@@ -12,6 +12,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.control import reach
 from musculoskeletal_ae.control.follower import Follower
+from musculoskeletal_ae.control.holding import away_text
 from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import Report
@@ -127,8 +128,11 @@ def _target(core: Controller) -> Iterator[Condition]:
         yield kind.TORQUE_MISSING.condition()
     if target.unreachable_reason:
         yield kind.OUT_OF_REACH.condition(target.unreachable_reason)
-    if core.is_following and core.estimate is not None and follower.progress.has_fallen:
-        yield kind.ARM_FALLEN.condition(_fallen(core, core.estimate))
+    if core.holding.is_away and core.mae is not None and core.estimate is not None:
+        joint = core.holding.farthest.partition(' ')[0]
+        yield kind.AWAY_FROM_TARGET.condition(
+            away_text(core.holding, robot, core.mae, core.estimate), [joint]
+        )
 
 
 def _limits(core: Controller) -> Iterator[Condition]:
@@ -163,6 +167,8 @@ def _add_motion(core: Controller, values: dict[str, str]) -> None:
     if missing is not None and np.abs(robot.kinematics.radian * missing).max() > reach.NOTABLE:
         each = zip(robot.joints, missing, robot.units)
         values['missing torque'] = ', '.join(f'{n} {m:.2f} {unit.torque}' for n, m, unit in each)
+    if farthest := core.holding.farthest:
+        values['distance from the target'] = farthest
 
 
 def _add_body(core: Controller, values: dict[str, str]) -> None:
@@ -230,21 +236,3 @@ def slowed(follower: Follower) -> str:
             'the muscle modules'
         )
     return f'slowed to {share:.0f} % of its speed because of the limits of the muscle modules'
-
-
-def _fallen(core: Controller, estimate: Array) -> str:
-    """Return a text for users about an arm that could not stay at its target.
-
-    The text states the joint that is farthest from its target, the distance, and the torque that
-    the muscles lack in the estimated posture `estimate` [rad], (D,).
-    """
-    mae, robot = core.mae, core.robot
-    error = core.activities.follower.progress.error
-    assert mae is not None  # the arm has moved, which requires a network
-    joint = int(np.abs(error / robot.kinematics.radian).argmax())
-    distance = f'{abs(error[joint]):.2f} {robot.units[joint].theta}'
-    text = f'{robot.joints[joint]} rests {distance} away from its target'
-    missing = reach.lacking(robot, mae, estimate)
-    if not missing:
-        return text
-    return f'{text}; in this posture, the muscles lack {missing}; lift the arm by hand'

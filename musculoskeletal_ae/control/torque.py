@@ -72,6 +72,11 @@ class TorqueControl(ActivityControl):
         """End the activity; the target is kept for the next time."""
 
     @property
+    def has_arrived(self) -> bool:
+        """Whether the arm should be at its target: always, unless no gain pulls it there."""
+        return self._settings.position_gain > 0.0
+
+    @property
     def missing_torque(self) -> Array:
         """Torque [N·m], (D,), that the tensions of the last step do not provide."""
         return self._missing_torque

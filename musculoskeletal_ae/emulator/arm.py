@@ -243,6 +243,9 @@ class EmulatedArm(modules.Arm):
         placed = load.se3Action(pin.SE3(np.eye(3), self._body.effector))
         self._model.inertias[self._body.effector_joint] = self._bare_inertia + placed
 
+    def _turn_gravity(self, mount: Array) -> None:
+        self._model.gravity.linear = mount.T @ self.robot.kinematics.model.gravity.linear
+
     def _step(self) -> None:
         model, data, joint = self._model, self._data, self._joint
         if not self.robot.kinematics.tree.is_coupled:

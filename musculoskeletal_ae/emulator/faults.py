@@ -3,13 +3,15 @@
 
 A line `KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]` describes a fault, such as 'drop:0.3',
 'stuck_motor:biceps', 'bias:tension:40' or 'dead_sensor:elbow'. If the line names no muscle or
-joint, the fault affects all muscles.
+joint, the fault affects all muscles. The turn of the base (`mount_x`, `mount_y`) is no fault of the
+arm, but of its mounting: `robot.urdf` states another direction of gravity.
 """
 
 from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
+import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -17,6 +19,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.validity import QUANTITIES
 
 SPEED_LIMIT = 0.25  # largest speed of a muscle module's motor [m/s]; chosen by hand
+TURN = 6.2832  # largest turn of the base, by which it is upright again [rad]
 SPIKE_SHARE = 0.05  # fraction of the readings in which one muscle has a spike
 
 
@@ -49,6 +52,9 @@ KINDS = {
     'unzeroed': Kind('lengths have offsets of 0.4 to 1 times this size', 0.13, 1.0, 'm'),
     'slack': Kind('tendons are longer by this size', 0.05, 1.0, 'm'),
     'overheat': Kind('modules have at least this temperature', 90.0, 1e3, '°C'),
+    'saturate': Kind('tension sensors read at most this tension', 150.0, 1e4, 'N'),
+    'mount_x': Kind('the base is turned about x', np.pi, TURN, 'rad', of_muscle=False),
+    'mount_y': Kind('the base is turned about y', np.pi, TURN, 'rad', of_muscle=False),
 }
 LEGAL = 'KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]; kinds: ' + ', '.join(KINDS)
 
@@ -122,9 +128,13 @@ class Faults:
         self._reordered: Readings | None = None  # readings that are sent after the next ones
         self._queue: list[tuple[float, Readings]] = []
         # Effects on the mechanics, each (M,): relative loss of motor speed, excess length of the
-        # tendon [m], offset of the length sensor [m], minimum temperature of the housing [°C].
-        self.stuck, self.slack, self.zero, self.hot = np.zeros((4, robot.muscle_count))
+        # tendon [m], offset of the length sensor [m], minimum temperature of the housing [°C],
+        # highest reading of the tension sensor [N], to which the module reacts as well.
+        count = robot.muscle_count
+        self.stuck, self.slack, self.zero, self.hot, self.ceiling = np.zeros((5, count))
         size, sign = rng.spawn(1)[0].uniform(0.4, 1.0, (2, robot.muscle_count))
+        #: turn of the base: the rotation matrix from its frame to that of `robot.urdf`, (3, 3)
+        self.mount: Array = np.eye(3)
         self._unzeroed_factor = np.where(sign < 0.7, -1.0, 1.0) * size
         self.set([])
 
@@ -143,15 +153,25 @@ class Faults:
         if self._delay() != delay:  # queued readings would arrive between newer ones
             self._queue.clear()
         self.stuck[:] = self.slack[:] = self.zero[:] = 0.0
-        self.hot[:] = -np.inf
+        self.hot[:], self.ceiling[:] = -np.inf, np.inf
         for fault in self._of('winch_speed'):
             self.stuck[fault.which] = 1.0 - fault.size / SPEED_LIMIT
         for fault in self._of('stuck_motor'):
             self.stuck[fault.which] = 1.0
-        for kind, sizes in (('slack', self.slack), ('unzeroed', self.zero), ('overheat', self.hot)):
+        sizes_of = {
+            'slack': self.slack,
+            'unzeroed': self.zero,
+            'overheat': self.hot,
+            'saturate': self.ceiling,
+        }
+        for kind, sizes in sizes_of.items():
             for fault in self._of(kind):
                 sizes[fault.which] = fault.size
         self.zero *= self._unzeroed_factor
+        self.mount = np.eye(3)
+        for fault in self._of('mount_x', 'mount_y'):
+            axis = np.array([fault.kind == 'mount_x', fault.kind == 'mount_y', False], dtype=float)
+            self.mount = self.mount @ pin.exp3(fault.size * axis)
 
     def _of(self, *names: str) -> list[Fault]:
         return [fault for fault in self._faults if fault.kind in names]
@@ -159,6 +179,7 @@ class Faults:
     def apply(self, readings: Readings) -> Readings:
         """Return the readings with all sensor faults applied."""
         values = {name: getattr(readings, name).copy() for name in (*QUANTITIES, 'theta')}
+        values['tension'] = np.minimum(values['tension'], self.ceiling)
         for fault in self._of('bias', 'spike', 'dead_sensor', 'nan_sensor', 'freeze'):
             for name in fault.quantities:
                 value, which = values[name], fault.which

@@ -309,6 +309,7 @@ class ForeignArm(Arm):
             reason = ' '.join(str(error).split())
             raise MusculoskeletalError(f'reality {file or "foreign"}: {reason}') from error
         super().__init__(robot, seed, body.length_bias)
+        self._upright_gravity = model.opt.gravity.copy()
         if file is None or deviates:
             self._set_joint_friction()
         elif effects is not None and effects.joint_friction == 0.0:
@@ -411,6 +412,10 @@ class ForeignArm(Arm):
         self._muscle.length[which] -= memory.longer[which]
         memory.elongation[which] = self.individual.elastic.elongation(bias)[which]
         memory.slow[which], memory.loop[which] = 0.0, 0.0
+
+    def _turn_gravity(self, mount: Array) -> None:
+        turn = self._root.rotation @ mount.T @ self._root.rotation.T
+        self._model.opt.gravity[:] = turn @ self._upright_gravity
 
     def set_payload(self, mass: float) -> None:
         """Attach a mass [kg] to the hand, as a ball of 5 cm radius at the end effector."""

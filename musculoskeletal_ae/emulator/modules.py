@@ -96,6 +96,7 @@ class Command(NamedTuple):
     slack: Array  # excess length of the tendon [m]
     zero: Array  # additional offset of the length sensor [m]
     hot: Array  # minimum temperature of the housing [°C]
+    ceiling: Array  # highest reading of the tension sensor [N]
 
 
 class MuscleState(NamedTuple):
@@ -145,6 +146,7 @@ def wind(
     Returns:
         The length of tendon that was wound in [m]; negative if it was paid out.
     """
+    tension = min(tension, command.ceiling[m])
     previous, bias = muscle.reference[m], modules.tension_bias[m]
     most = min(modules.speed[m], SPEED_LIMIT * (1.0 - command.stuck[m]))
     if modules.follows_position[m] > 0.0:
@@ -198,9 +200,16 @@ def camera_reading(pose: pin.SE3, rng: np.random.Generator) -> pin.SE3:
     return pin.SE3(pose.rotation @ turn, pose.translation + shift)
 
 
-def accelerometer_reading(robot: Robot, theta: Array, link: str, rng: np.random.Generator) -> Array:
-    """Return the reading [m/s²] (3,) of an accelerometer in a link's axes while the arm rests."""
+def accelerometer_reading(
+    robot: Robot, theta: Array, link: str, rng: np.random.Generator, mount: Array | None = None
+) -> Array:
+    """Return the reading [m/s²] (3,) of an accelerometer in a link's axes while the arm rests.
+
+    `mount` is the turn of the base (`Faults.mount`), (3, 3); by default, there is none.
+    """
     turn = robot.kinematics.link_pose(theta, link).rotation
+    if mount is not None:
+        turn = mount @ turn
     held: Array = -turn.T @ robot.kinematics.model.gravity.linear
     return held + rng.normal(0.0, ACCELERATION_NOISE, 3)
 
@@ -236,10 +245,11 @@ class Arm(ABC):
         self._current_zero = rng.normal(0.0, CURRENT_ZERO, count)
         share = DRIVE_FRICTION * rng.uniform(0.5, 1.5, count)
         self._drive_friction: Array = share * robot.description.tension.limit
+        self._mount = self.faults.mount  # turn of the base that the simulation uses
         self._wrench = np.zeros(6)
         self._command = Command(
             np.zeros(robot.muscle_count), length_bias.copy(), self.faults.stuck,
-            self.faults.slack, self.faults.zero, self.faults.hot,
+            self.faults.slack, self.faults.zero, self.faults.hot, self.faults.ceiling,
         )  # fmt: skip
         self._muscle = MuscleState(*(np.zeros(robot.muscle_count) for _ in MuscleState._fields))
 
@@ -404,6 +414,9 @@ class Arm(ABC):
 
     def step(self, duration: float) -> None:
         """Advance the time by `duration` [s], rounded to whole steps of 1 ms."""
+        if self.faults.mount is not self._mount:
+            self._mount = self.faults.mount
+            self._turn_gravity(self._mount)
         for _ in range(round(duration / STEP)):
             self._age += STEP
             if self._age > self.command_timeout:
@@ -413,6 +426,10 @@ class Arm(ABC):
     @abstractmethod
     def _step(self) -> None:
         """Advance the time by one step of 1 ms."""
+
+    @abstractmethod
+    def _turn_gravity(self, mount: Array) -> None:
+        """Simulate with the weight of an arm whose base is turned by `mount` (`Faults.mount`)."""
 
     @abstractmethod
     def _raw_readings(self) -> tuple[Array, Array, Array, Array]:
@@ -466,7 +483,7 @@ class Arm(ABC):
 
     def accelerometer(self, link: str) -> Array:
         """Return the reading [m/s²] (3,) of an accelerometer on a link while the arm rests."""
-        return accelerometer_reading(self.robot, self.theta, link, self._rng)
+        return accelerometer_reading(self.robot, self.theta, link, self._rng, self.faults.mount)
 
     @abstractmethod
     def route_points(self) -> Array:

@@ -35,6 +35,7 @@ from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.length_trust import EVIDENCE_OF, Evidence, LengthTrust
 from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
+from musculoskeletal_ae.estimation.mounting import MountingCheck
 from musculoskeletal_ae.estimation.repair_check import RepairCheck
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.estimation.state_estimator import Estimate, StateEstimator
@@ -97,6 +98,7 @@ class Estimator:
         suspects: The latched finding and its verification.
         calibration: The running length calibration, or None.
         contact: The contact estimator.
+        mounting: Checks the direction of gravity.
         sample: The last sample; None before the first.
         output: Results of the last message with an estimate; None before the first, and from the
             start of a length calibration until its first estimate.
@@ -124,6 +126,7 @@ class Estimator:
         self.suspects = SuspectHandling(robot)
         self.calibration: CheckedCalibration | None = None
         self.contact = ContactEstimator(robot)
+        self.mounting = MountingCheck(robot)
         self.sample: MuscleSample | None = None
         self.output: Output | None = None
         self.measured: Array | None = None
@@ -191,6 +194,7 @@ class Estimator:
         reduced = mae.without(isolated)
         self.health.use(reduced)
         self.contact.use(reduced)
+        self.mounting.use(reduced)
         self.stream.use_transmission(reduced.transmission)
         self.state.use(mae, isolated)
         self._use_body(self.body.with_isolated(isolated))
@@ -293,6 +297,7 @@ class Estimator:
                 raise MusculoskeletalError(f'{self.cause}; {self.advice}')
             self._note(Evidence.AGREES)
         self.health.accept(range(self.robot.muscle_count))
+        self.mounting.reset()
         self._clear(self.suspects.clear(self.body.isolated))
 
     def clock_jumped_back(self) -> None:
@@ -424,6 +429,8 @@ class Estimator:
         if known and self.robot.tension_source.is_known:
             pull = sample.bone_tension * self.body.used
             contact = self.contact.step(estimate.state.theta, pull, sent_apart)
+            if self.suspects.finding is None:
+                self.mounting.step(estimate.state.theta, pull, contact.torque)
         self.output = Output(
             sample, estimate.state, estimate.covariance, estimate.anomaly, detected, contact
         )

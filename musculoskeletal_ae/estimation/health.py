@@ -12,6 +12,7 @@ from musculoskeletal_ae.estimation.detectors.frozen_sensor import FrozenSensor
 from musculoskeletal_ae.estimation.detectors.joint_disagreement import JointDisagreement
 from musculoskeletal_ae.estimation.detectors.length_jump import LengthJump
 from musculoskeletal_ae.estimation.detectors.missing_values import MissingValues
+from musculoskeletal_ae.estimation.detectors.saturated_sensor import SaturatedSensor
 from musculoskeletal_ae.estimation.detectors.thermal_drift import ThermalDrift
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.estimation.settings import Detection
@@ -56,6 +57,7 @@ class HealthMonitor:
             self.residual,
             self.joints,
             FrozenSensor(robot),
+            SaturatedSensor(robot),
             ThermalDrift(heat or Heat(robot)),
         ]
 

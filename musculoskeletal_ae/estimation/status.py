@@ -46,6 +46,8 @@ def report(core: Estimator) -> Report:
 def conditions(core: Estimator) -> tuple[Condition, ...]:
     """Return all conditions of the body and of the network."""
     present = [*_finding(core), *_changed_modules(core), *_isolated(core), *_unknown_offsets(core)]
+    if core.mounting.tilt is not None:
+        present.append(ConditionKind.OTHER_MOUNTING.condition(core.mounting.tilt.text))
     if core.state.mae is None:
         present.append(ConditionKind.NO_CHECKPOINT.condition(steps=[Step.PROVIDE_CHECKPOINT]))
     return tuple(present)

@@ -20,6 +20,9 @@ consequences:
 
     values_missing          is never latched. With `on_anomaly: isolate` the muscle is isolated
                             without a verification, because a sensor that reports NaN is faulty.
+    sensor_saturated        With `on_anomaly: isolate` the muscle is isolated without a verification
+                            and without a stop: a verification demands less tension than that at
+                            which the sensor saturates.
     lengths_jumped          concern several muscles, none of which is isolated. The length offsets
     lengths_disagree        become unreliable, and the finding stays latched until the next length
                             calibration, or until a reset while joint sensors agree with the
@@ -53,6 +56,10 @@ from musculoskeletal_ae.robot.robot import Robot
 
 ACQUITTALS = 2  # number of suspects verified as healthy after which the next one is not verified
 WITHIN = 60.0  # time during which a suspect verified as healthy counts [s]
+
+
+#: reactions to findings that leave no doubt which muscle is faulty
+AT_ONCE = Reaction.ISOLATE_AT_ONCE, Reaction.ISOLATE_ONLY
 
 
 class SuspectHandling:
@@ -104,12 +111,12 @@ class SuspectHandling:
         """
         isolated, muscle = tuple(isolated), finding.muscle
         isolates = self.settings.on_anomaly == ISOLATE
-        if finding.kind.reaction is Reaction.ISOLATE_AT_ONCE:
-            if not isolates or muscle in isolated:
-                return isolated
-            self.last_verdict = muscle, Verdict(Outcome.VALUES_MISSING)
+        if finding.kind.reaction in AT_ONCE and isolates and muscle not in isolated:
+            self.last_verdict = muscle, Verdict(Outcome(finding.kind.identifier))
             self.faults[muscle] = self.last_verdict[1]
             return (*isolated, muscle)
+        if finding.kind.reaction is Reaction.ISOLATE_ONLY:
+            return isolated
         if self.explains(finding):
             return isolated
         if self.finding is not None:

@@ -88,7 +88,9 @@ class Outcome(Enum):
     TENSION_SENSOR_FROZEN = 'tension_sensor_frozen'
     NOT_WOUND_IN = 'not_wound_in'
     TENSION_UNKNOWN = 'tension_unknown'
-    VALUES_MISSING = 'values_missing'  # isolated at once, without a verification
+    # isolated at once, without a verification
+    VALUES_MISSING = 'values_missing'
+    SENSOR_SATURATED = 'sensor_saturated'
 
 
 _TEXTS = {
@@ -101,6 +103,7 @@ _TEXTS = {
     Outcome.NOT_WOUND_IN: 'not verified, because it was not wound in',
     Outcome.TENSION_UNKNOWN: 'not verified, because its tension is unknown (tension_source: none)',
     Outcome.VALUES_MISSING: 'a sensor reports NaN instead of a number',
+    Outcome.SENSOR_SATURATED: 'its tension sensor saturates or is frozen',
 }
 
 

@@ -38,3 +38,5 @@ class Update(NamedTuple):
     error: float = 0.0
     seconds: float = 0.0  # duration of the update [s]
     device: str = 'cpu'  # device of the training
+    #: estimated joint-sensor offsets z [rad], (D,); empty if the preset estimates none
+    sensor_offset: Array = np.empty(0)

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 # `kinematics.RACK` [m].
 ROUGH_OFFSET = np.deg2rad(2.0)  # σ of z of a roughly calibrated sensor [rad]
 ACCURATE_OFFSET = 0.003  # σ of z of an accurately calibrated sensor [rad]
+#: refuse an update that finds a larger |z|: ten times σ of a roughly calibrated sensor [rad]
+LARGEST_OFFSET = 10.0 * ROUGH_OFFSET
 STOP_SPREAD = 0.01  # standard deviation of the distance between a stop and its limit [rad]
 OFFSETS = np.linspace(-4.0 * ROUGH_OFFSET, 4.0 * ROUGH_OFFSET, 281)  # grid of z [rad]
 NO_STOPS = 0.1  # probability that a joint's limits are not mechanical stops

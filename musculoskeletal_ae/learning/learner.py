@@ -29,6 +29,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
 from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR, SampleCollector
 from musculoskeletal_ae.learning.job import Update
+from musculoskeletal_ae.learning.joint_stops import LARGEST_OFFSET
 from musculoskeletal_ae.learning.keeper import CheckpointKeeper
 from musculoskeletal_ae.learning.offset_history import HELD_TIME, OffsetHistory
 from musculoskeletal_ae.learning.report import learner_conditions, learner_report
@@ -336,6 +337,8 @@ class Learner:
             self.scheduler.note_news()
             return
         mae = self.scheduler.finish(update)
+        if self.impossible_offsets:
+            return
         for muscle, newest in update.changed:
             self._forget(muscle, newest)
         if self.keeper.is_accepted(mae):
@@ -438,6 +441,24 @@ class Learner:
         """Whether lengths have jumped without a reaction of the estimator."""
         has_jumped = self.collector.has_jumped and self.body.offsets.known
         return has_jumped and not self.collector.is_anomaly
+
+    @property
+    def impossible_offsets(self) -> dict[str, str]:
+        """Offsets that the joint sensors cannot have, by the name of the joint, as texts.
+
+        The last update has found them and is therefore refused. Samples with wrong angles, or
+        lengths with wrong offsets, lead to such an offset.
+        """
+        if self.last_update is None or self.last_update.sensor_offset.size == 0:
+            return {}
+        offset, radian = self.last_update.sensor_offset, self.robot.kinematics.radian
+        return {
+            self.robot.joints[j]: (
+                f'{offset[j]:.2f} {self.robot.units[j].theta}, largest '
+                f'{LARGEST_OFFSET * radian[j]:.2f}'
+            )
+            for j in np.flatnonzero(np.abs(offset) > LARGEST_OFFSET * radian)
+        }
 
     @property
     def idle_time(self) -> float:

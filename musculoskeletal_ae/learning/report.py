@@ -36,6 +36,9 @@ def _failures(learner: Learner) -> Iterator[Condition]:
         yield kind.TRAINING_FAILED.condition(problem)
     if problem := learner.keeper.trouble:
         yield kind.STATE_NOT_SAVED.condition(problem)
+    if offsets := learner.impossible_offsets:
+        detail = ', '.join(f'{joint} ({text})' for joint, text in offsets.items())
+        yield kind.SENSOR_OFFSET_IMPOSSIBLE.condition(detail, offsets)
     if learner.has_unsettled_jump:
         yield kind.LENGTHS_NOT_LEARNED.condition()
 

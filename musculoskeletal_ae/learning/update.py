@@ -103,6 +103,7 @@ class BodyUpdater(Updater):
             fit.noise,
             contradicted if alone else (),
             () if alone else tuple(muscle for muscle, _ in contradicted),
+            sensor_offset=self.body.zero.copy(),
         )
 
     def _at_angles(self, read: Observations | None) -> Observations | None:

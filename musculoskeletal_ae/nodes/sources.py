@@ -60,19 +60,22 @@ NAMING = 1.0  # longest time for which the graph knows a publisher but not its n
 TWIN_SILENCE = 3.0  # time without a report after which a second node counts as stopped [s]
 LINK_SILENCE = 3.0  # time without a message after which a link counts as having no sensor [s]
 LINK_PATIENCE = 3.0  # time for which there may be more publishers than links [s]
-UNNAMED = '_NODE_NAME_UNKNOWN_'  # name that the graph returns for a node that it does not know
+#: name that the graph returns for a node of which it knows only a publisher
+UNNAMED = '_NODE_NAME_UNKNOWN_'
+#: how messages to users call such a node
+NAMELESS = 'a node that has not announced its name yet'
 
 
 class Publisher(NamedTuple):
     """One publisher in the ROS graph."""
 
-    node: str  # full name
+    node: str  # full name, or NAMELESS
     identity: bytes
 
     @property
     def is_named(self) -> bool:
         """Whether the graph knows the publisher's node."""
-        return not self.node.endswith(UNNAMED)
+        return self.node != NAMELESS
 
 
 class Authorship:
@@ -116,7 +119,8 @@ class Authorship:
         old = [each for each in present if now - self._first_seen[each.identity] >= LEASE]
         if len(nodes) > 1 or turns - before >= TURNS or len(old) > 1:
             names = (
-                f'{count} nodes {node}' if count > 1 else node for node, count in nodes.items()
+                f'{count} nodes {node}' if count > 1 and node != NAMELESS else node
+                for node, count in nodes.items()
             )
             self.intruders = ' and '.join(sorted(names))
         self.is_certain = not fresh
@@ -188,6 +192,11 @@ class LinkSensors:
             self.problem = f'{what}; stop all but one publisher for each link'
 
 
+def full_name(namespace: str, name: str) -> str:
+    """Return the full name of a node of the graph, or NAMELESS while the graph has no name."""
+    return NAMELESS if name == UNNAMED else f'{namespace.rstrip("/")}/{name}'
+
+
 def publishers_of(node: Node, topic: str) -> list[Publisher]:
     """Return the publishers of a topic if there are at least two, otherwise [].
 
@@ -198,7 +207,7 @@ def publishers_of(node: Node, topic: str) -> list[Publisher]:
     if not topic or node.count_publishers(topic) < 2:
         return []
     return [
-        Publisher(f'{each.node_namespace.rstrip("/")}/{each.node_name}', bytes(each.endpoint_gid))
+        Publisher(full_name(each.node_namespace, each.node_name), bytes(each.endpoint_gid))
         for each in node.get_publishers_info_by_topic(topic)
     ]
 

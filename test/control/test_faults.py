@@ -115,6 +115,8 @@ TOLERATED = {
     f'spike:length:{MUSCLE}': 1.0,
     f'spike:tension:{MUSCLE}:400': 1.0,
     'spike:temperature': 1.0,
+    'mount_x:0.5': 1.0,
+    'mount_y:0.5': 1.0,
     f'overheat:{MUSCLE}': 2.5,  # 90 °C: the controller only limits the tension of this muscle
 }
 thorough = pytest.mark.thorough
@@ -133,6 +135,7 @@ OTHERS = [
     pytest.param(f'dead_sensor:tension:{MUSCLE}', 2.5, None, marks=thorough),
     (f'stuck_motor:{MUSCLE}', 1.5, None),
     (f'slack:{MUSCLE}', 1.5, None),
+    pytest.param(f'saturate:{MUSCLE}:60', 1.5, None, marks=thorough),
     (f'winch_speed:{MUSCLE}:0.009', 1.5, None),
     # The cause is either an implausible length or a jump.
     (f'unzeroed:{MUSCLE}:0.1', 1.0, 'length'),

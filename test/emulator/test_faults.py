@@ -195,3 +195,28 @@ def test_every_kind_of_fault_can_be_set_by_name_and_repaired(name, arm, robot):
     assert arm.faults.deliver(arm.sense(), 100.0)
     assert not arm.faults.stuck.any() and not arm.faults.slack.any()
     assert np.isfinite(arm.theta).all()
+
+
+@pytest.mark.parametrize('reality', ['kin', 'foreign'])
+def test_an_arm_mounted_upside_down_falls_upwards_and_its_accelerometer_shows_it(robot, reality):
+    fallen, readings = [], []
+    for lines in ([], ['mount_y:3.1416'], []):
+        arm = make_arm(robot, 1, reality)
+        arm.set_faults(['mount_x'])
+        arm.set_faults(lines)
+        arm.set_ruptured(robot.muscles)
+        arm.step(2.0)
+        fallen.append(robot.kinematics.end_effector_pose(arm.theta).translation[2])
+        readings.append(arm.accelerometer('torso')[2])
+    assert fallen[1] > fallen[0] + 0.2 and fallen[2] == pytest.approx(fallen[0])
+    assert readings[0] > 9.0 and readings[1] < -9.0
+
+
+def test_a_saturated_tension_sensor_reads_no_more_than_its_size(arm, robot):
+    name = robot.muscles[MUSCLE]
+    arm.set_faults([f'saturate:{name}:20'])
+    arm.command_length(to_mid_range(robot, 80.0))
+    arm.step(1.0)
+    assert arm.tension[MUSCLE] > 30.0
+    read = arm.sense().tension
+    assert read[MUSCLE] == 20.0 and np.delete(read, MUSCLE).max() > 30.0

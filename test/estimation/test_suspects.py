@@ -28,6 +28,8 @@ def suspects(robot):
         (ConditionKind.LENGTH_JUMP, 'isolate', True, (2,), True),
         (ConditionKind.VALUES_MISSING, 'stop', False, (), False),
         (ConditionKind.VALUES_MISSING, 'isolate', False, (2,), False),
+        (ConditionKind.SENSOR_SATURATED, 'stop', True, (), False),
+        (ConditionKind.SENSOR_SATURATED, 'isolate', False, (2,), False),
     ],
 )
 def test_the_consequences_of_each_finding(suspects, kind, on_anomaly, latched, isolated, verified):

@@ -26,6 +26,7 @@ from musculoskeletal_ae.nodes.sources import (
     LinkSensors,
     Publisher,
     Twins,
+    full_name,
 )
 from musculoskeletal_ae.reception import Stamps
 from musculoskeletal_ae.signals.body_state import Trust
@@ -57,10 +58,11 @@ def test_two_nodes_of_one_name_are_intruders_once_they_take_turns_or_outlast_the
 
 
 def test_a_publisher_without_a_name_is_waited_for_and_then_an_intruder():
-    unnamed = [FIRST, Publisher(f'/{UNNAMED}', b'3')]
+    unnamed = [FIRST, Publisher(full_name('_NODE_NAMESPACE_UNKNOWN_', UNNAMED), b'3')]
     early = looked(unnamed)
     assert (early.intruders, early.is_certain) == ('', False)
-    assert looked(unnamed, (0, 0), (0.0, NAMING)).intruders
+    late = looked(unnamed, (0, 0), (0.0, NAMING)).intruders
+    assert late == '/estimator and a node that has not announced its name yet'
 
 
 def report(node, identity):

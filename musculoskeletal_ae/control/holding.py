@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks that an arm which holds a posture is where it was asked to be.
+
+    the arm is away from its target:  max_j |θ_target − θ_estimated|_j > AWAY for LASTING
+
+"Holding" is a claim about the posture, not about the commands. The distance counts from the end of
+the motion. While the arm moves, and where a user asks for a torque besides that of the weight, no
+posture is claimed.
+
+AWAY is larger than the distances that friction leaves on healthy arms, see
+doc/explanation/control_and_safety.md. Causes of larger distances are a payload or a contact, weak
+or lost muscles, or a base that is mounted otherwise than in `robot.urdf`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control import reach
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+#: report a joint that rests further than this away from its target [rad]; for prismatic joints
+#: times `kinematics.RACK` [m]
+AWAY = 0.5
+LASTING = 5.0  # report it after this time [s]
+#: what may be the cause where nothing more is known
+POSSIBLE_CAUSES = (
+    'possible causes: a payload or contact, tendon friction, a muscle that pulls less than its '
+    'sensor reads, or a base that is mounted otherwise than in robot.urdf'
+)
+
+
+class HoldingCheck:
+    """Compares the estimated posture of a resting arm with its target.
+
+    Attributes:
+        distance: θ_target − θ_estimated [rad], (D,), while the arm rests at the end of a motion;
+            None otherwise.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self.distance: Array | None = None
+        self._away_time = 0.0  # time for which the arm has been away from its target [s]
+
+    def step(self, target: Array | None, theta: Array | None, dt: float) -> None:
+        """Compare target and estimate, θ [rad] (D,) each, dt [s] after the last call.
+
+        Without a target, the arm does not claim to hold a posture.
+        """
+        self.distance = None if target is None or theta is None else target - theta
+        is_away = self.largest > AWAY
+        self._away_time = self._away_time + dt if is_away else 0.0
+
+    @property
+    def largest(self) -> float:
+        """Distance of the joint that is farthest from its target [rad]; NaN without a distance.
+
+        Distances of prismatic joints are divided by `kinematics.RACK`.
+        """
+        if self.distance is None:
+            return math.nan
+        return float(np.abs(self.distance / self._robot.kinematics.radian).max())
+
+    @property
+    def is_away(self) -> bool:
+        """Whether a joint has rested further than AWAY from its target for the time LASTING."""
+        return self._away_time > LASTING
+
+    @property
+    def farthest(self) -> str:
+        """The joint that is farthest from its target, with its distance; '' without a distance."""
+        if self.distance is None:
+            return ''
+        joint = int(np.abs(self.distance / self._robot.kinematics.radian).argmax())
+        unit = self._robot.units[joint].theta
+        return f'{self._robot.joints[joint]} {abs(self.distance[joint]):.2f} {unit}'
+
+
+def away_text(check: HoldingCheck, robot: Robot, mae: Mae, theta: Array) -> str:
+    """Return a sentence on an arm that is away from its target, with the causes that are evident.
+
+    Args:
+        check: The check of this arm.
+        robot: The robot, without its isolated muscles.
+        mae: The network.
+        theta: The estimated posture [rad], (D,).
+    """
+    text = f'{check.farthest} away'
+    cause = POSSIBLE_CAUSES
+    if missing := reach.lacking(robot, mae, theta):
+        without = f'without {robot.names(robot.isolated)}, ' if robot.isolated else ''
+        lift = '; lift the arm by hand' if robot.isolated else ''
+        cause = f'{without}in this posture, the muscles lack {missing}{lift}'
+    return f'{text}; {cause}'

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Detects a tension sensor that saturates below the tension limit.
+
+    T_read = min(T + noise, T_sat),   T_sat < T_limit
+
+The readings of a working sensor contain noise, also where a motor can pull no harder. Readings that
+stay exactly the same, although this sensor's readings usually vary, are therefore clipped: by the
+sensor, its amplifier or the driver. A muscle is reported in two cases:
+
+- Its readings have been clipped twice at the same value, were lower in between, and have not been
+  higher. A frozen sensor is not lower in between (`frozen_sensor.py`).
+- Its reading stays the same although its module winds in. The sensor may then also be frozen.
+
+Drivers whose readings often repeat are not checked, and neither are
+messages that repeat the readings of most muscles, as those of a simulator without noise at rest.
+Values near T_bias are not checked, because an ideal module may hold exactly T_bias.
+
+Such a muscle is no longer safe: while its command demands more than T_sat, the module winds in
+without seeing the tension grow, and neither the limiter nor the watchdog sees it. Emulated arms of
+which all sensors saturated at 120 to 150 N reached 350 to 420 N, with a limit of 200 N. A sensor
+that saturates above T_limit is no fault, because the limiter keeps the readings below.
+"""
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
+from musculoskeletal_ae.robot.robot import Robot
+
+WINDING_TIME = 0.5  # report a module that winds in after its reading was the same for this long [s]
+WOUND = 0.005  # and after it has wound in by this length meanwhile [m]
+LASTING = 0.15  # count a visit to a value after the reading has stayed exactly there this long [s]
+VISITS = 2  # report a muscle after this number of visits at the same value
+SAME = 2e-3  # two visits are at the same value if they differ by less than this share of it
+BELOW = 0.1  # count another visit only after the reading was lower by this share of the value
+#: forget a value after the reading has been higher for this long [s]; a spike is shorter
+BEYOND = 0.05
+#: share of the messages in which a reading below the highest ones differs from the previous one
+VARYING = 0.5
+MEMORY = 10.0  # time constant of this share [s]
+LEAST = 1.5  # lowest T_sat, relative to T_bias
+
+
+class SaturatedSensor(Detector):
+    """Reports a muscle whose tension readings pile up at one highest value below the limit."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot, count = robot, robot.muscle_count
+        self._limit = robot.description.tension.limit
+        self._bias = robot.description.tension.bias
+        self._highest: Array = np.zeros(count)  # highest reading of two successive ones [N]
+        #: share of the messages below it in which the reading differed from the previous one
+        self._varying: Array = np.zeros(count)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all visits."""
+        count = self._robot.muscle_count
+        self._before: Array = np.full(count, np.nan)  # reading of the previous message [N]
+        self._unchanged: Array = np.zeros(count)  # time without a change of the reading [s]
+        self._length: Array = np.zeros(count)  # l when the reading changed last [m]
+        self._beyond: Array = np.zeros(count)  # time for which the reading has been higher [s]
+        self._value: Array = np.full(count, np.nan)  # value of the last visit [N]
+        self._visits: Ints = np.zeros(count, dtype=np.int64)
+        self._has_left = np.ones(count, dtype=bool)  # whether it was lower since the last visit
+
+    def step(self, observation: Observation) -> Finding | None:
+        """Count the visits of all muscles; report the first one with enough visits, or None."""
+        sample, dt, value = observation.sample, observation.dt, self._value
+        reading = sample.newest[1]
+        is_same = reading == self._before
+        if 2 * np.count_nonzero(is_same) > len(is_same):  # a repeated message
+            return None
+        self._highest = np.fmax(self._highest, np.minimum(reading, self._before))
+        self._before = reading
+        self._unchanged = (self._unchanged + dt) * is_same
+        self._length = np.where(is_same, self._length, sample.length)
+        is_below = ~(reading >= (1.0 - SAME) * self._highest)
+        self._varying += dt / MEMORY * is_below * (~is_same - self._varying)
+        self._has_left |= reading < (1.0 - BELOW) * value
+        self._beyond = (self._beyond + dt) * (reading > (1.0 + SAME) * value)
+        is_clipped = (self._unchanged >= LASTING) & (self._varying > VARYING) & sample.usable
+        is_clipped &= (reading > LEAST * self._bias) & (reading < self._limit)
+        at_value = np.abs(reading - value) <= SAME * value
+        again, new = is_clipped & at_value & self._has_left, is_clipped & ~at_value
+        is_wrong = self._beyond > BEYOND
+        self._visits = np.where(new, 1, self._visits + again) * ~is_wrong
+        self._value = np.where(is_wrong, np.nan, np.where(new, reading, value))
+        self._has_left = (self._has_left & ~(again | new)) | is_wrong
+        wound = is_clipped & (self._unchanged >= WINDING_TIME)
+        wound &= self._length - sample.length > WOUND
+        if wound.any():
+            muscle = int(wound.argmax())
+            text = f'its tension stays at exactly {reading[muscle]:.0f} N while its module winds in'
+            evidence = f'{text}: the sensor saturates or is frozen'
+            return Finding(muscle, ConditionKind.SENSOR_SATURATED, evidence)
+        if self._visits.max() < VISITS:
+            return None
+        muscle = int(self._visits.argmax())
+        evidence = f'its tension sensor saturates at {self._value[muscle]:.0f} N'
+        return Finding(muscle, ConditionKind.SENSOR_SATURATED, evidence)

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks from tensions whether gravity acts in the direction that `robot.urdf` states.
+
+The torques of weight, springs, motion and muscles are in balance. The weight's torque is linear in
+the vector of gravity, so the balance of the joints in several postures shows its direction u:
+
+    r_j(u, m) = (Y(θ) u ‖g‖)_j + m (Y_hand(θ) u ‖g‖)_j − (Y(θ) g − τ_ext)_j
+    S(u, m)   = Σ_postures Σ_j ½ (ν + 1) ln(1 + (r_j / σ_j)² / ν),   σ_j = NOISE Σ_m |G_mj| T_m
+    evidence  = min S(u, m) over u within UPRIGHT of g  −  min S(u, m) over all u
+
+Y(θ) u is the torque that holds the weight of the arm where gravity is u, Y_hand that of a mass of
+1 kg in the hand, g the gravity of `robot.urdf`, and τ_ext the external torque that the contact
+estimator computes with g (`estimation/contact.py`). u are directions on a sphere, and m masses of a
+payload. A payload is thus no evidence: it acts in the direction of gravity. S is the negative
+logarithm of a Student likelihood, because friction and pushes cause large residuals now and then.
+
+A posture counts only if it differs from the last one that counted. An arm that stands still, with
+the same friction all the time, therefore adds no evidence. At the stop of a joint, the muscles need
+not hold the weight: a residual counts there only if the stop would have to pull.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+DIRECTIONS = 162  # number of directions u, which are about 16° apart
+#: masses m of a payload, as shares of the mass of the moving links
+PAYLOADS = 0.0, 0.3, 0.6, 1.2
+UPRIGHT = 25.0  # angle up to which a direction counts as that of `robot.urdf` [°]
+#: σ_j as a share of the muscles' absolute torques at the joint: the share with which S is smallest
+NOISE = 0.08, 0.16, 0.32
+LEAST_NOISE = 0.1  # smallest σ_j [N·m]
+FREEDOM = 4.0  # ν: with larger residuals, a posture counts less
+#: motion of a joint after which a posture counts again [rad]; for prismatic joints times
+#: `kinematics.RACK` [m]
+MOVED = 0.2
+#: distance from a limit below which a joint may rest at its stop [rad]; for prismatic joints times
+#: `kinematics.RACK` [m]
+AT_STOP = 0.12
+MEMORY = 100.0  # number of postures after which the weight of a posture has decreased to 1/e
+ENOUGH = 30  # number of postures from which the evidence is judged
+CERTAIN = 25.0  # report another direction of gravity from this evidence on
+CLEARED = 8.0  # end the report when the evidence is below this value
+
+
+class Tilt(NamedTuple):
+    """A direction of gravity that differs from the one that `robot.urdf` states.
+
+    Attributes:
+        angle: Angle between the two directions [°].
+        direction: Direction of gravity in the frame of the root link, a unit vector, (3,).
+        evidence: Logarithm of the likelihood ratio.
+    """
+
+    angle: float
+    direction: Array
+    evidence: float
+
+    @property
+    def text(self) -> str:
+        """A sentence for users."""
+        x, y, z = self.direction
+        return (
+            f'the tensions show that gravity acts along ({x:.1f}, {y:.1f}, {z:.1f}) of the root '
+            f'link, about {self.angle:.0f}° away from the direction in robot.urdf'
+        )
+
+
+def directions(down: Array) -> Array:
+    """Return unit vectors in all directions, (DIRECTIONS + 1, 3), the first one along `down`."""
+    place = np.arange(DIRECTIONS) + 0.5
+    polar = np.arccos(1.0 - 2.0 * place / DIRECTIONS)
+    turn = np.pi * (1.0 + np.sqrt(5.0)) * place
+    sphere = np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)
+    return np.vstack([down / np.linalg.norm(down), np.transpose(sphere)])
+
+
+class MountingCheck:
+    """Compares the direction of gravity with the one that `robot.urdf` states.
+
+    `use` must be called before `step`.
+
+    Attributes:
+        tilt: The direction of gravity, if it certainly differs from the one of `robot.urdf`.
+        evidence: Logarithm of the likelihood ratio between the best direction and the best one near
+            that of `robot.urdf`.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot, kinematics = robot, robot.kinematics
+        self._model = pin.Model(kinematics.model)
+        self._data = self._model.createData()
+        self._gravity: Array = kinematics.model.gravity.linear.copy()
+        self._strength = float(np.linalg.norm(self._gravity))
+        self._directions = directions(self._gravity)
+        cosine = self._directions @ self._directions[0]
+        self._angles = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        moving = sum(float(inertia.mass) for inertia in self._model.inertias[1:])
+        self._payloads = moving * np.array(PAYLOADS)
+        self._is_learned = False
+        self.reset()
+
+    def use(self, mae: Mae) -> None:
+        """Use another network; without statistics of the learned arm, nothing is checked."""
+        self._mae = mae
+        self._is_learned = mae.anomaly is not None and mae.anomaly.calibrated
+
+    def reset(self) -> None:
+        """Discard all evidence, for example after a reset by the user."""
+        self.tilt: Tilt | None = None
+        self.evidence = 0.0
+        self._count = 0
+        self._counted_at = np.full(self._robot.joint_count, np.inf)  # θ that counted last
+        shape = len(NOISE), len(self._payloads), len(self._directions)
+        self._sum = np.zeros(shape)  # S
+
+    def step(self, theta: Array, tension: Array, torque: Array) -> None:
+        """Update the evidence with one message.
+
+        Args:
+            theta: Joint angles θ [rad], (D,).
+            tension: Bone-side tensions [N], (M,).
+            torque: External torque τ_ext [N·m], (D,); 0 where a stop may be the only cause.
+        """
+        robot = self._robot
+        radian = robot.kinematics.radian
+        moved = np.abs(theta - self._counted_at) / radian
+        if not self._is_learned or not moved.max() > MOVED or not np.isfinite(torque).all():
+            return
+        self._counted_at = theta
+        load = tension @ np.abs(self._mae.muscle_jacobian(theta, tension))
+        noise = np.maximum(load, LEAST_NOISE / radian)
+        of_arm, of_hand = self._regressors(theta)
+        weight = of_arm @ self._gravity - torque  # torque that the muscles hold
+        u = self._strength * self._directions.T
+        held = (of_arm + self._payloads[:, None, None] * of_hand) @ u  # (payloads, D, directions)
+        residual = (held - weight[:, None]) / noise[:, None]
+        at_stop = self._at_stop(theta)
+        residual[:, at_stop[0]] = np.minimum(residual[:, at_stop[0]], 0.0)
+        residual[:, at_stop[1]] = np.maximum(residual[:, at_stop[1]], 0.0)
+        residual[:, torque == 0.0] = 0.0
+        joints = np.count_nonzero(torque)
+        cost = np.array([self._cost(residual / share) + joints * np.log(share) for share in NOISE])
+        self._sum = (1.0 - 1.0 / MEMORY) * self._sum + cost
+        self._count += 1
+        self._judge()
+
+    @staticmethod
+    def _cost(residual: Array) -> Array:
+        cost: Array = 0.5 * (FREEDOM + 1.0) * np.log1p(residual**2 / FREEDOM).sum(axis=1)
+        return cost
+
+    def _judge(self) -> None:
+        best = self._sum.min(axis=(0, 1))  # by direction
+        self.evidence = float(best[self._angles <= UPRIGHT].min() - best.min())
+        if self._count < ENOUGH:
+            return
+        if self.evidence < CLEARED:
+            self.tilt = None
+        elif self.evidence > CERTAIN or self.tilt is not None:
+            place = int(best.argmin())
+            angle = float(self._angles[place])
+            self.tilt = Tilt(angle, self._directions[place], self.evidence)
+
+    def _at_stop(self, theta: Array) -> tuple[Bools, Bools]:
+        """Return which joints may rest at their lower and at their upper stop, (D,) each."""
+        robot = self._robot
+        near = AT_STOP * robot.kinematics.radian
+        return theta < robot.lower + near, theta > robot.upper - near
+
+    def _regressors(self, theta: Array) -> tuple[Array, Array]:
+        """Return Y of the arm and of a mass of 1 kg in the hand, (D, 3) each."""
+        kinematics, model = self._robot.kinematics, self._model
+        angles, columns = kinematics.tree.angles(theta), []
+        for unit in np.eye(3):
+            model.gravity.linear = unit
+            torque = np.array(pin.computeGeneralizedGravity(model, self._data, angles))
+            columns.append(kinematics.tree.of_theta(torque, theta))
+        of_hand = -kinematics.end_effector_jacobian(theta)[:3].T
+        return np.column_stack(columns), of_hand

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Another mounting than that of robot.urdf is found, and payloads, pushes and errors are none."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from exact_mae import ExactMae
+
+from musculoskeletal_ae.estimation.mounting import MountingCheck
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import TensionProgramme
+
+ARM = Robot.load('musashi_left_arm')
+DOWN = np.array([0.0, 0.0, -9.81])
+
+
+class Exploring:
+    """An arm at rest in one random posture after the other, with errors of its tensions."""
+
+    def __init__(self, gravity, payload=0.0, push=0.0, seed=0):
+        self.gravity, self.payload, self.push = gravity, payload, push
+        self.mae, self.rng = ExactMae(ARM), np.random.default_rng(seed)
+        self.mae.anomaly = SimpleNamespace(calibrated=True)
+        self.model = pin.Model(ARM.kinematics.model)
+        self.model.gravity.linear = gravity
+        self.gain = 1.0 + 0.1 * self.rng.standard_normal(ARM.muscle_count)
+        self.check = MountingCheck(ARM)
+        self.check.use(self.mae)
+
+    def rest(self, times=1):
+        kinematics = ARM.kinematics
+        theta = ARM.random_postures(1, self.rng)[0]
+        weight = pin.computeGeneralizedGravity(
+            self.model, self.model.createData(), kinematics.tree.angles(theta)
+        )
+        force = self.payload * self.gravity + self.push * self.rng.standard_normal(3)
+        weight = weight - kinematics.end_effector_jacobian(theta)[:3].T @ force
+        jacobian = self.mae.muscle_jacobian(theta, np.full(ARM.muscle_count, 60.0))
+        tension = TensionProgramme(jacobian, weight, 10.0, 400.0).nearest(60.0)
+        if not np.allclose(-tension @ jacobian, weight, atol=0.1):  # the muscles cannot hold it
+            return
+        read = tension * self.gain + self.rng.normal(0.0, 5.0, len(tension))
+        torque = kinematics.holding_torque(theta) + read @ jacobian
+        for _ in range(times):
+            self.check.step(theta, read, torque)
+
+
+@pytest.mark.parametrize('angle', [45.0, 90.0, 180.0])
+@pytest.mark.parametrize('axis', [0, 1])
+def test_a_turned_base_is_found_with_the_direction_of_gravity(angle, axis):
+    gravity = pin.exp3(np.radians(angle) * np.eye(3)[axis]).T @ DOWN
+    arm = Exploring(gravity)
+    for _ in range(60):
+        arm.rest()
+    tilt = arm.check.tilt
+    assert tilt.angle == pytest.approx(angle, abs=20.0)
+    assert tilt.direction @ gravity / 9.81 > np.cos(np.radians(25.0))
+    assert 'robot.urdf' in tilt.text
+
+
+@pytest.mark.parametrize(('payload', 'push'), [(0.0, 0.0), (3.6, 0.0), (0.0, 15.0)])
+@pytest.mark.parametrize('seed', range(3))
+def test_neither_a_payload_nor_pushes_are_another_mounting(payload, push, seed):
+    arm = Exploring(DOWN, payload, push, seed)
+    for _ in range(150):
+        arm.rest()
+        assert arm.check.tilt is None
+
+
+def test_an_arm_that_stands_still_adds_no_evidence():
+    arm = Exploring(-DOWN)
+    for _ in range(5):
+        arm.rest(times=500)
+    assert arm.check.tilt is None
