@@ -2,6 +2,7 @@
 """Lets mishaps of a laboratory happen, and checks what the nodes state and advise.
 
     python -m bench mishaps [--seeds 0,1,2,3,4] [--reality kin,foreign] [--kinds NAME,…] [--quick]
+    python -m bench mishaps --graph    # mishaps of nodes and topics, on the real ROS graph
     python -m bench mishaps --page doc/results/mishaps.md     # write the page from the results
 
 An individual explores and learns for LEARNING seconds in the laboratory of `bench/lab.py`. Each
@@ -55,6 +56,7 @@ from musculoskeletal_ae.control.exploration_steps import holdable_postures
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.remedy import Step
@@ -103,6 +105,12 @@ explores again without any condition, or when the patience of the operator ends.
   rad more.
 - **error**: medians of the true error [rad] before the mishap and after the end.
 - **tension**: highest true tension in multiples of `tension.limit`."""
+
+
+GRAPH = 'graph'  # emulator model of results on the ROS graph
+GRAPH_TEXT = """\
+`python -m bench mishaps --graph`: the nodes run as processes on an emulated arm26. A statement is
+the status line. The operator is that of `bench attack`."""
 
 
 class Course:
@@ -467,6 +475,30 @@ def run_healthy(robot: Robot, folder: Path, seed: int, reality: str, hours: floa
     return len(course.false)
 
 
+def run_graph(folder: Path, seeds: Iterable[int], again: bool) -> None:
+    """Play the mishaps on the ROS graph that have no result yet, once for each seed."""
+    from bench.mishaps_on_graph import GRAPH_MISHAPS, run
+
+    network = folder / 'graph.safetensors'
+    if not network.exists():
+        checkpoint.save(initial_mae(Robot.load('arm26')).mae, network)
+    for seed in seeds:
+        done = {
+            each['mishap']
+            for each in results(folder)
+            if (each['seed'], each['reality']) == (seed, GRAPH) and not again
+        }
+        kinds = [each.name for each in GRAPH_MISHAPS if each.name not in done]
+
+        def keep(result: dict[str, Any], file: Path = folder / f'{GRAPH}_{seed}.jsonl') -> None:
+            with file.open('a', encoding='utf-8') as stream:
+                stream.write(json.dumps(result, ensure_ascii=False) + '\n')
+            print(line(result), flush=True)
+
+        if kinds:
+            run(folder / f'{GRAPH}_{seed}', network, seed, kinds, keep)
+
+
 # -- table -----------------------------------------------------------------------------------------
 
 
@@ -509,6 +541,16 @@ def totals(of: Sequence[dict[str, Any]]) -> tuple[float, int, float]:
     )
 
 
+def graph_table(of: Sequence[dict[str, Any]]) -> str:
+    """Return the table of the mishaps on the ROS graph in Markdown."""
+    lines = ['| mishap | ' + ' | '.join(PAGE_FACTS) + ' |', '|---' * 7 + '|']
+    mine = [each for each in of if each['reality'] == GRAPH]
+    for name in dict.fromkeys(each['mishap'] for each in mine):
+        cells = row([each for each in mine if each['mishap'] == name])
+        lines.append('| ' + ' | '.join([name, *cells]) + ' |')
+    return '\n'.join(lines)
+
+
 def table(of: Sequence[dict[str, Any]], realities: Sequence[str]) -> str:
     """Return the table of all mishaps in Markdown."""
     heads = [f'{reality}: {fact}' for reality in realities for fact in PAGE_FACTS]
@@ -522,6 +564,12 @@ def table(of: Sequence[dict[str, Any]], realities: Sequence[str]) -> str:
     return '\n'.join(lines)
 
 
+def _place(name: str) -> int:
+    """Return the place of a mishap in tables; those on the graph come last."""
+    order = [mishap.name for mishap in MISHAPS]
+    return order.index(name) if name in order else len(order)
+
+
 def _false_statements(of: Iterable[dict[str, Any]]) -> str:
     """Return the false statements, one for each mishap and identifier, in Markdown."""
     first: dict[tuple[str, str], tuple[str, int]] = {}
@@ -529,8 +577,7 @@ def _false_statements(of: Iterable[dict[str, Any]]) -> str:
         for name, what in each['false'].items():
             text, count = first.get((each['mishap'], name), (what['text'], 0))
             first[each['mishap'], name] = text, count + 1
-    order = [mishap.name for mishap in MISHAPS]
-    ordered = sorted(first.items(), key=lambda item: (order.index(item[0][0]), item[0][1]))
+    ordered = sorted(first.items(), key=lambda item: (_place(item[0][0]), item[0][1]))
     rows = [
         f'| {mishap} | `{name}` | {count} | {text.replace("|", "/")[:240]} |'
         for (mishap, name), (text, count) in ordered
@@ -541,8 +588,7 @@ def _false_statements(of: Iterable[dict[str, Any]]) -> str:
 def _bad_ends(of: Iterable[dict[str, Any]]) -> str:
     """Return the cases that did not end well, in Markdown."""
     rows = []
-    order = [mishap.name for mishap in MISHAPS]
-    for each in sorted(of, key=lambda each: order.index(each['mishap'])):
+    for each in sorted(of, key=lambda each: _place(each['mishap'])):
         if each['well']:
             continue
         error = f'{each["error before"]:.3f} → {each["error after"]:.3f}'
@@ -559,6 +605,7 @@ def _bad_ends(of: Iterable[dict[str, Any]]) -> str:
 def page(of: Sequence[dict[str, Any]], realities: Sequence[str]) -> str:
     """Return the page of results in Markdown."""
     soon, false, well = totals(of)
+    on_graph = [each['reality'] == GRAPH for each in of]
     commit = subprocess.run(
         ['git', 'log', '-1', '--format=%h', '--', 'musculoskeletal_ae'],
         cwd=Path(__file__).parent, capture_output=True, text=True, check=False,
@@ -585,6 +632,7 @@ def page(of: Sequence[dict[str, Any]], realities: Sequence[str]) -> str:
     parts = (
         head,
         table(of, realities),
+        *(['## On the ROS graph', GRAPH_TEXT, graph_table(of)] if any(on_graph) else []),
         '## False statements',
         _false_statements(of),
         '## Cases that did not end well',
@@ -638,6 +686,10 @@ def main(argv: list[str]) -> int:
             sum(run_healthy(robot, folder, s, r, options.healthy) for r in realities for s in seeds)
             > 0
         )
+    if options.graph:
+        run_graph(folder, seeds, options.again)
+        print(graph_table(results(folder)))
+        return 0
     for reality in realities:
         for seed in seeds:
             run_seed(robot, folder, seed, reality, kinds, options.again)
