@@ -29,25 +29,31 @@ Rng = np.random.Generator
 
 #: what a node says about itself in consequence of something else
 SELF = frozenset({
-    'anomaly_detected', 'not_exploring', 'calibrating', 'learning_waits_for_calibration',
-    'learning_paused_by_anomaly', 'checking_offsets', 'length_offsets_unknown',
-    'learning_paused_lengths_jumped', 'trajectory_slowed', 'no_usable_data',
+    'anomaly_detected', 'not_exploring', 'calibrating', 'learning_waits', 'gentle_only',
+    'length_offsets_unknown', 'trajectory_slowed', 'nothing_to_learn',
 })  # fmt: skip
 #: statements that a muscle is faulty, without saying what of it
-FAULTY = frozenset({'residual_distance', 'muscles_isolated'})
+FAULTY = frozenset({'residual_distance', 'muscle_isolated'})
 RUPTURE = FAULTY | {'slack_tendon'}
 JAM = FAULTY | {'jammed_module', 'motor_does_not_follow'}
 ONE_LENGTH = FAULTY | {'length_jump', 'length_disagrees'}
 SEVERAL_LENGTHS = frozenset({'lengths_jumped', 'lengths_disagree'})
-REVOKED = frozenset({'length_offsets_revoked'})
+REVOKED = frozenset({
+    'length_offsets_revoked', 'lengths_not_learned', 'offsets_not_believed',
+})  # fmt: skip
 FROZEN = FAULTY | {'sensor_frozen'}
 MISSING = FAULTY | {'values_missing', 'implausible_muscle_states'}
 TENSION_SENSOR = FAULTY | {'tension_sensor_saturated', 'tension_sensor_disagrees'}
 JOINT = frozenset({'joint_sensors_disagree', 'joint_sensor_disagrees', 'joint_sensor_frozen'})
-STALE = frozenset({'stale_muscle_states', 'no_muscle_states', 'stale_estimate', 'no_usable_data'})
-HEAT = frozenset({'heat_limits_tension', 'overheated', 'thermal_drift'})
+STALE = frozenset({
+    'stale_muscle_states', 'no_muscle_states', 'silent_topic', 'stale_estimate', 'slow_topic',
+    'nothing_to_learn',
+})  # fmt: skip
+HEAT = frozenset({
+    'tension_limited_by_heat', 'overheated', 'thermal_drift', 'module_changed',
+})  # fmt: skip
 OFF_TARGET = frozenset({
-    'arm_has_fallen', 'missing_torque', 'out_of_reach', 'holding_off_target', 'too_much_tension',
+    'arm_fallen', 'torque_missing', 'out_of_reach', 'holding_off_target', 'tension_above_limit',
     'overload',
 })  # fmt: skip
 SOFTWARE = frozenset({
@@ -952,12 +958,12 @@ MISHAPS: tuple[Mishap, ...] = (
     Mishap('joint sensor reads −π once', one_minus_pi, is_harmless=True,
            says='joint.*(dropped|rejected)'),
     Mishap('noise on joint sensors', noisy_joints, is_harmless=True, says='nois'),
-    Mishap('driver of the joint sensors ends', no_joints, frozenset({'no_usable_data'}),
+    Mishap('driver of the joint sensors ends', no_joints, frozenset({'nothing_to_learn'}),
            says='joint'),
     Mishap('driver restarts, one length reversed', driver_reverses, says=ORDER,
            allowed=_LENGTHS | STALE | _CONSEQUENCES),
     Mishap('driver restarts, lengths counted from 0', driver_zeroes,
-           SEVERAL_LENGTHS | REVOKED | {'learning_paused_lengths_jumped'},
+           SEVERAL_LENGTHS | REVOKED,
            allowed=STALE | _CONSEQUENCES),
     Mishap('driver restarts in mm', driver_in_mm, frozenset({'implausible_muscle_states'}),
            says=ORDER, allowed=_LENGTHS | STALE | _CONSEQUENCES),
@@ -984,7 +990,7 @@ MISHAPS: tuple[Mishap, ...] = (
     Mishap('operator stops the arm', operator_stops, frozenset({'operator_stop'})),
     Mishap('operator calibrates needlessly', needless_calibration, is_harmless=True),
     Mishap('estimator restarts', restarts(ESTIMATOR), frozenset({'stale_estimate'}),
-           allowed=STALE),
+           allowed=STALE | {'no_checkpoint'}),
     Mishap('learner restarts', restarts(LEARNER), is_harmless=True),
     Mishap('controller restarts while holding', restarts(CONTROLLER, (Step.RESET_CONTROLLER,)),
            frozenset({'restarted'}), allowed=STALE, holds=True),

@@ -475,7 +475,14 @@ def run_healthy(robot: Robot, folder: Path, seed: int, reality: str, hours: floa
     return len(course.false)
 
 
-def run_graph(folder: Path, seeds: Iterable[int], again: bool) -> None:
+def is_wanted(name: str, kinds: Sequence[str] | None) -> bool:
+    """Return whether the option `--kinds` names a mishap or a part of its name."""
+    return kinds is None or any(kind in name for kind in kinds)
+
+
+def run_graph(
+    folder: Path, seeds: Iterable[int], wanted: Sequence[str] | None, again: bool
+) -> None:
     """Play the mishaps on the ROS graph that have no result yet, once for each seed."""
     from bench.mishaps_on_graph import GRAPH_MISHAPS, run
 
@@ -488,7 +495,8 @@ def run_graph(folder: Path, seeds: Iterable[int], again: bool) -> None:
             for each in results(folder)
             if (each['seed'], each['reality']) == (seed, GRAPH) and not again
         }
-        kinds = [each.name for each in GRAPH_MISHAPS if each.name not in done]
+        named = [each.name for each in GRAPH_MISHAPS if is_wanted(each.name, wanted)]
+        kinds = [name for name in named if name not in done]
 
         def keep(result: dict[str, Any], file: Path = folder / f'{GRAPH}_{seed}.jsonl') -> None:
             with file.open('a', encoding='utf-8') as stream:
@@ -668,12 +676,8 @@ def main(argv: list[str]) -> int:
     if options.page:
         options.page.write_text(page(results(folder), realities), encoding='utf-8')
         return 0
-    kinds = [
-        mishap.name
-        for mishap in MISHAPS
-        if options.kinds is None or any(kind in mishap.name for kind in options.kinds)
-    ]
-    if not kinds:
+    kinds = [mishap.name for mishap in MISHAPS if is_wanted(mishap.name, options.kinds)]
+    if not kinds and not options.graph:
         parser.error(f'--kinds {options.kinds}: no mishap has such a name; see --list')
     seeds = options.seeds
     if options.quick:
@@ -687,7 +691,7 @@ def main(argv: list[str]) -> int:
             > 0
         )
     if options.graph:
-        run_graph(folder, seeds, options.again)
+        run_graph(folder, seeds, options.kinds, options.again)
         print(graph_table(results(folder)))
         return 0
     for reality in realities:
