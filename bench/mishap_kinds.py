@@ -113,7 +113,7 @@ class Mishap:
     allowed: frozenset[str] = frozenset()
     is_harmless: bool = False
     holds: bool = False
-    patience: float = 150.0
+    patience: float = 100.0
 
 
 # -- changes of readings and commands --------------------------------------------------------------
@@ -940,7 +940,7 @@ MISHAPS: tuple[Mishap, ...] = (
     Mishap('tension reads NaN', changed(TENSION, nothing, 1.0, 1.0, '', False), MISSING),
     Mishap('temperatures are not read any more', no_temperatures, says='temperature',
            is_harmless=True),
-    Mishap('motor is hot', hot_motor, HEAT, says='heat|hot', patience=500.0),
+    Mishap('motor is hot', hot_motor, HEAT, says='heat|hot', patience=300.0),
     Mishap('cables of two tension sensors exchanged', exchanged_tensions, TENSION_SENSOR,
            says=ORDER),
     Mishap('driver repeats another length', copied_length, ONE_LENGTH | FROZEN, allowed=REVOKED),

@@ -12,6 +12,10 @@ stated, and takes the advised steps literally, in their order. A person repairs 
 a statement names. If nothing is stated for PATIENCE seconds, the person finds the fault without the
 nodes. At the end, the estimate is compared with the true posture for AFTER seconds.
 
+Each emulator model and seed has a file of its own, so several processes may share the work, as in
+
+    python -m bench mishaps --reality kin & python -m bench mishaps --reality foreign
+
 Results are kept in the folder `--out`, one line of JSON for each mishap, so that a run can be
 continued: mishaps that have a result there are not repeated. `--again` repeats them. `--healthy`
 lets healthy arms explore for some hours instead; every warning or error of theirs is false.
@@ -73,7 +77,7 @@ BETWEEN = 0.5  # time between two steps of a remedy [s]
 SETTLING = 4.0  # time after the steps of a remedy until the operator reads the statements again [s]
 QUIET = 3.0  # the arm is well when it has explored without a condition for this time [s]
 CALIBRATION = 60.0  # longest time for which an operator waits for a length calibration [s]
-AFTER = 30.0  # time in which the true error is measured [s]
+AFTER = 20.0  # time in which the true error is measured [s]
 WELL, WELL_RAD = 1.5, 0.02  # a larger error than this multiple or this much more is not well
 HOLDABLE = 4  # number of postures from which the one to hold is chosen
 PAGE_FACTS = ('true', 'after', 'false', 'well', 'error', 'tension')
@@ -220,7 +224,7 @@ class Course:
         if self.mended_at is None:  # the person finds the fault without a statement
             self.taken.append('— found by the person —')
             self.mend()
-            self._follow_advice(self.lab.now + self.mishap.patience / 2.0)
+            self._follow_advice(self.lab.now + 0.6 * self.mishap.patience)
 
     def _hold(self, rng: np.random.Generator) -> None:
         robot, lab = self.lab.arm.robot, self.lab
@@ -662,6 +666,9 @@ def main(argv: list[str]) -> int:
     parser.add_argument('--again', action='store_true', help='repeat mishaps that have a result')
     parser.add_argument(
         '--healthy', type=positive, help='let healthy arms explore for this time instead [h]'
+    )
+    parser.add_argument(
+        '--graph', action='store_true', help='mishaps of nodes and topics instead, on a ROS graph'
     )
     parser.add_argument(
         '--page', type=Path, help='write the page of all results in --out, run none'
