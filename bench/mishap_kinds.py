@@ -45,6 +45,8 @@ FROZEN = FAULTY | {'sensor_frozen'}
 MISSING = FAULTY | {'values_missing', 'implausible_muscle_states'}
 TENSION_SENSOR = FAULTY | {'tension_sensor_saturated', 'tension_sensor_disagrees'}
 JOINT = frozenset({'joint_sensors_disagree', 'joint_sensor_disagrees', 'joint_sensor_frozen'})
+#: messages are rejected, and say why: a true symptom of readings that jump
+REJECTED = frozenset({'implausible_muscle_states'})
 STALE = frozenset({
     'stale_muscle_states', 'no_muscle_states', 'silent_topic', 'stale_estimate', 'slow_topic',
     'nothing_to_learn',
@@ -916,7 +918,7 @@ MISHAPS: tuple[Mishap, ...] = (
     Mishap('tendon ruptures under load', rupture_under_load, RUPTURE, allowed=_CONSEQUENCES),
     Mishap('tendon ruptures at rest', rupture_at_rest, RUPTURE, allowed=_CONSEQUENCES),
     Mishap('tendon creeps', _slackening(0.06, 0.004), ONE_LENGTH | RUPTURE, allowed=REVOKED),
-    Mishap('spool slips on its shaft', slipped_winch, ONE_LENGTH, allowed=REVOKED),
+    Mishap('spool slips on its shaft', slipped_winch, ONE_LENGTH, says='jumped', allowed=REVOKED),
     Mishap('module jams', module_fault('stuck_motor'), JAM),
     Mishap('motor is weak', module_fault('winch_speed', 0.005, 0.02), JAM),
     Mishap('length reading freezes', frozen(LENGTH), FROZEN | ONE_LENGTH, allowed=REVOKED),
@@ -927,7 +929,7 @@ MISHAPS: tuple[Mishap, ...] = (
     Mishap('joint sensor drifts', joint_drifts, JOINT),
     Mishap(
         'driver restarts, two muscles exchanged', driver_exchanges, says=ORDER,
-        allowed=_LENGTHS | STALE | _CONSEQUENCES,
+        allowed=_LENGTHS | STALE | _CONSEQUENCES | REJECTED,
     ),
     Mishap('operator stops a verification', stop_of_verification,
            frozenset({'operator_stop'}), allowed=RUPTURE | _CONSEQUENCES),
@@ -943,7 +945,8 @@ MISHAPS: tuple[Mishap, ...] = (
     Mishap('motor is hot', hot_motor, HEAT, says='heat|hot', patience=300.0),
     Mishap('cables of two tension sensors exchanged', exchanged_tensions, TENSION_SENSOR,
            says=ORDER),
-    Mishap('driver repeats another length', copied_length, ONE_LENGTH | FROZEN, allowed=REVOKED),
+    Mishap('driver repeats another length', copied_length, ONE_LENGTH | FROZEN, says='jumped',
+           allowed=REVOKED),
     Mishap('encoder loses counts', lost_counts, ONE_LENGTH, allowed=REVOKED),
     Mishap('noise on tension readings', noisy_tensions, is_harmless=True, says='nois'),
     Mishap('joint sensor sticks', joint_fault(float, 'sticks'), JOINT),
@@ -961,10 +964,10 @@ MISHAPS: tuple[Mishap, ...] = (
     Mishap('driver of the joint sensors ends', no_joints, frozenset({'nothing_to_learn'}),
            says='joint'),
     Mishap('driver restarts, one length reversed', driver_reverses, says=ORDER,
-           allowed=_LENGTHS | STALE | _CONSEQUENCES),
+           allowed=_LENGTHS | STALE | _CONSEQUENCES | REJECTED),
     Mishap('driver restarts, lengths counted from 0', driver_zeroes,
-           SEVERAL_LENGTHS | REVOKED,
-           allowed=STALE | _CONSEQUENCES),
+           SEVERAL_LENGTHS | REVOKED, says='jumped',
+           allowed=STALE | _CONSEQUENCES | REJECTED),
     Mishap('driver restarts in mm', driver_in_mm, frozenset({'implausible_muscle_states'}),
            says=ORDER, allowed=_LENGTHS | STALE | _CONSEQUENCES),
     Mishap('driver restarts at half rate', half_rate, is_harmless=True, allowed=STALE),
@@ -1002,8 +1005,8 @@ MISHAPS: tuple[Mishap, ...] = (
            allowed=_LENGTHS | JOINT | _CONSEQUENCES),
     Mishap('clock is set back', clock_jumps_back, is_harmless=True),
     Mishap('tendon retied with another length', retied, RUPTURE,
-           allowed=_CONSEQUENCES | ONE_LENGTH | REVOKED),
+           allowed=_CONSEQUENCES | ONE_LENGTH | REVOKED | REJECTED),
     Mishap('tendon jumps off a guide', _slackening(0.04, 1.0), ONE_LENGTH | RUPTURE,
-           allowed=REVOKED),
+           allowed=REVOKED | REJECTED),
 )  # fmt: skip
 NAMES = {mishap.name: mishap for mishap in MISHAPS}

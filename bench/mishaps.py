@@ -40,6 +40,7 @@ import json
 import math
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -66,7 +67,7 @@ from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.robot.robot import Robot
 
-LEARNING = 240.0  # time in which an individual learns before its mishaps [s]
+LEARNING = 180.0  # time in which an individual learns before its mishaps [s]
 OTHER_LEARNING, OTHER_SEED = 90.0, 990  # of the individual whose network is the wrong one
 LOOK = 0.1  # time between two looks at the statements [s]
 GOAL = 5.0  # longest time from the first effect to the first true statement [s]
@@ -388,7 +389,11 @@ def play_forked(lab: Lab, mishap: Mishap, file: Path, *rest: Any) -> None:
     sys.stdout.flush()
     child = os.fork()
     if child:
-        os.waitpid(child, 0)
+        try:
+            os.waitpid(child, 0)
+        except BaseException:
+            os.kill(child, signal.SIGKILL)
+            raise
         return
     status = 1
     try:

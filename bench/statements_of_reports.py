@@ -84,11 +84,10 @@ def _of_controller(core: Controller, estimator: Estimator, now: float) -> Iterat
         if estimator.suspects.verification is not None:
             steps = ()
     if causes := stops.parse(values.get(stops.STOP_CAUSES, '')):
-        for number, cause in enumerate(causes):
-            text = report.message if number == 0 else f'also {cause.text}'
-            names = report.message if len(causes) == 1 else ''
+        texts = report.message.split('; also ')  # one for each cause, in their order
+        for number, (cause, text) in enumerate(zip(causes, texts)):
             mine = steps if number == 0 else ()
-            yield 'controller', cause.identifier, report.level, text, mine, names
+            yield 'controller', cause.identifier, report.level, text, mine, text
     elif waiting := values.get(WAITS_FOR):
         yield 'controller', waiting, report.level, report.message, (), ''
     elif report.level != 'ok':
