@@ -43,7 +43,7 @@ REVOKED = frozenset({
 })  # fmt: skip
 FROZEN = FAULTY | {'sensor_frozen'}
 MISSING = FAULTY | {'values_missing', 'implausible_muscle_states'}
-TENSION_SENSOR = FAULTY | {'tension_sensor_saturated', 'tension_sensor_disagrees'}
+TENSION_SENSOR = FAULTY | {'sensor_saturated', 'tension_sensor_disagrees'}
 JOINT = frozenset({'joint_sensors_disagree', 'joint_sensor_disagrees', 'joint_sensor_frozen'})
 #: messages are rejected, and say why: a true symptom of readings that jump
 REJECTED = frozenset({'implausible_muscle_states'})
@@ -273,9 +273,8 @@ def retied(lab: Lab, rng: Rng) -> Case:
     lab.arm.set_ruptured([name])
 
     def mend(lab: Lab) -> None:
-        if lab.arm._muscle.ruptured.any():
-            lab.arm.set_ruptured([])
-            _offsets(lab, muscle, size)
+        lab.arm.set_ruptured([])
+        _offsets(lab, muscle, size)
 
     return Case(f'{name}, {1e3 * size:.0f} mm', mend, (name,))
 
@@ -831,7 +830,7 @@ def stop_of_verification(lab: Lab, rng: Rng) -> Case:
         lab.arm.set_ruptured([])
 
     lab.before_step.append(stop)
-    return Case(name, mend, (name,), is_visible=lambda _: stopped[0])
+    return Case(name, mend, is_visible=lambda _: stopped[0])
 
 
 def operator_stops(lab: Lab, _: Rng) -> Case:
@@ -907,6 +906,7 @@ def healthy(_: Lab, __: Rng) -> Case:
     return Case('', lambda _: None, lasts=60.0)
 
 
+OF_JOINT = r'joint sensor|joint angle|joint reading|joint_states'
 ORDER = r'exchang|swapp|order of|wrong column|sign|reversed|unit'
 GRAVITY = r'gravity|mounted|away from its target|distance|payload|contact'
 NETWORK = r'network|checkpoint'
@@ -923,10 +923,8 @@ MISHAPS: tuple[Mishap, ...] = (
     Mishap('motor is weak', module_fault('winch_speed', 0.005, 0.02), JAM),
     Mishap('length reading freezes', frozen(LENGTH), FROZEN | ONE_LENGTH, allowed=REVOKED),
     Mishap('tension reading freezes', frozen(TENSION), FROZEN | TENSION_SENSOR),
-    Mishap(
-        'joint sensor slips', joint_slips, JOINT,
-    ),
-    Mishap('joint sensor drifts', joint_drifts, JOINT),
+    Mishap('joint sensor slips', joint_slips, JOINT, says=OF_JOINT),
+    Mishap('joint sensor drifts', joint_drifts, JOINT, says=OF_JOINT),
     Mishap(
         'driver restarts, two muscles exchanged', driver_exchanges, says=ORDER,
         allowed=_LENGTHS | STALE | _CONSEQUENCES | REJECTED,
@@ -949,20 +947,21 @@ MISHAPS: tuple[Mishap, ...] = (
            allowed=REVOKED),
     Mishap('encoder loses counts', lost_counts, ONE_LENGTH, allowed=REVOKED),
     Mishap('noise on tension readings', noisy_tensions, is_harmless=True, says='nois'),
-    Mishap('joint sensor sticks', joint_fault(float, 'sticks'), JOINT),
-    Mishap('joint sensor reversed', joint_fault(lambda x: -x, 'reversed'), JOINT),
-    Mishap('two joint sensors exchanged', joints_exchanged, JOINT, says=ORDER),
+    Mishap('joint sensor sticks', joint_fault(float, 'sticks'), JOINT, says=OF_JOINT),
+    Mishap('joint sensor reversed', joint_fault(lambda x: -x, 'reversed'), JOINT,
+           says=OF_JOINT),
+    Mishap('two joint sensors exchanged', joints_exchanged, JOINT, says=OF_JOINT),
     Mishap('joint sensor unplugged (NaN)', joint_fault(lambda _: math.nan, 'NaN'), JOINT,
-           says='joint.*NaN|NaN.*joint|joint.*missing|not finite|joint_states'),
+           says=f'{OF_JOINT}|not finite|NaN'),
     Mishap('joint sensors read 0 in bursts', zeros_of_joints, is_harmless=True,
-           says='joint.*(dropped|rejected)'),
+           says=OF_JOINT),
     Mishap('joint angles of 0 between the readings', zeros_between, JOINT,
-           says='joint'),
+           says=OF_JOINT),
     Mishap('joint sensor reads −π once', one_minus_pi, is_harmless=True,
-           says='joint.*(dropped|rejected)'),
+           says=OF_JOINT),
     Mishap('noise on joint sensors', noisy_joints, is_harmless=True, says='nois'),
     Mishap('driver of the joint sensors ends', no_joints, frozenset({'nothing_to_learn'}),
-           says='joint'),
+           says=OF_JOINT),
     Mishap('driver restarts, one length reversed', driver_reverses, says=ORDER,
            allowed=_LENGTHS | STALE | _CONSEQUENCES | REJECTED),
     Mishap('driver restarts, lengths counted from 0', driver_zeroes,

@@ -134,6 +134,7 @@ class Course:
         self.is_found_by_advice = False
         self.false: dict[str, dict[str, Any]] = {}  # the first of each false statement
         self.later: dict[str, str] = {}  # statements after the mending
+        self.stated: dict[str, Any] = {}  # all different statements, with time and judgement
         self.taken: list[str] = []  # steps that the operator took, and refusals
         self.peak = 0.0  # highest tension, in multiples of tension.limit
         self.quiet_since = lab.now
@@ -174,6 +175,8 @@ class Course:
         is_over = self.mended_at is not None and now - self.mended_at > LOOK
         for each in self.present:
             judged = judge(each, self.mishap, self.case)
+            what = f'{each.owner} {each.identifier} {" ".join(sorted(each.subjects))}'.strip()
+            self.stated.setdefault(what, [round(now - self.started_at, 2), judged, each.text[:200]])
             if judged == 'true' and self.true_at is None and self.effect_at is not None:
                 self.true_at, self.first_true = now, each.text
             if judged == 'false' and not is_over:
@@ -216,6 +219,7 @@ class Course:
         if self.mishap.holds:
             self._hold(rng)
         self.false.clear()
+        self.stated.clear()
         self.peak = 0.0
         self.begun_at = self.started_at = self.lab.now
         self.advised_at = None
@@ -320,14 +324,20 @@ class Course:
 
 
 def judge(statement: Statement, mishap: Mishap, case: Case) -> str:
-    """Return whether a statement is 'true', 'allowed' (true but secondary) or 'false'."""
-    concerned = frozenset(case.subjects)
+    """Return whether a statement is 'true', 'allowed' (true but secondary) or 'false'.
+
+    A true statement names a muscle or joint that is concerned, if the mishap concerns some.
+    """
+    concerned, subjects = frozenset(case.subjects), statement.subjects
+    names_it = not concerned or bool(subjects & concerned)
     # A statement that names other muscles or joints only is about something else.
-    is_about = not concerned or not statement.subjects or bool(statement.subjects & concerned)
+    is_about = names_it or not subjects
     is_said = bool(mishap.says) and re.search(mishap.says, statement.text, re.I) is not None
-    if is_about and (statement.identifier in mishap.true or is_said):
+    is_true = statement.identifier in mishap.true or is_said
+    if is_true and names_it:
         return 'true'
-    if statement.identifier in SELF or (is_about and statement.identifier in mishap.allowed):
+    is_secondary = is_true or statement.identifier in mishap.allowed
+    if statement.identifier in SELF or (is_about and is_secondary):
         return 'allowed'
     return 'false'
 
@@ -372,6 +382,7 @@ def play(lab: Lab, mishap: Mishap, seed: int, reality: str, before: float) -> di
         'true': course.first_true,
         'false': course.false,
         'afterwards': course.later,
+        'stated': course.stated,
         'mended by advice': is_advised,
         'well': bool(is_quiet and is_accurate and (is_advised or effect is None)),
         'ended': ended[:300],

@@ -49,6 +49,7 @@ def statements(
             'learner': learner,
         }
         robot = estimator.robot
+        body = {*robot.muscles, *robot.joints}  # subjects may also be topics and nodes
         return [
             Statement(
                 owner,
@@ -56,7 +57,7 @@ def statements(
                 each.level,
                 each.text,
                 tuple(each.steps),
-                frozenset(each.subjects) or named(robot, each.text),
+                frozenset(body.intersection(each.subjects)) or named(robot, each.text),
             )
             for owner, core in cores.items()
             for each in core.conditions(now)
