@@ -177,7 +177,7 @@ class Course:
             judged = judge(each, self.mishap, self.case)
             what = f'{each.owner} {each.identifier} {" ".join(sorted(each.subjects))}'.strip()
             self.stated.setdefault(what, [round(now - self.started_at, 2), judged, each.text[:200]])
-            if judged == 'true' and self.true_at is None and self.effect_at is not None:
+            if judged == 'true' and self.true_at is None:
                 self.true_at, self.first_true = now, each.text
             if judged == 'false' and not is_over:
                 key = f'{each.owner} {each.identifier}'
@@ -364,11 +364,10 @@ def play(lab: Lab, mishap: Mishap, seed: int, reality: str, before: float) -> di
     is_quiet = course.is_well
     after = course.mean_error(AFTER)
     is_accurate = after <= max(WELL * before, before + WELL_RAD)
-    is_needed = not mishap.is_harmless and course.effect_at is not None
-    case, effect = course.case, course.effect_at
-    seen = None
-    if course.true_at is not None and effect is not None:
-        seen = round(course.true_at - effect, 2)
+    case, effect, true_at = course.case, course.effect_at, course.true_at
+    is_needed = not mishap.is_harmless and (effect is not None or true_at is not None)
+    # A statement may come before the effect that this bench considers visible.
+    seen = None if true_at is None else round(max(0.0, true_at - (effect or true_at)), 2)
     ended = '' if is_quiet else '; '.join(each.text for each in course.present) or 'not exploring'
     is_advised = course.is_found_by_advice or case.lasts < math.inf or mishap.is_harmless
     return {
