@@ -83,6 +83,7 @@ class Case:
         is_visible: Whether the mishap can be seen in what the nodes receive; asked until it is.
         lasts: Time after which it ends by itself [s].
         settled_by: Steps after which nothing is left to be mended.
+        found_at: Muscles and joints at which a person finds the fault, besides `subjects`.
     """
 
     detail: str
@@ -91,6 +92,7 @@ class Case:
     is_visible: Callable[[Lab], bool] = _at_once
     lasts: float = math.inf
     settled_by: tuple[Step, ...] = ()
+    found_at: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -830,7 +832,7 @@ def stop_of_verification(lab: Lab, rng: Rng) -> Case:
         lab.arm.set_ruptured([])
 
     lab.before_step.append(stop)
-    return Case(name, mend, is_visible=lambda _: stopped[0])
+    return Case(name, mend, is_visible=lambda _: stopped[0], found_at=(name,))
 
 
 def operator_stops(lab: Lab, _: Rng) -> Case:

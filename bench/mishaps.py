@@ -81,6 +81,7 @@ CALIBRATION = 60.0  # longest time for which an operator waits for a length cali
 AFTER = 20.0  # time in which the true error is measured [s]
 WELL, WELL_RAD = 1.5, 0.02  # a larger error than this multiple or this much more is not well
 HOLDABLE = 4  # number of postures from which the one to hold is chosen
+SEEDS, REALITIES = (0, 1, 2, 3, 4), (KIN, FOREIGN)  # of the complete table
 PAGE_FACTS = ('true', 'after', 'false', 'well', 'error', 'tension')
 
 
@@ -315,7 +316,7 @@ class Course:
         if self.mended_at is not None:
             return ''
         for each in by:
-            named = each.subjects & {*self.case.subjects}
+            named = each.subjects & {*self.case.subjects, *self.case.found_at}
             if named or judge(each, self.mishap, self.case) == 'true':
                 self.mend(by_advice=True)
                 return ''
@@ -635,7 +636,7 @@ def page(of: Sequence[dict[str, Any]], realities: Sequence[str]) -> str:
     on_graph = [each['reality'] == GRAPH for each in of]
     commit = subprocess.run(
         ['git', 'log', '-1', '--format=%h', '--', 'musculoskeletal_ae'],
-        cwd=Path(__file__).parent, capture_output=True, text=True, check=False,
+        cwd=Path(__file__).parents[1], capture_output=True, text=True, check=False,
     ).stdout.strip()  # fmt: skip
     seeds = sorted({each['seed'] for each in of})
     worst = max((each['peak'] for each in of), default=math.nan)
@@ -656,8 +657,12 @@ def page(of: Sequence[dict[str, Any]], realities: Sequence[str]) -> str:
         ratio=f'{WELL:g}',
         more=f'{WELL_RAD:g}',
     )
+    planned = len(REALITIES) * len(SEEDS) * len(MISHAPS)
+    part = len(of) - sum(on_graph)
+    missing = f'**Incomplete**: {part} of {planned} runs have a result; the rest was not measured.'
     parts = (
         head,
+        *([missing] if part < planned else []),
         table(of, realities),
         *(['## On the ROS graph', GRAPH_TEXT, graph_table(of)] if any(on_graph) else []),
         '## False statements',
@@ -672,8 +677,10 @@ def main(argv: list[str]) -> int:
     """Play the mishaps and print the table; return 1 if the goals are missed."""
     parser = Parser('mishaps', (__doc__ or '').partition('\n')[0])
     parser.add_robot()
-    parser.add_seeds((0, 1, 2, 3, 4))
-    parser.add_argument('--reality', type=names, default=f'{KIN},{FOREIGN}', help='emulator models')
+    parser.add_seeds(SEEDS)
+    parser.add_argument(
+        '--reality', type=names, default=','.join(REALITIES), help='emulator models'
+    )
     parser.add_argument(
         '--kinds', type=names, help='mishaps, or parts of their names (default: all)'
     )
