@@ -37,7 +37,11 @@ def test_consequences_are_allowed_and_other_claims_are_false():
 def test_a_text_recognizes_a_condition_with_an_unknown_identifier():
     kind = Mishap('', lambda *_: OF_BICEPS, says='exchang')
     text = f'{BICEPS} and {TRICEPS} are exchanged'
-    assert mishaps.judge(said('new', text=text), kind, OF_BICEPS) == 'true'
+    assert mishaps.judge(said('new', BICEPS, TRICEPS, text=text), kind, OF_BICEPS) == 'true'
+
+
+def test_a_true_statement_names_what_is_concerned():
+    assert mishaps.judge(said('slack_tendon'), RUPTURE, OF_BICEPS) == 'allowed'
 
 
 def test_muscles_and_joints_are_named_by_whole_words():
