@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import covariance, false_stops, sim_pictures
+from bench import covariance, false_stops, lab, sim_pictures
 from bench.__main__ import benches, main
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot
@@ -47,21 +47,21 @@ def test_what_the_package_refuses_is_one_line_and_status_1(capsys):
 
 
 def test_a_busy_process_takes_its_oldest_message_and_the_last_of_a_full_queue():
-    process, received = false_stops.Process(25.0, [0]), []
+    process, received = lab.Process(25.0, [0]), []
     for n in range(10_000):
-        now = n * false_stops.SAMPLE_TIME
-        process.send(false_stops.Message(now, n))
+        now = n * lab.SAMPLE_TIME
+        process.send(lab.Message(now, n))
         if (at := process.runs(now)) is not None:
             received.append([content for _, _, content in process.receive(at)])
-    assert max(map(len, received)) == 1 + false_stops.QUEUE
+    assert max(map(len, received)) == 1 + lab.QUEUE
     assert sum(map(len, received)) + process.lost == received[-1][-1] + 1
     gap = max(np.diff(numbers)[0] for numbers in received if len(numbers) > 1)
-    assert gap > false_stops.QUEUE and process.longest_delay > gap * false_stops.SAMPLE_TIME
+    assert gap > lab.QUEUE and process.longest_delay > gap * lab.SAMPLE_TIME
 
 
 def test_a_healthy_arm_on_a_busy_computer_is_neither_suspected_nor_stopped(trained):
     loop = false_stops.BusyLoop(EmulatedArm(Robot.load('arm26'), 0), trained['default'], 0, 8.0)
-    result = loop.run(5.0)
+    result = loop.watch(5.0)
     assert result.problem == '' and result.seconds == pytest.approx(5.0)
     assert result.delay > 0.02
     assert loop.controller.supervisor.explores

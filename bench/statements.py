@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the nodes state about the arm, as one list of values for benches.
+
+`statements` is the only place that knows how the cores report. With `Estimator.conditions`, it
+passes the conditions of the cores on. Without, `statements_of_reports` reads their reports.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.robot.robot import Robot
+
+
+class Statement(NamedTuple):
+    """One statement of a node.
+
+    Attributes:
+        owner: The node.
+        identifier: What is stated.
+        level: 'ok', 'warn' or 'error'.
+        text: The statement as users read it.
+        steps: What users are advised to do.
+        subjects: The muscles and joints that the statement names.
+    """
+
+    owner: str
+    identifier: str
+    level: str
+    text: str
+    steps: tuple[Step, ...] = ()
+    subjects: frozenset[str] = frozenset()
+
+
+def statements(
+    estimator: Estimator, controller: Controller, learner: Learner, now: float
+) -> list[Statement]:
+    """Return what the nodes state at the time `now` of the steady clock [s]."""
+    if hasattr(estimator, 'conditions'):
+        cores: dict[str, Any] = {
+            'estimator': estimator,
+            'controller': controller,
+            'learner': learner,
+        }
+        robot = estimator.robot
+        body = {*robot.muscles, *robot.joints}  # subjects may also be topics and nodes
+        return [
+            Statement(
+                owner,
+                each.identifier,
+                each.level,
+                each.text,
+                tuple(each.steps),
+                frozenset(body.intersection(each.subjects)) or named(robot, each.text),
+            )
+            for owner, core in cores.items()
+            for each in core.conditions(now)
+        ]
+    from bench.statements_of_reports import statements_of_reports  # until cores have conditions
+
+    return [
+        Statement(*row[:5], named(estimator.robot, row[5]))
+        for row in statements_of_reports(estimator, controller, learner, now)
+    ]
+
+
+def troubles(all_statements: Iterable[Statement]) -> list[Statement]:
+    """Return the statements that are warnings or errors."""
+    return [each for each in all_statements if each.level != 'ok']
+
+
+def named(robot: Robot, text: str) -> frozenset[str]:
+    """Return the muscles and joints that a text names."""
+    names = (*robot.muscles, *robot.joints)
+    return frozenset(
+        name for name in names if re.search(rf'(?<![\w-]){re.escape(name)}(?![\w-])', text)
+    )
