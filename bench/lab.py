@@ -21,7 +21,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from itertools import zip_longest
 from pathlib import Path
@@ -31,8 +30,8 @@ import numpy as np
 
 from bench.learned_arm import STEPS, Seldom
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.stops import StopCause
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.estimation.estimator import Estimator
@@ -41,7 +40,7 @@ from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.state import StateStore
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
+from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.message_delay import MessageDelay
 from musculoskeletal_ae.signals.motor_interface import MuscleReading
 
@@ -201,7 +200,6 @@ class Lab:
         self._command: Array | None = None  # length command for the driver [m], (M,)
         self._published_body: BodyState | None = self.estimator.body
         self._published_anomaly = False
-        self._heard_offsets = self.estimator.body.offsets  # newest offsets that others received
 
     # -- time -----------------------------------------------------------------------------------
 
@@ -286,23 +284,12 @@ class Lab:
             self._published_body = core.body
             self.validator.isolated = core.body.isolated
             self.validator.forget()
-            body = core.body.with_offsets(self._as_heard(core.body.offsets))
+            body = core.body
             self._to_controller.append(lambda: self.controller.use_body(body))
             self._to_learner.append(lambda: self.learner.use_body(body))
 
     def _tell_controller(self, detected: bool) -> None:
         self.controller.anomaly(detected)
-
-    def _as_heard(self, offsets: LengthOffsets) -> LengthOffsets:
-        """Return length offsets as the other nodes understand them (`Shell.follow_offsets`).
-
-        Known offsets that change to other known offsets at once come from an estimator that was
-        restarted, and are unknown.
-        """
-        before, self._heard_offsets = self._heard_offsets, offsets
-        if before.known and offsets.known and (offsets.offset != before.offset).any():
-            return replace(LengthOffsets.unknown(len(offsets.offset)), offset=offsets.offset)
-        return offsets
 
     def _validate(self, candidate: Mae) -> None:
         """Let the estimator validate a network of the learner and, if it is accepted, use it."""
@@ -398,7 +385,7 @@ class Lab:
             core = self.controller = Controller(robot, seed=round(1e3 * self.now))
             supervisor = former.supervisor
             found = supervisor.condition if supervisor.is_latched else None
-            core.stop(StopCause.RESTARTED if found is None else found.cause)
+            core.stop(ConditionKind.RESTARTED if found is None else found.kind)
             if former.mae is not None:
                 core.use(former.mae)
             core.use_body(self.estimator.body)

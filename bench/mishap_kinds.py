@@ -20,7 +20,7 @@ import pinocchio as pin
 
 from bench.lab import CONTROLLER, ESTIMATOR, LEARNER, CommandFault, Lab, Packet, ReadingFault
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.stops import StopCause
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.remedy import Step
@@ -39,7 +39,7 @@ JAM = FAULTY | {'jammed_module', 'motor_does_not_follow'}
 ONE_LENGTH = FAULTY | {'length_jump', 'length_disagrees'}
 SEVERAL_LENGTHS = frozenset({'lengths_jumped', 'lengths_disagree'})
 REVOKED = frozenset({
-    'length_offsets_revoked', 'lengths_not_learned', 'offsets_not_believed',
+    'length_offsets_revoked', 'lengths_not_learned', 'length_calibration_stuck',
 })  # fmt: skip
 FROZEN = FAULTY | {'sensor_frozen'}
 MISSING = FAULTY | {'values_missing', 'implausible_muscle_states'}
@@ -55,9 +55,10 @@ HEAT = frozenset({
     'tension_limited_by_heat', 'overheated', 'thermal_drift', 'module_changed',
 })  # fmt: skip
 OFF_TARGET = frozenset({
-    'arm_fallen', 'torque_missing', 'out_of_reach', 'holding_off_target', 'tension_above_limit',
-    'overload',
+    'away_from_target', 'torque_missing', 'out_of_reach', 'tension_above_limit', 'overload',
 })  # fmt: skip
+#: symptoms of a base that is mounted otherwise
+MOUNTED = OFF_TARGET | {'other_mounting'}
 SOFTWARE = frozenset({
     Step.RESET_CONTROLLER, Step.RESET_ESTIMATOR, Step.CALIBRATE_LENGTHS, Step.EXPLORE,
     Step.EXPLORE_GENTLY, Step.RESTORE_MUSCLES, Step.WAIT_UNTIL_COOL, Step.REPORT_LOG,
@@ -826,7 +827,7 @@ def stop_of_verification(lab: Lab, rng: Rng) -> Case:
     def stop(lab: Lab) -> None:
         if lab.estimator.suspects.verification is not None and not stopped[0]:
             stopped[0] = True
-            lab.controller.stop(StopCause.OPERATOR)
+            lab.controller.stop(ConditionKind.OPERATOR)
 
     def mend(lab: Lab) -> None:
         lab.arm.set_ruptured([])
@@ -837,7 +838,7 @@ def stop_of_verification(lab: Lab, rng: Rng) -> Case:
 
 def operator_stops(lab: Lab, _: Rng) -> Case:
     """An operator stops the arm."""
-    lab.controller.stop(StopCause.OPERATOR)
+    lab.controller.stop(ConditionKind.OPERATOR)
     return Case('', lambda _: None, settled_by=(Step.RESET_CONTROLLER,))
 
 
@@ -980,11 +981,11 @@ MISHAPS: tuple[Mishap, ...] = (
     Mishap('emergency stop pressed and released', emergency_stop, JAM,
            says='command|follow|emergency'),
     Mishap('module gets no commands', lost_module, JAM),
-    Mishap('mounted upside down', mounted(0.8 * math.pi, math.pi), OFF_TARGET, says=GRAVITY,
+    Mishap('mounted upside down', mounted(0.8 * math.pi, math.pi), MOUNTED, says=GRAVITY,
            holds=True),
-    Mishap('mounted on its side', mounted(0.3 * math.pi, 0.6 * math.pi), OFF_TARGET,
+    Mishap('mounted on its side', mounted(0.3 * math.pi, 0.6 * math.pi), MOUNTED,
            says=GRAVITY, holds=True),
-    Mishap('payload of 3.6 kg while holding', payload, OFF_TARGET, says=GRAVITY, holds=True,
+    Mishap('payload of 3.6 kg while holding', payload, OFF_TARGET, says='payload', holds=True,
            is_harmless=True),
     Mishap('somebody holds the hand', held, says='contact|held', allowed=OFF_TARGET,
            is_harmless=True),

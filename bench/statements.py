@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the nodes state about the arm, as one list of values for benches.
 
-`statements` is the only place that knows how the cores report. With `Estimator.conditions`, it
-passes the conditions of the cores on. Without, `statements_of_reports` reads their reports.
+They are the conditions of the cores, with the muscles and joints that each concerns.
 """
 
 from __future__ import annotations
@@ -42,31 +41,24 @@ def statements(
     estimator: Estimator, controller: Controller, learner: Learner, now: float
 ) -> list[Statement]:
     """Return what the nodes state at the time `now` of the steady clock [s]."""
-    if hasattr(estimator, 'conditions'):
-        cores: dict[str, Any] = {
-            'estimator': estimator,
-            'controller': controller,
-            'learner': learner,
-        }
-        robot = estimator.robot
-        body = {*robot.muscles, *robot.joints}  # subjects may also be topics and nodes
-        return [
-            Statement(
-                owner,
-                each.identifier,
-                each.level,
-                each.text,
-                tuple(each.steps),
-                frozenset(body.intersection(each.subjects)) or named(robot, each.text),
-            )
-            for owner, core in cores.items()
-            for each in core.conditions(now)
-        ]
-    from bench.statements_of_reports import statements_of_reports  # until cores have conditions
-
+    cores: dict[str, Any] = {
+        'estimator': estimator,
+        'controller': controller,
+        'learner': learner,
+    }
+    robot = estimator.robot
+    body = {*robot.muscles, *robot.joints}  # subjects may also be topics and nodes
     return [
-        Statement(*row[:5], named(estimator.robot, row[5]))
-        for row in statements_of_reports(estimator, controller, learner, now)
+        Statement(
+            owner,
+            each.identifier,
+            each.level,
+            each.text,
+            each.steps,
+            frozenset(body.intersection(each.subjects)) or named(robot, each.text),
+        )
+        for owner, core in cores.items()
+        for each in core.conditions(now)
     ]
 
 
