@@ -42,11 +42,11 @@ REVOKED = frozenset({
     'length_offsets_revoked', 'lengths_not_learned', 'length_calibration_stuck',
 })  # fmt: skip
 FROZEN = FAULTY | {'sensor_frozen'}
-MISSING = FAULTY | {'values_missing', 'implausible_muscle_states'}
+MISSING = FAULTY | {'values_missing', 'implausible_muscle_states', 'readings_rejected'}
 TENSION_SENSOR = FAULTY | {'sensor_saturated', 'tension_sensor_disagrees'}
 JOINT = frozenset({'joint_sensors_disagree', 'joint_sensor_disagrees', 'joint_sensor_frozen'})
 #: messages are rejected, and say why: a true symptom of readings that jump
-REJECTED = frozenset({'implausible_muscle_states'})
+REJECTED = frozenset({'implausible_muscle_states', 'readings_rejected'})
 STALE = frozenset({
     'stale_muscle_states', 'no_muscle_states', 'silent_topic', 'stale_estimate', 'slow_topic',
     'nothing_to_learn',

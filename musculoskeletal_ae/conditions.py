@@ -329,6 +329,14 @@ class ConditionKind(Enum):
         (Step.CHECK_SENSOR, Step.RESET_ESTIMATOR),
         reaction=Reaction.STOP,
     )
+    READINGS_REJECTED = Declaration(
+        'readings_rejected',
+        'estimator',
+        'error',
+        'muscle_states have been rejected for 0.1 s, because values are missing or implausible',
+        'muscle_states are rejected',
+        (Step.CHECK_SENSOR,),
+    )
     VALUES_MISSING = Declaration(
         'values_missing',
         'estimator',

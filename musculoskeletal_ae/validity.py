@@ -58,13 +58,15 @@ def read_muscle_states(
     isolated: Sequence[int] | Ints = (),
     unknown: float = 0.0,
     source: TensionSource = TENSION_SENSOR,
+    names: Sequence[str] = (),
 ) -> Array:
     """Return l [m], T_read [N] and temperature [°C] of a Float64MultiArray, (3, M).
 
     Motor currents are converted to T_read. A temperature that is not measured is NaN. Values of
     isolated muscles are not checked: lengths and tensions that are not finite or beyond
     ±MOST_ISOLATED are replaced by `unknown`, and such temperatures by NaN. If the modules have no
-    source of tension, tensions are not checked either, and are returned as NaN.
+    source of tension, tensions are not checked either, and are returned as NaN. An error states the
+    name of the muscle if `names` has it, otherwise its number.
     """
     values = _values(message, len(QUANTITIES), muscles)
     usable = np.isfinite(values)
@@ -80,7 +82,8 @@ def read_muscle_states(
     usable[2] |= np.isnan(values[2])
     if not usable.all():
         row, muscle = np.argwhere(~usable)[0]
-        stated = f'{QUANTITIES[row]} of muscle {muscle} is {values[row, muscle]}'
+        name = names[muscle] if len(names) else f'muscle {muscle}'
+        stated = f'{QUANTITIES[row]} of {name} is {values[row, muscle]}'
         raise MessageError('not finite', f'{stated}; expected a finite number')
     return values
 

@@ -49,6 +49,7 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 from musculoskeletal_ae.signals.heat import Heat
+from musculoskeletal_ae.signals.limits import Persistence
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
 #: largest time between two messages that detectors count [s]; a longer pause counts as this time
@@ -132,6 +133,7 @@ class Estimator:
         self.measured: Array | None = None
         self.stepped_at = -math.inf
         self._commands = ModuleCommands()
+        self._rejected = Persistence()  # why messages are rejected
         self._measured: tuple[float, Array | None] = -math.inf, None  # time and measured θ
         #: whether `mae.isolated` of a new network decides which muscles are isolated; this ends
         #: with the first finding or call of `isolate` or `keep_isolated`
@@ -358,21 +360,27 @@ class Estimator:
         start = middle if self.output is None else self.output.state.theta
         return posture_of_marker(self.robot, pose, start)
 
-    def report(self, _: float) -> Report:
+    def report(self, now: float) -> Report:
         """Return the status for /diagnostics."""
-        return status.report(self)
+        return status.report(self, now)
 
-    def conditions(self, _: float) -> tuple[Condition, ...]:
-        """Return everything that users should know about the body."""
-        return status.conditions(self)
+    def conditions(self, now: float) -> tuple[Condition, ...]:
+        """Return everything that users should know about the readings and the body."""
+        return status.conditions(self, now)
+
+    def rejected_because(self, now: float) -> str:
+        """Return why muscle states have been rejected for longer than a glitch, or ''."""
+        return self._rejected.lasting(now)
 
     def _take(self, take: Callable[[], MuscleSample], now: float) -> Output | None:
         try:
             sample = take()
         except RejectionError as error:
+            self._rejected.note(str(error), now)
             if error.states is not None:
                 self._handle(self.health.read(error.states, self.body.used, now), now)
             raise
+        self._rejected.note('', now)
         self._handle(self.health.read(sample.newest, self.body.used, now), now)
         if sample.jumped:
             self._handle_jump(sample.jumped, now)

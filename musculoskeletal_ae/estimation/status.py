@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 UNKNOWN_TENSION = 'unknown: tension_source is none'
 
 
-def report(core: Estimator) -> Report:
-    """Return the status of an estimator.
+def report(core: Estimator, now: float) -> Report:
+    """Return the status of an estimator; `now` is the time of a steady clock [s].
 
     The value `verification` is an identifier for programs, and `last outcome` is one of
     `verification.Outcome`.
     """
-    mae, present = core.state.mae, conditions(core)
+    mae, present = core.state.mae, conditions(core, now)
     if mae is None:
         return Report('', {}, present)
     values = {
@@ -43,9 +43,11 @@ def report(core: Estimator) -> Report:
     return Report(f'estimating{calibrated}', values, present)
 
 
-def conditions(core: Estimator) -> tuple[Condition, ...]:
-    """Return all conditions of the body and of the network."""
+def conditions(core: Estimator, now: float) -> tuple[Condition, ...]:
+    """Return all conditions of the readings, the body and the network; `now` is as in `report`."""
     present = [*_finding(core), *_changed_modules(core), *_isolated(core), *_unknown_offsets(core)]
+    if reason := core.rejected_because(now):
+        present.append(ConditionKind.READINGS_REJECTED.condition(reason))
     if core.mounting.tilt is not None:
         present.append(ConditionKind.OTHER_MOUNTING.condition(core.mounting.tilt.text))
     if core.state.mae is None:

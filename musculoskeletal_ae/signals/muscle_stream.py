@@ -261,6 +261,7 @@ class MuscleStream:
                 muscle_count,
                 self.body.isolated,
                 source=self._robot.tension_source,
+                names=self._robot.muscles,
             )
         except MessageError as error:
             raw = pull = None
