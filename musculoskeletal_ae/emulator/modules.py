@@ -404,6 +404,7 @@ class Arm(ABC):
 
     def step(self, duration: float) -> None:
         """Advance the time by `duration` [s], rounded to whole steps of 1 ms."""
+        self.faults.pass_time(duration)
         for _ in range(round(duration / STEP)):
             self._age += STEP
             if self._age > self.command_timeout:
