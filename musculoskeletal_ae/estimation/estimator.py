@@ -276,7 +276,9 @@ class Estimator:
     def joints(self, theta: Array, now: float) -> None:
         """Record θ [rad] (D,) as measured by joint sensors at `now` [s], NaN for other joints."""
         usable = self.joint_stream.take(now, theta).theta
-        self._readings = np.where(np.isnan(usable), self._readings, [usable, np.full_like(usable, now)])
+        self._readings = np.where(
+            np.isnan(usable), self._readings, [usable, np.full_like(usable, now)]
+        )
 
     @property
     def joint_trust(self) -> JointTrust:

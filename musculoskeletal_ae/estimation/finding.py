@@ -30,7 +30,6 @@ class Kind(Enum):
     LENGTHS_JUMPED = 'lengths_jumped'
     LENGTH_DISAGREES = 'length_disagrees'
     LENGTHS_DISAGREE = 'lengths_disagree'
-    JOINT_SENSORS_DISAGREE = 'joint_sensors_disagree'
     THERMAL_DRIFT = 'thermal_drift'
     VALUES_MISSING = 'values_missing'
 
@@ -42,10 +41,7 @@ REVOKING = REVOKING_ONE | {Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE}
 
 
 #: remedies of findings that do not end with the repair of one muscle
-_REMEDIES = {
-    Kind.JOINT_SENSORS_DISAGREE: (Step.CHECK_SENSOR, Step.RESET_ESTIMATOR),
-    **dict.fromkeys(REVOKING, (Step.CALIBRATE_LENGTHS,)),
-}
+_REMEDIES = dict.fromkeys(REVOKING, (Step.CALIBRATE_LENGTHS,))
 
 
 @dataclass(frozen=True)
@@ -53,8 +49,8 @@ class Finding:
     """A fault that a detector has found, and the muscle to which it is attributed.
 
     Attributes:
-        muscle: Index of the muscle. If the fault is of several muscles or of a joint sensor, it is
-            the index of one muscle whose readings the fault affects.
+        muscle: Index of the muscle. If the fault is of several muscles, it is the index of one of
+            them.
         kind: Kind of the fault.
         evidence: The evidence as a text for users.
     """

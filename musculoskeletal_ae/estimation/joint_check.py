@@ -19,21 +19,22 @@ count, because the error of a network in one posture says little about others.
 A change of muscle lengths also changes θ̂. The readings are therefore compared with two hypotheses:
 the sensors of the joints with large x are false, or the length of a single muscle has changed.
 
-    r = l − l_net(θ̂, T_end)       Δ = r − median of earlier r − G x       G: muscle Jacobian
+    Δ = l − l_net(θ, T_end) − median of earlier l − l_net(θ̂, T_end)
 
-Δ are the length changes with respect to the readings of the joint sensors, in healthy spreads of r.
-False joint sensors explain the part of Δ that has the form G δθ, with any δθ of these joints. A
-muscle explains its own component. Sensors are doubted if they leave a clearly smaller sum of
-squares. Joints without a sensor may have any δθ under both hypotheses.
+θ are the readings without their usual deviations, and the estimates for joints without a sensor.
+Under the first hypothesis, the angles of the joints in question may have any value: θ̂ and a motion
+along the muscle Jacobian. Under the second, Δ of one muscle does not count. Sensors are doubted if
+the first hypothesis leaves a clearly smaller sum of squares of Δ, in healthy spreads.
 """
 
 from collections import deque
 from collections.abc import Iterator
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.estimation.finding import Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -45,23 +46,27 @@ SPACING = 0.5  # shortest time between two messages that count [s]
 MOVED = 0.03
 EARLIER = 600  # largest number of earlier messages, at least 5 min of motion
 ENOUGH = 40  # judge a sensor by this many earlier messages at least
-NEWEST = 24  # number of newest messages, which are not yet among the earlier ones
+NEWEST = 48  # number of newest messages, which are not yet among the earlier ones
 #: Windows in which a sensor is judged: number of messages, smallest limit of the median of |x|
 #: [rad] (for prismatic joints times `kinematics.radian`), and limit in healthy spreads of x.
 #: The short window finds large errors fast; the long one averages over more postures.
-WINDOWS = ((6, 0.07, 6.0), (NEWEST, 0.05, 3.5))
-#: Trust a sensor again once the median of |x| over this many messages is below this share of the
-#: limit of the short window.
-AGREEING, AGREEING_SHARE = 12, 0.5
+WINDOWS = ((6, 0.12, 7.0), (24, 0.07, 3.0), (NEWEST, 0.06, 2.2))
+#: Multiply the limits by 1 + FEW/n if there are n earlier messages
+FEW = 20.0
+#: Trust a sensor again once the median of |x| is below AGREEING_LIMIT [rad] (for prismatic joints
+#: times `kinematics.radian`), or below AGREEING_SPREADS healthy spreads of x. It has to be so over
+#: the newest AGREEING messages and over the newer half of them.
+AGREEING, AGREEING_LIMIT, AGREEING_SPREADS = 12, 0.035, 1.0
 #: Smallest healthy spread of r [m], which bounds the precision of any length sensor
 LEAST_SPREAD = 0.0005
 #: Doubt joint sensors if they leave less than this share of the squares of length changes
 #: unexplained that a change of any single muscle leaves
 BETTER = 0.7
+USES = 10  # compute the medians of the earlier messages again after this many messages
 TO_SIGMA = 1.48  # standard deviation of a normal distribution, in medians of absolute deviations
 #: Doubt a sensor with fewer earlier messages if its reading differs from the estimate by this much
 #: [rad]; for prismatic joints times `kinematics.radian`
-GROSS = 0.5
+GROSS = 0.8
 
 
 class _Message(NamedTuple):
@@ -78,6 +83,7 @@ class _Usual(NamedTuple):
 
     deviation: Array  # θ − θ̂ [rad], (D,); 0 if unknown
     deviation_spread: Array  # [rad], (D,); NaN if unknown
+    count: Ints  # number of these messages, (D,)
     residual: Array  # r [m], (M,)
     residual_spread: Array  # [m], (M,)
 
@@ -101,11 +107,12 @@ class JointCheck:
         self._since = 0.0  # time since the last message that counted [s]
         #: estimate at the last message that counted [rad], (D,)
         self._counted_at = np.full(robot.joint_count, np.inf)
-        self._middle = np.zeros(robot.joint_count)  # usual θ − θ̂ [rad], (D,); 0 if unknown
+        self._usual: _Usual | None = None  # None if it has to be computed
+        self._uses = 0  # number of messages judged by `_usual`
 
     def use(self, mae: Mae) -> None:
         """Use another network; its isolated muscles are ignored."""
-        self._mae = mae
+        self._mae, self._usual = mae, None
         self._compared.clear()
         if not self._messages:
             return
@@ -126,6 +133,7 @@ class JointCheck:
 
     def forget(self) -> None:
         """Discard all messages, because the length offsets have changed; the trust stays."""
+        self._usual = None
         self._messages.clear()
         self._compared.clear()
 
@@ -137,6 +145,7 @@ class JointCheck:
         joints, doubted = self.trust.doubted, self.trust.is_doubted
         if not joints:
             return ()
+        self._usual = None
         self._set(doubted, Trust.CONFIRMED)
         for message, (deviation, _) in zip(self._messages, self._compared, strict=True):
             message.theta[doubted] = deviation[doubted] = np.nan
@@ -158,7 +167,8 @@ class JointCheck:
             return
         has_moved = (np.abs(estimate - self._counted_at) > MOVED * self._radian).any()
         # A sensor that is far off is also found while the arm stands still.
-        is_far = np.abs(theta - estimate - self._middle) > GROSS * self._radian
+        usual = 0.0 if self._usual is None else self._usual.deviation
+        is_far = np.abs(theta - estimate - usual) > GROSS * self._radian
         if not (has_moved or (is_far & ~self.trust.is_doubted).any()):
             return
         self._since, self._counted_at = 0.0, estimate
@@ -175,10 +185,13 @@ class JointCheck:
             self._compared[-1 - NEWEST][0][doubted] = np.nan
 
     def _judge(self) -> None:
-        deviation, residual = map(np.array, zip(*self._compared))
-        usual = self._usual(deviation[:-NEWEST], residual[:-NEWEST])
-        self._middle = usual.deviation
-        excess = deviation[-NEWEST:] - usual.deviation
+        usual = self._usual
+        if usual is None or self._uses >= USES:
+            usual, self._uses = self._compute_usual(), 0
+        self._usual, self._uses = usual, self._uses + 1
+        first = max(len(self._compared) - NEWEST, 0)
+        deviation, residual = map(np.array, zip(*islice(self._compared, first, None)))
+        excess = deviation - usual.deviation
         doubted = self.trust.is_doubted
         for count, limit in self._limits(usual):
             new = (_median(np.abs(excess[-count:])) > limit) & ~doubted
@@ -192,28 +205,35 @@ class JointCheck:
             self._set(agrees, Trust.TRUSTED)
             self._give_up(agrees)
 
-    def _usual(self, deviation: Array, residual: Array) -> _Usual:
-        """Return medians and spreads of earlier messages."""
-        is_known = np.isfinite(deviation).sum(axis=0) >= ENOUGH
+    def _compute_usual(self) -> _Usual:
+        """Return medians and spreads of the earlier messages."""
+        earlier = list(self._compared)[:-NEWEST]
+        deviation, residual = (
+            np.array([each[part] for each in earlier]).reshape(len(earlier), len(values))
+            for part, values in enumerate(self._compared[0])
+        )
+        count = np.isfinite(deviation).sum(axis=0)
+        is_known = count >= ENOUGH
         middle = np.where(is_known, _median(deviation), 0.0)
         spread = TO_SIGMA * _median(np.abs(deviation - middle))
         usual_residual = _median(residual)
         residual_spread = TO_SIGMA * _median(np.abs(residual - usual_residual))
         spread = np.where(is_known, spread, np.nan)
-        return _Usual(middle, spread, usual_residual, np.maximum(residual_spread, LEAST_SPREAD))
+        residual_spread = np.fmax(residual_spread, LEAST_SPREAD)
+        return _Usual(middle, spread, count, usual_residual, residual_spread)
 
     def _limits(self, usual: _Usual) -> Iterator[tuple[int, Array]]:
         """Yield the length of each window and the limits of the median of |x| [rad], (D,)."""
         for count, smallest, spreads in WINDOWS:
             limit = np.fmax(smallest * self._radian, spreads * usual.deviation_spread)
+            limit = limit * (1.0 + FEW / np.maximum(usual.count, 1))
             yield count, np.where(np.isnan(usual.deviation_spread), GROSS * self._radian, limit)
 
     def _agrees(self, excess: Array, usual: _Usual) -> Bools:
         """Return which joints agree with the lengths again, (D,)."""
-        shortest, smallest, spreads = WINDOWS[0]
-        limit = AGREEING_SHARE * np.fmax(smallest * self._radian, spreads * usual.deviation_spread)
+        limit = np.fmax(AGREEING_LIMIT * self._radian, AGREEING_SPREADS * usual.deviation_spread)
         agrees = np.ones(len(limit), dtype=bool)
-        for count in (shortest, AGREEING):
+        for count in (AGREEING // 2, AGREEING):
             agrees &= _median(np.abs(excess[-count:])) < limit
         return agrees
 
@@ -226,26 +246,31 @@ class JointCheck:
             residual: r of these messages [m], (N, M).
             usual: Medians and spreads of earlier messages.
         """
-        assert self._mae is not None
-        messages = list(self._messages)[-len(excess) :]
+        mae, spread = self._mae, usual.residual_spread
+        assert mae is not None
+        messages = [*islice(self._messages, len(self._messages) - len(excess), None)]
         tension = np.array([message.tension for message in messages])
         length = np.nan_to_num([message.length for message in messages])
-        used = ~np.isin(np.arange(length.shape[1]), self._mae.isolated)
-        jacobian = self._mae.muscle_jacobian(self._mae.estimate(tension, length).theta, tension)
-        spread = np.nan_to_num(usual.residual_spread, nan=1.0)[used]
-        jacobian = jacobian[:, used] / spread[:, None]
-        shift = np.nan_to_num(residual - np.nan_to_num(usual.residual))[:, used] / spread
-        # differences between measured lengths and those at the readings of the joint sensors
-        change = shift - np.einsum('nmd,nd->nm', jacobian, np.nan_to_num(excess))
-        is_free = joints | np.isnan(excess).any(axis=0)
-        by_joints = _misfit(change, jacobian[:, :, is_free])
-        is_free &= ~joints
-        others = ~np.eye(len(spread), dtype=bool)
+        estimate = mae.estimate(tension, length).theta
+        # Usual errors of readings and lengths are no sign of a fault.
+        read = estimate + np.nan_to_num(excess)
+        length = length - np.nan_to_num(usual.residual)
+        used = ~np.isin(np.arange(length.shape[1]), mae.isolated)
+
+        def misfit(is_free: Bools, muscles: Bools) -> float:
+            """Return the misfit of the lengths of some muscles if some joints have any angle."""
+            theta = np.where(is_free, estimate, read)
+            change = (length - mae.lengths(theta, tension)) / spread
+            jacobian = mae.muscle_jacobian(theta, tension) / spread[:, None]
+            return _unexplained(change[:, muscles], jacobian[:, muscles][:, :, is_free])
+
+        is_unknown = np.isnan(excess).any(axis=0)
+        by_joints = misfit(joints | is_unknown, used)
         by_muscle = min(
-            _misfit(change[:, other], jacobian[:, other][:, :, is_free]) for other in others
+            misfit(is_unknown, used & (np.arange(len(used)) != muscle))
+            for muscle in np.flatnonzero(used)
         )
-        total = _misfit(change, jacobian[:, :, is_free])
-        return by_joints < BETTER * min(by_muscle, total)
+        return by_joints < BETTER * by_muscle
 
     def _give_up(self, joints: Bools) -> None:
         """Discard the newest readings of joints, except those by which they are trusted again."""
@@ -274,19 +299,19 @@ class JointCheck:
 
         It is the time of the last message before which a window of messages agreed.
         """
-        count, smallest, _ = WINDOWS[0]
+        count = WINDOWS[0][0]
         deviation = np.array([deviation[joint] for deviation, _ in self._compared])
         usual = np.nanmedian(deviation[:-NEWEST]) if len(deviation) > NEWEST else 0.0
         excess = np.abs(deviation - usual)
-        limit = AGREEING_SHARE * smallest * self._radian[joint]
+        limit = AGREEING_LIMIT * self._radian[joint]
         for end in range(len(excess) - 1, count, -1):
             if np.median(excess[end - count : end]) < limit:  # NaN never agrees
                 return self._messages[end - count // 2].time
         return self._messages[0].time
 
 
-def _misfit(change: Array, jacobian: Array) -> float:
-    """Return the median of the squared length changes (N, M) that motions of joints do not explain.
+def _unexplained(change: Array, jacobian: Array) -> float:
+    """Return the median sum of squares of length changes that motions of joints do not explain.
 
     Args:
         change: Length changes, in healthy spreads, (N, M).
@@ -299,8 +324,7 @@ def _misfit(change: Array, jacobian: Array) -> float:
 
 
 def _median(values: Array) -> Array:
-    """Return the median of each column of (N, K), NaN where fewer than half of the values are known.
-    """
+    """Return the median of each column of (N, K), NaN where fewer than half of the values are known."""
     if not len(values):
         return np.full(values.shape[1], np.nan)
     is_known = 2 * np.isfinite(values).sum(axis=0) > len(values)

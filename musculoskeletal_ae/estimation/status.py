@@ -10,10 +10,12 @@ import numpy as np
 from musculoskeletal_ae.remedy import REMEDY_STEPS, identifiers, sentence
 from musculoskeletal_ae.report import MUSCLE_STATES, WAITS_FOR, Report
 from musculoskeletal_ae.signals.body_state import KNOWN
+from musculoskeletal_ae.signals.joint_trust import JointTrust
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.estimator import Estimator
     from musculoskeletal_ae.mae.mae import Mae
+    from musculoskeletal_ae.robot.robot import Robot
 
 UNKNOWN_TENSION = 'unknown: tension_source is none'
 #: key of the names of the isolated muscles with their faults, such as 'biceps (ruptured)'
@@ -41,6 +43,7 @@ def report(core: Estimator, now: float) -> Report:
         **_contact(core),
         **_offsets(core),
         **_familiarity(core),
+        **_joint_sensors(core),
     }
     if core.suspects.finding is not None:
         text = f'anomaly detected: {core.cause}; {core.advice}'
@@ -63,11 +66,37 @@ def report(core: Estimator, now: float) -> Report:
         )
         text = f'thermal drift: {"; ".join(changes)}'
         return Report('warn', text, {**values, 'state': 'thermal_drift'})
+    if core.joint_trust.doubted:
+        text = joint_trust_text(core.robot, core.joint_trust)
+        return Report('warn', text, {**values, 'state': 'joint_sensors_doubted'})
     if core.body.isolated:
         isolated = core.robot.names(core.body.isolated)
         text = f'estimating{calibrated} without {isolated}'
         return Report('warn', text, {**values, 'state': 'isolated'})
     return Report('ok', f'estimating{calibrated}', {**values, 'state': 'estimating'})
+
+
+def joint_trust_text(robot: Robot, trust: JointTrust) -> str:
+    """Return which joint sensors are in doubt, why and what to do, as a text for users."""
+    if not trust.doubted:
+        return 'all joint sensors are trusted'
+    sensors = ', '.join(
+        f'{robot.joints[j]} (differs by {trust.deviation[j]:+.2f} {robot.units[j].theta})'
+        for j in trust.doubted
+    )
+    return (
+        f'joint sensors disagree with the muscle lengths: {sensors}; their readings are not used. '
+        'Check these sensors and their order. If they are right, call estimator/reset'
+    )
+
+
+def _joint_sensors(core: Estimator) -> dict[str, str]:
+    trust, values = core.joint_trust, dict[str, str]()
+    if trust.doubted:
+        values['doubted joint sensors'] = ', '.join(core.robot.joints[j] for j in trust.doubted)
+    if impossible := core.joint_stream.text:
+        values['impossible joint readings'] = impossible
+    return values
 
 
 def _network(core: Estimator, mae: Mae) -> dict[str, str]:

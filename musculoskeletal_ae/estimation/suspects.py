@@ -27,7 +27,6 @@ consequences:
     length_jump             concern one muscle, which is isolated and verified like any other. If
     length_disagrees        it is not isolated, its length offset alone becomes unreliable, and the
                             finding stays latched as for several muscles.
-    joint_sensors_disagree  concerns no muscle, so none is isolated.
 
 A muscle may be repaired while its finding is latched, and the repair may make its length jump, or
 its winch may take seconds to come back. A wrong length of this muscle alone therefore neither
@@ -53,7 +52,7 @@ from musculoskeletal_ae.robot.robot import Robot
 ACQUITTALS = 2  # number of suspects verified as healthy after which the next one is not verified
 WITHIN = 60.0  # time during which a suspect verified as healthy counts [s]
 #: kinds of findings after which no muscle is isolated, because the named one may be healthy
-OF_SEVERAL = frozenset({Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE, Kind.JOINT_SENSORS_DISAGREE})
+OF_SEVERAL = frozenset({Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE})
 
 
 class SuspectHandling:

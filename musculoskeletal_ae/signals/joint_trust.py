@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import ClassVar
 
 import numpy as np
 
@@ -37,6 +38,8 @@ class JointTrust:
         deviation: By how much each sensor read too much at the newest doubt [rad], (D,), as the
             muscle lengths show; 0 if there was no doubt.
     """
+
+    ROWS: ClassVar[int] = 3  # number of rows of the published message
 
     trust: tuple[Trust, ...]
     since: Array
