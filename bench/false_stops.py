@@ -18,7 +18,7 @@ These times are as long as those measured on two cores at a load of 20. There, a
 computed for a few milliseconds 100 times a second took 13 ms on average, and 46 ms in 1 % of all
 cases. Ten times in 150 s it did not run for 0.12 to 0.41 s.
 
-The bench prints the false findings and stops, the pauses (stops that end by themselves, for example
+The bench prints the false findings, doubted joint sensors and stops, the pauses (stops that end by themselves, for example
 after 0.2 s without messages), the number of messages that the controller lost, and the longest
 delay of a message. An individual's hour ends with its first finding or stop. The exit status is 1
 if there was one.
@@ -42,6 +42,7 @@ from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import KIN, make_arm
 from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.estimation.status import joint_trust_text
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_TIME
 from musculoskeletal_ae.learning.learner import Learner
@@ -169,6 +170,8 @@ class BusyLoop:
         supervisor = self.controller.supervisor
         if self.estimator.cause:
             return f'finding: {self.estimator.cause}'
+        if self.estimator.joint_trust.doubted:
+            return joint_trust_text(self.estimator.robot, self.estimator.joint_trust)
         return f'stop: {supervisor.condition}' if supervisor.is_latched else ''
 
     def run(self, seconds: float) -> Result:

@@ -2,8 +2,9 @@
 """Faults of tendons, motors, sensors and communication, which can begin and end at any time.
 
 A line `KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]` describes a fault, such as 'drop:0.3',
-'stuck_motor:biceps', 'bias:tension:40' or 'dead_sensor:elbow'. If the line names no muscle or
-joint, the fault affects all muscles; 'exchange' names two joints, by default the first and the last.
+'stuck_motor:biceps', 'bias:tension:40', 'drift:theta:elbow:0.01' or 'dead_sensor:elbow'. If the
+line names no muscle or joint, the fault affects all muscles. 'exchange:JOINT:JOINT' exchanges two
+joint sensors, by default those of the first and the last joint.
 """
 
 from collections.abc import Iterable

@@ -97,6 +97,9 @@ class JointCheck:
 
     def __init__(self, robot: Robot) -> None:
         """Start without a network."""
+        #: Without tensions, a load changes the estimates as false joint sensors would. Only gross
+        #: errors can be judged then.
+        self._is_precise = robot.tension_source.is_known
         self._radian = robot.kinematics.radian * np.ones(robot.joint_count)
         self._mae: Mae | None = None
         self.trust = JointTrust.full(robot.joint_count)
@@ -190,14 +193,14 @@ class JointCheck:
             usual, self._uses = self._compute_usual(), 0
         self._usual, self._uses = usual, self._uses + 1
         first = max(len(self._compared) - NEWEST, 0)
-        deviation, residual = map(np.array, zip(*islice(self._compared, first, None)))
+        deviation = np.array([each[0] for each in islice(self._compared, first, None)])
         excess = deviation - usual.deviation
         doubted = self.trust.is_doubted
         for count, limit in self._limits(usual):
             new = (_median(np.abs(excess[-count:])) > limit) & ~doubted
             # At least the newer half of a window that exceeds the limit shows the change.
             rows = -(count // 2)
-            if new.any() and self._explains(new, excess[rows:], residual[rows:], usual):
+            if new.any() and self._explains(new, excess[rows:], usual):
                 self._set(new, Trust.DOUBTED, excess)
                 return
         agrees = doubted & self._agrees(excess, usual)
@@ -227,7 +230,8 @@ class JointCheck:
         for count, smallest, spreads in WINDOWS:
             limit = np.fmax(smallest * self._radian, spreads * usual.deviation_spread)
             limit = limit * (1.0 + FEW / np.maximum(usual.count, 1))
-            yield count, np.where(np.isnan(usual.deviation_spread), GROSS * self._radian, limit)
+            is_gross = np.isnan(usual.deviation_spread) | (not self._is_precise)
+            yield count, np.where(is_gross, GROSS * self._radian, limit)
 
     def _agrees(self, excess: Array, usual: _Usual) -> Bools:
         """Return which joints agree with the lengths again, (D,)."""
@@ -237,13 +241,12 @@ class JointCheck:
             agrees &= _median(np.abs(excess[-count:])) < limit
         return agrees
 
-    def _explains(self, joints: Bools, excess: Array, residual: Array, usual: _Usual) -> bool:
+    def _explains(self, joints: Bools, excess: Array, usual: _Usual) -> bool:
         """Return whether false sensors explain the newest messages better than a changed muscle.
 
         Args:
             joints: The joints whose sensors may be false, (D,).
             excess: x of these messages [rad], (N, D).
-            residual: r of these messages [m], (N, M).
             usual: Medians and spreads of earlier messages.
         """
         mae, spread = self._mae, usual.residual_spread
@@ -291,7 +294,7 @@ class JointCheck:
         if excess is not None:
             for j in np.flatnonzero(joints).tolist():
                 since[j] = self._begin_of_doubt(j)
-                deviation[j] = np.nanmedian(excess[-WINDOWS[0][0] :, j])
+                deviation[j] = np.nanmedian(excess[-(WINDOWS[0][0] // 2) :, j])
         self.trust = JointTrust(trusts, since, deviation)
 
     def _begin_of_doubt(self, joint: int) -> float:
@@ -324,7 +327,7 @@ def _unexplained(change: Array, jacobian: Array) -> float:
 
 
 def _median(values: Array) -> Array:
-    """Return the median of each column of (N, K), NaN where fewer than half of the values are known."""
+    """Return the median of each column of (N, K), NaN where most values are unknown."""
     if not len(values):
         return np.full(values.shape[1], np.nan)
     is_known = 2 * np.isfinite(values).sum(axis=0) > len(values)

@@ -2,8 +2,8 @@
 """Gives up the readings of joint sensors that are in doubt.
 
 The estimator doubts a sensor some time after its fault, and publishes when the doubt begins
-(`signals/joint_trust.py`). Samples of the doubtful time then lose the angle of this joint; they keep
-tensions, lengths and the other angles. What happens next depends on the estimator:
+(`signals/joint_trust.py`). Samples of the doubtful time then lose the angle of this joint. They
+keep tensions, lengths and the other angles. What happens next depends on the estimator:
 
     trusted again        the sensor was false in the meantime, so these angles stay unknown
     confirmed by user    the doubt was wrong, so the samples get their angles back

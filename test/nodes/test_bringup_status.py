@@ -336,7 +336,6 @@ def test_after_an_isolation_the_fault_is_named_and_the_learner_advises_nothing_f
 @pytest.mark.parametrize(
     ('kind', 'first'),
     [
-        (Kind.JOINT_SENSORS_DISAGREE, 'check the named sensor'),
         (Kind.LENGTHS_JUMPED, 'call estimator/zero'),
         (Kind.SLACK_TENDON, 'repair the muscle'),
         (None, 'call controller/reset'),  # the anomaly is over, but the stop is latched
