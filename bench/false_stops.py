@@ -18,10 +18,10 @@ These times are as long as those measured on two cores at a load of 20. There, a
 computed for a few milliseconds 100 times a second took 13 ms on average, and 46 ms in 1 % of all
 cases. Ten times in 150 s it did not run for 0.12 to 0.41 s.
 
-The bench prints the false findings, doubted joint sensors and stops, the pauses (stops that end by themselves, for example
-after 0.2 s without messages), the number of messages that the controller lost, and the longest
-delay of a message. An individual's hour ends with its first finding or stop. The exit status is 1
-if there was one.
+The bench prints the false findings, doubted joint sensors and stops, the pauses (stops that end by
+themselves, for example after 0.2 s without messages), the number of messages that the controller
+lost, and the longest delay of a message. An individual's hour ends with its first finding, doubt or
+stop. The exit status is 1 if there was one.
 """
 
 from __future__ import annotations
