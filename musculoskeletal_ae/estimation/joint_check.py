@@ -45,7 +45,7 @@ SPACING = 0.5  # shortest time between two messages that count [s]
 #: counted [rad]; for prismatic joints times `kinematics.radian`.
 MOVED = 0.03
 EARLIER = 600  # largest number of earlier messages, at least 5 min of motion
-ENOUGH = 40  # judge a sensor by this many earlier messages at least
+ENOUGH = 80  # judge a sensor by this many earlier messages at least
 NEWEST = 48  # number of newest messages, which are not yet among the earlier ones
 #: Windows in which a sensor is judged: number of messages, smallest limit of the median of |x|
 #: [rad] (for prismatic joints times `kinematics.radian`), and limit in healthy spreads of x.
@@ -97,9 +97,7 @@ class JointCheck:
 
     def __init__(self, robot: Robot) -> None:
         """Start without a network."""
-        #: Without tensions, a load changes the estimates as false joint sensors would. Only gross
-        #: errors can be judged then.
-        self._is_precise = robot.tension_source.is_known
+        self._has_tensions = robot.tension_source.is_known
         self._radian = robot.kinematics.radian * np.ones(robot.joint_count)
         self._mae: Mae | None = None
         self.trust = JointTrust.full(robot.joint_count)
@@ -225,12 +223,22 @@ class JointCheck:
         residual_spread = np.fmax(residual_spread, LEAST_SPREAD)
         return _Usual(middle, spread, count, usual_residual, residual_spread)
 
+    def _is_precise(self) -> bool:
+        """Return whether errors below GROSS can be judged.
+
+        A network that has learned little makes large errors in new postures. Without tensions, a
+        load changes the estimates as false joint sensors would.
+        """
+        statistics = None if self._mae is None else self._mae.anomaly
+        has_learned = statistics is not None and statistics.calibrated
+        return has_learned and self._has_tensions
+
     def _limits(self, usual: _Usual) -> Iterator[tuple[int, Array]]:
         """Yield the length of each window and the limits of the median of |x| [rad], (D,)."""
         for count, smallest, spreads in WINDOWS:
             limit = np.fmax(smallest * self._radian, spreads * usual.deviation_spread)
             limit = limit * (1.0 + FEW / np.maximum(usual.count, 1))
-            is_gross = np.isnan(usual.deviation_spread) | (not self._is_precise)
+            is_gross = np.isnan(usual.deviation_spread) | (not self._is_precise())
             yield count, np.where(is_gross, GROSS * self._radian, limit)
 
     def _agrees(self, excess: Array, usual: _Usual) -> Bools:

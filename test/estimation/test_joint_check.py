@@ -38,8 +38,8 @@ class Arm:
 
 
 @pytest.fixture(scope='module')
-def learned_once(robot, mae):
-    arm = Arm(robot, mae)
+def learned_once(robot, calibrated):
+    arm = Arm(robot, calibrated)
     arm.go(120.0, systematic)
     assert arm.doubted == ()
     return arm
@@ -77,13 +77,20 @@ def test_a_sensor_that_drifts_is_doubted(arm, rate):
     assert arm.doubted == (0,)
 
 
+def test_a_network_that_has_learned_little_does_not_blame_a_sensor_for_a_small_error(robot, mae):
+    arm = Arm(robot, mae)
+    arm.go(120.0, systematic)
+    arm.go(30.0, slip(0.3))
+    assert arm.doubted == ()
+
+
 def test_two_exchanged_sensors_are_both_doubted(arm):
     arm.go(10.0, lambda theta, _: systematic(theta)[::-1])
     assert arm.doubted == (0, 1)
 
 
-def test_a_single_sensor_is_judged_as_well(robot, mae):
-    arm = Arm(robot, mae)
+def test_a_single_sensor_is_judged_as_well(robot, calibrated):
+    arm = Arm(robot, calibrated)
     arm.go(120.0, lambda theta, _: np.array([np.nan, theta[1]]))
     arm.go(30.0, lambda theta, _: np.array([np.nan, theta[1] + 0.1]))
     assert arm.doubted == (1,)
