@@ -240,7 +240,7 @@ def test_joint_sensors_find_a_wrong_zero_after_a_reset_right_after_the_repair(ru
 
 def test_a_joint_sensor_that_all_lengths_outvote_is_doubted_and_the_arm_goes_on(moved):
     moved.joint_off = np.array([0.0, 1.0])
-    moved.go(4.0)
+    moved.go(8.0)
     assert moved.core.joint_trust.doubted == (1,)
     assert moved.robot.joints[1] in moved.core.report(moved.time).message
     assert moved.kind is None
