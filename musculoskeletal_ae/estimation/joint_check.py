@@ -83,7 +83,7 @@ class _Usual(NamedTuple):
 
     deviation: Array  # θ − θ̂ [rad], (D,); 0 if unknown
     deviation_spread: Array  # [rad], (D,); NaN if unknown
-    count: Ints  # number of these messages, (D,)
+    known_count: Ints  # number of these messages, (D,)
     residual: Array  # r [m], (M,)
     residual_spread: Array  # [m], (M,)
 
@@ -237,7 +237,7 @@ class JointCheck:
         """Yield the length of each window and the limits of the median of |x| [rad], (D,)."""
         for count, smallest, spreads in WINDOWS:
             limit = np.fmax(smallest * self._radian, spreads * usual.deviation_spread)
-            limit = limit * (1.0 + FEW / np.maximum(usual.count, 1))
+            limit = limit * (1.0 + FEW / np.maximum(usual.known_count, 1))
             is_gross = np.isnan(usual.deviation_spread) | (not self._is_precise())
             yield count, np.where(is_gross, GROSS * self._radian, limit)
 
@@ -275,7 +275,7 @@ class JointCheck:
             jacobian = mae.muscle_jacobian(theta, tension) / spread[:, None]
             return _unexplained(change[:, muscles], jacobian[:, muscles][:, :, is_free])
 
-        is_unknown = np.isnan(excess).any(axis=0)
+        is_unknown: Bools = np.isnan(excess).any(axis=0)
         by_joints = misfit(joints | is_unknown, used)
         by_muscle = min(
             misfit(is_unknown, used & (np.arange(len(used)) != muscle))

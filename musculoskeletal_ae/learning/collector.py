@@ -49,6 +49,7 @@ class SampleCollector:
         rejected: Number of messages and rests that were not used, by reason.
         used_at: Time of the last message that was suitable for learning [s]; −∞ before the first.
         obstacle: Why all messages since `used_at` were unsuitable.
+        joint_trust: Which joint sensors the estimator trusts.
     """
 
     def __init__(
@@ -78,7 +79,7 @@ class SampleCollector:
         self._robot = robot
         self._stream = MuscleStream(robot)
         self._joint_stream = JointStream(robot)
-        self._joint_trust = JointTrust.full(robot.joint_count)
+        self.joint_trust = JointTrust.full(robot.joint_count)
         self._pairing = Pairing[MuscleSample](period)
         self._detector = RestDetector(settings, joint_source != SENSOR, radian)
         self._margin = AnomalyMargin()
@@ -122,7 +123,7 @@ class SampleCollector:
         for name, status in zip(self._robot.joints, sample.status, strict=True):
             if status in IMPOSSIBLE:
                 self.rejected[f'{status.value}: {name}'] += 1
-        self._measure(time, 0, np.where(self._joint_trust.is_doubted, np.nan, sample.theta))
+        self._measure(time, 0, np.where(self.joint_trust.is_doubted, np.nan, sample.theta))
 
     def imu(self, time: float, link: str, acceleration: Array) -> None:
         """Record an accelerometer reading [m/s²] (3,) in the axes of a link.
@@ -250,7 +251,7 @@ class SampleCollector:
 
     def use_joint_trust(self, trust: JointTrust) -> None:
         """Use another trust in the joint sensors for readings from now on."""
-        self._joint_trust = trust
+        self.joint_trust = trust
 
     def set_anomaly(self, is_anomaly: bool) -> None:
         """Set whether an anomaly is present.

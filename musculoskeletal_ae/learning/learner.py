@@ -242,6 +242,11 @@ class Learner:
         return self.collector.body
 
     @property
+    def joint_trust(self) -> JointTrust:
+        """Which joint sensors the estimator trusts."""
+        return self.collector.joint_trust
+
+    @property
     def isolated(self) -> tuple[int, ...]:
         """Indices of the isolated muscles."""
         return self.body.isolated

@@ -64,7 +64,7 @@ class Learner(Shell):
         if topic := JOINT_TOPICS.get(value('joint_source')):
             self.needed.add(topic)
             self.follow_posture(topic, lambda theta: core.joints(self.now(), theta), some=True)
-        if value('joint_source') == learner.SENSOR:  # the estimator does not judge a camera
+        if value('joint_source') == 'sensor':  # the estimator does not judge a camera
             self.follow_joint_trust(core.use_joint_trust)
         self.links = [frame.name for frame in body_frames(self.robot.kinematics.model)]
         self.accelerometers = LinkSensors()

@@ -127,10 +127,6 @@ STRANGE = {
             'muscle',
         ),
     ),
-    'joint_sensor_trust': (
-        Float64MultiArray,
-        lambda robot: array_message(np.ones((3, robot.joint_count)), 'quantity', 'joint'),
-    ),
     'anomaly_detected': (Bool, lambda _: Bool(data=True)),
     'accepted_checkpoint': (UInt8MultiArray, lambda _: UInt8MultiArray(data=b'not a network')),
 }
