@@ -539,6 +539,7 @@ LATCHING = (
     'accepted_checkpoint',
     'anomaly_detected',
     'isolated_muscles',
+    'joint_sensor_trust',
     'muscle_length_zeros',
 )
 KINDS_OF = {'muscle_states': 'Float64MultiArray', 'anomaly': 'Float64'}

@@ -12,10 +12,10 @@ lost or come late. The times of `bench/lab.py` are as long as those measured on 
 of 20. There, a process that computed for a few milliseconds 100 times a second took 13 ms on
 average, and 46 ms in 1 % of all cases. Ten times in 150 s it did not run for 0.12 to 0.41 s.
 
-The bench prints the false findings and stops, the pauses (stops that end by themselves, for example
-after 0.2 s without messages), the number of messages that the controller lost, and the longest
-delay of a message. An individual's hour ends with its first finding or stop. The exit status is 1
-if there was one.
+The bench prints the false findings, doubted joint sensors and stops, the pauses (stops that end by
+themselves, for example after 0.2 s without messages), the number of messages that the controller
+lost, and the longest delay of a message. An individual's hour ends with its first finding, doubt or
+stop. The exit status is 1 if there was one.
 """
 
 from pathlib import Path
@@ -71,6 +71,9 @@ class BusyLoop(Lab):
         supervisor = self.controller.supervisor
         if self.estimator.cause:
             return f'finding: {self.estimator.cause}'
+        if doubted := self.estimator.joint_trust.doubted:
+            names = ', '.join(self.estimator.robot.joints[j] for j in doubted)
+            return f'doubted joint sensors: {names}'
         condition = supervisor.condition
         return f'stop: {condition.text}' if supervisor.is_latched and condition else ''
 

@@ -200,6 +200,7 @@ class Lab:
         self._command: Array | None = None  # length command for the driver [m], (M,)
         self._published_body: BodyState | None = self.estimator.body
         self._published_anomaly = False
+        self._published_trust = self.estimator.joint_trust
 
     # -- time -----------------------------------------------------------------------------------
 
@@ -280,6 +281,10 @@ class Lab:
             self._to_learner.append(lambda: self.learner.anomaly(detected))
             if (older := self.validator.anomaly(detected, self.now)) is not None:
                 self._use(older)
+        if (trust := core.joint_trust) is not self._published_trust:
+            self._published_trust = trust
+            self.validator.forget()
+            self._to_learner.append(lambda: self.learner.use_joint_trust(trust))
         if core.body is not self._published_body:
             self._published_body = core.body
             self.validator.isolated = core.body.isolated
@@ -378,6 +383,7 @@ class Lab:
             self.validator = CheckpointValidator(robot)
             self._candidate, self._published_body = None, None
             self._published_anomaly = False
+            self._published_trust = self.estimator.joint_trust
             self._estimates.clear()
             self.before_step.append(self._start_estimator(self.now + RESTARTING))
         elif node == CONTROLLER:

@@ -44,7 +44,7 @@ REVOKED = frozenset({
 FROZEN = FAULTY | {'sensor_frozen'}
 MISSING = FAULTY | {'values_missing', 'implausible_muscle_states', 'readings_rejected'}
 TENSION_SENSOR = FAULTY | {'sensor_saturated', 'tension_sensor_disagrees'}
-JOINT = frozenset({'joint_sensors_disagree', 'joint_sensor_disagrees', 'joint_sensor_frozen'})
+JOINT = frozenset({'joint_sensors_doubted', 'joint_readings_impossible'})
 #: messages are rejected, and say why: a true symptom of readings that jump
 REJECTED = frozenset({'implausible_muscle_states', 'readings_rejected'})
 STALE = frozenset({

@@ -280,7 +280,7 @@ class Course:
         try:
             if step is Step.RESET_CONTROLLER:
                 present = lab.controller.reset(lab.now)
-                refused = '' if present is None else str(present)
+                refused = '' if present is None else present.text
             elif step is Step.RESET_ESTIMATOR:
                 self._reset_estimator()
             elif step is Step.CALIBRATE_LENGTHS:
@@ -305,6 +305,9 @@ class Course:
 
     def _reset_estimator(self) -> None:
         lab = self.lab
+        if not lab.estimator.cause and lab.estimator.confirm_joint_sensors():
+            lab.publish()
+            return
         finding = lab.estimator.suspects.finding
         lab.estimator.reset()
         if finding is not None:

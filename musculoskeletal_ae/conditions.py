@@ -320,14 +320,24 @@ class ConditionKind(Enum):
         reaction=Reaction.STOP,
         revokes=Revokes.ALL,
     )
-    JOINT_SENSORS_DISAGREE = Declaration(
-        'joint_sensors_disagree',
+    JOINT_SENSORS_DOUBTED = Declaration(
+        'joint_sensors_doubted',
         'estimator',
-        'error',
-        'a joint sensor disagrees with the lengths of all muscles',
-        'a joint sensor disagrees with the lengths',
-        (Step.CHECK_SENSOR, Step.RESET_ESTIMATOR),
-        reaction=Reaction.STOP,
+        'warn',
+        'readings of joint sensors disagree with the muscle lengths; they are neither used nor '
+        'learned',
+        'joint sensors disagree with the muscle lengths',
+        (Step.CHECK_JOINT_SENSOR,),
+        reaction=Reaction.WARN,
+    )
+    JOINT_READINGS_IMPOSSIBLE = Declaration(
+        'joint_readings_impossible',
+        'estimator',
+        'warn',
+        'for 1 s, all readings of a joint sensor were beyond the joint limits, or jumped further '
+        'than a joint can move',
+        'impossible readings of joint sensors are not used',
+        (Step.CHECK_JOINT_SENSOR,),
     )
     READINGS_REJECTED = Declaration(
         'readings_rejected',

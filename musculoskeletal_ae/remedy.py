@@ -47,6 +47,10 @@ class Step(Enum):
         'correct_mounting',
         'mount the base as robot.urdf states, or correct robot.urdf',
     )
+    CHECK_JOINT_SENSOR = (
+        'check_joint_sensor',
+        'check the named joint sensors and their order; if they are right, call estimator/reset',
+    )
     CHECK_MODULE = (
         'check_module',
         'check drag, cooling and tension sensor of the module; then call estimator/reset',

@@ -2,9 +2,11 @@
 """Faults of tendons, motors, sensors and communication, which can begin and end at any time.
 
 A line `KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]` describes a fault, such as 'drop:0.3',
-'stuck_motor:biceps', 'bias:tension:40' or 'dead_sensor:elbow'. If the line names no muscle or
-joint, the fault affects all muscles. The turn of the base (`mount_x`, `mount_y`) is no fault of the
-arm, but of its mounting: `robot.urdf` states another direction of gravity.
+'stuck_motor:biceps', 'bias:tension:40', 'drift:theta:elbow:0.01' or 'dead_sensor:elbow'. If the
+line names no muscle or joint, the fault affects all muscles. 'exchange:JOINT:JOINT' exchanges two
+joint sensors, by default those of the first and the last joint. The turn of the base (`mount_x`,
+`mount_y`) is no fault of the arm, but of its mounting: `robot.urdf` states another direction of
+gravity.
 """
 
 from collections.abc import Iterable
@@ -21,6 +23,7 @@ from musculoskeletal_ae.validity import QUANTITIES
 SPEED_LIMIT = 0.25  # largest speed of a muscle module's motor [m/s]; chosen by hand
 TURN = 6.2832  # largest turn of the base, by which it is upright again [rad]
 SPIKE_SHARE = 0.05  # fraction of the readings in which one muscle has a spike
+BURST_TIME, BURST_PAUSE = 0.3, 3.0  # mean duration of a burst, and of the pause before it [s]
 
 
 class Kind(NamedTuple):
@@ -37,6 +40,9 @@ class Kind(NamedTuple):
 #: size of a spike or bias of each quantity (theta: joint angles): default, largest, unit
 SIZES = {'length': (0.05, 1.0, 'm'), 'tension': (100.0, 1e4, 'N'),
          'temperature': (60.0, 1e3, '°C'), 'theta': (0.1, 3.2, 'rad')}  # fmt: skip
+#: rate of a drift of each quantity: default, largest, unit
+RATES = {'length': (1e-4, 0.1, 'm/s'), 'tension': (1.0, 1e3, 'N/s'),
+         'temperature': (0.1, 1e2, '°C/s'), 'theta': (0.01, 1.0, 'rad/s')}  # fmt: skip
 KINDS = {
     'drop': Kind('readings are lost', 0.5, 1.0, 'share', of_muscle=False),
     'delay': Kind('readings are delayed', 0.1, 10.0, 's', of_muscle=False),
@@ -47,6 +53,9 @@ KINDS = {
     'nan_sensor': Kind('sensors read NaN', of_quantity=True),
     'spike': Kind('sensors have spikes of this size', *SIZES['length'], of_quantity=True),
     'bias': Kind('sensors have this offset', *SIZES['length'], of_quantity=True),
+    'drift': Kind('sensors drift at this rate', *RATES['length'], of_quantity=True),
+    'burst': Kind('sensors read this value in bursts', *SIZES['length'], of_quantity=True),
+    'exchange': Kind('two joint sensors are exchanged', of_muscle=False),
     'stuck_motor': Kind('motors are jammed'),
     'winch_speed': Kind('motors are limited to this speed', 0.009, SPEED_LIMIT, 'm/s'),
     'unzeroed': Kind('lengths have offsets of 0.4 to 1 times this size', 0.13, 1.0, 'm'),
@@ -76,6 +85,11 @@ class Fault(NamedTuple):
     which: Ints  # indices of the muscles, or of the joints if the quantity is theta
     size: float
 
+    @property
+    def key(self) -> tuple[object, ...]:
+        """A hashable value that is the same for equal faults."""
+        return self.kind, self.quantities, tuple(self.which.tolist()), self.size
+
 
 def read_fault(line: str, robot: Robot) -> Fault:
     """Return the fault that a line describes.
@@ -87,6 +101,12 @@ def read_fault(line: str, robot: Robot) -> Fault:
     if name not in KINDS:
         raise MusculoskeletalError(f'{line[:80]!r}; legal: {LEGAL}')
     kind = KINDS[name]
+    if name == 'exchange':
+        words = words or [robot.joints[0], robot.joints[-1]]
+        if len(words) != 2 or not set(words) <= set(robot.joints):
+            legal = f'exchange:JOINT:JOINT; joints: {", ".join(robot.joints)}'
+            raise MusculoskeletalError(f'{line[:80]!r}; legal: {legal}')
+        return Fault(name, ('theta',), np.array([robot.joints.index(word) for word in words]), 0.0)
     quantities: tuple[str, ...] = QUANTITIES if kind.of_quantity else ()
     size, largest, unit, smallest = kind.size, kind.largest, kind.unit, 0.0
     if kind.of_quantity and words and words[0] in QUANTITIES:
@@ -94,9 +114,9 @@ def read_fault(line: str, robot: Robot) -> Fault:
     elif kind.of_quantity and words and words[0] in robot.joints:
         quantities = ('theta',)
     elif kind.size:
-        quantities = quantities[:1]  # without a quantity, spikes and biases affect lengths
+        quantities = quantities[:1]  # without a quantity, faults with a size affect lengths
     if quantities and kind.size:
-        size, largest, unit = SIZES[quantities[0]]
+        size, largest, unit = (RATES if name == 'drift' else SIZES)[quantities[0]]
         unit, smallest = f'{unit} of {quantities[0]}', -largest
     # The name of a muscle may be a number.
     if words and largest and ':'.join(words) not in robot.muscles:
@@ -127,6 +147,10 @@ class Faults:
         self._frozen: dict[tuple[str, int], float] = {}
         self._reordered: Readings | None = None  # readings that are sent after the next ones
         self._queue: list[tuple[float, Readings]] = []
+        self._time = 0.0  # time since the start [s]
+        self._begins: dict[tuple[object, ...], float] = {}  # begin of each drift [s], by its key
+        #: time of the next change of each burst [s], and whether the burst is present, by its key
+        self._bursts: dict[tuple[object, ...], tuple[float, bool]] = {}
         # Effects on the mechanics, each (M,): relative loss of motor speed, excess length of the
         # tendon [m], offset of the length sensor [m], minimum temperature of the housing [°C],
         # highest reading of the tension sensor [N], to which the module reacts as well.
@@ -148,6 +172,10 @@ class Faults:
         self._faults = tuple(read_fault(line, self._robot) for line in lines)
         frozen = {(name, m) for f in self._of('freeze') for name in f.quantities for m in f.which}
         self._frozen = {key: value for key, value in self._frozen.items() if key in frozen}
+        drifts = [fault.key for fault in self._of('drift')]
+        self._begins = {key: self._begins.get(key, self._time) for key in drifts}
+        bursts = [fault.key for fault in self._of('burst')]
+        self._bursts = {key: self._bursts.get(key, (self._time, True)) for key in bursts}
         if not self._of('reorder'):
             self._reordered = None
         if self._delay() != delay:  # queued readings would arrive between newer ones
@@ -176,15 +204,35 @@ class Faults:
     def _of(self, *names: str) -> list[Fault]:
         return [fault for fault in self._faults if fault.kind in names]
 
+    def pass_time(self, duration: float) -> None:
+        """Advance the time of drifts and bursts by `duration` [s]."""
+        self._time += duration
+
+    def _is_in_burst(self, fault: Fault) -> bool:
+        until, is_present = self._bursts[fault.key]
+        while self._time >= until:
+            is_present = not is_present
+            until += self._rng.exponential(BURST_TIME if is_present else BURST_PAUSE)
+        self._bursts[fault.key] = until, is_present
+        return is_present
+
     def apply(self, readings: Readings) -> Readings:
         """Return the readings with all sensor faults applied."""
         values = {name: getattr(readings, name).copy() for name in (*QUANTITIES, 'theta')}
         values['tension'] = np.minimum(values['tension'], self.ceiling)
-        for fault in self._of('bias', 'spike', 'dead_sensor', 'nan_sensor', 'freeze'):
+        kinds = 'exchange', 'bias', 'drift', 'burst', 'spike', 'dead_sensor', 'nan_sensor', 'freeze'
+        for fault in self._of(*kinds):
+            is_in_burst = fault.kind == 'burst' and self._is_in_burst(fault)
             for name in fault.quantities:
                 value, which = values[name], fault.which
                 if fault.kind == 'bias':
                     value[which] += fault.size
+                elif fault.kind == 'exchange':
+                    value[which] = value[which[::-1]]
+                elif fault.kind == 'drift':
+                    value[which] += fault.size * (self._time - self._begins[fault.key])
+                elif fault.kind == 'burst':
+                    value[which] = np.where(is_in_burst, fault.size, value[which])
                 elif fault.kind == 'dead_sensor':
                     value[which] = 0.0
                 elif fault.kind == 'nan_sensor':

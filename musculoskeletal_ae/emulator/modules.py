@@ -417,6 +417,7 @@ class Arm(ABC):
         if self.faults.mount is not self._mount:
             self._mount = self.faults.mount
             self._turn_gravity(self._mount)
+        self.faults.pass_time(duration)
         for _ in range(round(duration / STEP)):
             self._age += STEP
             if self._age > self.command_timeout:

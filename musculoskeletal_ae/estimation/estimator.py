@@ -32,6 +32,7 @@ from musculoskeletal_ae.estimation.detectors.joint_disagreement import GAP_LEARN
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
 from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.health import HealthMonitor
+from musculoskeletal_ae.estimation.joint_check import JointCheck
 from musculoskeletal_ae.estimation.length_trust import EVIDENCE_OF, Evidence, LengthTrust
 from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
@@ -49,6 +50,8 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 from musculoskeletal_ae.signals.heat import Heat
+from musculoskeletal_ae.signals.joint_stream import JointStream
+from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.limits import Persistence
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
@@ -103,8 +106,11 @@ class Estimator:
         sample: The last sample; None before the first.
         output: Results of the last message with an estimate; None before the first, and from the
             start of a length calibration until its first estimate.
+        joint_stream: Judges single readings of the joint sensors.
+        joint_check: Decides which joint sensors are trusted.
         measured: Joint angles from joint sensors [rad], (D,), at the last message with an estimate;
-            None unless all joint sensors reported a value within the 0.05 s before it.
+            None unless all joint sensors are trusted and reported a usable value within the 0.05 s
+            before it.
         stepped_at: Time on the steady clock at which the last message was accepted while there was
             a network [s].
     """
@@ -134,7 +140,10 @@ class Estimator:
         self.stepped_at = -math.inf
         self._commands = ModuleCommands()
         self._rejected = Persistence()  # why messages are rejected
-        self._measured: tuple[float, Array | None] = -math.inf, None  # time and measured θ
+        self.joint_stream = JointStream(robot)
+        self.joint_check = JointCheck(robot)
+        #: usable readings of the joint sensors [rad] and their times [s], (2, D); NaN if unknown
+        self._readings = np.full((2, robot.joint_count), np.nan)
         #: whether `mae.isolated` of a new network decides which muscles are isolated; this ends
         #: with the first finding or call of `isolate` or `keep_isolated`
         self._follows_network = True
@@ -195,6 +204,7 @@ class Estimator:
         isolated = mae.isolated if self._follows_network else self.body.isolated
         reduced = mae.without(isolated)
         self.health.use(reduced)
+        self.joint_check.use(reduced)
         self.contact.use(reduced)
         self.mounting.use(reduced)
         self.stream.use_transmission(reduced.transmission)
@@ -250,6 +260,7 @@ class Estimator:
         self.contact.reset()
         self.reset()
         self.health.joints.forget()
+        self.joint_check.forget()
 
     def commanded(
         self, now: float, length: Array | None = None, tension: Array | None = None
@@ -258,8 +269,23 @@ class Estimator:
         self._commands.note(now, length, tension)
 
     def joints(self, theta: Array, now: float) -> None:
-        """Record θ [rad] (D,) as measured by the joint sensors at `now` [s]."""
-        self._measured = now, theta
+        """Record θ [rad] (D,) as measured by joint sensors at `now` [s], NaN for other joints."""
+        usable = self.joint_stream.take(now, theta).theta
+        self._readings = np.where(
+            np.isnan(usable), self._readings, [usable, np.full_like(usable, now)]
+        )
+
+    @property
+    def joint_trust(self) -> JointTrust:
+        """Which joint sensors are trusted; times are those of the steady clock."""
+        return self.joint_check.trust
+
+    def confirm_joint_sensors(self) -> tuple[int, ...]:
+        """Trust all joint sensors again, as the user wants; return the joints that were in doubt.
+
+        The readings of the doubtful time then count as well.
+        """
+        return self.joint_check.confirm()
 
     def restore(self, muscles: Iterable[int]) -> None:
         """Use isolated muscles (indices) again; muscles that are not isolated are ignored.
@@ -428,11 +454,16 @@ class Estimator:
             self._verify(sample, estimate, dt, now)
         demand = self._commands.demand(self.robot, sample.length, now)
         known = self.body.offsets.known
+        readings = self._fresh_readings(now)
         self.measured = self._measured_theta(now)
         command = self._commands.length(now)
         observation = Observation(sample, estimate, demand, dt, known, self.measured, command)
         finding = self.health.step(observation)
         detected = self._handle(finding, now)
+        if detected:
+            self.joint_check.drop_newest()
+        elif known and self.suspects.finding is None:
+            self.joint_check.step(observation, readings, now)
         contact = None
         if known and self.robot.tension_source.is_known:
             pull = sample.bone_tension * self.body.used
@@ -461,11 +492,15 @@ class Estimator:
         self.stream.use_body(body)
 
     def _measured_theta(self, now: float) -> Array | None:
-        """Return θ [rad] (D,) from joint sensors, or None if a value is missing or too old."""
-        time, theta = self._measured
-        if theta is None or now - time >= JOINTS_AGE or not np.isfinite(theta).all():
-            return None
-        return theta
+        """Return θ [rad] (D,) from joint sensors, or None if a value is missing or in doubt."""
+        theta = self._fresh_readings(now)
+        is_known = np.isfinite(theta).all() and not self.joint_trust.doubted
+        return theta if is_known else None
+
+    def _fresh_readings(self, now: float) -> Array:
+        """Return the usable readings of joint sensors [rad], (D,), with NaN where they are old."""
+        theta, time = self._readings
+        return np.where(now - time < JOINTS_AGE, theta, np.nan)
 
     def _handle_jump(self, jumped: tuple[int, ...], now: float) -> None:
         """Respond to a jump of lengths in two cases in which the detector `LengthJump` does not.

@@ -23,8 +23,8 @@ class Finding:
     """A fault that a detector has found, and the muscle to which it is attributed.
 
     Attributes:
-        muscle: Index of the muscle. If the fault is of several muscles or of a joint sensor, it is
-            the index of one muscle whose readings the fault affects.
+        muscle: Index of the muscle. If the fault is of several muscles, it is the index of one of
+            them.
         kind: Kind of the fault. Its declaration states the consequence and the remedy.
         evidence: The evidence as a text for users.
     """

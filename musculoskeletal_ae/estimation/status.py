@@ -36,6 +36,7 @@ def report(core: Estimator, now: float) -> Report:
         **_contact(core),
         **_offsets(core),
         **_familiarity(core),
+        **_joint_sensors(core),
     }
     if core.calibration is not None:
         return Report('calibrating the lengths', values, present)
@@ -46,6 +47,9 @@ def report(core: Estimator, now: float) -> Report:
 def conditions(core: Estimator, now: float) -> tuple[Condition, ...]:
     """Return all conditions of the readings, the body and the network; `now` is as in `report`."""
     present = [*_finding(core), *_changed_modules(core), *_isolated(core), *_unknown_offsets(core)]
+    present += _doubted_joints(core)
+    if names := core.joint_stream.unreadable(now):
+        present.append(ConditionKind.JOINT_READINGS_IMPOSSIBLE.condition(', '.join(names), names))
     if reason := core.rejected_because(now):
         present.append(ConditionKind.READINGS_REJECTED.condition(reason))
     if core.mounting.tilt is not None:
@@ -102,6 +106,24 @@ def _unknown_offsets(core: Estimator) -> Iterator[Condition]:
         yield kind.LENGTH_OFFSETS_UNKNOWN.condition(detail, names, steps=steps)
     if calibration is not None and calibration.problem:
         yield kind.LENGTH_CALIBRATION_STUCK.condition(calibration.problem)
+
+
+def _doubted_joints(core: Estimator) -> Iterator[Condition]:
+    trust, robot = core.joint_trust, core.robot
+    if trust.doubted:
+        detail = ', '.join(
+            f'{robot.joints[j]} by {trust.deviation[j]:+.2f} {robot.units[j].theta}'
+            for j in trust.doubted
+        )
+        names = [robot.joints[j] for j in trust.doubted]
+        yield ConditionKind.JOINT_SENSORS_DOUBTED.condition(detail, names)
+
+
+def _joint_sensors(core: Estimator) -> dict[str, str]:
+    values = dict[str, str]()
+    if impossible := core.joint_stream.text:
+        values['impossible joint readings'] = impossible
+    return values
 
 
 def _network(core: Estimator, mae: Mae) -> dict[str, str]:

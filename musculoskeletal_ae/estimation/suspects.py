@@ -30,7 +30,6 @@ consequences:
     length_jump             concern one muscle, which is isolated and verified like any other. If
     length_disagrees        it is not isolated, its length offset alone becomes unreliable, and the
                             finding stays latched as for several muscles.
-    joint_sensors_disagree  concerns no muscle, so none is isolated.
 
 A muscle may be repaired while its finding is latched, and the repair may make its length jump, or
 its winch may take seconds to come back. A wrong length of this muscle alone therefore neither

@@ -135,6 +135,13 @@ class Reservoir:
         """Forget the messages of the last `seconds` in which the arm was considered healthy."""
         self._kept = [row for row in self._kept if row[-1] <= self.time - seconds]
 
+    def remove_angles(self, joint: int, seconds: float) -> None:
+        """Mark θ of a joint as not measured in the messages of the last `seconds`."""
+        place = 3 * self._muscles + joint
+        for row in self._kept:
+            if row[-1] > self.time - seconds:
+                row[place] = np.nan
+
     def clear(self) -> None:
         """Forget all messages and rests, for example after the body has changed."""
         self._missing = frozenset()

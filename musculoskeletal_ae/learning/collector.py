@@ -2,8 +2,9 @@
 """Turns raw messages into samples: new rests of the arm that are safe to learn from.
 
     l, T ─► plausible (`signals.muscle_stream`) ─┐
-    θ, gravity ──────────────────────────────────┴► paired by time (`pairing`)
-         ─► θ plausible ─► at rest (`rest`) ─► no anomaly near (`margin`) ─► new (`samples`)
+    θ ─► plausible and trusted (`joint_stream`) ─┤
+    gravity ─────────────────────────────────────┴► paired by time (`pairing`)
+         ─► at rest (`rest`) ─► no anomaly near (`margin`) ─► new (`samples`)
 
 Values of isolated muscles are replaced by 0 before messages are paired. A sample contains the
 version of the body state at that time, and the muscles that were isolated then.
@@ -17,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.margin import AnomalyMargin
 from musculoskeletal_ae.learning.rest import RestDetector
@@ -25,7 +25,9 @@ from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
 from musculoskeletal_ae.learning.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
-from musculoskeletal_ae.signals.limits import LIMITS, check_posture
+from musculoskeletal_ae.signals.joint_stream import IMPOSSIBLE, JointStream
+from musculoskeletal_ae.signals.joint_trust import JointTrust
+from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 from musculoskeletal_ae.signals.pairing import Paired, Pairing
 
@@ -47,6 +49,7 @@ class SampleCollector:
         rejected: Number of messages and rests that were not used, by reason.
         used_at: Time of the last message that was suitable for learning [s]; −∞ before the first.
         obstacle: Why all messages since `used_at` were unsuitable.
+        joint_trust: Which joint sensors the estimator trusts.
     """
 
     def __init__(
@@ -75,6 +78,8 @@ class SampleCollector:
         self._needs_joints = joint_source == SENSOR
         self._robot = robot
         self._stream = MuscleStream(robot)
+        self._joint_stream = JointStream(robot)
+        self.joint_trust = JointTrust.full(robot.joint_count)
         self._pairing = Pairing[MuscleSample](period)
         self._detector = RestDetector(settings, joint_source != SENSOR, radian)
         self._margin = AnomalyMargin()
@@ -84,7 +89,6 @@ class SampleCollector:
             robot.joint_count + 3 * len(robot.kinematics.tree.parent), np.nan
         )
         self._longest_pause = max(LIMITS.pause, settings.rest_time)
-        self._skipped = 0.0  # time covered by unused messages since the last used message [s]
 
     @property
     def body(self) -> BodyState:
@@ -112,9 +116,14 @@ class SampleCollector:
     def joints(self, time: float, theta: Array) -> None:
         """Record θ [rad] (D,) received at `time` [s], with NaN for unmeasured joints.
 
-        It is paired with the message of muscle_states that is nearest in time.
+        It is paired with the message of muscle_states that is nearest in time. Impossible readings
+        are counted and not used; those of joint sensors that the estimator doubts are not used.
         """
-        self._measure(time, 0, theta)
+        sample = self._joint_stream.take(time, theta)
+        for name, status in zip(self._robot.joints, sample.status, strict=True):
+            if status in IMPOSSIBLE:
+                self.rejected[f'{status.value}: {name}'] += 1
+        self._measure(time, 0, np.where(self.joint_trust.is_doubted, np.nan, sample.theta))
 
     def imu(self, time: float, link: str, acceleration: Array) -> None:
         """Record an accelerometer reading [m/s²] (3,) in the axes of a link.
@@ -187,17 +196,9 @@ class SampleCollector:
         A message is used only after `margin` has held it back for some time. Messages during an
         anomaly and shortly after it are ignored.
         """
-        dt = min(paired.dt + self._skipped, self._longest_pause)
+        dt = min(paired.dt, self._longest_pause)
         measured = self._unmeasured if paired.theta is None else paired.theta
         theta, gravity = np.split(measured, [self._robot.joint_count])
-        try:
-            check_posture(self._robot, theta, LIMITS.joint_outside)
-        except MessageError as error:
-            self.rejected[error.reason] += 1
-            self.obstacle = str(error)
-            self._skipped = dt
-            return []
-        self._skipped = 0.0
         if self._needs_joints and np.isnan(theta).all():
             self.obstacle = NO_JOINTS
         else:
@@ -248,6 +249,10 @@ class SampleCollector:
         self.healthy.use_isolated(body.isolated)
         self.reset()
 
+    def use_joint_trust(self, trust: JointTrust) -> None:
+        """Use another trust in the joint sensors for readings from now on."""
+        self.joint_trust = trust
+
     def set_anomaly(self, is_anomaly: bool) -> None:
         """Set whether an anomaly is present.
 
@@ -259,7 +264,7 @@ class SampleCollector:
     def reset(self) -> None:
         """Discard incomplete samples, for example after a backward jump of the clock."""
         self._stream.reset()
+        self._joint_stream.reset()
         self._pairing.reset()
         self._detector.reset()
         self._margin.reset()
-        self._skipped = 0.0

@@ -31,8 +31,6 @@ class Update(NamedTuple):
     #: index of a muscle whose newest samples contradict the fitted body, and the number of these
     #: newest samples; at most one entry
     changed: tuple[tuple[int, int], ...] = ()
-    #: several muscles that the newest samples contradict at once, which indicates a wrong θ
-    contradicted: tuple[int, ...] = ()
     #: mean ‖θ_est − θ‖₂ over the newest samples, with θ_est of the network before the update [rad];
     #: NaN if none of them has measured angles
     error: float = 0.0

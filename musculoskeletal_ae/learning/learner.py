@@ -29,6 +29,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
 from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR, SampleCollector
 from musculoskeletal_ae.learning.job import Update
+from musculoskeletal_ae.learning.joint_history import JointHistory
 from musculoskeletal_ae.learning.joint_stops import LARGEST_OFFSET
 from musculoskeletal_ae.learning.keeper import CheckpointKeeper
 from musculoskeletal_ae.learning.offset_history import HELD_TIME, OffsetHistory
@@ -41,6 +42,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
+from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 from musculoskeletal_ae.signals.pairing import Paired
@@ -116,6 +118,7 @@ class Learner:
         self.keeper = CheckpointKeeper(robot, samples, directory, own_preset.validates_updates)
         saved = self.keeper.load()
         self.offset_history = OffsetHistory(samples, self.body.offsets.offset)
+        self.joint_history = JointHistory(samples, robot.joint_count)
         self._time = -math.inf  # time of the last message [s]
         self._jumps = 0  # number of jumps of lengths so far
         if self.samples:
@@ -188,6 +191,7 @@ class Learner:
         self.keeper.observe(paired.message, paired.dt, self.collector.is_anomaly, measured)
         for _ in self.collector.collect(paired):
             self.offset_history.accepted(time)
+            self.joint_history.accepted(time)
             self._note_new_samples()
 
     def _use_known_offsets(self) -> None:
@@ -222,6 +226,11 @@ class Learner:
     def body(self) -> BodyState:
         """The body state: length offsets and isolated muscles."""
         return self.collector.body
+
+    @property
+    def joint_trust(self) -> JointTrust:
+        """Which joint sensors the estimator trusts."""
+        return self.collector.joint_trust
 
     @property
     def isolated(self) -> tuple[int, ...]:
@@ -261,6 +270,21 @@ class Learner:
         body = self.body.with_isolated(muscles)
         if body is not self.body:
             self.use_body(body)
+
+    def use_joint_trust(self, trust: JointTrust) -> None:
+        """Use another trust in the joint sensors, whose times are those of the messages.
+
+        Doubted sensors are not learned. Their readings since the begin of the doubt are given up,
+        unless the user confirms them (`joint_history`).
+        """
+        self.collector.use_joint_trust(trust)
+        doubted = self.joint_history.use(trust)
+        for joint in doubted:
+            self.collector.healthy.remove_angles(joint, self._time - trust.since[joint])
+        if doubted:
+            self.reset()
+            self.keeper.forget_messages()
+        self._note_new_samples()
 
     def anomaly(self, detected: bool) -> None:
         """Stop learning if an anomaly is `detected`; resume learning otherwise.

@@ -94,8 +94,4 @@ def _update_values(robot: Robot, update: Update) -> dict[str, str]:
     if len(update.noise):
         worst = int(update.noise.argmax())
         values['length noise'] = f'{1e3 * update.noise[worst]:.2f} mm ({robot.muscles[worst]})'
-    if update.contradicted:
-        names = robot.names(update.contradicted)
-        key = 'newest samples contradict several muscles'
-        values[key] = f'{names}; check the joint sensors'
     return values

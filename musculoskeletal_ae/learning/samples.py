@@ -12,7 +12,7 @@ tensions so far, and the newest sample always stays.
 from __future__ import annotations
 
 from bisect import bisect
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -204,6 +204,31 @@ class SampleStore:
         """Forget the held samples; return their number."""
         count, self.held = len(self.held), []
         return count
+
+    def remove_angles(self, joint: int, numbers: Set[int]) -> dict[int, float]:
+        """Mark θ of a joint as not measured in the samples with these numbers.
+
+        Returns:
+            The removed angles [rad] by number of the sample.
+        """
+        removed = dict[int, float]()
+        for place, number in enumerate(self.numbers):
+            if number in numbers and np.isfinite(angle := self.samples[place].theta[joint]):
+                removed[number] = float(angle)
+                self._set_angle(place, joint, np.nan)
+        return removed
+
+    def put_back_angles(self, joint: int, angles: Mapping[int, float]) -> int:
+        """Put removed angles [rad] of a joint back, by number; return how many were put back."""
+        places = [place for place, number in enumerate(self.numbers) if number in angles]
+        for place in places:
+            self._set_angle(place, joint, angles[self.numbers[place]])
+        return len(places)
+
+    def _set_angle(self, place: int, joint: int, angle: float) -> None:
+        theta = self.samples[place].theta.copy()
+        theta[joint] = angle
+        self.samples[place] = self.samples[place]._replace(theta=theta)
 
     def lengthen(self, by: Array, first: int) -> int:
         """Add `by` [m] (M,) to the lengths of all samples with number `first` or above.

@@ -85,9 +85,8 @@ class BodyUpdater(Updater):
         job = job._replace(healthy=job.healthy._replace(learned=learned, judging=judging))
         self._trainer.move(self.body_fit.lengthened())
         contradicted = contradicted_muscles(observed, fit)
-        # Several contradicted muscles indicate a slipped joint sensor or contact, not replaced
-        # muscles. The robust weights exclude the newest samples then, until they are the majority.
-        alone = len(contradicted) == 1
+        # Several contradicted muscles do not indicate replaced muscles, but for example contact.
+        # The robust weights then exclude the newest samples, until they are the majority.
         if self._statistics_held and not job.statistics_hold:
             self._trainer.restart()
         self._statistics_held = job.statistics_hold
@@ -101,8 +100,7 @@ class BodyUpdater(Updater):
             self._published(self._trainer.network, 'default', self._trainer.steps, job, fit),
             loss_now,
             fit.noise,
-            contradicted if alone else (),
-            () if alone else tuple(muscle for muscle, _ in contradicted),
+            contradicted if len(contradicted) == 1 else (),
             sensor_offset=self.body.zero.copy(),
         )
 

@@ -3,11 +3,11 @@
 
 muscle_states → estimated_joint_states with estimated_joint_covariance, estimated_muscle_states,
 anomaly, anomaly_detected, estimated_external_wrench, isolated_muscles, muscle_length_zeros,
-estimated/markers; on request muscle_joint_states and /tf.
+joint_sensor_trust, estimated/markers; on request muscle_joint_states and /tf.
 mae_checkpoint → accepted_checkpoint, the networks that have passed the validation.
 marker_pose → vision_joint_states, the joint angles measured by a camera.
 joint_states are optional. They are used by the length calibration, by the validation of
-checkpoints, and by the detector that compares them with the lengths.
+checkpoints, and by the detectors that compare them with the lengths.
 """
 
 import time
@@ -48,6 +48,7 @@ from musculoskeletal_ae.nodes.sources import AUTHORS
 from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.signals.body_state import LengthOffsets
+from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, RejectionError
 from musculoskeletal_ae.validity import read_pose
 
@@ -73,6 +74,7 @@ class Estimator(Shell):
         self.published_anomaly = False
         self.published_isolated: tuple[int, ...] | None = None
         self.published_offsets: LengthOffsets | None = None
+        self.published_trust: JointTrust | None = None
         self.detected.publish(Bool(data=self.published_anomaly))
         self.needed.add('muscle_states')
         if not self.get_parameter('use_sim_time').value:  # simulated time may be slow
@@ -93,12 +95,13 @@ class Estimator(Shell):
         self.follow_muscle_messages(self._on_muscles)
         self.follow_posture('joint_states', self._on_joints, some=True)
         self._publish_offsets()
+        self._publish_joint_trust()
         for kind in ('length', 'tension'):
             self.follow_muscles(f'muscle_{kind}_command', partial(self._on_command, kind))
         self.listen(PoseStamped, 'marker_pose', self._on_marker, SENSOR)
         Markers(self, 'estimated', self._lines)
         serve(self, Trigger, 'estimator/check_health', self._check_health)
-        serve(self, Trigger, 'estimator/reset', self._reset)
+        serve(self, Trigger, 'estimator/reset', self._reset_or_confirm)
         serve(self, Trigger, 'estimator/zero', self._calibrate)
         serve(self, Trigger, 'estimator/isolate', self._isolate_more)
         serve(self, Trigger, 'estimator/restore', self._restore)
@@ -114,6 +117,7 @@ class Estimator(Shell):
         self.detected = publisher(Bool, 'anomaly_detected', LATCHED)
         self.isolated = publisher(String, 'isolated_muscles', LATCHED)
         self.offsets = publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
+        self.trust = publisher(Float64MultiArray, 'joint_sensor_trust', LATCHED)
         self.mirror = None
         if self.parameter('mirror_muscles'):
             self.mirror = publisher(JointState, 'muscle_joint_states', RELIABLE)
@@ -177,6 +181,14 @@ class Estimator(Shell):
         self._publish_isolated()
         return f'isolated: {self.robot.names(self.core.body.isolated) or "none"}'
 
+    def _reset_or_confirm(self, request: Trigger.Request) -> str:
+        """End the anomaly; if there is none, trust the doubted joint sensors again."""
+        if not self.core.cause and (joints := self.core.confirm_joint_sensors()):
+            self._publish_joint_trust()
+            names = ', '.join(self.robot.joints[joint] for joint in joints)
+            return f'trusting these joint sensors again: {names}'
+        return self._reset(request)
+
     def _reset(self, _: Trigger.Request) -> str:
         finding = self.core.suspects.finding
         self.core.reset()
@@ -206,10 +218,8 @@ class Estimator(Shell):
     # -- messages -------------------------------------------------------------------------------
 
     def _on_joints(self, theta: Array) -> None:
-        if np.isnan(theta).any():
-            return  # sensors of only some joints determine neither length offsets nor posture
         self.core.joints(theta, time.monotonic())
-        if self.frames is not None and self.tf_source == 'sensor':
+        if np.isfinite(theta).all() and self.frames is not None and self.tf_source == 'sensor':
             self.frames.publish(theta)
 
     def _on_command(self, kind: str, command: Array) -> None:
@@ -228,6 +238,7 @@ class Estimator(Shell):
                 self._publish_isolated()
             raise
         self._publish_offsets()
+        self._publish_joint_trust()
         sample = self.core.sample
         if self.mirror is not None and self.core.body.offsets.known and sample is not None:
             self._publish_mirror(sample, clock.to_msg())
@@ -307,6 +318,18 @@ class Estimator(Shell):
         yield from super().conditions()
         if problem := self.memory.problem:
             yield ConditionKind.OFFSETS_NOT_SAVED.condition(problem)
+
+    def _publish_joint_trust(self) -> None:
+        trust, before = self.core.joint_trust, self.published_trust
+        if trust is before:
+            return
+        self.published_trust = trust
+        self.trust.publish(array_message(trust.rows(time.monotonic()), 'quantity', 'joint'))
+        if before is not None:
+            self.candidates.validator.forget()  # the readings so far may be wrong
+            names = ', '.join(self.robot.joints[joint] for joint in trust.doubted)
+            self.get_logger().warning(f'doubted joint sensors: {names or "none"}')
+            self._report()
 
     def _lines(self) -> list[Line]:
         output = self.core.output

@@ -2,7 +2,7 @@
 """The node `learner`: learns the body online, and publishes the network for the estimator.
 
 muscle_states, joint_states or vision_joint_states (or neither), imu, anomaly_detected,
-isolated_muscles, muscle_length_zeros → mae_checkpoint.
+isolated_muscles, muscle_length_zeros, joint_sensor_trust → mae_checkpoint.
 """
 
 import time
@@ -64,6 +64,8 @@ class Learner(Shell):
         if topic := JOINT_TOPICS.get(value('joint_source')):
             self.needed.add(topic)
             self.follow_posture(topic, lambda theta: core.joints(self.now(), theta), some=True)
+        if value('joint_source') == 'sensor':  # the estimator does not judge a camera
+            self.follow_joint_trust(core.use_joint_trust)
         self.links = [frame.name for frame in body_frames(self.robot.kinematics.model)]
         self.accelerometers = LinkSensors()
         self.listen(Imu, IMU, self._take_imu, SENSOR)

@@ -36,6 +36,7 @@ from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.exceptions import (
     CheckpointError,
+    MessageError,
     MusculoskeletalError,
     printable,
 )
@@ -63,6 +64,7 @@ from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
+from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.message_delay import MessageDelay
 from musculoskeletal_ae.signals.motor_interface import STATES, MotorInterface
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
@@ -537,6 +539,18 @@ class Shell(Node):
             changed()
 
         self.listen(String, 'isolated_muscles', take, LATCHED)
+
+    def follow_joint_trust(self, follow: Callable[[JointTrust], object]) -> None:
+        """Call `follow` with the estimator's trust in the joint sensors, in times of `now`."""
+
+        def take(message: Float64MultiArray) -> None:
+            rows = read_array(message, JointTrust.ROWS, self.robot.joint_count)
+            try:
+                follow(JointTrust.from_rows(rows, self.now()))
+            except ValueError as error:
+                raise MessageError('impossible trust', str(error)) from error
+
+        self.listen(Float64MultiArray, 'joint_sensor_trust', take, LATCHED)
 
     def follow_anomaly(self, follow: Callable[[bool], object]) -> None:
         """Call `follow` whenever an anomaly begins or ends.

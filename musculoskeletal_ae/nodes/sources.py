@@ -45,6 +45,7 @@ AUTHORS = {
     'muscle_length_zeros': _ESTIMATOR,
     'anomaly_detected': _ESTIMATOR,
     'isolated_muscles': _ESTIMATOR,
+    'joint_sensor_trust': _ESTIMATOR,
     'accepted_checkpoint': _ESTIMATOR,
     'mae_checkpoint': 'the learner',
     CLOCK: 'the source of time',

@@ -325,6 +325,18 @@ def test_the_learner_follows_the_isolated_muscles_of_a_running_estimator(
         graph.wait(lambda wanted=muscles: known() == wanted, text or 'nobody')
 
 
+def test_the_learner_gives_up_the_joint_sensors_that_the_estimator_doubts(host, graph, arm26):
+    learner = host()
+    publisher = graph.publisher(Float64MultiArray, 'joint_sensor_trust', LATCHED)
+    for trust in (1.0, 2.0):
+        rows = np.array([[0.0, trust], [0.0, 3.0], [0.0, 0.5]])
+        publisher.publish(array_message(rows, 'quantity', 'joint'))
+        graph.wait(
+            lambda wanted=trust: learner.node.core.joint_trust.trust[1] == wanted,
+            f'trust {trust:g} in {arm26.joints[1]}',
+        )
+
+
 # -- real processes -------------------------------------------------------------------------------
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detects that muscle lengths and joint sensors indicate different postures.
+"""Detects muscle lengths that contradict the joint sensors.
 
     g = l − l_net(θ, T_end)
     Δ = g − g_usual
@@ -14,9 +14,9 @@ by as much as the offset.
 
 A joint sensor with an offset δθ changes g as well, but like a change of posture: Δ = −G δθ, where G
 is the muscle Jacobian ∂l/∂θ. Because muscles outnumber joints, arbitrary errors of lengths rarely
-have this form. If some δθ explains most of Δ, the joint sensor with the largest δθ is reported;
-otherwise, the lengths are reported. If only one length disagrees with θ, only its muscle is
-reported.
+have this form. If some δθ explains most of Δ, nothing is reported here, because the joint sensors
+are false (`joint_check.py`); otherwise, the lengths are reported. If only one length disagrees with
+θ, only its muscle is reported.
 
 A healthy tendon that is shorter than l_net is stretched and has tension. If a tendon is shorter but
 has no tension, it is ruptured. Its muscle is reported, provided that the lengths of all other
@@ -101,7 +101,7 @@ UNEXPLAINED = 0.5
 
 
 class JointDisagreement(Detector):
-    """Reports muscle lengths, or a joint sensor, if they indicate different postures.
+    """Reports muscle lengths that contradict the joint sensors.
 
     Attributes:
         gap: Measured minus computed length of each muscle [m], (M,); 0 for isolated muscles. None
@@ -158,7 +158,7 @@ class JointDisagreement(Detector):
         return self.gap is not None and self._excess(self.gap) <= 1.0
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report lengths or a joint sensor if they have disagreed for more than 1 s.
+        """Report lengths if they have contradicted the joint sensors for more than 1 s.
 
         The result is None if there is nothing to report.
         """
@@ -218,7 +218,7 @@ class JointDisagreement(Detector):
         change, largest = self._change(gap)
         return largest.excess(change, self._used)
 
-    def _finding(self, observation: Observation) -> Finding:
+    def _finding(self, observation: Observation) -> Finding | None:
         assert self._mae is not None
         assert self.gap is not None
         assert observation.measured is not None
@@ -238,18 +238,11 @@ class JointDisagreement(Detector):
             'length differs from that at the measured posture by '
             f'{largest.text(change, self._used, muscle)}'
         )
-        if np.linalg.norm(unexplained) > UNEXPLAINED * np.linalg.norm(change):
-            is_alone = self._others_agree(muscle, change, largest)
-            kind = ConditionKind.LENGTH_DISAGREES if is_alone else ConditionKind.LENGTHS_DISAGREE
-            return Finding(muscle, kind, f'its {evidence}')
-        j = int(np.abs(shift / self._robot.kinematics.radian).argmax())
-        offset = f'{shift[j]:.2f} {self._robot.units[j].theta}'
-        cause = (
-            f'the lengths look as if joint sensor {self._robot.joints[j]} had an offset of {offset}'
-        )
-        return Finding(
-            muscle, ConditionKind.JOINT_SENSORS_DISAGREE, f"{cause}: the muscle's {evidence}"
-        )
+        if np.linalg.norm(unexplained) <= UNEXPLAINED * np.linalg.norm(change):
+            return None  # false joint sensors explain it, which `joint_check` judges
+        is_alone = self._others_agree(muscle, change, largest)
+        kind = ConditionKind.LENGTH_DISAGREES if is_alone else ConditionKind.LENGTHS_DISAGREE
+        return Finding(muscle, kind, f'its {evidence}')
 
     def _others_agree(self, muscle: int, change: Array, largest: Largest) -> bool:
         """Return whether the lengths of all muscles but one agree with the measured posture."""

@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Decides which joint sensors are trusted, by comparing them with the muscle lengths.
+
+    x_j = (θ_j − θ̂_j) − median of the same in earlier messages
+
+θ_j is the reading of joint sensor j, and θ̂_j the network's estimate from tensions and lengths,
+which no joint sensor enters. A false sensor therefore changes its own x_j only. This also holds if
+only some joints have sensors, and if two sensors are exchanged.
+
+The earlier messages are the anchor. Both x_j and the median are computed with the network in use,
+again for each new network. If the network learns from a false sensor, it follows the new readings
+and departs from the earlier ones, so that their difference stays. A constant offset of a sensor
+cancels out.
+
+A sensor is doubted while the median of |x_j| over the newest messages exceeds a limit: a constant
+or a multiple of the healthy spread of x_j, whichever is larger. Only messages of different postures
+count, because the error of a network in one posture says little about others.
+
+A change of muscle lengths also changes θ̂. The readings are therefore compared with two hypotheses:
+the sensors of the joints with large x are false, or the length of a single muscle has changed.
+
+    Δ = l − l_net(θ, T_end) − median of earlier l − l_net(θ̂, T_end)
+
+θ are the readings without their usual deviations, and the estimates for joints without a sensor.
+Under the first hypothesis, the angles of the joints in question may have any value: θ̂ and a motion
+along the muscle Jacobian. Under the second, Δ of one muscle does not count. Sensors are doubted if
+the first hypothesis leaves a clearly smaller sum of squares of Δ, in healthy spreads.
+"""
+
+from collections import deque
+from collections.abc import Iterator
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.estimation.finding import Observation
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.joint_trust import JointTrust, Trust
+
+SPACING = 0.5  # shortest time between two messages that count [s]
+#: A message counts if the estimate of a joint has moved by this much since the last one that
+#: counted [rad]; for prismatic joints times `kinematics.radian`.
+MOVED = 0.03
+EARLIER = 600  # largest number of earlier messages, at least 5 min of motion
+ENOUGH = 80  # judge a sensor by this many earlier messages at least
+NEWEST = 48  # number of newest messages, which are not yet among the earlier ones
+#: Windows in which a sensor is judged: number of messages, smallest limit of the median of |x|
+#: [rad] (for prismatic joints times `kinematics.radian`), and limit in healthy spreads of x.
+#: The short window finds large errors fast; the long one averages over more postures.
+WINDOWS = ((6, 0.12, 7.0), (24, 0.07, 3.0), (NEWEST, 0.06, 2.2))
+#: Multiply the limits by 1 + FEW/n if there are n earlier messages
+FEW = 20.0
+#: Trust a sensor again once the median of |x| is below AGREEING_LIMIT [rad] (for prismatic joints
+#: times `kinematics.radian`), or below AGREEING_SPREADS healthy spreads of x. It has to be so over
+#: the newest AGREEING messages and over the newer half of them.
+AGREEING, AGREEING_LIMIT, AGREEING_SPREADS = 12, 0.035, 1.0
+#: Smallest healthy spread of r [m], which bounds the precision of any length sensor
+LEAST_SPREAD = 0.0005
+#: Doubt joint sensors if they leave less than this share of the squares of length changes
+#: unexplained that a change of any single muscle leaves
+BETTER = 0.7
+USES = 10  # compute the medians of the earlier messages again after this many messages
+TO_SIGMA = 1.48  # standard deviation of a normal distribution, in medians of absolute deviations
+#: Doubt a sensor with fewer earlier messages if its reading differs from the estimate by this much
+#: [rad]; for prismatic joints times `kinematics.radian`
+GROSS = 0.8
+
+
+class _Message(NamedTuple):
+    """Readings of one message that counts."""
+
+    time: float  # [s]
+    theta: Array  # readings of the joint sensors [rad], (D,); NaN where unknown or in doubt
+    tension: Array  # bone-side tensions [N], (M,)
+    length: Array  # lengths [m], (M,); NaN for isolated muscles
+
+
+class _Usual(NamedTuple):
+    """Medians of earlier messages, and their spread about them."""
+
+    deviation: Array  # θ − θ̂ [rad], (D,); 0 if unknown
+    deviation_spread: Array  # [rad], (D,); NaN if unknown
+    known_count: Ints  # number of these messages, (D,)
+    residual: Array  # r [m], (M,)
+    residual_spread: Array  # [m], (M,)
+
+
+class JointCheck:
+    """Judges the joint sensors of one arm.
+
+    Attributes:
+        trust: The newest decision.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        """Start without a network."""
+        self._has_tensions = robot.tension_source.is_known
+        self._radian = robot.kinematics.radian * np.ones(robot.joint_count)
+        self._mae: Mae | None = None
+        self.trust = JointTrust.full(robot.joint_count)
+        #: messages in order of time; the last NEWEST of them are judged by the earlier ones
+        self._messages: deque[_Message] = deque(maxlen=EARLIER + NEWEST)
+        #: θ − θ̂ [rad] (D,) and r [m] (M,) of each message with the network in use
+        self._compared: deque[tuple[Array, Array]] = deque(maxlen=EARLIER + NEWEST)
+        self._since = 0.0  # time since the last message that counted [s]
+        #: estimate at the last message that counted [rad], (D,)
+        self._counted_at = np.full(robot.joint_count, np.inf)
+        self._usual: _Usual | None = None  # None if it has to be computed
+        self._uses = 0  # number of messages judged by `_usual`
+
+    def use(self, mae: Mae) -> None:
+        """Use another network; its isolated muscles are ignored."""
+        self._mae, self._usual = mae, None
+        self._compared.clear()
+        if not self._messages:
+            return
+        theta, tension, length = map(np.array, zip(*(each[1:] for each in self._messages)))
+        estimate = mae.estimate(tension, np.nan_to_num(length)).theta
+        used = ~np.isin(np.arange(length.shape[1]), mae.isolated)
+        # Messages in which a muscle was isolated that is used now cannot be compared.
+        is_complete = np.isfinite(length[:, used]).all(axis=1)
+        deviation = np.where(is_complete[:, None], theta - estimate, np.nan)
+        residual = np.where(is_complete[:, None] & used, length, np.nan)
+        self._compared.extend(zip(deviation, residual - mae.lengths(estimate, tension)))
+
+    def drop_newest(self) -> None:
+        """Discard the newest messages, because an anomaly has been found."""
+        for _ in range(min(NEWEST, len(self._messages))):
+            self._messages.pop()
+            self._compared.pop()
+
+    def forget(self) -> None:
+        """Discard all messages, because the length offsets have changed; the trust stays."""
+        self._usual = None
+        self._messages.clear()
+        self._compared.clear()
+
+    def confirm(self) -> tuple[int, ...]:
+        """Trust all doubted sensors, because the user has confirmed them; return their joints.
+
+        Their earlier readings are no anchor any more, because they contradict the confirmed ones.
+        """
+        joints, doubted = self.trust.doubted, self.trust.is_doubted
+        if not joints:
+            return ()
+        self._usual = None
+        self._set(doubted, Trust.CONFIRMED)
+        for message, (deviation, _) in zip(self._messages, self._compared, strict=True):
+            message.theta[doubted] = deviation[doubted] = np.nan
+        return joints
+
+    # -- messages -------------------------------------------------------------------------------
+
+    def step(self, observation: Observation, theta: Array, now: float) -> None:
+        """Judge the sensors by a message of an arm without an anomaly, whose offsets are known.
+
+        Args:
+            observation: The message.
+            theta: Usable readings of the joint sensors [rad], (D,), NaN for other joints.
+            now: Time of a steady clock [s].
+        """
+        self._since += observation.dt
+        estimate, sample = observation.estimate.state.theta, observation.sample
+        if self._mae is None or self._since < SPACING - 1e-9 or np.isnan(theta).all():
+            return
+        has_moved = (np.abs(estimate - self._counted_at) > MOVED * self._radian).any()
+        # A sensor that is far off is also found while the arm stands still.
+        usual = 0.0 if self._usual is None else self._usual.deviation
+        is_far = np.abs(theta - estimate - usual) > GROSS * self._radian
+        if not (has_moved or (is_far & ~self.trust.is_doubted).any()):
+            return
+        self._since, self._counted_at = 0.0, estimate
+        length = np.where(sample.usable, sample.length, np.nan)
+        tension = np.nan_to_num(sample.bone_tension)
+        self._messages.append(_Message(now, theta.copy(), tension, length))
+        self._compared.append((theta - estimate, length - self._mae.lengths(estimate, tension)))
+        if len(self._messages) >= WINDOWS[0][0]:
+            self._judge()
+        if len(self._messages) > NEWEST:
+            # Readings of a doubted sensor are no anchor.
+            doubted = self.trust.is_doubted
+            self._messages[-1 - NEWEST].theta[doubted] = np.nan
+            self._compared[-1 - NEWEST][0][doubted] = np.nan
+
+    def _judge(self) -> None:
+        usual = self._usual
+        if usual is None or self._uses >= USES:
+            usual, self._uses = self._compute_usual(), 0
+        self._usual, self._uses = usual, self._uses + 1
+        first = max(len(self._compared) - NEWEST, 0)
+        deviation = np.array([each[0] for each in islice(self._compared, first, None)])
+        excess = deviation - usual.deviation
+        doubted = self.trust.is_doubted
+        for count, limit in self._limits(usual):
+            new = (_median(np.abs(excess[-count:])) > limit) & ~doubted
+            # At least the newer half of a window that exceeds the limit shows the change.
+            rows = -(count // 2)
+            if new.any() and self._explains(new, excess[rows:], usual):
+                self._set(new, Trust.DOUBTED, excess)
+                return
+        agrees = doubted & self._agrees(excess, usual)
+        if agrees.any():
+            self._set(agrees, Trust.TRUSTED)
+            self._give_up(agrees)
+
+    def _compute_usual(self) -> _Usual:
+        """Return medians and spreads of the earlier messages."""
+        earlier = list(self._compared)[:-NEWEST]
+        deviation, residual = (
+            np.array([each[part] for each in earlier]).reshape(len(earlier), len(values))
+            for part, values in enumerate(self._compared[0])
+        )
+        count = np.isfinite(deviation).sum(axis=0)
+        is_known = count >= ENOUGH
+        middle = np.where(is_known, _median(deviation), 0.0)
+        spread = TO_SIGMA * _median(np.abs(deviation - middle))
+        usual_residual = _median(residual)
+        residual_spread = TO_SIGMA * _median(np.abs(residual - usual_residual))
+        spread = np.where(is_known, spread, np.nan)
+        residual_spread = np.fmax(residual_spread, LEAST_SPREAD)
+        return _Usual(middle, spread, count, usual_residual, residual_spread)
+
+    def _is_precise(self) -> bool:
+        """Return whether errors below GROSS can be judged.
+
+        A network that has learned little makes large errors in new postures. Without tensions, a
+        load changes the estimates as false joint sensors would.
+        """
+        statistics = None if self._mae is None else self._mae.anomaly
+        has_learned = statistics is not None and statistics.calibrated
+        return has_learned and self._has_tensions
+
+    def _limits(self, usual: _Usual) -> Iterator[tuple[int, Array]]:
+        """Yield the length of each window and the limits of the median of |x| [rad], (D,)."""
+        for count, smallest, spreads in WINDOWS:
+            limit = np.fmax(smallest * self._radian, spreads * usual.deviation_spread)
+            limit = limit * (1.0 + FEW / np.maximum(usual.known_count, 1))
+            is_gross = np.isnan(usual.deviation_spread) | (not self._is_precise())
+            yield count, np.where(is_gross, GROSS * self._radian, limit)
+
+    def _agrees(self, excess: Array, usual: _Usual) -> Bools:
+        """Return which joints agree with the lengths again, (D,)."""
+        limit = np.fmax(AGREEING_LIMIT * self._radian, AGREEING_SPREADS * usual.deviation_spread)
+        agrees = np.ones(len(limit), dtype=bool)
+        for count in (AGREEING // 2, AGREEING):
+            agrees &= _median(np.abs(excess[-count:])) < limit
+        return agrees
+
+    def _explains(self, joints: Bools, excess: Array, usual: _Usual) -> bool:
+        """Return whether false sensors explain the newest messages better than a changed muscle.
+
+        Args:
+            joints: The joints whose sensors may be false, (D,).
+            excess: x of these messages [rad], (N, D).
+            usual: Medians and spreads of earlier messages.
+        """
+        mae, spread = self._mae, usual.residual_spread
+        assert mae is not None
+        messages = [*islice(self._messages, len(self._messages) - len(excess), None)]
+        tension = np.array([message.tension for message in messages])
+        length = np.nan_to_num([message.length for message in messages])
+        estimate = mae.estimate(tension, length).theta
+        # Usual errors of readings and lengths are no sign of a fault.
+        read = estimate + np.nan_to_num(excess)
+        length = length - np.nan_to_num(usual.residual)
+        used = ~np.isin(np.arange(length.shape[1]), mae.isolated)
+
+        def misfit(is_free: Bools, muscles: Bools) -> float:
+            """Return the misfit of the lengths of some muscles if some joints have any angle."""
+            theta = np.where(is_free, estimate, read)
+            change = (length - mae.lengths(theta, tension)) / spread
+            jacobian = mae.muscle_jacobian(theta, tension) / spread[:, None]
+            return _unexplained(change[:, muscles], jacobian[:, muscles][:, :, is_free])
+
+        is_unknown = np.asarray(np.isnan(excess).any(axis=0))
+        by_joints = misfit(joints | is_unknown, used)
+        by_muscle = min(
+            misfit(is_unknown, used & (np.arange(len(used)) != muscle))
+            for muscle in np.flatnonzero(used)
+        )
+        return by_joints < BETTER * by_muscle
+
+    def _give_up(self, joints: Bools) -> None:
+        """Discard the newest readings of joints, except those by which they are trusted again."""
+        for place in range(max(-NEWEST, -len(self._messages)), -AGREEING):
+            self._messages[place].theta[joints] = self._compared[place][0][joints] = np.nan
+
+    def _set(self, joints: Bools, trust: Trust, excess: Array | None = None) -> None:
+        """Set the trust in some joints; with `excess`, a doubt begins.
+
+        Args:
+            joints: The joints, (D,).
+            trust: The new trust in each of them.
+            excess: x of the newest messages [rad], (N, D).
+        """
+        old = self.trust
+        trusts = tuple(trust if is_it else each for is_it, each in zip(joints, old.trust))
+        since, deviation = old.since.copy(), old.deviation.copy()
+        if excess is not None:
+            for j in np.flatnonzero(joints).tolist():
+                since[j] = self._begin_of_doubt(j)
+                deviation[j] = np.nanmedian(excess[-(WINDOWS[0][0] // 2) :, j])
+        self.trust = JointTrust(trusts, since, deviation)
+
+    def _begin_of_doubt(self, joint: int) -> float:
+        """Return the time since which the readings of a joint may be wrong [s].
+
+        It is the time of the last message before which a window of messages agreed.
+        """
+        count = WINDOWS[0][0]
+        deviation = np.array([deviation[joint] for deviation, _ in self._compared])
+        usual = np.nanmedian(deviation[:-NEWEST]) if len(deviation) > NEWEST else 0.0
+        excess = np.abs(deviation - usual)
+        limit = AGREEING_LIMIT * self._radian[joint]
+        for end in range(len(excess) - 1, count, -1):
+            if np.median(excess[end - count : end]) < limit:  # NaN never agrees
+                return self._messages[end - count // 2].time
+        return self._messages[0].time
+
+
+def _unexplained(change: Array, jacobian: Array) -> float:
+    """Return the median sum of squares of length changes that motions of joints do not explain.
+
+    Args:
+        change: Length changes, in healthy spreads, (N, M).
+        jacobian: Changes of the lengths with each of these joints, (N, M, K).
+    """
+    if jacobian.shape[2]:
+        motion = np.einsum('nkm,nm->nk', np.linalg.pinv(jacobian), change)
+        change = change - np.einsum('nmk,nk->nm', jacobian, motion)
+    return float(np.median(np.square(change).sum(axis=1)))
+
+
+def _median(values: Array) -> Array:
+    """Return the median of each column of (N, K), NaN where most values are unknown."""
+    if not len(values):
+        return np.full(values.shape[1], np.nan)
+    is_known = 2 * np.isfinite(values).sum(axis=0) > len(values)
+    return np.where(is_known, np.nanmedian(np.where(is_known, values, 0.0), axis=0), np.nan)

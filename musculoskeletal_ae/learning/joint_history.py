@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gives up the readings of joint sensors that are in doubt.
+
+The estimator doubts a sensor some time after its fault, and publishes when the doubt begins
+(`signals/joint_trust.py`). Samples of the doubtful time then lose the angle of this joint. They
+keep tensions, lengths and the other angles. What happens next depends on the estimator:
+
+    trusted again        the sensor was false in the meantime, so these angles stay unknown
+    confirmed by user    the doubt was wrong, so the samples get their angles back
+"""
+
+from collections import deque
+
+from musculoskeletal_ae.learning.samples import SampleStore
+from musculoskeletal_ae.signals.joint_trust import JointTrust, Trust
+
+MOST_RECENT = 400  # number of newest samples whose times are known
+
+
+class JointHistory:
+    """Removes angles from the samples of one store, and puts them back.
+
+    Attributes:
+        given_up: Number of angles that were given up, not counting those that were put back.
+    """
+
+    def __init__(self, samples: SampleStore, joint_count: int) -> None:
+        """Start with sensors that are all trusted."""
+        self._samples = samples
+        self._trust = JointTrust.full(joint_count)
+        #: times [s] and numbers of recent samples
+        self._recent: deque[tuple[float, int]] = deque(maxlen=MOST_RECENT)
+        #: angles that were removed [rad], by number of the sample, for each doubted joint
+        self._removed: dict[int, dict[int, float]] = {}
+        self.given_up = 0
+
+    def accepted(self, now: float) -> None:
+        """Record that the newest sample of the store was taken at `now` [s]."""
+        self._recent.append((now, self._samples.accepted))
+
+    def use(self, trust: JointTrust) -> tuple[int, ...]:
+        """Remove or put back angles, as another trust requires; return the newly doubted joints."""
+        before, self._trust = self._trust, trust
+        new = tuple(j for j in trust.doubted if before.trust[j] is not Trust.DOUBTED)
+        for j in new:
+            numbers = {number for at, number in self._recent if at >= trust.since[j]}
+            self._removed[j] = self._samples.remove_angles(j, numbers)
+            self.given_up += len(self._removed[j])
+        for j in [j for j in self._removed if trust.trust[j] is not Trust.DOUBTED]:
+            removed = self._removed.pop(j)
+            if trust.trust[j] is Trust.CONFIRMED:
+                self.given_up -= self._samples.put_back_angles(j, removed)
+        return new

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which joint sensors are trusted, as the estimator has decided.
+
+The estimator compares the joint sensors with the muscle lengths (`estimation/joint_check.py`), and
+publishes its decision on the latched topic `joint_sensor_trust`. Nothing else judges whether a
+plausible reading is right. Every change creates a new `JointTrust`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import ClassVar
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools
+
+
+class Trust(IntEnum):
+    """Whether a joint sensor is trusted; the numbers are published."""
+
+    #: Its readings are used. If they were in doubt before, those of the doubtful time are given up.
+    TRUSTED = 0
+    #: Its readings are not used, from the begin of the doubt on.
+    DOUBTED = 1
+    #: Its readings are used, including those of the doubtful time, because the user confirmed them.
+    CONFIRMED = 2
+
+
+@dataclass(frozen=True, eq=False)
+class JointTrust:
+    """The trust in every joint sensor of one arm, with the evidence.
+
+    Attributes:
+        trust: Trust in each joint sensor, D values.
+        since: Begin of the newest doubt in each sensor [s], (D,); NaN if there was none.
+        deviation: By how much each sensor read too much at the newest doubt [rad], (D,), as the
+            muscle lengths show; 0 if there was no doubt.
+    """
+
+    ROWS: ClassVar[int] = 3  # number of rows of the published message
+
+    trust: tuple[Trust, ...]
+    since: Array
+    deviation: Array
+
+    @classmethod
+    def full(cls, joint_count: int) -> JointTrust:
+        """Return the trust in sensors that have never been in doubt."""
+        unknown = np.full(joint_count, np.nan)
+        return cls((Trust.TRUSTED,) * joint_count, unknown, np.zeros(joint_count))
+
+    @property
+    def is_doubted(self) -> Bools:
+        """Which joint sensors are in doubt, (D,)."""
+        return np.array([each is Trust.DOUBTED for each in self.trust], dtype=bool)
+
+    @property
+    def doubted(self) -> tuple[int, ...]:
+        """Indices of the joint sensors that are in doubt."""
+        return tuple(np.flatnonzero(self.is_doubted).tolist())
+
+    def rows(self, now: float) -> Array:
+        """Return the message that is published at `now` [s]: trust, age of the doubt, deviation.
+
+        Args:
+            now: Time on the clock of `since` [s].
+
+        Returns:
+            The numbers of `Trust`, the time since the begin of the newest doubt [s] (0 if there was
+            none) and the deviations [rad], (3, D).
+        """
+        age = np.nan_to_num(np.maximum(now - self.since, 0.0))
+        return np.array([np.array(self.trust, dtype=float), age, self.deviation])
+
+    @classmethod
+    def from_rows(cls, rows: Array, now: float) -> JointTrust:
+        """Return the trust that a message (3, D) received at `now` [s] describes.
+
+        Raises:
+            ValueError: If a number in the message is not a `Trust`.
+        """
+        trust = tuple(Trust(number) for number in rows[0].tolist())
+        return cls(trust, np.where(rows[1] > 0.0, now - rows[1], np.nan), rows[2])
