@@ -19,6 +19,10 @@ class Step(Enum):
     RESET_CONTROLLER = 'reset_controller', 'call controller/reset'
     RESET_ESTIMATOR = 'reset_estimator', 'call estimator/reset'
     CALIBRATE_LENGTHS = 'calibrate_lengths', 'call estimator/zero'
+    CORRECT_WIRING = (
+        'correct_wiring',
+        'correct the order of the muscles, or the sign of the length, in the driver',
+    )
     EXPLORE = 'explore', 'call controller/explore true to explore again'
     EXPLORE_GENTLY = (
         'explore_gently',

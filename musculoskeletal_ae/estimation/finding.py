@@ -28,6 +28,7 @@ class Kind(Enum):
     SENSOR_FROZEN = 'sensor_frozen'
     LENGTH_JUMP = 'length_jump'
     LENGTHS_JUMPED = 'lengths_jumped'
+    MUSCLES_EXCHANGED = 'muscles_exchanged'
     LENGTH_DISAGREES = 'length_disagrees'
     LENGTHS_DISAGREE = 'lengths_disagree'
     JOINT_SENSORS_DISAGREE = 'joint_sensors_disagree'
@@ -38,13 +39,18 @@ class Kind(Enum):
 #: findings of one unreliable length; they revoke its offset unless the muscle is isolated
 REVOKING_ONE = frozenset({Kind.LENGTH_JUMP, Kind.LENGTH_DISAGREES})
 #: findings of unreliable lengths; those of several lengths revoke all length offsets
-REVOKING = REVOKING_ONE | {Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE}
+REVOKING = REVOKING_ONE | {
+    Kind.LENGTHS_JUMPED,
+    Kind.LENGTHS_DISAGREE,
+    Kind.MUSCLES_EXCHANGED,
+}
 
 
 #: remedies of findings that do not end with the repair of one muscle
 _REMEDIES = {
     Kind.JOINT_SENSORS_DISAGREE: (Step.CHECK_SENSOR, Step.RESET_ESTIMATOR),
     **dict.fromkeys(REVOKING, (Step.CALIBRATE_LENGTHS,)),
+    Kind.MUSCLES_EXCHANGED: (Step.CORRECT_WIRING, Step.CALIBRATE_LENGTHS),
 }
 
 

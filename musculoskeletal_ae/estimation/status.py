@@ -54,6 +54,8 @@ def report(core: Estimator, now: float) -> Report:
         values[CALIBRATION] = STANDING if core.calibration.is_standing else GENTLE_MOTION
         if core.calibration.problem:
             values['calibration problem'] = core.calibration.problem
+            if steps := core.calibration.remedy:
+                values[REMEDY_STEPS] = identifiers(steps)
         return Report('warn', text, {**values, 'state': 'calibrating'})
     calibrated = '' if core.health.residual.is_calibrated else ', uncalibrated'
     if core.heat.changed:

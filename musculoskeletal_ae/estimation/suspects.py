@@ -22,7 +22,7 @@ consequences:
                             without a verification, because a sensor that reports NaN is faulty.
     lengths_jumped          concern several muscles, none of which is isolated. The length offsets
     lengths_disagree        become unreliable, and the finding stays latched until the next length
-                            calibration, or until a reset while joint sensors agree with the
+    muscles_exchanged       calibration, or until a reset while joint sensors agree with the
                             lengths.
     length_jump             concern one muscle, which is isolated and verified like any other. If
     length_disagrees        it is not isolated, its length offset alone becomes unreliable, and the
@@ -53,7 +53,14 @@ from musculoskeletal_ae.robot.robot import Robot
 ACQUITTALS = 2  # number of suspects verified as healthy after which the next one is not verified
 WITHIN = 60.0  # time during which a suspect verified as healthy counts [s]
 #: kinds of findings after which no muscle is isolated, because the named one may be healthy
-OF_SEVERAL = frozenset({Kind.LENGTHS_JUMPED, Kind.LENGTHS_DISAGREE, Kind.JOINT_SENSORS_DISAGREE})
+OF_SEVERAL = frozenset(
+    {
+        Kind.LENGTHS_JUMPED,
+        Kind.LENGTHS_DISAGREE,
+        Kind.MUSCLES_EXCHANGED,
+        Kind.JOINT_SENSORS_DISAGREE,
+    }
+)
 
 
 class SuspectHandling:
