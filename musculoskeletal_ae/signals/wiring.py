@@ -42,7 +42,7 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 BETTER = 1.4
 #: A fault is assumed if correcting it divides the cost of all readings by at least this factor.
 COST_BETTER = 1.1
-#: standard deviation of noise that is added to every misfit [m], so that an arm at rest shows nothing
+#: standard deviation of noise that is added to every misfit [m]; an arm at rest then shows nothing
 NOISE = 0.0005
 MOST_SAMPLES = 400  # largest number of messages that are used, evenly distributed
 

@@ -61,7 +61,7 @@ def test_an_arm_at_rest_shows_no_fault():
 
 
 def test_muscles_of_equal_moment_arms_are_called_undetermined():
-    theta, length, tension = readings('arm26', 0)
+    theta, _, tension = readings('arm26', 0)
     robot = ROBOTS['arm26']
 
     def lengths(theta, tension):  # muscle 1 equals muscle 2
