@@ -10,7 +10,8 @@ wiring, or reports nothing more. For comparison, a healthy driver restarts witho
 It prints one line for each case:
 
 - `named`: the muscles were named, and no others; `refused`: offsets were refused, but others were
-  named, or none; `unnoticed`: nothing was reported within the time; `FALSE`: offsets were accepted,
+  named, or none; `other`: another fault was reported; `unnoticed`: nothing was reported within a
+  minute; `FALSE`: offsets were accepted,
 - the error of the estimate and the anomaly score A before the restart and at the end.
 
 A healthy driver must be calibrated: `accepted`, or else `REFUSED`.
@@ -45,7 +46,8 @@ from musculoskeletal_ae.signals.wiring import Wiring
 MINUTES = 2.0  # duration of the exploration that is learned [min]
 BEFORE = 10.0  # duration of the exploration before the restart [s]
 RESTART = 0.5  # time without messages [s]
-LONGEST = 120.0  # longest time in which the advice is followed [s]
+LONGEST = 180.0  # longest time in which the advice is followed [s]
+NOTHING = 60.0  # time after which the advice has ended if nothing is reported [s]
 AFTER = 10.0  # duration of the exploration after the advice [s]
 REFUSING = 15.0  # time for which a calibration may go on after it has enough data [s]
 OFFSET = 0.1  # largest length offset after a restart of a driver that loses its offsets [m]
@@ -146,7 +148,7 @@ class Loop:
                     return _named(estimator, calibration.problem)
                 if calibration.problem and calibration.time > calibration.enough + REFUSING:
                     return set()
-            elif self.time > end - LONGEST + 20.0:
+            elif self.time > end - LONGEST + NOTHING:
                 return None
         return set() if estimator.calibration is not None else None
 
@@ -194,6 +196,8 @@ def run(robot: Robot, mae: Mae, arm: Arm, seed: int, case: Case) -> dict[str, An
         outcome = 'accepted' if is_new else 'REFUSED'
     elif named is None:
         outcome = 'FALSE' if is_new else 'unnoticed'
+        if loop.estimator.cause:
+            outcome = 'other'
     else:
         outcome = 'named' if named == set(case.wiring.faulty) else 'refused'
     after = loop.explore(AFTER)
