@@ -9,9 +9,9 @@ one muscle reversed. The bench calls the services that the estimator advises, un
 wiring, or reports nothing more. For comparison, a healthy driver restarts without length offsets.
 It prints one line for each case:
 
-- `named`: the muscles were named, and no others; `refused`: offsets were refused, but others were
-  named, or none; `other`: another fault was reported; `unnoticed`: nothing was reported within a
-  minute; `FALSE`: offsets were accepted,
+- `named`: the muscles were named, and no others; `undetermined`: others were named, too;
+  `refused`: offsets were refused without naming the muscles; `other`: another fault was reported;
+  `unnoticed`: nothing was reported within a minute; `FALSE`: offsets were accepted,
 - the error of the estimate and the anomaly score A before the restart and at the end.
 
 A healthy driver must be calibrated: `accepted`, or else `REFUSED`.
@@ -199,7 +199,10 @@ def run(robot: Robot, mae: Mae, arm: Arm, seed: int, case: Case) -> dict[str, An
         if loop.estimator.cause:
             outcome = 'other'
     else:
-        outcome = 'named' if named == set(case.wiring.faulty) else 'refused'
+        wrong = set(case.wiring.faulty)
+        outcome = 'undetermined' if named >= wrong else 'refused'
+        if named == wrong:
+            outcome = 'named'
     after = loop.explore(AFTER)
     calibration = loop.estimator.calibration
     said = loop.estimator.cause or ('' if calibration is None else calibration.problem)
