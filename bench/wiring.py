@@ -195,9 +195,9 @@ def run(robot: Robot, mae: Mae, arm: Arm, seed: int, case: Case) -> dict[str, An
     if case.what == 'healthy':
         outcome = 'accepted' if is_new else 'REFUSED'
     elif named is None:
-        outcome = 'FALSE' if is_new else 'unnoticed'
-        if loop.estimator.cause:
-            outcome = 'other'
+        outcome = 'other' if loop.estimator.cause else 'unnoticed'
+        if is_new:
+            outcome = 'FALSE'
     else:
         wrong = set(case.wiring.faulty)
         outcome = 'undetermined' if named >= wrong else 'refused'
