@@ -23,8 +23,10 @@ calibration, and the residual of a network with known length offsets. `decide` c
 If several wirings explain the readings equally well, all of them are reported as alternatives. This
 happens if muscles have nearly the same moment arms.
 
-Factors between misfits, for individuals 0–4 of two shipped arms, both emulator models, initial and
-learned networks (`bench order`): see BETTER and COST_BETTER.
+In gentle motion of emulated individual 0 of musashi_left_arm, both emulator models, a correction
+divides the misfit by 2.2 to 18 and the cost by 1.3 to 8. On the healthy arm, no exchange divides
+the misfit by more than 0.9 or the cost by more than 1.01, with initial and with learned networks.
+`bench wiring` counts what live arms report.
 """
 
 from __future__ import annotations
