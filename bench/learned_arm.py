@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.reality import KIN, make_arm
 from musculoskeletal_ae.experiments.online_learning import teach
 from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,
@@ -57,17 +57,20 @@ def initial(robot: Robot, folder: Path) -> Mae:
     return checkpoint.load(file, robot)
 
 
-def learned_arm(robot: Robot, seed: int, folder: Path, minutes: float) -> LearnedArm:
+def learned_arm(
+    robot: Robot, seed: int, folder: Path, minutes: float, reality: str = KIN
+) -> LearnedArm:
     """Return an individual that has learned for `minutes` [min].
 
     If the cache in `folder` has the individual, it is read from there.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    driver, file = initial(robot, folder), folder / f'learned_{seed}.safetensors'
-    messages = folder / f'exploring_{seed}.npz'
+    name = f'{seed}' if reality == KIN else f'{reality}_{seed}'
+    driver, file = initial(robot, folder), folder / f'learned_{name}.safetensors'
+    messages = folder / f'exploring_{name}.npz'
     if not file.exists():
         stream = EXPLORATION_STREAM + seed
-        exploring = record(EmulatedArm(robot, seed), driver, stream, 60.0 * minutes)
+        exploring = record(make_arm(robot, seed, reality), driver, stream, 60.0 * minutes)
         learner = Learner(robot, driver, seed=seed, steps=STEPS, trainer=Seldom)
         teach(learner, zip(*exploring, strict=True))
         np.savez(messages, *exploring)

@@ -300,6 +300,16 @@ class ConditionKind(Enum):
         reaction=Reaction.STOP,
         revokes=Revokes.ALL,
     )
+    MUSCLES_EXCHANGED = Declaration(
+        'muscles_exchanged',
+        'estimator',
+        'error',
+        'the driver has exchanged two muscles, in readings and commands',
+        'exchanged muscles',
+        (Step.CORRECT_WIRING, Step.CALIBRATE_LENGTHS),
+        reaction=Reaction.STOP,
+        revokes=Revokes.ALL,
+    )
     LENGTH_DISAGREES = Declaration(
         'length_disagrees',
         'estimator',

@@ -21,6 +21,10 @@ class Step(Enum):
     def __init__(self, identifier: str, text: str, place: int = 0) -> None:
         self.identifier, self.text, self.place = identifier, text, place
 
+    CORRECT_WIRING = (
+        'correct_wiring',
+        'correct the order of the muscles, or the sign of the length, in the driver',
+    )
     REPAIR_MUSCLE = 'repair_muscle', 'repair the muscle'
     REPAIR_EMULATED_RUPTURE = (
         'repair_emulated_rupture',

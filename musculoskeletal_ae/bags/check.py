@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
@@ -25,13 +24,8 @@ from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
+from musculoskeletal_ae.signals.wiring import Wiring, judge
 
-# A column counts as misplaced only if another muscle fits it this many times better, because bodies
-# differ from their model and neighbouring muscles are similar.
-_BETTER_FIT = 2.5
-# A column whose length has a smaller standard deviation than this is not checked [m].
-_LEAST_MOTION = 0.005
-_MOST_SAMPLES = 2000  # largest number of samples that are compared with the model
 _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 
 
@@ -127,39 +121,19 @@ def _resting_postures(robot: Robot, recording: Pairs) -> int:
     return samples.accepted
 
 
-def misplaced_muscles(pairs: Pairs, robot: Robot) -> list[tuple[str, str]]:
-    """Find columns of recorded lengths and tensions that seem to belong to another muscle.
+def recorded_wiring(pairs: Pairs, robot: Robot) -> Wiring:
+    """Judge to which muscles the recorded columns belong, and which signs their lengths have.
 
     Column i of the arrays should belong to muscle i of the robot, but arrays carry no names. The
-    geometric model therefore predicts the length of every muscle from the recorded joint angles
-    and tensions. Column i is misplaced if the prediction for another muscle fits its length
-    clearly better than the prediction for muscle i, up to a constant offset.
-
-    Columns whose length hardly varies and columns of isolated muscles are not checked.
-
-    Returns:
-        Two names for each misplaced column: the muscle to which the column should belong, and the
-        muscle whose prediction it fits.
+    lengths are compared with those of the geometric model at the recorded joint angles. Columns
+    that were isolated at any time are not judged.
     """
-    known = np.flatnonzero(np.isfinite(pairs.theta).all(axis=1))
-    if len(known) < 2:
-        return []
-    rows = known[np.linspace(0, len(known) - 1, min(len(known), _MOST_SAMPLES)).astype(int)]
-    theta = pairs.theta[rows].clip(robot.lower, robot.upper)
-    length, tension = pairs.length[rows], pairs.tension[rows]
-    moved = length.std(axis=0) > _LEAST_MOTION
-    moved &= ~(pairs.isolated == 1).any(axis=0)  # isolated muscles may have any readings
-    columns = range(robot.muscle_count)
-    # The tension in column i stretches the muscle of this column, whichever muscle that is.
-    tensions = [np.repeat(tension[:, [i]], robot.muscle_count, axis=1) for i in columns]
-    modelled = [robot.muscle_lengths(theta, stretching) for stretching in tensions]
-    errors = np.array([(length[:, [i]] - modelled[i]).std(axis=0) for i in columns])
-    _, best = linear_sum_assignment(errors)
-    return [
-        (robot.muscles[i], robot.muscles[j])
-        for i, j in enumerate(best)
-        if moved[i] and errors[i, i] > _BETTER_FIT * errors[i, j]
-    ]
+    straight = Wiring.straight(robot.muscle_count)
+    if np.count_nonzero(np.isfinite(pairs.theta).all(axis=1)) < 2:
+        return straight
+    theta = pairs.theta.clip(robot.lower, robot.upper)
+    used = ~(pairs.isolated == 1).any(axis=0)
+    return judge(robot.muscle_lengths, theta, pairs.length, pairs.tension, used=used).wiring
 
 
 def _contents(bag: Bag, progress: Callable[[float], None]) -> list[str]:
@@ -212,9 +186,10 @@ def _fit(bag: Bag, name: str, namespace: str | None, motors: MotorSettings) -> _
         problem = f'the bag has neither joint_states nor muscle_states that fit {name}'
         return _Fit([problem], left_out)
     pairs = streams.pairs()
-    misplaced = [
-        f'muscles are not in the order of {name}: {muscle} behaves like {like}'
-        for muscle, like in misplaced_muscles(pairs, robot)
-    ]
-    faults = misplaced or wrong_joint_sensors(robot, pairs)
+    wiring = recorded_wiring(pairs, robot)
+    if wiring.faulty:
+        what = 'in the order' if wiring.misplaced else 'of the signs'
+        faults = [f'muscles are not {what} of {name}: {wiring.text(robot.muscles)}']
+    else:
+        faults = wrong_joint_sensors(robot, pairs)
     return _Fit(faults, left_out, '' if faults else motion_text(robot, pairs))

@@ -139,7 +139,8 @@ def _in_order(messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
         newest = max(newest, message.log_time)
         heapq.heappush(waiting, (message.log_time, number, message))
         held += len(message.data) + _OVERHEAD
-        while waiting[0][0] < newest - LONGEST_PAUSE or held > MOST_HELD:
+        # A single message may be larger than MOST_HELD, so that none is left.
+        while waiting and (waiting[0][0] < newest - LONGEST_PAUSE or held > MOST_HELD):
             _, _, earliest = heapq.heappop(waiting)
             held -= len(earliest.data) + _OVERHEAD
             yield earliest

@@ -21,10 +21,11 @@ from musculoskeletal_ae.driver.verdict import FAULTS, ZERO_TOLERANCE, Verdict
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals import joint_sensors
+from musculoskeletal_ae.signals import joint_sensors, wiring
 from musculoskeletal_ae.signals.limits import length_range, reading_range
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
+from musculoskeletal_ae.signals.wiring import Judgement, Wiring
 from musculoskeletal_ae.validity import (
     QUANTITIES,
     joints_not_finite,
@@ -52,11 +53,10 @@ TENSION_UNITS = {'kgf': 9.80665, 'lbf': 4.44822, 'kN': 1000.0}  # other units of
 HOTTEST_AT_REST = 55.0
 # Lengths of healthy arms differ from the model. For the emulated individuals 0–9 of arm26 and
 # musashi_left_arm (notes/removed_benches.md), the offset is at most 42 mm (hence ZERO_TOLERANCE),
-# and lengths change by 0.31 to 1.55 times the model's changes. If another muscle fits a column 2.5
-# times better than its own muscle, the misfit to its own muscle is below 8.5 mm.
+# and lengths change by 0.31 to 1.55 times the model's changes.
 SLOPES = 0.2, 2.2  # legal range of the change of l, divided by the change that the model predicts
-MISPLACED = 0.012  # misfit of a column to its own muscle above which it can be misplaced [m]
-BETTER = 2.5  # a column is misplaced only if another muscle fits it better by this factor
+#: a column of an arm at rest is misplaced only if another muscle fits it better by this factor
+BETTER_AT_REST = 2.5
 MOVED = 0.04  # smallest range of l that allows a check of its sign and slope [m]
 #: fraction of the misfit that a correction of angles may leave; with more, the lengths are blamed
 JOINTS_BETTER = 0.8
@@ -467,22 +467,25 @@ class Listening:
         least = robot.actuation.choose(MOVED, math.inf)
         moved: Bools = np.ptp(model, axis=0) > least
 
-        def misfit(error: Array) -> Array:
-            # On a moved arm, length offsets do not affect this comparison. On an arm at rest, the
-            # offset is the only information.
-            spread: Array = error.std(axis=0) if moved.any() else np.abs(np.median(error, axis=0))
-            return spread
-
-        fit = np.array([misfit(column[:, None] - model) for column in length.T])
-        own, doubt = fit.diagonal().copy(), ''
-        if not moved.any():
+        straight = Wiring.straight(robot.muscle_count)
+        judgement, doubt = Judgement(straight, (straight,), (), 0.0), ''
+        if moved.any():
+            # On a moved arm, length offsets do not affect the comparison.
+            readings = robot.muscle_lengths, theta, length, tension
+            judgement = wiring.judge(*readings)
+            fit, reversed_fit = np.sqrt(wiring.square_misfits(*readings, signs=True))
+            own, inverse = fit.diagonal(), reversed_fit.diagonal()
+        else:
+            # On an arm at rest, the offset is the only information.
+            offsets = np.median(length[:, :, None] - model[:, None], axis=0)
+            fit, own = np.abs(offsets), np.abs(offsets.diagonal())
+            inverse = np.abs(np.median(length + model, axis=0))
             better = robot.actuation.choose('moving the arm by hand', '`check_driver --move`')
             doubt = (
                 f'; judged at rest, which is not reliable: {better} checks sign and order better'
             )
             fit = np.maximum(fit, fit.T)  # at rest, only pairwise exchanges can be recognised
         rows, best = linear_sum_assignment(fit)
-        inverse = misfit(length + model)
         # Antagonists mirror each other. If all signs are wrong, exchanged antagonists fit as well,
         # but are less likely.
         compared = moved if moved.any() else np.full(len(own), self._zeroed)
@@ -495,17 +498,12 @@ class Listening:
             by_hand = f'publish joint_states of all joints, and {by_hand}'
         of_positions = 'use --move, with a --tension at which the joints move'
         verdict.advise(('order', 'sign'), robot.actuation.choose(by_hand, of_positions))
-        # Columns that fit better if they are exchanged with another one, but not clearly enough for
-        # a fault, (M,).
-        square, own_square = np.square(fit), np.square(own)
-        is_unclear = (square + square.T < own_square[:, None] + own_square).any(axis=1)
-        for m, other in enumerate(best.tolist()):
+        order = judgement.wiring.order if moved.any() else best.tolist()
+        for m, other in enumerate(order):
             off = float(np.median((length - model)[:, m]))
-            turned = all_turned or inverse[m] < fit[m, other]
-            follows = other == m or turned or fit[m, m] <= BETTER * fit[m, other]
-            if moved.any():
-                follows |= not moved[m] or fit[m, m] <= MISPLACED
-            else:
+            follows = other == m or all_turned
+            if not moved.any():
+                follows |= inverse[m] < fit[m, other] or own[m] <= BETTER_AT_REST * fit[m, other]
                 # Two muscles that are exchanged both misfit; if one misfits, its zero is wrong.
                 follows |= not self._zeroed or min(own[m], own[other]) <= ZERO_TOLERANCE
             if not follows:
@@ -518,7 +516,7 @@ class Listening:
                     inverted = SLOPES[0] < -slope < SLOPES[1]
                     verdict.failed('sign' if inverted else 'slope', m, detail=detail)
                     continue
-                if not is_unclear[m]:
+                if m in judgement.right:
                     verdict.passed('order', m)
                 verdict.passed('sign', m)
             if not self._zeroed:

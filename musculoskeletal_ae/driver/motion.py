@@ -15,10 +15,11 @@ from typing import Literal
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.driver.order import JOINTS_BETTER, Order, corrected, judge_order, wrong_side
+from musculoskeletal_ae.driver.order import JOINTS_BETTER, judge_order, wrong_side
 from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.report import is_overloaded
-from musculoskeletal_ae.signals.joint_sensors import judge, sign_notes
+from musculoskeletal_ae.signals.joint_sensors import corrected, judge, sign_notes
+from musculoskeletal_ae.signals.wiring import Judgement
 
 RELEASE = 0.6  # wait after a release [s]
 MEAN = 0.3  # time over which readings are averaged [s]
@@ -215,7 +216,7 @@ class MotionTest(ABC):
         meant = corrected(theta, judgement.faults)
         of_joints = judge_order(robot, meant, states[:, 0], states[:, 1], tested)
         # A fault of the joint sensors is preferred, because it can look like exchanged antagonists.
-        if order.misplaced and (
+        if order.is_faulty and (
             not judgement.faults or order.misfit < JOINTS_BETTER * of_joints.misfit
         ):
             self._report_misplaced(order)
@@ -223,7 +224,7 @@ class MotionTest(ABC):
         for fault in judgement.faults:
             verdict.failed(fault.kind, names=', '.join(robot.joints[j] for j in fault.joints))
         if judgement.faults:
-            if order.misplaced:
+            if order.is_faulty:
                 verdict.notes.append(
                     f'the lengths look the same if {self._moves_like(order)}: check the order of '
                     'these muscles, too'
@@ -239,14 +240,14 @@ class MotionTest(ABC):
         )
         verdict.notes += sign_notes(robot, judgement.right, remedy)
 
-    def _report_misplaced(self, order: Order) -> None:
+    def _report_misplaced(self, order: Judgement) -> None:
         """Record muscles whose readings and commands are both misplaced."""
         moves = self._moves_like(order)
-        self.verdict.failed('both misplaced', *order.misplaced, moves=moves)
+        self.verdict.failed('both misplaced', *order.wiring.misplaced, moves=moves)
 
-    def _moves_like(self, order: Order) -> str:
+    def _moves_like(self, order: Judgement) -> str:
         names = self._robot.muscles
-        moves = [f'{names[j]} moves like {names[k]}' for j, k in order.misplaced.items()]
+        moves = [f'{names[j]} moves like {names[k]}' for j, k in order.wiring.misplaced.items()]
         return ', and '.join(moves)
 
     def _wait(self, duration: float) -> Wait:

@@ -20,9 +20,11 @@ from musculoskeletal_ae.estimation.length_calibration import (
 from musculoskeletal_ae.estimation.length_trust import Evidence
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
+from musculoskeletal_ae.signals.wiring import Judgement
 
 SHIFTED = 0.02  # use an estimated offset if it differs by more than this from the one in use [m]
 #: Reject a stated posture if a joint sensor differs by more than this [rad]; for prismatic joints
@@ -95,6 +97,21 @@ class CheckedCalibration:
     def problem(self) -> str:
         """Why the calibration does not end although it has enough data, or ''."""
         return self._calibration.problem or self._problem
+
+    @property
+    def wiring(self) -> Judgement | None:
+        """What the newest fit tells about order and signs of the columns; None before the first."""
+        return self._calibration.wiring
+
+    @property
+    def remedy(self) -> tuple[Step, ...]:
+        """What a user must do before the lengths can be calibrated; () if the wiring is right."""
+        return self._calibration.remedy
+
+    @property
+    def overtime(self) -> float:
+        """Time for which the arm has moved or stood longer than required [s]."""
+        return self._calibration.time - self._calibration.enough
 
     def step(self, sample: MuscleSample, dt: float, theta: Array | None) -> Evidence | None:
         """Continue the calibration by one message.

@@ -27,11 +27,13 @@ class Finding:
             them.
         kind: Kind of the fault. Its declaration states the consequence and the remedy.
         evidence: The evidence as a text for users.
+        others: Indices of further muscles that the fault concerns, as far as they are known.
     """
 
     muscle: int
     kind: ConditionKind
     evidence: str
+    others: tuple[int, ...] = ()
 
     @property
     def is_of_one_length(self) -> bool:

@@ -14,6 +14,7 @@ from musculoskeletal_ae.estimation.detectors.length_jump import LengthJump
 from musculoskeletal_ae.estimation.detectors.missing_values import MissingValues
 from musculoskeletal_ae.estimation.detectors.saturated_sensor import SaturatedSensor
 from musculoskeletal_ae.estimation.detectors.thermal_drift import ThermalDrift
+from musculoskeletal_ae.estimation.exchange import ExchangeCheck
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.mae.mae import Mae
@@ -50,6 +51,7 @@ class HealthMonitor:
         chosen = preset_named(preset)
         self.residual, by_physics = chosen.residual_detectors(robot, self.settings)
         self.joints = JointDisagreement(robot)
+        self._exchange = ExchangeCheck(robot)
         self._detectors: list[Detector] = [
             LengthJump(),
             MissingValues(robot),
@@ -65,6 +67,7 @@ class HealthMonitor:
         """Use another network; its isolated muscles are ignored."""
         for detector in self._detectors:
             detector.use(mae)
+        self._exchange.use(mae)
 
     def configure(self, settings: Detection) -> None:
         """Use these settings from the next message on."""
@@ -92,6 +95,10 @@ class HealthMonitor:
         return next(filter(None, findings), None)
 
     def step(self, observation: Observation) -> Finding | None:
-        """Check a message for which there is an estimate; return the first finding or None."""
+        """Check a message for which there is an estimate; return the first finding or None.
+
+        If two exchanged muscles explain this finding, they are reported instead.
+        """
         findings = [detector.step(observation) for detector in self._detectors]
-        return next(filter(None, findings), None)
+        self._exchange.note(observation)
+        return self._exchange.explain(next(filter(None, findings), None), observation)

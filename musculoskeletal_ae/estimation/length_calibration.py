@@ -4,19 +4,28 @@
 The arm moves gently, with or without measured joint angles, or it stands in a stated posture.
 `length_moments.py` collects the readings, and `length_fit.py` fits the offsets to them. This file
 decides when to fit and whether the result is reliable.
+
+Offsets cannot correct readings in a wrong order, or lengths with a wrong sign. Such readings would
+often lead to plausible but false offsets. Before offsets of a moving arm are accepted, the wiring
+is therefore judged (`signals/wiring.py`), and a wrong one is refused with the names of the muscles.
+A standing arm does not show the wiring.
 """
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.estimation.length_fit import FARTHEST, Fit, LengthFit, Steps
+from musculoskeletal_ae.estimation.length_fit import FARTHEST, Fit, LengthFit
 from musculoskeletal_ae.estimation.length_moments import MomentCollector, Moments
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.remedy import Step, sentence
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import UNKNOWN, LengthOffsets
+from musculoskeletal_ae.signals.wiring import Judgement, judge
 
 ENOUGH_WITH_ANGLES = 20.0  # required duration of gentle motion with measured joint angles [s]
 ENOUGH = 38.0  # required duration of gentle motion without measured joint angles [s]
@@ -33,6 +42,8 @@ LARGEST_RESIDUAL = 0.02
 #: cost per residual above which a fit is rejected: correct offsets cost 0.2 to 0.5, offsets of a
 #: wrong posture 1.1, and pure noise 0.95
 LARGEST_COST = 0.75
+#: remedy if the order or the sign of the readings is wrong
+CORRECT_DRIVER = Step.CORRECT_WIRING, Step.CALIBRATE_LENGTHS
 #: remedy if a calibration in gentle motion fails, for which a network that has not learned the arm
 #: may be too inexact
 OTHER_WAY = (
@@ -50,6 +61,8 @@ class LengthCalibration:
         posture: Joint angles in which the arm stands [rad], (D,), or None if it moves gently.
         offsets: The newest estimate of the offsets, which may still be unreliable; None before the
             first estimate.
+        wiring: What the newest fit tells about the order and the signs of the columns; None before
+            they have been judged.
     """
 
     def __init__(self, robot: Robot, mae: Mae, posture: Array | None = None) -> None:
@@ -64,11 +77,12 @@ class LengthCalibration:
         self._fit = LengthFit(robot, mae)
         self._collector = MomentCollector(self._fit.used, robot.joint_count, posture)
         self._since = 0.0  # time since the last fit began [s]
-        self._work: tuple[Steps, Moments] | None = None  # the running fit
+        self._work: Generator[None, None, None] | None = None  # the running fit
         self._best: Fit | None = None
         self._has_angles = False  # whether joint angles are measured most of the time
         self._problem = ''  # reason why the last fit is not reliable
         self.offsets: LengthOffsets | None = None
+        self.wiring: Judgement | None = None
 
     @property
     def is_standing(self) -> bool:
@@ -106,6 +120,11 @@ class LengthCalibration:
             return 'the arm moved away; hold it still and call estimator/zero again'
         return self._problem
 
+    @property
+    def remedy(self) -> tuple[Step, ...]:
+        """What a user must do before the lengths can be calibrated; () if the wiring is right."""
+        return CORRECT_DRIVER if self.wiring is not None and self.wiring.is_faulty else ()
+
     def step(self, tension: Array, length: Array, dt: float, theta: Array | None = None) -> None:
         """Record the readings of one message, and continue or begin a fit if one is due.
 
@@ -122,8 +141,9 @@ class LengthCalibration:
         self._since += dt
         if self._work is not None:
             for _ in range(min(max(1, round(dt / PIECE_TIME)), MOST_PIECES)):
-                if self._work is not None:
-                    self._continue_fit(*self._work)
+                if next(self._work, self) is self:
+                    self._work = None
+                    break
         elif self._since >= self._pause and len(self._collector):
             self._since = 0.0
             self._begin_fit(self._collector.moments())
@@ -137,19 +157,30 @@ class LengthCalibration:
         self._has_angles = 2 * len(measured) > len(moments.theta)
         if self._has_angles:
             moments = moments.rows(measured)
+            if self.time >= self.enough and not self.is_standing:
+                readings = moments.theta, moments.read, moments.tension
+                self.wiring = judge(self._mae.lengths, *readings, used=self._fit.used)
             self._judge(self._fit.known_angles(moments), moments)
         else:
-            self._work = self._fit.unknown_angles(moments, self._best), moments
+            self._work = self._fit_unknown_angles(moments)
 
-    def _continue_fit(self, steps: Steps, moments: Moments) -> None:
-        try:
-            next(steps)
-        except StopIteration as ended:
-            self._work = None
-            self._judge(ended.value, moments)
+    def _fit_unknown_angles(self, moments: Moments) -> Generator[None, None, None]:
+        """Fit the offsets, and judge the wiring once there is enough motion.
 
-    def _judge(self, fit: Fit, moments: Moments) -> None:
-        """Make a fit the newest estimate of the offsets, and decide whether it is reliable."""
+        The generator yields after each short piece of work.
+        """
+        is_enough = self.time >= self.enough
+        fit = yield from self._fit.unknown_angles(moments, self._best)
+        if is_enough:
+            self.wiring = yield from self._fit.wiring(fit, moments)
+        self._judge(fit, moments, is_enough)
+
+    def _judge(self, fit: Fit, moments: Moments, is_enough: bool | None = None) -> None:
+        """Make a fit the newest estimate of the offsets, and decide whether it is reliable.
+
+        `is_enough` says whether the moments suffice for reliable offsets; None to decide it by the
+        present duration of the motion.
+        """
         muscle_count, used = self._robot.muscle_count, self._fit.used
         expected = self._mae.lengths(fit.theta, moments.tension)
         # An isolated muscle still receives commands and needs an offset, however uncertain.
@@ -159,7 +190,7 @@ class LengthCalibration:
         residual = np.median(np.abs(used * (moments.length - offset - expected)), axis=0)
         self._best, self._problem = fit, ''
         deviation = np.full(muscle_count, UNKNOWN)
-        if self.time >= self.enough:
+        if self.time >= self.enough if is_enough is None else is_enough:
             self._problem = self._problem_of(fit, residual)
             if not self._problem:
                 independent = max(1.0, len(fit.theta) / CORRELATED)
@@ -174,6 +205,8 @@ class LengthCalibration:
             fit: The fit.
             residual: Median residual of each length [m], (M,).
         """
+        if self.wiring is not None and self.remedy:
+            return f'{self.wiring.text(self._robot.muscles)}: {sentence(self.remedy)}'
         if residual.max() > LARGEST_RESIDUAL:
             name = self._robot.muscles[int(residual.argmax())]
             limit = 1e3 * LARGEST_RESIDUAL

@@ -26,10 +26,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.estimation.length_moments import Moments
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.wiring import Judgement, Wiring, decide, single_faults
 
 # Constants in rad and N·m are for revolute joints. For a prismatic joint, angles are multiplied by
 # `kinematics.RACK` and become [m], and torques are divided by it and become [N].
@@ -67,6 +68,10 @@ BATCH = 20  # number of postures that are fitted during one message
 COARSE_LENGTH = 0.01  # standard deviation of a length in coarse fits [m]
 COARSE_TORQUE = 2.0  # standard deviation of a torque in coarse fits [N·m]
 COARSE_ANGLE = 0.1  # standard deviation of the excess over joint limits in coarse fits [rad]
+
+# Constants of the judgement of the wiring.
+LIKELY = 3  # number of the likeliest wirings that are fitted to all moments
+MOST_FAULTS = 3  # largest number of exchanges and reversed signs that are searched for
 
 FARTHEST = 0.3  # largest offset [m], and largest change of an angle in a Gauss–Newton step [rad]
 ROUNDS = 20  # largest number of Gauss–Newton steps
@@ -144,8 +149,7 @@ class LengthFit:
             moments: The moments.
             before: An earlier fit, from whose constants the fit starts a second time, or None.
         """
-        rows = np.unique(np.linspace(0, len(moments.length) - 1, FEW_MOMENTS).astype(np.int64))
-        few = moments.rows(rows)
+        few = moments.rows(_few(moments))
         guesses = yield from self._guesses(moments, few)
         likeliest = yield from self._best(guesses, few, FIRST_ROUNDS)
         # A few moments may mislead. All moments decide between the new start and the earlier fit.
@@ -153,6 +157,63 @@ class LengthFit:
         if before is not None:
             candidates.append(before.constants)
         return (yield from self._best(candidates, moments, ROUNDS))
+
+    def wiring(self, fit: Fit, moments: Moments) -> Generator[None, None, Judgement]:
+        """Judge whether columns are exchanged or have a wrong sign.
+
+        Each wiring that differs by one fault is fitted to a few moments. The fit begins with the
+        postures of `fit`, which are roughly right although some columns are wrong. All moments
+        decide among the likeliest wirings. If a fault is found, another one is searched for. The
+        generator yields after each short piece of work.
+
+        Args:
+            fit: The fit to the readings as they are.
+            moments: The moments to which it was fitted.
+        """
+        wiring = Wiring.straight(self._robot.muscle_count)
+        judgement, columns = Judgement(wiring, (wiring,), (), fit.cost), np.flatnonzero(self.used)
+        rows = _few(moments)
+        for _ in range(MOST_FAULTS):
+            wiring, coarse = judgement.wiring, list[tuple[float, Wiring]]()
+            for other in single_faults(wiring, columns.tolist()):
+                start = self._start(fit, moments, wiring, other, rows)
+                few = _rewired(moments.rows(rows), other)
+                coarse.append(((yield from self._refine(start, few, FIRST_ROUNDS)).cost, other))
+            likely, fits = sorted(coarse, key=lambda each: each[0])[:LIKELY], dict[Wiring, Fit]()
+            for _, other in likely:
+                start = self._start(fit, moments, wiring, other, np.arange(len(moments.length)))
+                fits[other] = yield from self._refine(start, _rewired(moments, other), ROUNDS)
+            costs = [(other, max(other_fit.cost, 0.0)) for other, other_fit in fits.items()]
+            newest = decide(wiring, fit.cost, costs)
+            if newest.wiring == wiring:
+                break
+            judgement, fit = newest, fits[newest.wiring]
+        return judgement
+
+    def _start(self, fit: Fit, moments: Moments, before: Wiring, after: Wiring, rows: Ints) -> Fit:
+        """Return an initial fit of one wiring, from a fit of another one.
+
+        The postures are kept, and so are all constants except the length offsets of the muscles
+        whose columns change.
+
+        Args:
+            fit: The fit to all moments with the wiring `before`.
+            moments: The moments.
+            before: The wiring of `fit`.
+            after: The wiring of the result.
+            rows: Indices of the moments to which the result applies.
+        """
+        few, theta, constants = _rewired(moments.rows(rows), after), fit.theta[rows], fit.constants
+        constants = constants.copy()
+        changed = [
+            muscle
+            for now, then in zip(zip(*before), zip(*after))
+            for muscle in (now[0], then[0])
+            if now != then
+        ]
+        error = few.length - self._mae.lengths(theta, few.tension)
+        constants[changed] = np.median(error[:, changed], axis=0)
+        return Fit(np.inf, constants, theta)
 
     def cost_per_residual(self, fit: Fit) -> float:
         """Return the cost of a fit, divided by the number of its length and torque residuals."""
@@ -341,6 +402,24 @@ class LengthFit:
             if before - cost < 1e-4 * before and np.abs(shift).max() < 1e-4:
                 break
         return fit
+
+
+def _few(moments: Moments) -> Ints:
+    """Return the indices of FEW_MOMENTS moments, evenly distributed."""
+    last = len(moments.length) - 1
+    few: Ints = np.unique(np.linspace(0, last, FEW_MOMENTS).astype(np.int64))
+    return few
+
+
+def _rewired(moments: Moments, wiring: Wiring) -> Moments:
+    """Return moments in the order and with the signs of the muscles, according to a wiring."""
+    return Moments(
+        wiring.unsigned(moments.tension),
+        wiring.signed(moments.length),
+        wiring.signed(moments.sliding),
+        wiring.signed(moments.read),
+        moments.theta,
+    )
 
 
 def _turning(theta: Array, sticking: Array) -> Array:

@@ -5,7 +5,7 @@ Detectors, the length calibration, the joint sensors, the check of a repaired mu
 provide evidence. `TRANSITIONS` has the trust that follows from each of them. The estimator
 publishes the result on `muscle_length_zeros`, and all other nodes follow it.
 
-    start ── ASSUMED ───────────────────────────► KNOWN ── JUMPED, DISAGREES ──► REVOKED
+    start ── ASSUMED ───────────────────────────► KNOWN ── JUMPED, EXCHANGED, DISAGREES ──► REVOKED
     start ── NOT_CALIBRATED, RESTARTED ─► UNKNOWN ── CALIBRATED ─► KNOWN ◄── AGREES ── REVOKED
     any ──── CALIBRATING ───────────────► UNKNOWN
     KNOWN ── MOVED, then CONFIRMED ─────► KNOWN
@@ -38,6 +38,7 @@ class Evidence(Enum):
     CALIBRATING = 'being calibrated'
     CALIBRATED = 'calibrated'
     JUMPED = 'revoked because the length jumped'
+    EXCHANGED = 'revoked because the driver exchanges muscles'
     DISAGREES = 'revoked because lengths disagree with the joint sensors'
     AGREES = 'confirmed by the joint sensors'
     MOVED = 'changed while the muscle was repaired; not checked yet'
@@ -61,6 +62,7 @@ TRANSITIONS = {
     Evidence.CALIBRATING: Transition(_ANY, Trust.UNKNOWN),
     Evidence.CALIBRATED: Transition(_UNKNOWN, Trust.KNOWN),
     Evidence.JUMPED: Transition(_KNOWN, Trust.REVOKED),
+    Evidence.EXCHANGED: Transition(_KNOWN, Trust.REVOKED),
     Evidence.DISAGREES: Transition(_KNOWN, Trust.REVOKED),
     Evidence.AGREES: Transition(_REVOKED, Trust.KNOWN),
     Evidence.MOVED: Transition(_KNOWN, Trust.KNOWN),
@@ -72,6 +74,7 @@ TRANSITIONS = {
 EVIDENCE_OF = {
     ConditionKind.LENGTH_JUMP: Evidence.JUMPED,
     ConditionKind.LENGTHS_JUMPED: Evidence.JUMPED,
+    ConditionKind.MUSCLES_EXCHANGED: Evidence.EXCHANGED,
     ConditionKind.LENGTH_DISAGREES: Evidence.DISAGREES,
     ConditionKind.LENGTHS_DISAGREE: Evidence.DISAGREES,
 }

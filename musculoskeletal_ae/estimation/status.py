@@ -64,11 +64,11 @@ def _finding(core: Estimator) -> Iterator[Condition]:
     finding = core.suspects.finding
     if finding is None:
         return
-    muscle = core.robot.muscles[finding.muscle]
-    detail = f'{muscle}: {finding.evidence}'
+    names = [core.robot.muscles[muscle] for muscle in (finding.muscle, *finding.others)]
+    detail = f'{", ".join(names)}: {finding.evidence}'
     if core.suspects.verification is not None:
         detail += f' (it is being verified, which ends by itself within {LONGEST:g} s)'
-    yield finding.kind.condition(detail, [muscle], level='error', steps=core.remedy)
+    yield finding.kind.condition(detail, names, level='error', steps=core.remedy)
 
 
 def _changed_modules(core: Estimator) -> Iterator[Condition]:
@@ -105,7 +105,11 @@ def _unknown_offsets(core: Estimator) -> Iterator[Condition]:
             detail = f'{detail}; calibrating: {calibration.progress}'
         yield kind.LENGTH_OFFSETS_UNKNOWN.condition(detail, names, steps=steps)
     if calibration is not None and calibration.problem:
-        yield kind.LENGTH_CALIBRATION_STUCK.condition(calibration.problem)
+        stuck, wiring = kind.LENGTH_CALIBRATION_STUCK, calibration.wiring
+        faulty = () if wiring is None or not wiring.is_faulty else wiring.faulty
+        names = [core.robot.muscles[muscle] for muscle in faulty]
+        steps = calibration.remedy or stuck.steps
+        yield stuck.condition(calibration.problem, names, steps=steps)
 
 
 def _doubted_joints(core: Estimator) -> Iterator[Condition]:

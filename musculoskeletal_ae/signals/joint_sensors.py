@@ -16,7 +16,7 @@ the same at θ and −θ. In the second case, a wrong sign is found only if both
 have the same sign. Readings with the wrong sign are then beyond the limits.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -54,6 +54,20 @@ class JointFault(NamedTuple):
     joints: tuple[int, ...]  # indices of the joints
     begin: float = 0.0  # begin and end of a stuck reading [s]
     end: float = 0.0
+
+
+def corrected(theta: Array, faults: Iterable[JointFault]) -> Array:
+    """Return θ (N, D) as the joint sensors would publish it without these faults."""
+    theta = theta.copy()
+    for fault in faults:
+        joints = list(fault.joints)
+        if fault.kind == SIGN:
+            theta[:, joints] *= -1.0
+        elif fault.kind == ORDER:
+            theta[:, joints] = theta[:, joints[::-1]]
+        elif fault.kind == DEGREES:
+            theta[:, joints] = np.radians(theta[:, joints])
+    return theta
 
 
 class Judgement(NamedTuple):
@@ -294,27 +308,18 @@ def _hypotheses(lengths: _Lengths, theta: Array) -> Iterator[_Hypothesis]:
     most = BEYOND * robot.kinematics.radian
     is_beyond = np.maximum(theta - robot.upper, robot.lower - theta).max(axis=0) > most
     far = np.flatnonzero(is_beyond).tolist()
+    faults = list[JointFault]()
     if far:  # readings beyond the limits may be legal with the other sign, or as degrees
-        changed = theta.copy()
-        changed[:, far] *= -1.0
-        yield _Hypothesis(JointFault(SIGN, tuple(far)), changed)
-    for joints in (sorted({*far} & {*turning}), turning):
-        if far and joints:
-            changed = theta.copy()
-            changed[:, joints] = np.radians(changed[:, joints])
-            yield _Hypothesis(JointFault(DEGREES, tuple(joints)), changed)
+        faults.append(JointFault(SIGN, tuple(far)))
+        degrees = sorted({*far} & {*turning}), turning
+        faults += [JointFault(DEGREES, tuple(joints)) for joints in degrees if joints]
     pairs = list(combinations(np.flatnonzero(lengths.moved(theta)).tolist(), 2))
     if pairs:  # yield only the best exchange, because the caller's search for signs takes time
-        misfits = [lengths.misfit(_exchanged(theta, pair)) for pair in pairs]
-        pair = pairs[int(np.argmin(misfits))]
-        yield _Hypothesis(JointFault(ORDER, pair), _exchanged(theta, pair))
-
-
-def _exchanged(theta: Array, pair: tuple[int, int]) -> Array:
-    """Return θ (N, D) with two joints exchanged."""
-    exchanged = theta.copy()
-    exchanged[:, list(pair)] = theta[:, list(reversed(pair))]
-    return exchanged
+        exchanges = [JointFault(ORDER, pair) for pair in pairs]
+        misfits = [lengths.misfit(corrected(theta, [fault])) for fault in exchanges]
+        faults.append(exchanges[int(np.argmin(misfits))])
+    for fault in faults:
+        yield _Hypothesis(fault, corrected(theta, [fault]))
 
 
 def _repeats(time: Array, values: Array) -> Iterator[tuple[int, int]]:

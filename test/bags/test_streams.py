@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from bags import bag_samples as samples
 from bags.arm_bag import ARRAY, JOINTS, STRING, Arm, array, joints, string
-from musculoskeletal_ae.bags.check import check_bag, misplaced_muscles, motion_text
+from musculoskeletal_ae.bags.check import check_bag, motion_text, recorded_wiring
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.exceptions import BagError
@@ -132,7 +132,7 @@ def test_of_isolated_muscles_nothing_counts_while_they_are(arm, robot, tmp_path)
     assert_array_equal(pairs.tension[:100, 1:], arm.tension[:100, 1:])
     swapped = pairs._replace(length=pairs.length[:, [1, 0, *range(2, count)]])
     # Muscles that were isolated at any time are not compared, so no column counts as misplaced.
-    assert misplaced_muscles(swapped, robot) == []
+    assert not recorded_wiring(swapped, robot).faulty
 
 
 def test_isolated_muscles_are_unknown_if_the_bag_does_not_contain_them(arm, robot, tmp_path):
@@ -148,7 +148,7 @@ def test_some_joint_sensors_will_do(robot, tmp_path):
     pairs = streams(arm, robot, tmp_path).pairs()
     assert_array_equal(pairs.theta[:, 1:], arm.theta[:, 1:])
     assert np.isnan(pairs.theta[:, 0]).all()
-    assert misplaced_muscles(pairs, robot) == []  # the comparison requires all joint angles
+    assert not recorded_wiring(pairs, robot).faulty  # the comparison requires all joint angles
 
 
 def test_a_message_that_was_sent_before_the_last_one_is_left_out(arm, robot, tmp_path):
@@ -166,8 +166,7 @@ def test_a_recording_of_another_arm_is_refused(arm, tmp_path):
 def test_muscles_in_another_order_are_named(robot, tmp_path):
     order = [1, 0, *range(2, robot.muscle_count)]
     result = streams(Arm(robot, order=order), robot, tmp_path)
-    names = robot.muscles
-    assert misplaced_muscles(result.pairs(), robot) == [(names[0], names[1]), (names[1], names[0])]
+    assert recorded_wiring(result.pairs(), robot).misplaced == {0: 1, 1: 0}
 
 
 def test_muscles_in_their_order_are_not_doubted_for_noise_and_offsets(arm, robot, tmp_path):
@@ -175,7 +174,7 @@ def test_muscles_in_their_order_are_not_doubted_for_noise_and_offsets(arm, robot
     pairs = streams(arm, robot, tmp_path).pairs()
     scale = rng.uniform(0.8, 1.2, robot.muscle_count)
     length = pairs.length * scale + rng.normal(0.0, 0.002, pairs.length.shape) + 0.05
-    assert misplaced_muscles(pairs._replace(length=length), robot) == []
+    assert not recorded_wiring(pairs._replace(length=length), robot).faulty
 
 
 def test_the_check_says_what_is_in_a_bag_and_what_it_fits(arm, tmp_path):

@@ -12,8 +12,10 @@ from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.length_calibration import LARGEST_RESIDUAL, LengthCalibration
 from musculoskeletal_ae.estimation.length_moments import WINDOW
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
+from musculoskeletal_ae.signals.wiring import Wiring
 
 DT = 0.025  # time between two messages [s]
 OFFSET = np.array([0.06, -0.09, 0.12, -0.05, 0.1, -0.13])
@@ -81,6 +83,40 @@ def test_length_offsets_are_found_without_joint_sensors(robot, mae, moment):
     calibration = run(LengthCalibration(robot, mae), moment, 90.0, sees=False)
     assert calibration.is_done and calibration.time < 60.0
     np.testing.assert_allclose(calibration.offsets.offset, OFFSET, atol=3e-3)
+
+
+def rewired(moment, wiring):
+    """Return `moment` as a driver with this wiring publishes it."""
+
+    def published(t):
+        theta, tension, length = moment(t)
+        into = list(wiring.order)
+        return theta, tension[into], np.array(wiring.sign) * length[into]
+
+    return published
+
+
+STRAIGHT = Wiring.straight(6)
+
+
+@pytest.mark.parametrize('wiring', [STRAIGHT.exchanged(0, 3), STRAIGHT.reversed(4)])
+def test_a_wrong_order_or_sign_is_named_and_no_offsets_are_accepted(robot, mae, moment, wiring):
+    calibration = run(LengthCalibration(robot, mae), rewired(moment, wiring), 40.0, sees=True)
+    assert not calibration.is_done and not calibration.offsets.known
+    assert calibration.wiring.wiring == wiring
+    assert calibration.problem.startswith(wiring.text(robot.muscles))
+    assert calibration.remedy == (Step.CORRECT_WIRING, Step.CALIBRATE_LENGTHS)
+
+
+@pytest.mark.usefixtures('seldom')
+def test_exchanged_muscles_are_named_without_joint_sensors(robot, mae, moment):
+    wiring = STRAIGHT.exchanged(0, 3)
+    calibration, begin = LengthCalibration(robot, mae), 0.0
+    while not calibration.problem and begin < 120.0:
+        run(calibration, rewired(moment, wiring), 5.0, sees=False, begin=begin)
+        begin += 5.0
+    assert not calibration.is_done
+    assert calibration.wiring.wiring == wiring, calibration.problem
 
 
 def test_length_offsets_are_found_from_a_stated_posture_if_the_arm_stands(robot, mae, moment):

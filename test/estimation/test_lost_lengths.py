@@ -33,6 +33,7 @@ class MovingArm:
         self.off, self.joint_off = np.zeros(robot.muscle_count), np.zeros(robot.joint_count)
         self.tension = robot.tension.bias + 20.0
         self.tense = np.ones(robot.muscle_count)  # 0 for a tendon without tension
+        self.order = np.arange(robot.muscle_count)  # muscle that each column of the readings shows
         self.posture = None  # θ of an arm that stands still [rad], or None
 
     def go(self, seconds, sensors=True):
@@ -50,7 +51,7 @@ class MovingArm:
                 self.core.joints(theta + self.joint_off, self.time)
             states = np.array([length, tension, np.full_like(length, 25.0)])
             with suppress(RejectionError):
-                self.core.step(states, self.time, self.time)
+                self.core.step(states[:, self.order], self.time, self.time)
 
     @property
     def kind(self):
@@ -122,6 +123,28 @@ def test_a_jump_of_lengths_revokes_the_offsets_until_a_calibration(
     assert arm.kind is None
     assert not arm.offsets.revoked
     assert not arm.offsets.known
+
+
+@pytest.mark.parametrize('pair', [(0, 2), (1, 4)])
+def test_exchanged_muscles_are_named_instead_of_lost_offsets(robot, calibrated, pair):
+    arm = MovingArm(robot, calibrated)
+    arm.go(10.0, sensors=False)
+    assert arm.kind is None
+    arm.order[list(pair)] = arm.order[list(reversed(pair))]
+    arm.go(10.0, sensors=False)
+    assert arm.kind is ConditionKind.MUSCLES_EXCHANGED, arm.core.cause
+    first, second = (robot.muscles[m] for m in pair)
+    assert f'the readings of {first} and {second} are exchanged' in arm.core.cause
+    assert arm.core.remedy == (Step.CORRECT_WIRING, Step.CALIBRATE_LENGTHS)
+    assert arm.offsets.revoked
+
+
+def test_a_jump_of_two_lengths_that_no_exchange_explains_is_one_of_lost_offsets(robot, calibrated):
+    arm = MovingArm(robot, calibrated)
+    arm.go(10.0, sensors=False)
+    arm.off = SEVERAL * (np.arange(6) < 2)
+    arm.go(2.0, sensors=False)
+    assert arm.kind is ConditionKind.LENGTHS_JUMPED
 
 
 def test_a_jump_without_a_network_is_not_forgotten(robot, mae):

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Decides whether a finding is explained by two muscles that a driver has exchanged.
+
+If a driver restarts with two muscles exchanged, in readings and commands, their lengths jump or no
+longer fit the rest of the arm. Detectors then report lost length offsets or a damaged muscle, and
+the advice that follows would be wrong. If the muscles are exchanged, putting the two columns back
+restores the usual anomaly score A in all recent messages (`signals/wiring.py`). A network that has
+learned the arm is exact enough for this. With any other network, the length calibration judges the
+order, because the arm moves meanwhile.
+"""
+
+import math
+from collections import deque
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation.finding import Finding, Observation
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.residuals import anomaly, residuals
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.wiring import Judgement, Wiring, decide, single_faults
+
+SPACING = 0.25  # time between two messages that are kept [s]
+USUAL_COUNT = 120  # number of messages whose median A is the usual one
+ENOUGH = 20  # smallest number of messages from which the usual A is known
+RECENT = 20  # number of the newest of these messages by which a finding is judged
+ANOMALOUS = 2.0  # judge by the messages whose A is above this multiple of the usual A
+#: assume an exchange only if A after putting the columns back is below this multiple of the usual A
+USUAL = 1.5
+#: assume an exchange only if putting the columns back divides A by at least this factor. With both
+#: factors, in moments of four learned arms, an exchange explained 3 of 930 shifted lengths.
+BETTER = 3.0
+#: kinds of findings to which an exchange can lead
+EXPLAINED = frozenset(
+    {
+        ConditionKind.LENGTHS_JUMPED,
+        ConditionKind.LENGTHS_DISAGREE,
+        ConditionKind.LENGTH_DISAGREES,
+        ConditionKind.RESIDUAL_DISTANCE,
+    }
+)
+
+
+class ExchangeCheck:
+    """Keeps recent messages, and replaces a finding that exchanged muscles explain."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self._mae: Mae | None = None
+        #: T_end and l as read of recent messages
+        self._messages: deque[tuple[Array, Array]] = deque(maxlen=USUAL_COUNT)
+        self._offset: Array = np.zeros(robot.muscle_count)  # length offsets of these messages [m]
+        self._since = 0.0  # time since a message was last kept [s]
+
+    def use(self, mae: Mae) -> None:
+        """Use another network; its isolated muscles are ignored."""
+        self._mae = mae
+
+    def note(self, observation: Observation) -> None:
+        """Keep a message in regular intervals, while the length offsets are known."""
+        sample, offset = observation.sample, _offset(observation)
+        if not observation.lengths_known or not np.allclose(offset, self._offset, atol=1e-9):
+            self._messages.clear()
+            self._offset = offset
+        self._since += observation.dt
+        if observation.lengths_known and self._since >= SPACING - 1e-9:
+            self._since = 0.0
+            self._messages.append((sample.bone_tension, sample.length_read))
+
+    def explain(self, finding: Finding | None, observation: Observation) -> Finding | None:
+        """Return a finding of exchanged muscles if they explain `finding`, else `finding`."""
+        if finding is None or finding.kind not in EXPLAINED or not observation.lengths_known:
+            return finding
+        judgement = self._judge(observation)
+        if judgement is None or not judgement.is_faulty:
+            return finding
+        text = f'{judgement.text(self._robot.muscles)}: the lengths then fit the arm again'
+        first, *others = judgement.faulty
+        return Finding(first, ConditionKind.MUSCLES_EXCHANGED, text, tuple(others))
+
+    def _judge(self, observation: Observation) -> Judgement | None:
+        """Return which exchange restores the usual A; None if that cannot be judged.
+
+        Wrong signs are not considered, because in few postures a lost length offset of one muscle
+        can look like one.
+        """
+        mae, sample = self._mae, observation.sample
+        if mae is None or mae.anomaly is None or not mae.anomaly.calibrated:
+            return None
+        used = ~np.isin(np.arange(self._robot.muscle_count), mae.isolated)
+        slack = sample.motor_tension < LIMITS.slack_share * self._robot.description.tension.bias
+        if len(self._messages) < ENOUGH or (slack & used).any():
+            return None  # no exchange explains a tendon without tension
+        offset = _offset(observation)
+        messages = *self._messages, (sample.bone_tension, sample.length_read)
+        tension, length = (np.array(part) for part in zip(*messages))
+
+        def scores(wiring: Wiring) -> Array:
+            """Return A of all messages if their columns are wired in this way."""
+            ordered, shifted = wiring.unsigned(tension), wiring.signed(length) - offset
+            state = mae.estimate(ordered, shifted)
+            return anomaly(residuals(state, ordered, shifted, mae.isolated))
+
+        straight = Wiring.straight(self._robot.muscle_count)
+        present = scores(straight)
+        usual = float(np.median(present))
+        is_anomalous = present > ANOMALOUS * usual
+        is_anomalous[: -RECENT - 1] = False
+        if not is_anomalous.any():
+            return None
+        tension, length = tension[is_anomalous], length[is_anomalous]
+
+        def cost(wiring: Wiring) -> float:
+            """Return the median A, or infinity if it is not healthy."""
+            value = float(np.median(scores(wiring)))
+            return value if value < USUAL * usual else math.inf
+
+        # An exchange makes both lengths jump, if they differ by enough.
+        columns = sample.jumped or np.flatnonzero(used).tolist()
+        others = [(other, cost(other)) for other in single_faults(straight, columns, signs=False)]
+        return decide(straight, float(np.median(present[is_anomalous])), others, BETTER)
+
+
+def _offset(observation: Observation) -> Array:
+    """Return the length offsets of a message [m], (M,)."""
+    return observation.sample.length_read - observation.sample.length
