@@ -412,7 +412,8 @@ NAN = np.nan
     ('angles', 'shift', 'obstacle'),
     [
         ([NAN, NAN], 0.0, 'without usable joint angles'),
-        ([9.0, 0.0], 0.0, 'joint limits'),
+        ([9.0, 9.0], 0.0, 'without usable joint angles'),  # far outside the joint limits
+        ([9.0, -0.5], 0.0, ''),
         ([0.1, 0.2], 5.0, 'muscle_states are rejected'),
         (None, 0.0, 'without usable joint angles'),
         ([0.1, NAN], 0.0, ''),  # one joint sensor is enough for a sample
