@@ -38,12 +38,13 @@ UNIT_TOLERANCE = 0.01  # largest deviation of a quaternion's norm from 1
 QUANTITIES = ('length', 'tension', 'temperature')
 
 
-def read_array(message: Any, rows: int, columns: int) -> Array:
+def read_array(message: Any, rows: int, columns: int, owner: str = 'muscle') -> Array:
     """Return the data of a Float64MultiArray as (rows, columns), or (columns,) for one row.
 
-    The data must be finite. The layout may be empty; otherwise it must match.
+    The data must be finite. The layout may be empty; otherwise it must match, and the label of the
+    columns is `owner`.
     """
-    values = _values(message, rows, columns)
+    values = _values(message, rows, columns, owner)
     finite = np.isfinite(values)
     if not finite.all():
         place = np.flatnonzero(~finite)[0]
@@ -88,7 +89,7 @@ def read_muscle_states(
     return values
 
 
-def _values(message: Any, rows: int, columns: int) -> Array:
+def _values(message: Any, rows: int, columns: int, owner: str = 'muscle') -> Array:
     """Return the data of a Float64MultiArray as (rows, columns), with size and layout checked."""
     count = len(message.data)
     if count > MOST_ENTRIES:
@@ -98,7 +99,7 @@ def _values(message: Any, rows: int, columns: int) -> Array:
     if count != rows * columns:
         raise MessageError('wrong length', f'{count} values; expected {rows * columns}')
     stated = [(dim.label, dim.size, dim.stride) for dim in message.layout.dim]
-    legal = [('quantity', rows, rows * columns), ('muscle', columns, columns)][rows == 1 :]
+    legal = [('quantity', rows, rows * columns), (owner, columns, columns)][rows == 1 :]
     fits = len(stated) == len(legal) and all(
         label in ('', name) and size == length and stride in (0, step)
         for (label, size, stride), (name, length, step) in zip(stated, legal)

@@ -275,7 +275,7 @@ class JointCheck:
             jacobian = mae.muscle_jacobian(theta, tension) / spread[:, None]
             return _unexplained(change[:, muscles], jacobian[:, muscles][:, :, is_free])
 
-        is_unknown = np.asarray(np.isnan(excess).any(axis=0))
+        is_unknown = np.asarray(np.isnan(excess).any(axis=0), dtype=bool)
         by_joints = misfit(joints | is_unknown, used)
         by_muscle = min(
             misfit(is_unknown, used & (np.arange(len(used)) != muscle))

@@ -544,7 +544,7 @@ class Shell(Node):
         """Call `follow` with the estimator's trust in the joint sensors, in times of `now`."""
 
         def take(message: Float64MultiArray) -> None:
-            rows = read_array(message, JointTrust.ROWS, self.robot.joint_count)
+            rows = read_array(message, JointTrust.ROWS, self.robot.joint_count, 'joint')
             try:
                 follow(JointTrust.from_rows(rows, self.now()))
             except ValueError as error:
