@@ -35,6 +35,7 @@ from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.estimation.length_trust import Evidence
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_TIME
 from musculoskeletal_ae.learning.learner import Learner
@@ -320,8 +321,7 @@ class Lab:
         self.estimator.use(mae)
         self.validator.take(mae, self.now)
         self.controller.use(mae)
-        waits = not self.estimator.body.offsets.known and self.estimator.calibration is None
-        if waits:
+        if Evidence.NOT_CALIBRATED in self.estimator.trust.evidence:  # it waits for a network
             self.estimator.calibrate_lengths()
 
     def _control(self, now: float) -> None:

@@ -35,7 +35,7 @@ SELF = frozenset({
 #: statements that a muscle is faulty, without saying what of it
 FAULTY = frozenset({'residual_distance', 'muscle_isolated'})
 RUPTURE = FAULTY | {'slack_tendon'}
-JAM = FAULTY | {'jammed_module', 'motor_does_not_follow'}
+JAM = FAULTY | {'module_stands'}
 ONE_LENGTH = FAULTY | {'length_jump', 'length_disagrees'}
 SEVERAL_LENGTHS = frozenset({'lengths_jumped', 'lengths_disagree'})
 REVOKED = frozenset({
@@ -43,10 +43,12 @@ REVOKED = frozenset({
 })  # fmt: skip
 FROZEN = FAULTY | {'sensor_frozen'}
 MISSING = FAULTY | {'values_missing', 'implausible_muscle_states', 'readings_rejected'}
-TENSION_SENSOR = FAULTY | {'sensor_saturated', 'tension_sensor_disagrees'}
+TENSION_SENSOR = FAULTY | {'sensor_saturated', 'module_stands'}
 JOINT = frozenset({'joint_sensors_doubted', 'joint_readings_impossible'})
 #: messages are rejected, and say why: a true symptom of readings that jump
-REJECTED = frozenset({'implausible_muscle_states', 'readings_rejected'})
+REJECTED = frozenset({
+    'implausible_muscle_states', 'readings_rejected', 'stale_muscle_states', 'stale_estimate',
+})  # fmt: skip
 STALE = frozenset({
     'stale_muscle_states', 'no_muscle_states', 'silent_topic', 'stale_estimate', 'slow_topic',
     'nothing_to_learn',
@@ -921,7 +923,8 @@ MISHAPS: tuple[Mishap, ...] = (
     Mishap('tendon ruptures under load', rupture_under_load, RUPTURE, allowed=_CONSEQUENCES),
     Mishap('tendon ruptures at rest', rupture_at_rest, RUPTURE, allowed=_CONSEQUENCES),
     Mishap('tendon creeps', _slackening(0.06, 0.004), ONE_LENGTH | RUPTURE, allowed=REVOKED),
-    Mishap('spool slips on its shaft', slipped_winch, ONE_LENGTH, says='jumped', allowed=REVOKED),
+    Mishap('spool slips on its shaft', slipped_winch, ONE_LENGTH, says='jumped',
+           allowed=REVOKED | REJECTED),
     Mishap('module jams', module_fault('stuck_motor'), JAM),
     Mishap('motor is weak', module_fault('winch_speed', 0.005, 0.02), JAM),
     Mishap('length reading freezes', frozen(LENGTH), FROZEN | ONE_LENGTH, allowed=REVOKED),
@@ -930,7 +933,7 @@ MISHAPS: tuple[Mishap, ...] = (
     Mishap('joint sensor drifts', joint_drifts, JOINT, says=OF_JOINT),
     Mishap(
         'driver restarts, two muscles exchanged', driver_exchanges, says=ORDER,
-        allowed=_LENGTHS | STALE | _CONSEQUENCES | REJECTED,
+        allowed=_LENGTHS | STALE | _CONSEQUENCES | REJECTED | HEAT,
     ),
     Mishap('operator stops a verification', stop_of_verification,
            frozenset({'operator_stop'}), allowed=RUPTURE | _CONSEQUENCES),

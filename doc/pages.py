@@ -43,9 +43,10 @@ If several causes begin together, the first one in this table is reported.
 ## Steps of remedies
 
 Each condition on `/diagnostics` lists the identifiers of its steps \
-([Diagnostics](diagnostics.md)). While an anomaly is present, these causes need no steps of their \
-own, because they usually follow from it: {consequences}. Their steps are advised if these causes \
-outlast the anomaly.
+([Diagnostics](diagnostics.md)). Some causes follow from others, and need no steps of their own \
+while these are present:
+
+{consequences}
 
 {steps}
 """
@@ -70,8 +71,9 @@ def stops() -> str:
         states=_listed(states),
         diagram=supervisor.diagram(),
         table=_table(('cause', 'condition', 'action', 'ends', 'remedy'), causes),
-        consequences=_listed(
-            kind.identifier for kind in ConditionKind if kind in status.CONSEQUENCES
+        consequences='\n'.join(
+            f'- from `{first.identifier}`: {_listed(kind.identifier for kind in others)}'
+            for first, others in status.CONSEQUENCES.items()
         ),
         steps=_table(
             ('identifier', 'step'), [(f'`{step.identifier}`', step.text) for step in Step]

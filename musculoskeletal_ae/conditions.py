@@ -253,12 +253,13 @@ class ConditionKind(Enum):
         REPAIR,
         reaction=Reaction.ISOLATE,
     )
-    JAMMED_MODULE = Declaration(
-        'jammed_module',
+    MODULE_STANDS = Declaration(
+        'module_stands',
         'estimator',
         'error',
-        'a muscle module does not follow its commands',
-        'jammed module',
+        'a winch stands still although its tension reading is far from the commanded tension: it '
+        'is jammed, or the reading is wrong',
+        'a module stands still against its commands',
         REPAIR,
         reaction=Reaction.ISOLATE,
     )
@@ -554,8 +555,8 @@ class ConditionKind(Enum):
         'stale_muscle_states',
         'controller',
         'error',
-        'muscle_states are older than max_age',
-        'muscle_states are too old',
+        'no usable muscle_states have arrived for max_age',
+        'no usable muscle_states',
         (Step.CHECK_DRIVER, Step.RESET_CONTROLLER),
         Stop(Action.HOLD, _CONDITION),
     )
@@ -563,8 +564,8 @@ class ConditionKind(Enum):
         'stale_estimate',
         'controller',
         'error',
-        'estimated_joint_states are older than max_age',
-        'estimated_joint_states are too old',
+        'no usable estimated_joint_states have arrived for max_age',
+        'no usable estimated_joint_states',
         (Step.CHECK_ESTIMATOR, Step.RESET_CONTROLLER),
         Stop(Action.HOLD, _CONDITION),
     )

@@ -33,16 +33,15 @@ DOING = {
     Activity.TORQUE: 'holding',
     Activity.GRAVITY_COMPENSATION: 'gravity compensation',
 }
-#: causes that usually follow from an anomaly: a faulty muscle makes estimates implausible, and
-#: implausible estimates are rejected. While the anomaly is present, they need no remedy of their
-#: own.
-CONSEQUENCES = frozenset(
-    {
-        ConditionKind.IMPLAUSIBLE_MUSCLE_STATES,
-        ConditionKind.IMPLAUSIBLE_ESTIMATE,
-        ConditionKind.STALE_ESTIMATE,
-    }
-)
+_OF_READINGS = ConditionKind.IMPLAUSIBLE_ESTIMATE, ConditionKind.STALE_ESTIMATE
+#: what follows from each cause: a faulty muscle makes readings and estimates implausible, and
+#: without usable readings there are no estimates. While the first cause is present, the others need
+#: no remedy of their own.
+CONSEQUENCES = {
+    ConditionKind.ANOMALY: (ConditionKind.IMPLAUSIBLE_MUSCLE_STATES, *_OF_READINGS),
+    ConditionKind.IMPLAUSIBLE_MUSCLE_STATES: (ConditionKind.STALE_MUSCLE_STATES, *_OF_READINGS),
+    ConditionKind.STALE_MUSCLE_STATES: _OF_READINGS,
+}
 ONLY_RESET = (Step.RESET_CONTROLLER,)
 
 
@@ -81,9 +80,11 @@ def conditions(core: Controller, now: float) -> tuple[Condition, ...]:
 def _stop(core: Controller, now: float) -> Iterator[Condition]:
     """Yield every cause of a stop, of a pause, or of waiting before the first command."""
     supervisor, present = core.supervisor, core.stop_conditions(now)
+    followed = {kind for each in present for kind in CONSEQUENCES.get(each.kind, ())}
     if supervisor.is_running:
         for each in present:
-            needed = tuple(step for step in each.steps if step is not Step.RESET_CONTROLLER)
+            steps = () if each.kind in followed else each.steps
+            needed = tuple(step for step in steps if step is not Step.RESET_CONTROLLER)
             yield each._replace(level='warn', text=f'waiting: {each.text}', steps=needed)
         return
     causes = supervisor.causes(present)
@@ -92,10 +93,10 @@ def _stop(core: Controller, now: float) -> Iterator[Condition]:
             yield each._replace(level='warn', text=f'paused: {each.text}', steps=())
         return
     for each in causes:
-        steps: tuple[Step, ...] = each.steps
+        steps = each.steps
         if supervisor.ends_by_itself:
             steps = ()
-        elif core.watchdog.has_anomaly and each.kind in CONSEQUENCES:
+        elif each.kind in followed:
             steps = ONLY_RESET
         yield each._replace(level='error', text=f'stopped: {each.text}', steps=steps)
 

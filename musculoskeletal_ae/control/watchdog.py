@@ -88,7 +88,7 @@ class DataAge:
         """
         allowed = max_age / min(max(self.pace, SLOWEST), 1.0)
         return [
-            kind.condition(f'older than {allowed:.3g} s')
+            kind.condition(f'for {allowed:.3g} s')
             for kind, came_at in self._came_at.items()
             if self.awake(now) - came_at > allowed
         ]

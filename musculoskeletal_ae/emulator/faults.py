@@ -111,8 +111,8 @@ def read_fault(line: str, robot: Robot) -> Fault:
     size, largest, unit, smallest = kind.size, kind.largest, kind.unit, 0.0
     if kind.of_quantity and words and words[0] in QUANTITIES:
         quantities = (words.pop(0),)
-    elif kind.of_quantity and words and words[0] in robot.joints:
-        quantities = ('theta',)
+    elif kind.of_quantity and words and words[0] in ('theta', *robot.joints):
+        words, quantities = words[words[0] == 'theta' :], ('theta',)
     elif kind.size:
         quantities = quantities[:1]  # without a quantity, faults with a size affect lengths
     if quantities and kind.size:
@@ -131,8 +131,12 @@ def read_fault(line: str, robot: Robot) -> Fault:
     if words and not kind.of_muscle:
         legal = f'{name}[:SIZE], which affects all readings'
         raise MusculoskeletalError(f'{line[:80]!r}; legal: {legal}')
-    if quantities == ('theta',) and len(words) == 1:
-        return Fault(name, quantities, np.array([robot.joints.index(words[0])]), size)
+    if quantities == ('theta',):
+        if unknown := set(words) - set(robot.joints):
+            legal = f'joints: {", ".join(robot.joints)}'
+            raise MusculoskeletalError(f'{line[:80]!r}: unknown joint {unknown}; legal: {legal}')
+        joints = [robot.joints.index(word) for word in words] or range(robot.joint_count)
+        return Fault(name, quantities, np.array(joints), size)
     muscles = robot.muscle_indices([':'.join(words)] if words else robot.muscles)
     return Fault(name, quantities, np.array(muscles), size)
 

@@ -31,7 +31,8 @@ ANOMALOUS = 2.0  # judge by the messages whose A is above this multiple of the u
 #: assume an exchange only if A after putting the columns back is below this multiple of the usual A
 USUAL = 1.5
 #: assume an exchange only if putting the columns back divides A by at least this factor. With both
-#: factors, in moments of four learned arms, an exchange explained 3 of 930 shifted lengths.
+#: factors, in moments of two learned arms, an exchange explained 3 of 475 shifts of one or two
+#: lengths, and it was recognised in 194 of 229 exchanges.
 BETTER = 3.0
 #: kinds of findings to which an exchange can lead
 EXPLAINED = frozenset(

@@ -499,7 +499,7 @@ def test_a_stop_by_stale_data_outlasts_a_later_verification():
     bench.isolate([])
     bench.core.anomaly(False)
     bench.step(50)
-    assert 'older' in bench.condition
+    assert 'no usable' in bench.condition
 
 
 def test_a_stop_pays_an_isolated_muscle_out_to_its_longest_length_at_most():

@@ -229,7 +229,7 @@ def test_data_that_are_late_briefly_stop_the_arm_and_it_resumes_by_itself(what):
     bench.step(50)
     bench.blind = {what}
     held = bench.step(60)  # data are stale after 0.2 s; the arm would be released after 0.7 s
-    assert 'older' in bench.condition
+    assert 'no usable' in bench.condition
     assert bench.report().level == 'warn'
     assert len({tuple(command.value) for command in held[25:]}) == 1
     bench.blind = set()
@@ -327,7 +327,7 @@ def test_commands_follow_the_clock_of_the_messages_at_any_pace(pace):
 )
 def test_the_age_limit_grows_with_a_slow_clock_and_never_shrinks(pace, gap, late):
     _, cause = run(pace, gap, at=200, count=201)
-    assert ('older' in cause) is late
+    assert ('no usable' in cause) is late
 
 
 def causes(bench):

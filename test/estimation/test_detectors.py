@@ -195,7 +195,7 @@ def test_a_winch_that_does_not_follow_its_command_is_jammed(robot, mae, watch, w
         if kind == 'length':
             watched.demand = robot.actuation.demanded(length, length - (reported - 30.0) / 1e4)
         _, _, finding = watched.step((tension, length), state)
-        if finding is not None and finding.kind is ConditionKind.JAMMED_MODULE:
+        if finding is not None and finding.kind is ConditionKind.MODULE_STANDS:
             findings.append((n, finding.muscle))
     assert findings
     assert {muscle for _, muscle in findings} == {3}

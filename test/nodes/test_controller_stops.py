@@ -100,7 +100,7 @@ def test_a_lost_driver_stops_the_arm_and_a_new_one_lets_it_resume(moving):
     arm.set_max_age(IMPATIENT)
     arm.says('stale_muscle_states')
     refused = reset(arm).message
-    assert refused.startswith('refused: muscle_states are too old')
+    assert refused.startswith('refused: no usable muscle_states')
     assert 'call controller/reset again' in refused
     before = arm.count()
     arm.graph.wait(lambda: arm.count() > before + 20, 'commands without a driver')

@@ -71,7 +71,9 @@ class JammedModule(Detector):
             return None
         muscle = int(self._time.argmax())
         return Finding(
-            muscle, ConditionKind.JAMMED_MODULE, 'its winch does not follow the commands'
+            muscle,
+            ConditionKind.MODULE_STANDS,
+            'its winch is jammed, or its tension reading is wrong',
         )
 
     def _is_far(self, observation: Observation) -> Bools | None:
