@@ -35,7 +35,7 @@ SELF = frozenset({
 #: statements that a muscle is faulty, without saying what of it
 FAULTY = frozenset({'residual_distance', 'muscle_isolated'})
 RUPTURE = FAULTY | {'slack_tendon'}
-JAM = FAULTY | {'module_stands'}
+JAM = FAULTY | {'module_stands', 'slack_tendon'}
 ONE_LENGTH = FAULTY | {'length_jump', 'length_disagrees'}
 SEVERAL_LENGTHS = frozenset({'lengths_jumped', 'lengths_disagree'})
 REVOKED = frozenset({

@@ -248,8 +248,9 @@ class ConditionKind(Enum):
         'slack_tendon',
         'estimator',
         'error',
-        'a tendon carries no tension although it should',
-        'slack tendon',
+        'a muscle has no tension although its command demands some: its tendon has ruptured or is '
+        'slack, or its winch is jammed',
+        'a muscle has no tension',
         REPAIR,
         reaction=Reaction.ISOLATE,
     )
