@@ -43,7 +43,7 @@ REVOKED = frozenset({
 })  # fmt: skip
 FROZEN = FAULTY | {'sensor_frozen'}
 MISSING = FAULTY | {'values_missing', 'implausible_muscle_states', 'readings_rejected'}
-TENSION_SENSOR = FAULTY | {'sensor_saturated', 'module_stands'}
+TENSION_SENSOR = FAULTY | {'sensor_saturated', 'module_stands', 'tension_above_limit', 'overload'}
 JOINT = frozenset({'joint_sensors_doubted', 'joint_readings_impossible'})
 #: messages are rejected, and say why: a true symptom of readings that jump
 REJECTED = frozenset({
@@ -942,8 +942,10 @@ MISHAPS: tuple[Mishap, ...] = (
            TENSION_SENSOR),
     Mishap('tension reading is too small', changed(TENSION, gain, 0.4, 0.7, '×', False),
            TENSION_SENSOR),
-    Mishap('length reads NaN', changed(LENGTH, nothing, 1.0, 1.0, '', False), MISSING),
-    Mishap('tension reads NaN', changed(TENSION, nothing, 1.0, 1.0, '', False), MISSING),
+    Mishap('length reads NaN', changed(LENGTH, nothing, 1.0, 1.0, '', False), MISSING,
+           allowed=REJECTED),
+    Mishap('tension reads NaN', changed(TENSION, nothing, 1.0, 1.0, '', False), MISSING,
+           allowed=REJECTED),
     Mishap('temperatures are not read any more', no_temperatures, says='temperature',
            is_harmless=True),
     Mishap('motor is hot', hot_motor, HEAT, says='heat|hot', patience=300.0),

@@ -637,8 +637,8 @@ class ConditionKind(Enum):
         'tension_above_limit',
         'controller',
         'warn',
-        'a tension is above 1.1 × tension.limit',
-        'too much tension',
+        'a tension reading is above 1.1 × tension.limit',
+        'tension readings above 1.1 × tension.limit',
     )
     TENSION_LIMITED_BY_HEAT = Declaration(
         'tension_limited_by_heat',

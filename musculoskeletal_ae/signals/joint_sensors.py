@@ -294,7 +294,7 @@ class _Lengths:
 
 
 def _solve(products: Array, right: Array) -> Array:
-    solution: Array = np.linalg.lstsq(products, right)[0].astype(float)
+    solution: Array = np.linalg.lstsq(products, right, rcond=None)[0].astype(float)
     return solution
 
 

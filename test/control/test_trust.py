@@ -189,7 +189,7 @@ def test_a_tension_that_stays_above_its_limit_is_reported_at_once_and_releases_t
     tension[3] = 230.0
     bench.tension = tension
     bench.step(3)  # the median filter needs three messages to pass the new tensions
-    assert f'too much tension: {ROBOT.muscles[3]} (above 220 N)' in bench.report().message
+    assert f'above 1.1 × tension.limit: {ROBOT.muscles[3]} (above 220 N)' in bench.report().message
     before = bench.step(round(OVERLOAD_TIME / DT) - 3)[-1]
     assert bench.cause == ''
     after = bench.step(10)

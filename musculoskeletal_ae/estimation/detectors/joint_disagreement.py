@@ -232,7 +232,7 @@ class JointDisagreement(Detector):
         tension = observation.sample.bone_tension
         jacobian = self._mae.muscle_jacobian(observation.measured, tension)
         jacobian = jacobian * self._used[:, None]
-        shift = np.linalg.lstsq(jacobian, -change)[0]
+        shift = np.linalg.lstsq(jacobian, -change, rcond=None)[0]
         unexplained = change + jacobian @ shift
         evidence = (
             'length differs from that at the measured posture by '
