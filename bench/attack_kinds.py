@@ -38,6 +38,10 @@ REPAIRS = {
     Step.REPAIR_EMULATED_FAULT,
     Step.FREE_ARM,
     Step.CHECK_SENSOR,
+    Step.CHECK_TENDON,
+    Step.CHECK_MODULE,
+    Step.CHECK_JOINT_SENSOR,
+    Step.REPAIR_SENSOR,
 }
 OFFSET = 0.08  # absolute value of false length offsets [m]
 

@@ -29,8 +29,8 @@ every cause that keeps the arm stopped.
 
 The table names the action with which each cause stops the arm:
 
-- `hold` keeps the last command, because the cause may clear. After `hold_time`, it does the same \
-as `release`.
+- `hold` keeps the last command, because the cause may clear. After `hold_time`, it pays \
+out the muscles as `release` does.
 - `release` keeps the last command for `hold_time` in any case. Then it pays out all muscles until \
 each exerts T_bias. Modules that follow positions are paid out until their measured tension is \
 T_bias, or by `release` of muscles.yaml where no tension is known.
@@ -44,7 +44,7 @@ If several causes begin together, the first one in this table is reported.
 
 Each condition on `/diagnostics` lists the identifiers of its steps \
 ([Diagnostics](diagnostics.md)). Some causes follow from others, and need no steps of their own \
-while these are present:
+while these are present, except for the reset:
 
 {consequences}
 
@@ -76,7 +76,11 @@ def stops() -> str:
             for first, others in status.CONSEQUENCES.items()
         ),
         steps=_table(
-            ('identifier', 'step'), [(f'`{step.identifier}`', step.text) for step in Step]
+            ('place', 'identifier', 'step'),
+            [
+                (str(step.place), f'`{step.identifier}`', step.text)
+                for step in sorted(Step, key=lambda step: step.place)
+            ],
         ),
     )
 

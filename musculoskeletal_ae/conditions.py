@@ -170,7 +170,7 @@ class ConditionKind(Enum):
         'error',
         'another node publishes a topic of the driver, the estimator, the learner or the '
         'controller, or has the name of this node',
-        'several publishers',
+        'another node publishes for this arm, or has the same name',
         (Step.STOP_SECOND_PUBLISHER, Step.RESET_CONTROLLER),
         Stop(Action.RELEASE, _RESET),
     )
@@ -180,7 +180,7 @@ class ConditionKind(Enum):
         'error',
         '`muscle_states` or `estimated_joint_states` is published or was received, but no usable '
         'message has arrived for 1 s',
-        'silent topic',
+        'no usable messages',
         (Step.CHECK_DRIVER,),
     )
     MISSING_TOPIC = Declaration(
@@ -203,8 +203,8 @@ class ConditionKind(Enum):
         'learner',
         'warn',
         '`imu` has more publishers than there are links of which messages arrive',
-        'imu is not used',
-        (Step.STOP_SECOND_PUBLISHER,),
+        'imu is not used, because it has more publishers than links',
+        (Step.CHECK_IMU,),
     )
 
     # -- emulated arm ---------------------------------------------------------------------------
@@ -214,7 +214,7 @@ class ConditionKind(Enum):
         'hardware_emulator',
         'error',
         'the emulated arm has left the range in which it can be simulated',
-        'the simulation diverged under excessive forces',
+        'the emulated arm has left the range that can be simulated',
         (Step.RESET_EMULATOR,),
     )
     MODULES_IN_SAFE_STATE = Declaration(
@@ -269,7 +269,7 @@ class ConditionKind(Enum):
         'estimator',
         'error',
         'a length or tension sensor repeats one reading',
-        'frozen sensor',
+        'a sensor repeats one reading',
         REPAIR,
         reaction=Reaction.ISOLATE,
     )
@@ -287,8 +287,8 @@ class ConditionKind(Enum):
         'estimator',
         'error',
         'the length of one muscle has jumped',
-        'the length has jumped',
-        (Step.CALIBRATE_LENGTHS,),
+        'the length of a muscle has jumped',
+        (Step.CHECK_TENDON, Step.CALIBRATE_LENGTHS),
         reaction=Reaction.ISOLATE,
         revokes=Revokes.ONE,
     )
@@ -317,8 +317,8 @@ class ConditionKind(Enum):
         'estimator',
         'error',
         'the length of one muscle disagrees with the joint sensors',
-        'the length disagrees with the joint sensors',
-        (Step.CALIBRATE_LENGTHS,),
+        'the length of a muscle disagrees with the joint sensors',
+        (Step.CHECK_TENDON, Step.CALIBRATE_LENGTHS),
         reaction=Reaction.ISOLATE,
         revokes=Revokes.ONE,
     )
@@ -338,7 +338,7 @@ class ConditionKind(Enum):
         'warn',
         'readings of joint sensors disagree with the muscle lengths; they are neither used nor '
         'learned',
-        'joint sensors disagree with the muscle lengths',
+        'joint sensors are not used, because they disagree with the muscle lengths',
         (Step.CHECK_JOINT_SENSOR,),
         reaction=Reaction.WARN,
     )
@@ -363,8 +363,8 @@ class ConditionKind(Enum):
         'values_missing',
         'estimator',
         'error',
-        'the length or the tension of a muscle has been NaN for a while',
-        'values are missing',
+        'the length or the tension of one muscle has been NaN for 0.15 s',
+        'the length or the tension of a muscle is NaN',
         REPAIR,
         reaction=Reaction.ISOLATE_ONLY,
     )
@@ -374,7 +374,7 @@ class ConditionKind(Enum):
         'error',
         'a tension sensor cannot read more than a value below tension.limit, so that the arm may '
         'pull more than it reads',
-        'saturated tension sensor',
+        'a tension sensor saturates below tension.limit',
         (Step.REPAIR_SENSOR, Step.RESET_ESTIMATOR),
         reaction=Reaction.ISOLATE_AT_ONCE,
     )
@@ -383,7 +383,7 @@ class ConditionKind(Enum):
         'estimator',
         'error',
         'the constants of the thermal model of a hot module have changed',
-        'thermal drift',
+        'a hot module heats or cools otherwise than before',
         REPAIR,
         reaction=Reaction.ISOLATE,
     )
@@ -392,7 +392,7 @@ class ConditionKind(Enum):
         'estimator',
         'warn',
         'the constants of the thermal model of a cool module have changed',
-        'a module has changed',
+        'a cool module heats or cools otherwise than before',
         (Step.CHECK_MODULE,),
         reaction=Reaction.WARN,
     )
@@ -404,7 +404,7 @@ class ConditionKind(Enum):
         'estimator',
         'warn',
         'a muscle is isolated, and is not being verified',
-        'isolated',
+        'a muscle is isolated and not used',
         (Step.RESTORE_MUSCLES,),
     )
     LENGTH_OFFSETS_UNKNOWN = Declaration(
@@ -438,7 +438,7 @@ class ConditionKind(Enum):
         'estimator',
         'warn',
         'the tensions of an arm that has learned show another direction of gravity than robot.urdf',
-        'the base is mounted otherwise than in robot.urdf',
+        'gravity, as the tensions show it, is not as in robot.urdf',
         (Step.CORRECT_MOUNTING, Step.RESET_ESTIMATOR),
     )
 
@@ -494,7 +494,7 @@ class ConditionKind(Enum):
         'estimator, controller, learner, sim',
         'warn',
         'the node has no network yet',
-        'no checkpoint',
+        'no network (checkpoint) yet',
         (Step.PROVIDE_CHECKPOINT, Step.RESET_CONTROLLER),
         Stop(Action.RELEASE, _RESET),
     )
@@ -503,7 +503,7 @@ class ConditionKind(Enum):
         'controller',
         'error',
         'anomaly_detected is true; the estimator reports the finding',
-        'the estimator has found a fault',
+        'the estimator has found a fault, which it reports',
         (Step.RESET_CONTROLLER,),
         Stop(Action.RELEASE, _VERIFICATION),
     )
@@ -539,7 +539,7 @@ class ConditionKind(Enum):
         'controller',
         'error',
         'a tension is above 1.1 × tension.limit for 0.2 s although its muscle is paid out',
-        'overload',
+        'overload, although the muscle is paid out',
         (Step.FREE_ARM, Step.RESET_CONTROLLER),
         Stop(Action.RELEASE_AT_ONCE, _VERIFICATION),
     )
@@ -578,7 +578,7 @@ class ConditionKind(Enum):
         'controller',
         'warn',
         'the arm does not move, because its length offsets are unknown',
-        'while the length offsets are unknown, the arm can only explore gently',
+        'the arm stands: while the length offsets are unknown, it can only explore gently',
         (Step.EXPLORE_GENTLY,),
     )
     NOT_EXPLORING = Declaration(
@@ -586,7 +586,7 @@ class ConditionKind(Enum):
         'controller',
         'warn',
         'a stop has ended the exploration, or it was refused at the start',
-        'the exploration does not go on by itself',
+        'the exploration was ended by a stop or refused, and does not go on by itself',
         (Step.EXPLORE,),
     )
     TARGET_CLAMPED = Declaration(
@@ -622,7 +622,7 @@ class ConditionKind(Enum):
         'controller',
         'warn',
         'the muscles cannot hold the target, or the hand cannot reach it',
-        'out of reach',
+        'the target cannot be reached or held',
     )
     AWAY_FROM_TARGET = Declaration(
         'away_from_target',
@@ -652,7 +652,8 @@ class ConditionKind(Enum):
         'controller',
         'warn',
         'the file that keeps a stop for the next controller cannot be written',
-        'the stop is not kept',
+        'the stop cannot be written to disk, and a restarted controller will not know of it',
+        (Step.FREE_DISK,),
     )
 
     # -- learning -------------------------------------------------------------------------------
@@ -662,7 +663,8 @@ class ConditionKind(Enum):
         'learner',
         'error',
         'the training process has ended or does not answer',
-        'no updates are made',
+        'the training process has ended or does not answer',
+        (Step.RESTART_NODE,),
     )
     STATE_NOT_SAVED = Declaration(
         'state_not_saved',
@@ -679,7 +681,7 @@ class ConditionKind(Enum):
         'an update has found an offset of a joint sensor above 0.35 rad, and is not used',
         'the result of learning is not used, because it contains a larger offset than a joint '
         'sensor can have',
-        (Step.CHECK_SENSOR, Step.LEARN_AFRESH),
+        (Step.CHECK_JOINT_SENSOR, Step.LEARN_AFRESH),
     )
     LENGTHS_NOT_LEARNED = Declaration(
         'lengths_not_learned',
@@ -702,7 +704,7 @@ class ConditionKind(Enum):
         'learner',
         'ok',
         'learning waits for the end of an anomaly or of a length calibration',
-        'learning is paused',
+        'learning waits',
     )
     NOTHING_TO_LEARN = Declaration(
         'nothing_to_learn',
@@ -719,14 +721,14 @@ class ConditionKind(Enum):
         _ALL,
         'warn',
         'a request was refused in the last 10 s',
-        'refused',
+        'a request was refused',
     )
     PART_IGNORED = Declaration(
         'part_ignored',
         _ALL,
         'warn',
         'a part of a message was not used in the last 10 s',
-        'ignored',
+        'a part of a message was not used',
     )
     REPLAY_STANDS = Declaration(
         'replay_stands',

@@ -25,7 +25,7 @@ class Step(Enum):
         'correct_wiring',
         'correct the order of the muscles, or the sign of the length, in the driver',
     )
-    REPAIR_MUSCLE = 'repair_muscle', 'repair the muscle'
+    REPAIR_MUSCLE = 'repair_muscle', 'repair tendon, winch or sensor of the named muscle'
     REPAIR_EMULATED_RUPTURE = (
         'repair_emulated_rupture',
         "set ruptured_muscles of hardware_emulator to [''], or press Repair on the page",
@@ -34,10 +34,10 @@ class Step(Enum):
         'repair_emulated_fault',
         "set faults of hardware_emulator to ['']",
     )
-    FREE_ARM = 'free_arm', 'free the arm'
+    FREE_ARM = 'free_arm', 'remove what pulls at the arm'
     CHECK_SENSOR = (
         'check_sensor',
-        'check the named sensor, or call estimator/zero if the lengths have offsets',
+        'check the sensors of the named muscles',
     )
     REPAIR_SENSOR = (
         'repair_sensor',
@@ -45,7 +45,7 @@ class Step(Enum):
     )
     CHECK_LOAD = (
         'check_load',
-        'check payload, contacts, isolated muscles and mounting; lift the arm by hand',
+        'check payload, contacts, isolated muscles and the mounting of the base',
     )
     CORRECT_MOUNTING = (
         'correct_mounting',
@@ -53,12 +53,14 @@ class Step(Enum):
     )
     CHECK_JOINT_SENSOR = (
         'check_joint_sensor',
-        'check the named joint sensors and their order; if they are right, call estimator/reset',
+        'correct the named joint sensors or their order; if they are right, call estimator/reset',
     )
     CHECK_MODULE = (
         'check_module',
         'check drag, cooling and tension sensor of the module; then call estimator/reset',
     )
+    CHECK_TENDON = 'check_tendon', 'check tendon and length sensor of the named muscle'
+    CHECK_IMU = 'check_imu', 'check the publishers of imu and the link that each one names'
     CHECK_CHECKPOINT = 'check_checkpoint', 'check that the checkpoint belongs to this arm'
     CHECK_DRIVER = 'check_driver', 'check that the driver is running'
     CHECK_RATE = 'check_rate', 'check the rate at which the driver publishes'
@@ -72,14 +74,17 @@ class Step(Enum):
     )
     STOP_OTHER_ROBOT = (
         'stop_other_robot',
-        'stop the node of the other robot that publishes accepted_checkpoint',
+        'stop the node that publishes this checkpoint, or restart it with the files of this robot',
     )
     PROVIDE_CHECKPOINT = (
         'provide_checkpoint',
-        'set the parameter `checkpoint`, or start the learner',
+        'set the parameter checkpoint, or start the learner',
     )
-    WAIT_UNTIL_COOL = 'wait_until_cool', 'wait until all windings are below temperature_limit'
-    REPORT_LOG = 'report_log', 'report the error with the log of the node'
+    WAIT_UNTIL_COOL = (
+        'wait_until_cool',
+        'wait until all windings are below the parameter temperature_limit',
+    )
+    REPORT_LOG = 'report_log', 'keep the log of the node, and report the error'
     FREE_DISK = 'free_disk', 'make the state directory writable, with free space'
     LEARN_AFRESH = (
         'learn_afresh',
@@ -88,8 +93,12 @@ class Step(Enum):
     )
     RESET_EMULATOR = 'reset_emulator', 'call hardware_emulator/reset'
     RESET_ESTIMATOR = 'reset_estimator', 'call estimator/reset', 1
-    CALIBRATE_LENGTHS = 'calibrate_lengths', 'call estimator/zero', 1
-    RESTORE_MUSCLES = 'restore_muscles', 'to use it again, call estimator/restore', 1
+    CALIBRATE_LENGTHS = 'calibrate_lengths', 'call estimator/zero to calibrate the lengths', 1
+    RESTORE_MUSCLES = (
+        'restore_muscles',
+        'once the isolated muscle is repaired, call estimator/restore to use it again',
+        1,
+    )
     RESET_CONTROLLER = 'reset_controller', 'call controller/reset', 2
     EXPLORE = 'explore', 'call controller/explore true to explore again', 3
     EXPLORE_GENTLY = (

@@ -85,9 +85,7 @@ def _isolated(core: Estimator) -> Iterator[Condition]:
             continue
         name, fault = core.robot.muscles[muscle], core.suspects.faults.get(muscle)
         detail = name if fault is None else f'{name} ({fault})'
-        first = () if fault is None else (Step.REPAIR_MUSCLE,)
-        steps = [*first, Step.RESTORE_MUSCLES]
-        yield ConditionKind.MUSCLE_ISOLATED.condition(detail, [name], steps=steps)
+        yield ConditionKind.MUSCLE_ISOLATED.condition(detail, [name])
 
 
 def _unknown_offsets(core: Estimator) -> Iterator[Condition]:

@@ -79,7 +79,7 @@ class Reported(NamedTuple):
         level = SHOWN_LEVELS[self.condition.level]
         text = f'{level}: {", ".join(self.nodes)}: {self.condition.text}'
         steps = self.condition.steps
-        return f'{text} (to go on: {sentence(steps)})' if steps else text
+        return f'{text} (to end it: {sentence(steps)})' if steps else text
 
 
 class Situation:

@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.nodes.messages import LATCHED
+from musculoskeletal_ae.remedy import Step
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.usefixtures('both_cores')
@@ -245,7 +246,7 @@ def a_rupture_is_shown_and_a_dead_node_named(graph, arm, run):
     assert graph.set_parameter(emulator, 'ruptured_muscles', ['brachialis'])[0]
     graph.wait(lambda: detected and detected[-1].data, 'the detection')
     line = run.wait_for_output(': brachialis: ')
-    assert 'repair the muscle' in line and 'estimator/reset' in line
+    assert Step.REPAIR_MUSCLE.text in line and 'estimator/reset' in line
     assert graph.set_parameter(emulator, 'ruptured_muscles', [''])[0]
     graph.wait(
         lambda: (

@@ -312,7 +312,7 @@ def test_a_stop_is_reported_with_every_cause_that_refuses_the_reset():
     assert reported.values['stop cause'] == 'operator_stop'
     for cause in (
         'controller/stop',
-        'several publishers: two estimators',
+        'another node publishes for this arm, or has the same name: two estimators',
         'no usable muscle_states',
     ):
         assert f'stopped: {cause}' in reported.message

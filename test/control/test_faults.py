@@ -41,7 +41,11 @@ class Loop:
 
     @property
     def cause(self):
-        return str(self.controller.supervisor.condition or '')
+        return (
+            ''
+            if self.controller.supervisor.condition is None
+            else self.controller.supervisor.condition.text
+        )
 
     def run(self, seconds):
         """Step all parts every 10 ms, and exchange messages as their nodes do."""
@@ -128,7 +132,7 @@ thorough = pytest.mark.thorough
 OTHERS = [
     pytest.param('drop:1', 1.0, 'no usable', marks=thorough),
     pytest.param(f'bias:length:{MUSCLE}:0.3', 1.0, 'muscle_states', marks=thorough),
-    (f'bias:tension:{MUSCLE}:400', 1.0, 'overload: tension of'),
+    (f'bias:tension:{MUSCLE}:400', 1.0, 'paid out: tension of'),
     pytest.param(f'bias:temperature:{MUSCLE}:90', 2.5, 'overheated', marks=thorough),
     (f'overheat:{MUSCLE}:120', 2.5, 'overheated'),
     pytest.param(f'freeze:{MUSCLE}', 2.5, None, marks=thorough),

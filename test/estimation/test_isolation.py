@@ -136,7 +136,7 @@ def test_a_ruptured_muscle_is_isolated_at_once_and_stays_isolated(loop, robot, h
     assert report.level == 'warn'
     (isolated,) = report.conditions
     assert isolated.identifier == 'muscle_isolated' and isolated.subjects == (robot.muscles[2],)
-    assert isolated.text == f'isolated: {robot.muscles[2]} (ruptured)'
+    assert isolated.text == f'a muscle is isolated and not used: {robot.muscles[2]} (ruptured)'
     assert report.values['last outcome'] == 'ruptured'
     loop.step(healthy, 30)  # the muscle is repaired
     loop.core.isolate(())

@@ -13,7 +13,7 @@ from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.length_trust import Evidence
 from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.remedy import REPAIR, Step
+from musculoskeletal_ae.remedy import REPAIR, Step, sentence
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 
 DT = 0.02
@@ -218,7 +218,7 @@ def test_the_repair_of_a_suspect_keeps_the_offsets(ruptured):
     repair(ruptured)
     assert ruptured.core.trust.evidence[2] is Evidence.MOVED
     assert ruptured.kind is ConditionKind.SLACK_TENDON
-    assert ruptured.core.advice == 'repair the muscle; call estimator/reset'
+    assert ruptured.core.advice == sentence(REPAIR)
     assert ruptured.offsets is before
     ruptured.core.reset()
     ruptured.go(3.0, sensors=ruptured.has_sensors)
@@ -238,7 +238,7 @@ def test_a_jump_of_another_muscle_during_a_repair_revokes_the_offsets(ruptured, 
     ruptured.off = jump
     ruptured.go(2.0, sensors=ruptured.has_sensors)
     assert ruptured.offsets.revoked
-    assert ruptured.core.advice == 'call estimator/zero'
+    assert ruptured.core.advice.endswith(Step.CALIBRATE_LENGTHS.text)
     with pytest.raises(MusculoskeletalError, match='estimator/zero'):
         ruptured.core.reset()
 

@@ -207,7 +207,7 @@ def test_every_condition_is_shown_with_its_node_and_its_remedy():
     situation.diagnosed(diagnostics('/left/controller', *present))
     trouble = situation.trouble()
     for condition in present:
-        to_do = f' (to go on: {sentence(condition.steps)})' if condition.steps else ''
+        to_do = f' (to end it: {sentence(condition.steps)})' if condition.steps else ''
         if condition.level != 'ok' or condition.steps:
             assert f'controller: {condition.text}{to_do}' in trouble, condition
     assert trouble.index('ERROR') < trouble.index('warning') < trouble.index('note')
@@ -223,7 +223,7 @@ def test_a_healthy_arm_and_the_faults_of_another_arm_show_nothing():
     assert (situation.level(), situation.trouble(), situation.steps()) == ('ok', '', [])
     situation.diagnosed(diagnostics('/left/controller', OPERATOR))
     assert situation.trouble() == (
-        'ERROR: controller: controller/stop was called (to go on: call controller/reset)'
+        'ERROR: controller: controller/stop was called (to end it: call controller/reset)'
     )
     situation.diagnosed(diagnostics('/left/controller', mode='holding'))
     assert situation.trouble() == ''
@@ -235,7 +235,7 @@ def test_a_stop_by_the_operator_is_shown_beside_a_verification():
     situation.diagnosed(diagnostics('/estimator', verified))
     situation.diagnosed(diagnostics('/controller', OPERATOR, mode='verifying'))
     assert 'being verified' in situation.trouble()
-    assert 'controller/stop was called (to go on: call controller/reset)' in situation.trouble()
+    assert 'controller/stop was called (to end it: call controller/reset)' in situation.trouble()
 
 
 def test_steps_of_several_conditions_are_given_once_and_the_reset_comes_after_the_repair():

@@ -145,7 +145,7 @@ def test_an_unreachable_command_is_reported_and_bad_commands_change_nothing(arm,
 def test_the_simulator_waits_for_a_checkpoint_and_refuses_unfit_ones(graph, mae, trained_file):
     graph.listen(JointState, 'sim/joint_states')
     sim = graph.host(Sim, robot='arm26')
-    graph.wait(lambda: 'no checkpoint' in sim.report().message, 'the report')
+    graph.wait(lambda: 'no network' in sim.report().message, 'the report')
     assert not graph.received['sim/joint_states']
     graph.send_network(b'not a network', 'accepted_checkpoint')
     graph.wait(lambda: 'accepted_checkpoint' in str(sim.rejected), 'the refusal')
