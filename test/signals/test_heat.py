@@ -187,7 +187,7 @@ def test_an_anomaly_of_a_cool_muscle_is_reported_without_a_stop(trained):
     assert motors.core.cause == ''
     reported, how = motors.core.report(motors.now), f'{ROBOT.muscles[2]}: its module '
     assert reported.level == 'warn'
-    assert f'a module has changed: the module of {ROBOT.muscles[2]} ' in reported.message
+    assert f': the module of {ROBOT.muscles[2]} ' in reported.message
     assert reported.values['suspect muscle'] == ROBOT.muscles[2]
     motors.run(120, TENSION.limit)
     assert motors.core.cause.startswith(how)
