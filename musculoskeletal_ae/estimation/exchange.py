@@ -62,13 +62,15 @@ class ExchangeCheck:
 
     def note(self, observation: Observation) -> None:
         """Keep a message in regular intervals, while the length offsets are known."""
+        self._since += observation.dt
+        if self._since < SPACING - 1e-9:
+            return
+        self._since = 0.0
         sample, offset = observation.sample, _offset(observation)
         if not observation.lengths_known or not np.allclose(offset, self._offset, atol=1e-9):
             self._messages.clear()
             self._offset = offset
-        self._since += observation.dt
-        if observation.lengths_known and self._since >= SPACING - 1e-9:
-            self._since = 0.0
+        if observation.lengths_known:
             self._messages.append((sample.bone_tension, sample.length_read))
 
     def explain(self, finding: Finding | None, observation: Observation) -> Finding | None:
