@@ -349,8 +349,8 @@ class Lab:
             core.sent_at = now
             offset = core.stream.body.offsets.offset
             self._command = command.value + offset
-            seen = self._command - self.estimator.body.offsets.offset
-            self.estimator.commanded(now, length=seen)
+            length = self._command - self.estimator.body.offsets.offset
+            self.estimator.commanded(now, length=length)
 
     def _learn(self, now: float) -> None:
         core = self.learner

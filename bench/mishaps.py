@@ -371,7 +371,7 @@ def play(lab: Lab, mishap: Mishap, seed: int, reality: str, before: float) -> di
     case, effect, true_at = course.case, course.effect_at, course.true_at
     is_needed = not mishap.is_harmless and (effect is not None or true_at is not None)
     # A statement may come before the effect that this bench considers visible.
-    seen = None if true_at is None else round(max(0.0, true_at - (effect or true_at)), 2)
+    delay = None if true_at is None else round(max(0.0, true_at - (effect or true_at)), 2)
     ended = '' if is_quiet else '; '.join(each.text for each in course.present) or 'not exploring'
     is_advised = course.is_found_by_advice or case.lasts < math.inf or mishap.is_harmless
     return {
@@ -381,7 +381,7 @@ def play(lab: Lab, mishap: Mishap, seed: int, reality: str, before: float) -> di
         'detail': case.detail,
         'effect': None if effect is None else round(effect - course.begun_at, 2),
         'needs statement': is_needed,
-        'true after': seen,
+        'true after': delay,
         'true': course.first_true,
         'false': course.false,
         'afterwards': course.later,

@@ -21,7 +21,7 @@ from typing import Literal, NamedTuple, cast, get_args
 from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.remedy import REPAIR, Step
 
-#: ok: for information only, because another condition or the user has caused it
+#: 'ok' means that nothing has to be done: another condition, or the user, is the cause
 Level = Literal['ok', 'warn', 'error']
 LEVELS: tuple[Level, ...] = get_args(Level)
 CONDITIONS = 'conditions'  # key of the value in /diagnostics

@@ -58,7 +58,7 @@ class HoldingCheck:
 
     @property
     def largest(self) -> float:
-        """Distance of the joint that is farthest from its target [rad]; NaN without a distance.
+        """Largest distance of a joint from its target [rad]; NaN while `distance` is None.
 
         Distances of prismatic joints are divided by `kinematics.RACK`.
         """
@@ -72,11 +72,18 @@ class HoldingCheck:
         return self._away_time > LASTING
 
     @property
-    def farthest(self) -> str:
-        """The joint that is farthest from its target, with its distance; '' without a distance."""
+    def farthest(self) -> int | None:
+        """Index of the joint with the largest distance; None while `distance` is None."""
         if self.distance is None:
+            return None
+        return int(np.abs(self.distance / self._robot.kinematics.radian).argmax())
+
+    @property
+    def text(self) -> str:
+        """This joint and its distance, such as 'elbow 0.62 rad'; '' while `distance` is None."""
+        joint = self.farthest
+        if self.distance is None or joint is None:
             return ''
-        joint = int(np.abs(self.distance / self._robot.kinematics.radian).argmax())
         unit = self._robot.units[joint].theta
         return f'{self._robot.joints[joint]} {abs(self.distance[joint]):.2f} {unit}'
 
@@ -90,7 +97,7 @@ def away_text(check: HoldingCheck, robot: Robot, mae: Mae, theta: Array) -> str:
         mae: The network.
         theta: The estimated posture [rad], (D,).
     """
-    text = f'{check.farthest} away'
+    text = f'{check.text} away'
     cause = POSSIBLE_CAUSES
     if missing := reach.lacking(robot, mae, theta):
         without = f'without {robot.names(robot.isolated)}, ' if robot.isolated else ''

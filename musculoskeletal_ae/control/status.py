@@ -129,11 +129,10 @@ def _target(core: Controller) -> Iterator[Condition]:
         yield kind.TORQUE_MISSING.condition()
     if target.unreachable_reason:
         yield kind.OUT_OF_REACH.condition(target.unreachable_reason)
-    if core.holding.is_away and core.mae is not None and core.estimate is not None:
-        joint = core.holding.farthest.partition(' ')[0]
-        yield kind.AWAY_FROM_TARGET.condition(
-            away_text(core.holding, robot, core.mae, core.estimate), [joint]
-        )
+    joint = core.holding.farthest if core.holding.is_away else None
+    if joint is not None and core.mae is not None and core.estimate is not None:
+        text = away_text(core.holding, robot, core.mae, core.estimate)
+        yield kind.AWAY_FROM_TARGET.condition(text, [robot.joints[joint]])
 
 
 def _limits(core: Controller) -> Iterator[Condition]:
@@ -168,8 +167,8 @@ def _add_motion(core: Controller, values: dict[str, str]) -> None:
     if missing is not None and np.abs(robot.kinematics.radian * missing).max() > reach.NOTABLE:
         each = zip(robot.joints, missing, robot.units)
         values['missing torque'] = ', '.join(f'{n} {m:.2f} {unit.torque}' for n, m, unit in each)
-    if farthest := core.holding.farthest:
-        values['distance from the target'] = farthest
+    if distance := core.holding.text:
+        values['distance from the target'] = distance
 
 
 def _add_body(core: Controller, values: dict[str, str]) -> None:

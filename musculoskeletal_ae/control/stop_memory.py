@@ -47,7 +47,7 @@ class StopMemory:
         """
         self.found: Condition | None = None
         self.problem = ''
-        self._written: ConditionKind | None = None  # content of the file
+        self._written: ConditionKind | None = None  # the stop cause that the file contains
         self._is_latched = False  # whether the file has to outlive this controller
         self._next_attempt = 0.0
         self._file: Path | None = None

@@ -46,7 +46,7 @@ SPACING = 0.5  # shortest time between two messages that count [s]
 MOVED = 0.03
 EARLIER = 600  # largest number of earlier messages, at least 5 min of motion
 ENOUGH = 80  # judge a sensor by this many earlier messages at least
-NEWEST = 48  # number of newest messages, which are not yet among the earlier ones
+NEWEST = 48  # number of newest messages, which are judged by all messages before them
 #: Windows in which a sensor is judged: number of messages, smallest limit of the median of |x|
 #: [rad] (for prismatic joints times `kinematics.radian`), and limit in healthy spreads of x.
 #: The short window finds large errors fast; the long one averages over more postures.
@@ -59,8 +59,8 @@ FEW = 20.0
 AGREEING, AGREEING_LIMIT, AGREEING_SPREADS = 12, 0.035, 1.0
 #: Smallest healthy spread of r [m], which bounds the precision of any length sensor
 LEAST_SPREAD = 0.0005
-#: Doubt joint sensors if they leave less than this share of the squares of length changes
-#: unexplained that a change of any single muscle leaves
+#: Doubt joint sensors if the assumption that they are false leaves a sum of squares of Δ that is
+#: smaller than this share of the one that a change of any single muscle leaves
 BETTER = 0.7
 USES = 10  # compute the medians of the earlier messages again after this many messages
 TO_SIGMA = 1.48  # standard deviation of a normal distribution, in medians of absolute deviations

@@ -157,10 +157,11 @@ class LengthCalibration:
         self._has_angles = 2 * len(measured) > len(moments.theta)
         if self._has_angles:
             moments = moments.rows(measured)
-            if self.time >= self.enough and not self.is_standing:
+            is_enough = self.time >= self.enough
+            if is_enough and not self.is_standing:
                 readings = moments.theta, moments.read, moments.tension
                 self.wiring = judge(self._mae.lengths, *readings, used=self._fit.used)
-            self._judge(self._fit.known_angles(moments), moments)
+            self._judge(self._fit.known_angles(moments), moments, is_enough)
         else:
             self._work = self._fit_unknown_angles(moments)
 
@@ -175,11 +176,10 @@ class LengthCalibration:
             self.wiring = yield from self._fit.wiring(fit, moments)
         self._judge(fit, moments, is_enough)
 
-    def _judge(self, fit: Fit, moments: Moments, is_enough: bool | None = None) -> None:
+    def _judge(self, fit: Fit, moments: Moments, is_enough: bool) -> None:
         """Make a fit the newest estimate of the offsets, and decide whether it is reliable.
 
-        `is_enough` says whether the moments suffice for reliable offsets; None to decide it by the
-        present duration of the motion.
+        `is_enough` says whether there was enough motion for reliable offsets when the fit began.
         """
         muscle_count, used = self._robot.muscle_count, self._fit.used
         expected = self._mae.lengths(fit.theta, moments.tension)
@@ -190,7 +190,7 @@ class LengthCalibration:
         residual = np.median(np.abs(used * (moments.length - offset - expected)), axis=0)
         self._best, self._problem = fit, ''
         deviation = np.full(muscle_count, UNKNOWN)
-        if self.time >= self.enough if is_enough is None else is_enough:
+        if is_enough:
             self._problem = self._problem_of(fit, residual)
             if not self._problem:
                 independent = max(1.0, len(fit.theta) / CORRELATED)

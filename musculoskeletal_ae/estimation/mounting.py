@@ -170,7 +170,7 @@ class MountingCheck:
             self.tilt = Tilt(angle, self._directions[place], self.evidence)
 
     def _at_stop(self, theta: Array) -> tuple[Bools, Bools]:
-        """Return which joints may rest at their lower and at their upper stop, (D,) each."""
+        """Return which joints are near their lower limit, (D,), and which near the upper, (D,)."""
         robot = self._robot
         near = AT_STOP * robot.kinematics.radian
         return theta < robot.lower + near, theta > robot.upper - near

@@ -468,10 +468,10 @@ class Learner:
 
     @property
     def impossible_offsets(self) -> dict[str, str]:
-        """Offsets that the joint sensors cannot have, by the name of the joint, as texts.
+        """Joints of which the last update estimated an impossibly large sensor offset.
 
-        The last update has found them and is therefore refused. Samples with wrong angles, or
-        lengths with wrong offsets, lead to such an offset.
+        The texts give the offset and the largest possible one, by the name of the joint. Such an
+        update is refused: it has learned from wrong angles, or from lengths with wrong offsets.
         """
         if self.last_update is None or self.last_update.sensor_offset.size == 0:
             return {}

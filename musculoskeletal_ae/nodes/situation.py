@@ -83,7 +83,7 @@ class Reported(NamedTuple):
 
 
 class Situation:
-    """The newest reports of the nodes in one namespace."""
+    """The newest report of each node in one namespace."""
 
     def __init__(
         self,

@@ -140,16 +140,3 @@ class JointStream:
         return ', '.join(
             f'{name}: {count} × {kind.value}' for (name, kind), count in self.rejected.items()
         )
-
-
-def usable_angles(robot: Robot, time: Array, theta: Array) -> Array:
-    """Return the usable angles of a recording [rad], (N, D), with NaN for all other readings.
-
-    Args:
-        robot: The robot.
-        time: Times of the messages [s], (N,).
-        theta: Readings of the joint sensors [rad], (N, D); NaN where a joint was not measured.
-    """
-    stream = JointStream(robot)
-    usable = [stream.take(float(at), row).theta for at, row in zip(time, theta, strict=True)]
-    return np.array(usable).reshape(theta.shape)

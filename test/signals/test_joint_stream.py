@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.joint_stream import JointReading, JointStream, usable_angles
+from musculoskeletal_ae.signals.joint_stream import JointReading, JointStream
 
 PERIOD = 0.01
 
@@ -18,6 +18,11 @@ def robot():
 def moving(seconds=6.0):
     time = PERIOD * np.arange(round(seconds / PERIOD))
     return time, np.stack([-0.6 + 0.4 * np.sin(time), -1.0 + 0.6 * np.sin(3.0 * time)], axis=1)
+
+
+def usable_angles(robot, time, theta):
+    stream = JointStream(robot)
+    return np.array([stream.take(now, row).theta for now, row in zip(time, theta, strict=True)])
 
 
 @pytest.mark.parametrize('value', [0.0, -np.pi, 1e6, np.nan])

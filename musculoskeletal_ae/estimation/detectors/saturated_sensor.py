@@ -66,7 +66,7 @@ class SaturatedSensor(Detector):
         self._has_left = np.ones(count, dtype=bool)  # whether it was lower since the last visit
 
     def step(self, observation: Observation) -> Finding | None:
-        """Count the visits of all muscles; report the first one with enough visits, or None."""
+        """Report a muscle whose reading was clipped often enough, or while its module winds in."""
         sample, dt, value = observation.sample, observation.dt, self._value
         reading = sample.newest[1]
         is_same = reading == self._before
