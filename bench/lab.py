@@ -43,7 +43,7 @@ from musculoskeletal_ae.learning.state import StateStore
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.message_delay import MessageDelay
-from musculoskeletal_ae.signals.motor_interface import MuscleReading
+from musculoskeletal_ae.signals.readings import MuscleReading
 
 CORES = 2  # number of cores of the simulated computer
 WAIT = 0.0008  # mean time until a process gets the processor, for each process per core [s]

@@ -90,14 +90,14 @@ class Loop:
         estimator, controller = self.estimator, self.controller
         if self._has_sensors:
             estimator.joints(read.theta, now)
-        states = np.array([read.length, read.tension, read.temperature])
+        message = read.message(self.driver.arm.robot)
         with suppress(RejectionError):
-            output = estimator.step(states, now, now)
+            output = estimator.take(message, now, now)
         if estimator.body.offsets is not self._offsets:
             self._offsets = estimator.body.offsets
             controller.use_body(estimator.body)
         with suppress(RejectionError):
-            controller.muscles(states, now)
+            controller.take(message, now)
         if output is not None:
             controller.estimated(output.state.theta, now)
         if bool(estimator.cause) != self._detected:

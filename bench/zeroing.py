@@ -70,14 +70,14 @@ class Loop:
         now, read, estimator, control = self.time, self.arm.sense(), self.estimator, self.controller
         if joints:
             estimator.joints(read.theta, now)
-        states = np.array([read.length, read.tension, read.temperature])
-        estimate = estimator.step(states, now, now)
+        message = read.message(self.arm.robot)
+        estimate = estimator.take(message, now, now)
         zeros = estimator.body.offsets
         if zeros is not self._zeros:
             control.use_body(estimator.body)
             self._zeros = zeros
         if estimate is not None:
-            control.muscles(np.array([read.length, read.tension, read.temperature]), now)
+            control.take(message, now)
             control.estimated(estimate.state.theta, now)
             if estimate.detected:
                 self.alarms += 1

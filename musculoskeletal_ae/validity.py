@@ -20,6 +20,7 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.tension_source import TENSION_SENSOR, TensionSource
+from musculoskeletal_ae.signals.readings import QUANTITIES, Presence, Row
 
 #: largest legal number of entries of an array in a message, or of joints × points in a trajectory;
 #: far more than any arm needs
@@ -35,7 +36,6 @@ MOST_EFFORT = 1000.0  # highest torque that may be requested of one joint [N·m]
 #: largest value of an isolated muscle that is kept; much larger values could overflow when squared
 MOST_ISOLATED = 1e6
 UNIT_TOLERANCE = 0.01  # largest deviation of a quaternion's norm from 1
-QUANTITIES = ('length', 'tension', 'temperature')
 
 
 def read_array(message: Any, rows: int, columns: int, owner: str = 'muscle') -> Array:
@@ -61,32 +61,49 @@ def read_muscle_states(
     source: TensionSource = TENSION_SENSOR,
     names: Sequence[str] = (),
 ) -> Array:
-    """Return l [m], T_read [N] and temperature [°C] of a Float64MultiArray, (3, M).
+    """Return the readings of a Float64MultiArray, (Q, M), one row for each of `QUANTITIES`.
 
-    Motor currents are converted to T_read. A temperature that is not measured is NaN. Values of
-    isolated muscles are not checked: lengths and tensions that are not finite or beyond
-    ±MOST_ISOLATED are replaced by `unknown`, and such temperatures by NaN. If the modules have no
-    source of tension, tensions are not checked either, and are returned as NaN. An error states the
-    name of the muscle if `names` has it, otherwise its number.
+    Motor currents are converted to T_read [N]. Values that are not measured are NaN, where this is
+    legal. Values of isolated muscles are not checked: values that are not finite or beyond
+    ±MOST_ISOLATED are replaced by NaN where this is legal, otherwise by `unknown`. If the modules
+    have no source of tension, tensions are not checked either, and are returned as NaN. An error
+    states the name of the muscle if `names` has it, otherwise its number.
     """
-    values = _values(message, len(QUANTITIES), muscles)
+    values = muscle_rows(message, muscles)
     usable = np.isfinite(values)
-    values[1] = source.from_message(values[1])
-    usable[1] |= not source.is_known
+    values[Row.TENSION] = source.from_message(values[Row.TENSION])
+    usable[Row.TENSION] |= not source.is_known
     if len(isolated) == 0 and usable.all():
         return values
     replaced = ~(np.abs(values) < MOST_ISOLATED) & np.isin(np.arange(muscles), isolated)
-    replaced[1] &= source.is_known
+    replaced[Row.TENSION] &= source.is_known
     values[replaced] = unknown
-    values[2, replaced[2]] = np.nan
     usable |= replaced
-    usable[2] |= np.isnan(values[2])
+    for row, quantity in enumerate(QUANTITIES):
+        if quantity.presence is not Presence.REQUIRED:
+            values[row, replaced[row]] = np.nan
+            usable[row] |= np.isnan(values[row])
     if not usable.all():
         row, muscle = np.argwhere(~usable)[0]
         name = names[muscle] if len(names) else f'muscle {muscle}'
-        stated = f'{QUANTITIES[row]} of {name} is {values[row, muscle]}'
+        stated = f'{QUANTITIES[row].name} of {name} is {values[row, muscle]}'
         raise MessageError('not finite', f'{stated}; expected a finite number')
     return values
+
+
+def muscle_rows(message: Any, muscles: int) -> Array:
+    """Return the rows of a message of muscle_states, (Q, M), without a check of their values.
+
+    Optional rows that the message lacks are NaN.
+    """
+    lacking = 0
+    for quantity in reversed(QUANTITIES):
+        expected = muscles * (len(QUANTITIES) - lacking)
+        if quantity.presence is not Presence.OPTIONAL or len(message.data) >= expected:
+            break
+        lacking += 1
+    values = _values(message, len(QUANTITIES) - lacking, muscles)
+    return np.pad(values, ((0, lacking), (0, 0)), constant_values=np.nan) if lacking else values
 
 
 def _values(message: Any, rows: int, columns: int, owner: str = 'muscle') -> Array:

@@ -7,6 +7,7 @@ from functools import cache, lru_cache
 
 import numpy as np
 from exact_mae import ExactMae, rest_readings
+from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.activities import Inputs
@@ -95,7 +96,7 @@ class Bench:
 
     def send(self, read):
         """Give the controller a message of muscle states (3, M)."""
-        self.core.muscles(read, self.now)
+        self.core.take(reading(read), self.now)
 
     def configure(self, **chosen):
         self.core.configure(replace(self.core.settings, **chosen))

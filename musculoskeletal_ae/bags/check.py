@@ -3,6 +3,7 @@
 
 from array import array
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
@@ -24,6 +25,8 @@ from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
+from musculoskeletal_ae.signals.muscle_stream import RejectionError
+from musculoskeletal_ae.signals.readings import muscle_reading
 from musculoskeletal_ae.signals.wiring import Wiring, judge
 
 _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
@@ -114,8 +117,10 @@ def _resting_postures(robot: Robot, recording: Pairs) -> int:
                 isolated = newest
                 collector.use_body(collector.body.with_isolated(isolated))
             collector.joints(time, theta)
-            states = np.array([length, tension, np.full(len(length), np.nan)])
-            if (paired := collector.muscles(time, states)) is not None:
+            paired = None
+            with suppress(RejectionError):
+                paired = collector.take(time, muscle_reading(robot, length=length, tension=tension))
+            if paired is not None:
                 collector.collect(paired)
             bar.add()
     return samples.accepted

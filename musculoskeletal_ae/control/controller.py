@@ -20,8 +20,7 @@ the verification has ended the anomaly, unless another stop cause needs a reset.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -273,43 +272,22 @@ class Controller:
         """Check and filter a message of muscle_states, and use its values from now on.
 
         Args:
-            message: The message.
+            message: The message, or a `MuscleReading`.
             now: Time of reception by the steady clock [s].
             delay: How late the message is (`MessageDelay`) [s].
 
         Raises:
             RejectionError: If the message cannot be used.
         """
-        with self._relieving(now, delay):
-            self._use_sample(self.stream.take(message, now, delay=delay), now)
-
-    def muscles(self, states: Array, now: float) -> None:
-        """Check and filter raw muscle states, and use their values from now on, as `take` does.
-
-        Args:
-            states: Lengths [m], tensions [N] and temperatures [°C] as measured, (3, M).
-            now: Time of reception by the steady clock [s].
-
-        Raises:
-            RejectionError: If the values are implausible for this arm.
-        """
-        with self._relieving(now):
-            self._use_sample(self.stream.take_states(np.asarray(states), now), now)
-
-    @contextmanager
-    def _relieving(self, now: float, delay: float = 0.0) -> Iterator[None]:
-        """A context in which the tensions of a rejected message are still used.
-
-        The limiter and the watchdog can thus react to a tension that is too high, even though the
-        message was rejected. The `RejectionError` is then raised again.
-        """
         try:
-            yield
+            sample = self.stream.take(message, now, delay=delay)
         except RejectionError as error:
+            # Limiter and watchdog still react to a tension that is too high.
             if error.pull is not None:
                 self.rejected_pull = error.pull
                 self.watchdog.take_rejected(error.pull[1], self.stream.body.used, now, delay)
             raise
+        self._use_sample(sample, now)
 
     def _use_sample(self, sample: MuscleSample, now: float) -> None:
         self.sample, self.rejected_pull = sample, None
@@ -320,7 +298,7 @@ class Controller:
         if self._awaited_samples and sample.delay <= OWN_PAUSE:
             self._awaited_samples -= 1
             if not self._awaited_samples:
-                self.limiter.restart(sample)
+                self.limiter.restart(sample, self.supervisor.is_running)
 
     def estimated(self, theta: Array, now: float, is_new: bool = True) -> None:
         """Check the estimated posture θ [rad], (D,), and use it for control from now on.

@@ -113,12 +113,21 @@ class CommandLimiter:
         """Largest possible muscle lengths [m], (M,); infinite while the offsets are unknown."""
         return self.slack_length if self.offsets_known else np.full_like(self.slack_length, np.inf)
 
-    def restart(self, sample: MuscleSample) -> None:
-        """Replace the last command by one that keeps the present tensions, if there is one."""
+    def restart(self, sample: MuscleSample, may_pull_harder: bool = True) -> None:
+        """Replace the last command by one that keeps the present tensions, if there is one.
+
+        Args:
+            sample: The newest muscle states.
+            may_pull_harder: Whether the new command may demand more of a muscle than the last one,
+                which it must not while the arm is stopped.
+        """
         if self.command is None:
             return
-        kind, self.command, self._last_length = self.command.kind, None, None
-        self.command = self.last(kind, sample)
+        before, self.command, self._last_length = self.command, None, None
+        kind, self.command = before.kind, self.last(before.kind, sample)
+        if not may_pull_harder:
+            softer = np.maximum if kind == LENGTH else np.minimum
+            self.command = Command(kind, softer(self.command.value, before.value))
         if kind == LENGTH:
             self._last_length = self.command.value, 0.0
 

@@ -22,12 +22,12 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals import joint_sensors, wiring
-from musculoskeletal_ae.signals.limits import length_range, reading_range
+from musculoskeletal_ae.signals.limits import length_range
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
+from musculoskeletal_ae.signals.readings import QUANTITIES, Presence, Row, possible_readings
 from musculoskeletal_ae.signals.wiring import Judgement, Wiring
 from musculoskeletal_ae.validity import (
-    QUANTITIES,
     joints_not_finite,
     read_muscle_states,
     read_posture,
@@ -104,15 +104,14 @@ class Listening:
         self._not_finite: Counter[str] = Counter()  # positions that are not finite, by joint
         self._read: list[tuple[Array, Array]] = []  # states (3, M) and θ (D,) at that time, or NaN
         self._rejected: dict[tuple[str, str], list[MessageError]] = {}  # by topic and reason
-        (low, high), most = length_range(robot), robot.tension.max
-        ones, beyond, (coldest, hottest) = np.ones_like(most), BEYOND[not zeroed], TEMPERATURES
-        least, most = -0.02 * most, 1.1 * most
+        #: lowest and highest possible values of each quantity, (Q, M)
+        self._low, self._high = possible_readings(robot)
+        (low, high), beyond = length_range(robot), BEYOND[not zeroed]
+        self._low[Row.LENGTH], self._high[Row.LENGTH] = low - beyond, high + beyond
+        self._low[Row.TEMPERATURE], self._high[Row.TEMPERATURE] = TEMPERATURES
         # T computed from currents may be wrong by drive friction and an unknown scale.
-        if robot.tension_source.is_current:
-            least, most = reading_range(robot)
-        #: lowest and highest possible values of l, T and temperature, (3, M)
-        self._low = np.stack([low - beyond, least, coldest * ones])
-        self._high = np.stack([high + beyond, most, hottest * ones])
+        if not robot.tension_source.is_current:
+            self._low[Row.TENSION] = -0.02 * robot.tension.max
 
     @property
     def count(self) -> int:
@@ -232,15 +231,17 @@ class Listening:
 
         Args:
             verdict: Receives the results.
-            states: Medians of the published l, T and temperatures, (3, M).
+            states: Medians of the published readings, (Q, M).
         """
         for what, texts, meant in _readings(states):
             possible = (meant >= self._low) & (meant <= self._high)
-            possible[2] |= np.isnan(meant[2])
-            possible[1] |= not self._robot.tension_source.is_known
+            for row, quantity in enumerate(QUANTITIES):
+                if quantity.presence is not Presence.REQUIRED:
+                    possible[row] |= np.isnan(meant[row])
+            possible[Row.TENSION] |= not self._robot.tension_source.is_known
             # Without a command, T must be close to T_bias in the right interpretation.
-            pulls = np.median(meant[1] / self._robot.tension.bias)
-            warm = meant[2][~np.isnan(meant[2])]
+            pulls = np.median(meant[Row.TENSION] / self._robot.tension.bias)
+            warm = meant[Row.TEMPERATURE][~np.isnan(meant[Row.TEMPERATURE])]
             is_usual = PULLS[0] < pulls < PULLS[1] and (
                 not len(warm) or USUAL[0] < np.median(warm) < USUAL[1]
             )
@@ -249,7 +250,7 @@ class Listening:
                     verdict.failed(self._of_source(what), **texts)
                     return False
                 verdict.passed('unit')
-                if np.isnan(states[2]).any():
+                if np.isnan(states[Row.TEMPERATURE]).any():
                     verdict.notes.append(
                         'temperatures are not measured (NaN), so nothing protects the motors from '
                         'heat'
@@ -257,7 +258,7 @@ class Listening:
                 return True
         for row, m in np.argwhere(~possible).tolist():
             value, low, high = distinct(states[row, m], self._low[row, m], self._high[row, m])
-            what = self._of_source(QUANTITIES[row])
+            what = self._of_source(QUANTITIES[row].name)
             verdict.failed(what, m, value=f'{value}, possible {low} to {high},')
         return False
 
@@ -281,14 +282,14 @@ class Listening:
         # With position-controlled modules, T depends on the posture, so it is not compared.
         bias = self._robot.actuation.choose(bias, np.full_like(bias, np.nan))
         for unit, newtons in TENSION_UNITS.items():
-            if (np.abs(newtons * states[1] / bias - 1.0) < UNIT_TOLERANCE).all():
+            if (np.abs(newtons * states[Row.TENSION] / bias - 1.0) < UNIT_TOLERANCE).all():
                 verdict.failed('tension unit', unit=unit)
                 return
         tolerated = np.minimum(RESTING_TENSION, RESTING_SHARE * bias)
-        for m in np.flatnonzero(np.abs(states[1] - bias) > tolerated).tolist():
-            verdict.failed('resting tension', m, got=states[1, m], bias=bias[m])
-        if np.nanmax(states[2], initial=-math.inf) > HOTTEST_AT_REST:
-            hottest = np.nanmax(states[2])
+        for m in np.flatnonzero(np.abs(states[Row.TENSION] - bias) > tolerated).tolist():
+            verdict.failed('resting tension', m, got=states[Row.TENSION, m], bias=bias[m])
+        if np.nanmax(states[Row.TEMPERATURE], initial=-math.inf) > HOTTEST_AT_REST:
+            hottest = np.nanmax(states[Row.TEMPERATURE])
             verdict.notes.append(
                 f'a module at rest reports {hottest:.0f} °C; check that the driver publishes °C, '
                 'not °F'
@@ -539,23 +540,28 @@ def _readings(states: Array) -> Iterator[tuple[str, dict[str, str], Array]]:
     """Yield interpretations of a message's values, from the literal one to the least likely.
 
     Each interpretation is a tuple: the name of the driver fault that would explain it ('' for
-    none), the values for the texts about this fault, and the values of l, T and temperature,
-    (3, M), that the driver should have published. If no interpretation gives possible values, the
+    none), the values for the texts about this fault, and the readings, (Q, M), that the driver
+    should have published. If no interpretation gives possible values, the
     last one is the literal one again, so that the values are reported as they were published.
 
     Args:
-        states: The published values, (3, M).
+        states: The published values, (Q, M).
     """
     yield '', {}, states
-    yield 'kelvin', {}, states - np.array([[0.0], [0.0], [273.15]])
-    yield 'by muscle', {}, states.reshape(-1, 3).T
-    for order in map(list, permutations(range(3))):
-        rows = ', '.join(QUANTITIES[order.index(i)] for i in range(3))
+    count = len(states)
+    celsius = states.copy()
+    celsius[Row.TEMPERATURE] -= 273.15
+    yield 'kelvin', {}, celsius
+    yield 'by muscle', {}, states.reshape(-1, count).T
+    for order in map(list, permutations(range(count))):
+        rows = ', '.join(QUANTITIES[order.index(i)].name for i in range(count))
         yield 'rows', {'rows': rows}, states[order]
     for row, (what, units) in enumerate(UNITS.items()):
         for unit, factor in units.items():
-            scale = np.ones((3, 1))
-            scale[row] = factor
-            yield f'{what} unit', {'unit': unit}, scale * states
-    yield 'tension sign', {}, states * np.array([[1.0], [-1.0], [1.0]])
+            scaled = states.copy()
+            scaled[row] *= factor
+            yield f'{what} unit', {'unit': unit}, scaled
+    pushing = states.copy()
+    pushing[Row.TENSION] *= -1.0
+    yield 'tension sign', {}, pushing
     yield '', {}, states

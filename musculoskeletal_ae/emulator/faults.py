@@ -18,7 +18,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.validity import QUANTITIES
+from musculoskeletal_ae.signals.readings import QUANTITIES, MuscleReading, muscle_reading
 
 SPEED_LIMIT = 0.25  # largest speed of a muscle module's motor [m/s]; chosen by hand
 TURN = 6.2832  # largest turn of the base, by which it is upright again [rad]
@@ -76,6 +76,16 @@ class Readings(NamedTuple):
     tension: Array  # muscle tensions [N], (M,)
     temperature: Array  # housing temperatures of the modules [°C], (M,)
 
+    def message(self, robot: Robot) -> MuscleReading:
+        """Return the readings of the muscle modules as a message of `muscle_states`."""
+        return muscle_reading(
+            robot, length=self.length, tension=self.tension, temperature=self.temperature
+        )
+
+
+#: quantities of the muscle modules that have sensor faults
+SENSED = tuple(quantity.name for quantity in QUANTITIES if quantity.name in Readings._fields)
+
 
 class Fault(NamedTuple):
     """One fault, parsed from a line."""
@@ -107,9 +117,9 @@ def read_fault(line: str, robot: Robot) -> Fault:
             legal = f'exchange:JOINT:JOINT; joints: {", ".join(robot.joints)}'
             raise MusculoskeletalError(f'{line[:80]!r}; legal: {legal}')
         return Fault(name, ('theta',), np.array([robot.joints.index(word) for word in words]), 0.0)
-    quantities: tuple[str, ...] = QUANTITIES if kind.of_quantity else ()
+    quantities: tuple[str, ...] = SENSED if kind.of_quantity else ()
     size, largest, unit, smallest = kind.size, kind.largest, kind.unit, 0.0
-    if kind.of_quantity and words and words[0] in QUANTITIES:
+    if kind.of_quantity and words and words[0] in SENSED:
         quantities = (words.pop(0),)
     elif kind.of_quantity and words and words[0] in ('theta', *robot.joints):
         words, quantities = words[words[0] == 'theta' :], ('theta',)
@@ -222,7 +232,7 @@ class Faults:
 
     def apply(self, readings: Readings) -> Readings:
         """Return the readings with all sensor faults applied."""
-        values = {name: getattr(readings, name).copy() for name in (*QUANTITIES, 'theta')}
+        values = {name: getattr(readings, name).copy() for name in (*SENSED, 'theta')}
         values['tension'] = np.minimum(values['tension'], self.ceiling)
         kinds = 'exchange', 'bias', 'drift', 'burst', 'spike', 'dead_sensor', 'nan_sensor', 'freeze'
         for fault in self._of(*kinds):

@@ -16,8 +16,7 @@ rupture to resuming.
 """
 
 import math
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -341,7 +340,7 @@ class Estimator:
         """Estimate the state from a message of muscle_states, and check for faults.
 
         Args:
-            message: The message.
+            message: The message, or a `MuscleReading`.
             time: Time of the message [s].
             now: Time on the steady clock [s].
             delay: How late the message is, compared with the fastest one [s].
@@ -352,23 +351,14 @@ class Estimator:
         Raises:
             RejectionError: If the message cannot be used.
         """
-        return self._take(partial(self.stream.take, message, time, now, delay), now)
-
-    def step(self, states: Array, time: float, now: float) -> Output | None:
-        """Estimate the state from the raw values of a message, and check for faults.
-
-        Args:
-            states: Raw l [m], T [N] and temperature [°C], (3, M).
-            time: Time of the message [s].
-            now: Time on the steady clock [s].
-
-        Returns:
-            The results; None without a network, or before the first estimate of the length offsets.
-
-        Raises:
-            RejectionError: If the values are implausible.
-        """
-        return self._take(partial(self.stream.take_states, states, time, now), now)
+        try:
+            sample = self.stream.take(message, time, now, delay)
+        except RejectionError as error:
+            self._rejected.note(str(error), now)
+            if error.states is not None:
+                self._handle(self.health.read(error.states, self.body.used, now), now)
+            raise
+        return self._use_sample(sample, now)
 
     def posture_of_marker(self, pose: pin.SE3) -> Array:
         """Return a posture in which the end effector has a given pose.
@@ -398,14 +388,7 @@ class Estimator:
         """Return why muscle states have been rejected for longer than a glitch, or ''."""
         return self._rejected.lasting(now)
 
-    def _take(self, take: Callable[[], MuscleSample], now: float) -> Output | None:
-        try:
-            sample = take()
-        except RejectionError as error:
-            self._rejected.note(str(error), now)
-            if error.states is not None:
-                self._handle(self.health.read(error.states, self.body.used, now), now)
-            raise
+    def _use_sample(self, sample: MuscleSample, now: float) -> Output | None:
         self._rejected.note('', now)
         self._handle(self.health.read(sample.newest, self.body.used, now), now)
         if sample.jumped:

@@ -78,7 +78,7 @@ class ClosedLoop:
         """Advance by one message; return a row of a recording."""
         arm, core, read, now = self.arm, self.core, self._read, self._now
         with suppress(MessageError):  # the nodes count and drop bad messages
-            core.muscles(np.array([read.length, read.tension, read.temperature]), now)
+            core.take(read.message(arm.robot), now)
             core.estimated(self.estimate(read, now), now)
         command = core.step(now)
         self.on_command(command, now)

@@ -90,8 +90,7 @@ class IsolatingLoop(ClosedLoop):
     def estimate(self, read: Readings, now: float) -> Array:
         """Estimate θ [rad] (D,), and report anomalies and isolations as the estimator node does."""
         core, true = self.estimator, self.arm.theta
-        states = np.array([read.length, read.tension, read.temperature])
-        estimate = core.step(states, now, now)
+        estimate = core.take(read.message(self.arm.robot), now, now)
         assert estimate is not None
         if bool(core.cause) != self._latched:
             self._latched = bool(core.cause)

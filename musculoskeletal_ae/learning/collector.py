@@ -145,7 +145,7 @@ class SampleCollector:
 
         Args:
             time: Time of reception [s].
-            message: The message.
+            message: The message, or a `MuscleReading`.
             delay: How late the message is (`MessageDelay`) [s].
 
         Returns:
@@ -157,27 +157,10 @@ class SampleCollector:
         try:
             sample = self._stream.take(message, time, delay=delay)
         except RejectionError as error:
-            self._note_rejected(error)
+            self.rejected[error.reason] += 1
+            self.obstacle = f'muscle_states are rejected: {error}'
             raise
         return self._paired(time, sample)
-
-    def muscles(self, time: float, states: Array) -> Paired[MuscleSample] | None:
-        """Check raw l [m], T [N] and temperature [°C], (3, M), as `take` does for a message.
-
-        Returns:
-            The previous message with its θ, or None if there is none. An implausible message is
-            counted in `rejected`.
-        """
-        try:
-            sample = self._stream.take_states(states, time)
-        except RejectionError as error:
-            self._note_rejected(error)
-            return None
-        return self._paired(time, sample)
-
-    def _note_rejected(self, error: RejectionError) -> None:
-        self.rejected[error.reason] += 1
-        self.obstacle = f'muscle_states are rejected: {error}'
 
     def _paired(self, time: float, sample: MuscleSample) -> Paired[MuscleSample] | None:
         if self.body.isolated:

@@ -17,6 +17,7 @@ way as the messages of a robot, except that training takes no time.
 
 import math
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,8 +45,9 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.limits import LIMITS
-from musculoskeletal_ae.signals.muscle_stream import MuscleSample
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample, RejectionError
 from musculoskeletal_ae.signals.pairing import Paired
+from musculoskeletal_ae.signals.readings import muscle_reading
 
 
 class Learner:
@@ -150,7 +152,8 @@ class Learner:
         """
         if theta is not None:
             self.joints(time, theta)
-        self.muscles(np.array([length, tension, np.full(len(length), np.nan)]), time)
+        with suppress(RejectionError):  # it is counted in `rejected`
+            self.take(muscle_reading(self.robot, length=length, tension=tension), time)
         return self.poll(time)
 
     def joints(self, time: float, theta: Array) -> None:
@@ -165,7 +168,7 @@ class Learner:
         """Learn from a message of muscle_states.
 
         Args:
-            message: The message.
+            message: The message, or a `MuscleReading`.
             time: Time of reception [s].
             delay: How late the message is (`MessageDelay`) [s].
 
@@ -173,10 +176,6 @@ class Learner:
             RejectionError: If the message cannot be used.
         """
         self._learn_from(self.collector.take(time, message, delay), time)
-
-    def muscles(self, states: Array, time: float) -> None:
-        """Learn from raw l [m], T [N] and temperature [°C], (3, M), received at `time` [s]."""
-        self._learn_from(self.collector.muscles(time, states), time)
 
     def _learn_from(self, paired: Paired[MuscleSample] | None, time: float) -> None:
         jumps = self.collector.jumps

@@ -8,7 +8,6 @@ published on /tf.
 
 from collections.abc import Callable
 
-import numpy as np
 import pinocchio as pin
 from geometry_msgs.msg import Point, TransformStamped, WrenchStamped
 from sensor_msgs.msg import JointState
@@ -31,6 +30,7 @@ from musculoskeletal_ae.nodes.sources import COMMANDS, MOTOR_COMMAND
 from musculoskeletal_ae.robot.drawing import BONE_COLOUR, Line
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.signals.motor_interface import STATES
+from musculoskeletal_ae.signals.readings import reading_rows
 from musculoskeletal_ae.validity import read_wrench
 
 MARKER_RATE = 10.0  # rate of the markers [Hz]
@@ -180,15 +180,15 @@ class Arm(Shell):
             tension: Tensions as the sensors of the muscle modules read them [N], (M,).
             temperature: Temperatures of the muscle modules [°C], (M,).
         """
-        tension = self.robot.tension_source.to_message(tension)
         stamp, motors, joints = self.get_clock().now().to_msg(), self._motors, self._joints
         if motors is not None and is_heard(motors):
-            message = motor_message(self.motors, length, tension, stamp)
+            effort = self.robot.tension_source.to_message(tension)
+            message = motor_message(self.motors, length, effort, stamp)
             if motors is joints:
                 add_joints(message, self.robot.joints, theta)
             motors.publish(message)
         if joints is not None and joints is not motors and is_heard(joints):
             joints.publish(joint_message(self.robot.joints, theta, stamp))
         if self._muscles is not None and is_heard(self._muscles):
-            rows = np.array([length, tension, temperature])
+            rows = reading_rows(self.robot, length=length, tension=tension, temperature=temperature)
             self._muscles.publish(array_message(rows, 'quantity', 'muscle'))

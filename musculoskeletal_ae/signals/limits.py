@@ -65,10 +65,7 @@ class Limits(NamedTuple):
 LIMITS = Limits()
 POSTURES = 500  # number of random postures over which `length_range` searches
 
-# Reasons under which rejected messages are counted.
-TENSION = 'tension beyond the maximum'
-LENGTH = 'length beyond what the joints allow'
-TEMPERATURE = 'impossible temperature'
+#: reason under which messages with a jump of a length are counted
 LENGTH_JUMPED = 'length jumped'
 
 

@@ -15,7 +15,7 @@ NaN, never 0.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -23,23 +23,10 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.reception import Stamps
 from musculoskeletal_ae.signals.motor_settings import ARRAY, JOINT_STATE, MotorSettings
+from musculoskeletal_ae.signals.readings import QUANTITIES, MuscleReading, Row
 from musculoskeletal_ae.validity import joint_names, read_array
 
 STATES = 'muscle_states'
-
-
-class Layout(NamedTuple):
-    """The layout of a reading, as in a Float64MultiArray: no named dimensions and no offset."""
-
-    dim: tuple[()] = ()
-    data_offset: int = 0
-
-
-class MuscleReading(NamedTuple):
-    """Lengths [m], tensions [N] and temperatures [°C] in the format of a muscle_states message."""
-
-    data: Array  # (3·M,)
-    layout: Layout = Layout()
 
 
 class MotorInterface:
@@ -134,12 +121,12 @@ class MotorInterface:
             detail = f'{stamp.sec}.{stamp.nanosec:09d} s is not later than the previous stamp'
             raise MessageError('repeated stamp', detail)
         position = np.array(message.position, dtype=float)[self._places]
-        rows = np.full((3, len(position)), np.nan)
+        rows = np.full((len(QUANTITIES), len(position)), np.nan)
         with np.errstate(over='ignore'):  # a result that overflows is later rejected as not finite
-            rows[0] = self._length_per_position * (position - self._zero)
+            rows[Row.LENGTH] = self._length_per_position * (position - self._zero)
             if len(message.effort):
                 effort = np.array(message.effort, dtype=float)[self._places]
-                rows[1] = self._tension_per_effort * (effort - self._effort_zero)
+                rows[Row.TENSION] = self._tension_per_effort * (effort - self._effort_zero)
         return MuscleReading(rows.ravel())
 
     def command(self, length: Array) -> Array:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,7 +33,8 @@ from musculoskeletal_ae.signals.length_jumps import DisplacedMuscles, LengthJump
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence
 from musculoskeletal_ae.signals.message_delay import longer_pause
 from musculoskeletal_ae.signals.plausibility import LevelCheck, TemperatureCheck
-from musculoskeletal_ae.validity import QUANTITIES, read_muscle_states
+from musculoskeletal_ae.signals.readings import Row
+from musculoskeletal_ae.validity import muscle_rows, read_muscle_states
 
 
 class RejectionError(MessageError):
@@ -40,7 +42,7 @@ class RejectionError(MessageError):
 
     Attributes:
         reason: Short text under which the message is counted.
-        states: The raw l, T and temperature, (3, M); None if the message had another shape.
+        states: The raw readings, (Q, M); None if the message had another shape.
         pull: Lengths [m], with the length offset removed, and measured tensions [N], together
             (2, M). They are medians of the last messages, including rejected ones; −∞ where they
             are implausible. None if there are not enough messages.
@@ -71,8 +73,8 @@ class MuscleSample:
         sliding: Direction in which each tendon slid last: 1 when wound in, −1 when paid out.
         temperature: Plausible temperature of the module's housing [°C]; NaN where it is unknown.
         usable: Which muscles are not isolated.
-        newest: l (offset removed), T and temperature of the last message alone, without the median
-            filter, (3, M).
+        newest: The readings of the last message alone, without the median filter, (Q, M), with the
+            length offset removed and motor-side tensions.
         jumped: Muscles whose new level after a jump is accepted with this message; usually none.
         tension_spread: Standard deviation σ_T of T [N]; 0 for tension sensors.
         delay: How late the message is, compared with the fastest one (`MessageDelay`) [s].
@@ -122,7 +124,7 @@ class MuscleSample:
     def shifted(self, offset: Array) -> MuscleSample:
         """Return the same sample with lengths reduced by `offset` [m], (M,)."""
         newest = self.newest.copy()
-        newest[0] -= offset
+        newest[Row.LENGTH] -= offset
         return replace(self, length=self.length - offset, newest=newest)
 
 
@@ -130,10 +132,10 @@ class MedianFilter:
     """Computes the median of each value over the last messages, to remove outliers."""
 
     def __init__(self, window: int) -> None:
-        self._last: deque[Array] = deque(maxlen=window)  # states as measured, (3, M) each
+        self._last: deque[Array] = deque(maxlen=window)  # readings, (Q, M) each
 
     def step(self, states: Array) -> Array:
-        """Return the median of the last messages, of which `states` (3, M) is the newest."""
+        """Return the median of the last messages, of which `states` (Q, M) is the newest."""
         self._last.append(states)
         return states if len(self._last) == 1 else median_of_rows(np.array(self._last))
 
@@ -150,10 +152,10 @@ class PlausiblePull:
 
     def __init__(self, levels: LevelCheck, window: int) -> None:
         self._levels = levels
-        self._last: deque[Array] = deque(maxlen=window)  # states as measured, (3, M) each
+        self._last: deque[Array] = deque(maxlen=window)  # readings, (Q, M) each
 
     def note(self, states: Array) -> None:
-        """Record the raw values of a message, (3, M)."""
+        """Record the readings of a message, (Q, M)."""
         self._last.append(states)
 
     def median(self, offset: Array) -> Array | None:
@@ -243,7 +245,7 @@ class MuscleStream:
     def take(
         self, message: Any, time: float, now: float | None = None, delay: float = 0.0
     ) -> MuscleSample:
-        """Check and convert a Float64MultiArray message.
+        """Check and convert a message, or a `MuscleReading`.
 
         Args:
             message: The message.
@@ -265,34 +267,16 @@ class MuscleStream:
             )
         except MessageError as error:
             raw = pull = None
-            if len(message.data) == len(QUANTITIES) * muscle_count:
-                raw = np.reshape(np.array(message.data, dtype=float), (len(QUANTITIES), -1))
+            with suppress(MessageError):  # a message of another shape has no readings
+                raw = muscle_rows(message, muscle_count)
                 self._pull.note(raw)
                 pull = self._pull.median(self.body.offsets.offset)
             raise RejectionError(error.reason, str(error).partition(': ')[2], raw, pull) from error
-        return self.take_states(states, time, now, delay)
-
-    def take_states(
-        self, states: Array, time: float, now: float | None = None, delay: float = 0.0
-    ) -> MuscleSample:
-        """Check and convert lengths, tensions and temperatures as the sensors measured them.
-
-        Args:
-            states: Lengths [m], tensions [N] and temperatures [°C], (3, M).
-            time: As in `take`.
-            now: As in `take`.
-            delay: As in `take`.
-
-        Raises:
-            RejectionError: If the values are implausible.
-        """
         now = time if now is None else now
         self._delay = delay
         offsets = self.body.offsets
-        states = states.copy()
-        states[1] = self._robot.tension_source.known(states[1])
         newest = states.copy()
-        newest[0] -= offsets.offset
+        newest[Row.LENGTH] -= offsets.offset
         self._pull.note(states)
         verdict = self._judge(states, newest, now)
         problem = verdict.problem
@@ -304,23 +288,23 @@ class MuscleStream:
             self._direction.reset()
         self._time, self._sample_delay = time, delay
         read = self._median.step(states)
-        length = read[0] - offsets.offset
+        length, tension = read[Row.LENGTH] - offsets.offset, read[Row.TENSION]
         sliding = self._direction.step(length)
-        newest[1] = self._transmission.motor(newest[1], sliding)
-        end = self._transmission.end(read[1], sliding)
+        newest[Row.TENSION] = self._transmission.motor(newest[Row.TENSION], sliding)
+        end = self._transmission.end(tension, sliding)
         return MuscleSample(
             time=time,
             length=length,
-            length_read=read[0],
-            tension_read=read[1],
-            motor_tension=self._transmission.motor(read[1], sliding),
+            length_read=read[Row.LENGTH],
+            tension_read=tension,
+            motor_tension=self._transmission.motor(tension, sliding),
             bone_tension=self._robot.actuation.known_tension(end),
             sliding=sliding,
-            temperature=self._temperatures.step(read[2], now - delay),
+            temperature=self._temperatures.step(read[Row.TEMPERATURE], now - delay),
             usable=self.body.used,
             newest=newest,
             jumped=verdict.displaced,
-            tension_spread=self._transmission.spread(read[1], sliding),
+            tension_spread=self._transmission.spread(tension, sliding),
             delay=delay,
         )
 
@@ -328,15 +312,15 @@ class MuscleStream:
         """Check all values for plausible levels, and the lengths for jumps.
 
         Args:
-            read: Lengths [m], tensions [N] and temperatures [°C] as measured, (3, M).
-            states: The same values with the length offset removed from the lengths, (3, M).
+            read: The readings, (Q, M).
+            states: The same readings with the length offset removed from the lengths, (Q, M).
             now: Time of reception by a steady clock [s].
         """
         known, used = self.body.offsets.known, self.body.used
         problem = self._levels.problem(states, used, known)
         if problem is not None:
             return Verdict(problem)
-        verdict = self._jumps.step(read[0], read[1], used, now, self._delay)
+        verdict = self._jumps.step(read[Row.LENGTH], read[Row.TENSION], used, now, self._delay)
         self.displaced.note(verdict)
         # While the length offsets are unknown, lengths are unreliable in any case, so that a jump
         # is no reason to reject the message.

@@ -10,14 +10,8 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import (
-    LENGTH,
-    LIMITS,
-    TEMPERATURE,
-    TENSION,
-    longest_lengths,
-    reading_range,
-)
+from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.readings import QUANTITIES, Row, possible_readings
 
 
 class LevelCheck:
@@ -25,11 +19,8 @@ class LevelCheck:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        longest = longest_lengths(robot)
-        (least, most), ones = reading_range(robot), np.ones_like(longest)
-        #: lowest and highest l [m], T [N] and temperature [°C], (3, M)
-        self._low = np.array([-longest, least, LIMITS.lowest_temperature * ones])
-        self._high = np.array([longest, most, LIMITS.highest_temperature * ones])
+        #: lowest and highest possible value of each quantity, (Q, M)
+        self._low, self._high = possible_readings(robot)
         self._slack = LIMITS.slack_share * robot.description.tension.bias
 
     def plausible_pull(self, states: Array, offset: Array) -> Array:
@@ -51,23 +42,25 @@ class LevelCheck:
         """Return reason and detail of the first implausible value, or None.
 
         Args:
-            states: l [m], T [N] and temperature [°C], (3, M); NaN is ignored.
+            states: Readings, (Q, M), with the length offset removed; NaN is ignored.
             used: Which muscles to check, (M,).
             lengths_known: Whether to check l, which requires known length offsets.
         """
         low = self._low.copy()
         # A slack tendon, such as that of a ruptured muscle, can be wound in beyond any posture.
-        low[0] -= np.where(states[1] < self._slack, LIMITS.slack_length_margin, 0.0)
+        low[Row.LENGTH] -= np.where(
+            states[Row.TENSION] < self._slack, LIMITS.slack_length_margin, 0.0
+        )
         beyond = ((states < low) | (states > self._high)) & used
-        beyond[0] &= lengths_known
+        beyond[Row.LENGTH] &= lengths_known
         if not np.count_nonzero(beyond):
             return None
-        quantity, muscle = np.argwhere(beyond)[0]
-        reason, unit = ((LENGTH, 'm'), (TENSION, 'N'), (TEMPERATURE, '°C'))[quantity]
-        place = quantity, muscle
+        row, muscle = np.argwhere(beyond)[0]
+        quantity = QUANTITIES[row]
+        place = row, muscle
         value, least, most = distinct(states[place], low[place], self._high[place])
-        legal = f'{least} to {most} {unit}'
-        return reason, f'{self._robot.muscles[muscle]} {value} {unit}, legal: {legal}'
+        stated = f'{self._robot.muscles[muscle]} {value} {quantity.unit}'
+        return quantity.reason, f'{stated}, legal: {least} to {most} {quantity.unit}'
 
 
 class TemperatureCheck:

@@ -4,6 +4,7 @@
 import sys
 from argparse import Namespace
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
 from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
+from musculoskeletal_ae.signals.readings import MuscleReading, muscle_reading
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 from musculoskeletal_ae.tools.model_training import prepare, train_on_model
 from musculoskeletal_ae.tools.network_cache import network_file
@@ -234,9 +236,10 @@ def anomaly_in(
             stream.use_transmission(reduced.transmission)
             health.reset()
             health.use(reduced)
-        states = np.array([recording.length[row], recording.tension[row], recording.tension[row]])
-        states[2] = np.nan
-        finding = _finding(health, reduced, stream, states, at, min(dt, LONGEST_PERIOD))
+        reading = muscle_reading(
+            robot, length=recording.length[row], tension=recording.tension[row]
+        )
+        finding = _finding(health, reduced, stream, reading, at, min(dt, LONGEST_PERIOD))
         progress()
         if finding is None:
             continue
@@ -311,16 +314,17 @@ def learn(
             mae = newest.without(isolated)
             stream.use_transmission(mae.transmission)
             health.use(mae)
-        states = np.array([length, tension, np.full(len(length), np.nan)])
+        reading = muscle_reading(learner.robot, length=length, tension=tension)
         learner.joints(at, theta)
-        finding = _finding(health, mae, stream, states, at, min(dt, LONGEST_PERIOD))
+        finding = _finding(health, mae, stream, reading, at, min(dt, LONGEST_PERIOD))
         if finding is not None:
             learner.anomaly(True)
             stop = stop or (
                 f'learning stopped {at:.1f} s after the start: an anomaly begins there '
                 f'({learner.robot.muscles[finding.muscle]}: {finding.kind.identifier})'
             )
-        learner.muscles(states, at)
+        with suppress(RejectionError):  # the learner counts it
+            learner.take(reading, at)
         learner.poll(at)
         if progress is not None:
             progress(dt)
@@ -331,7 +335,7 @@ def _finding(
     health: HealthMonitor,
     mae: Mae,
     stream: MuscleStream,
-    states: Array,
+    reading: MuscleReading,
     time: float,
     dt: float,
 ) -> Finding | None:
@@ -340,7 +344,7 @@ def _finding(
     An implausible message is skipped, with None as the result.
     """
     try:
-        sample = stream.take_states(states, time)
+        sample = stream.take(reading, time)
     except RejectionError:
         return None
     observation = observe(mae, sample.length, sample.motor_tension, sample.bone_tension, dt)

@@ -15,6 +15,7 @@ from control_bench import ROBOT
 from exact_mae import ExactMae
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, rule
+from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.command import LENGTH, TENSION
@@ -69,7 +70,7 @@ class Arm(RuleBasedStateMachine):
             if 'muscles' not in self.blind:
                 with suppress(MessageError):
                     states = np.array([read.length, read.tension, read.temperature])
-                    self.core.muscles(states, self.now)
+                    self.core.take(reading(states), self.now)
             if 'estimate' not in self.blind:
                 self.core.estimated(self.arm.theta, self.now)
 

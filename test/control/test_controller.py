@@ -7,6 +7,7 @@ from control_bench import DT, OTHER, REST, ROBOT, Bench, settled, values
 from exact_mae import ExactMae, rest_readings
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.command import LENGTH, TENSION
@@ -279,7 +280,7 @@ def test_a_hot_muscle_hands_its_load_to_others_and_is_reported():
         if step == 75:
             strongest = int(np.argmax(core.activities.follower.plan.tension.bone))
             temperature[strongest] = 84.0
-        core.muscles(np.array([length, tension, temperature]), 0.04 * step)
+        core.take(reading([length, tension, temperature]), 0.04 * step)
         core.estimated(theta, 0.04 * step)
         core.step(0.04 * step)
         planned.append(core.activities.follower.plan.tension.bone)

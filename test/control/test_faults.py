@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import FIRST_ESTIMATE, Controller
@@ -52,8 +53,8 @@ class Loop:
         for _ in range(round(seconds / DT)):
             self.now += DT
             self.arm.step(DT)
-            for reading in self.arm.faults.deliver(self.arm.sense(), self.now):
-                self.read(reading)
+            for read in self.arm.faults.deliver(self.arm.sense(), self.now):
+                self.read(read)
             command = self.controller.step(self.now)
             if command is not None:
                 self.commands.append(command.value + self.estimator.body.offsets.offset)
@@ -73,10 +74,10 @@ class Loop:
                     take(states)
 
     def control(self, states):
-        self.controller.muscles(states, self.now)
+        self.controller.take(reading(states), self.now)
 
     def estimate(self, states):
-        estimate = self.estimator.step(states, self.now, self.now)
+        estimate = self.estimator.take(reading(states), self.now, self.now)
         self.controller.use_body(self.estimator.body)
         if estimate is not None:
             self.controller.estimated(estimate.state.theta, self.now)

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.calibrating import SPEED, gentle_limit
@@ -44,7 +45,7 @@ class Loop:
             self.now += DT
             read = self.arm.sense()
             length = read.length + self.offset
-            self.core.muscles(np.array([length, read.tension, read.temperature]), self.now)
+            self.core.take(reading([length, read.tension, read.temperature]), self.now)
             if self.has_estimates:
                 self.core.estimated(self.arm.theta, self.now)
             command = self.core.step(self.now)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from control_bench import OTHER, REST, ROBOT, Bench, values
 from exact_mae import ExactMae, rest_readings
+from readings import reading
 from robots import write_robot
 
 from musculoskeletal_ae.conditions import ConditionKind
@@ -98,7 +99,7 @@ def test_the_sensors_of_an_isolated_muscle_do_not_move_the_arm():
         for _ in range(50):
             bench.now += 0.01
             read = np.array([length + longer * ~USED, pull, np.full(6, 30.0)])
-            bench.core.muscles(read, bench.now)
+            bench.core.take(reading(read), bench.now)
             bench.core.estimated(REST, bench.now)
             bench.core.step(bench.now)
         assert bench.cause == ''
@@ -366,7 +367,7 @@ def test_a_restart_of_the_estimator_does_not_end_the_stop_for_a_suspect():
     length, tension = rest_readings(ROBOT, REST)
     for _ in range(50):  # the estimator sends nothing, while muscle_states continue
         bench.now += 0.01
-        bench.core.muscles(np.array([length, tension, np.full(6, 30.0)]), bench.now)
+        bench.core.take(reading([length, tension, np.full(6, 30.0)]), bench.now)
         bench.core.step(bench.now)
     bench.core.anomaly(False)
     bench.isolate([])
@@ -397,7 +398,7 @@ def test_a_suspect_with_dead_sensors_is_wound_in_by_a_bounded_length():
     for _ in range(300):
         bench.now += 0.01
         read = np.array([length - 0.1 * ~USED, tension * USED, np.full(6, 30.0)])
-        bench.core.muscles(read, bench.now)
+        bench.core.take(reading(read), bench.now)
         bench.core.estimated(REST, bench.now)
         bench.core.step(bench.now)
     assert highest - bench.core.limiter.command.value[LOST] <= DEPTH + 1e-9
@@ -511,7 +512,7 @@ def test_a_stop_pays_an_isolated_muscle_out_to_its_longest_length_at_most():
     length, tension = rest_readings(ROBOT, REST)
     for _ in range(600):
         bench.now += 0.01
-        bench.core.muscles(np.array([length + 5.0 * ~USED, tension, np.full(6, 30.0)]), bench.now)
+        bench.core.take(reading([length + 5.0 * ~USED, tension, np.full(6, 30.0)]), bench.now)
         bench.core.estimated(REST, bench.now)
         bench.core.step(bench.now)
     assert bench.core.limiter.command.value[LOST] <= bench.core.limiter.slack_length[LOST]

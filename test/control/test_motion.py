@@ -12,6 +12,7 @@ import pytest
 from control_bench import DT, OTHER, REST, ROBOT, Bench, values
 from exact_mae import ExactMae, rest_readings
 from nominal_body import nominal_arm
+from readings import reading
 
 from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.command import LENGTH
@@ -244,7 +245,7 @@ def driven(arm, intervals=(10,), push=0.0, **chosen):
     now, off = 0.0, []
     while not off or core.activities.follower.progress.is_moving:
         theta, *read = arm.sense()
-        core.muscles(np.array([*read]), now)
+        core.take(reading([*read]), now)
         core.estimated(theta, now)
         if core.activities.follower.progress.trajectory is None:
             core.trajectory(points(REST, 0.3))

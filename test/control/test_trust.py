@@ -12,13 +12,14 @@ from exact_mae import rest_readings
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
+from readings import reading
 
 from musculoskeletal_ae.control.controller import REACTION_TIME, WINDOW
 from musculoskeletal_ae.control.supervisor import RESUME
 from musculoskeletal_ae.control.watchdog import OVERHEATED, OVERLOAD_TIME, OWN_PAUSE, Overload
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.signals.limits import LIMITS
-from musculoskeletal_ae.validity import QUANTITIES
+from musculoskeletal_ae.signals.readings import QUANTITIES
 
 TICK = 0.1 * DT  # largest change of a length command in one step under the rate limit [m]
 MUSCLE = ROBOT.muscles[0]
@@ -50,7 +51,8 @@ class DistortingBench(Bench):
         """
 
         def lie(read):
-            return np.array([rows.get(name, np.array)(row) for name, row in zip(QUANTITIES, read)])
+            names = [quantity.name for quantity in QUANTITIES]
+            return np.array([rows.get(name, np.array)(row) for name, row in zip(names, read)])
 
         self.lie = lie
         sent = self.step(count)
@@ -308,7 +310,7 @@ def run(pace, gap=0.0, at=150, count=150):
             now, time = now + DT, time + pace * DT
             sent.append(bench.core.step(now, time))
         now, time = now + DT / pace, time + DT
-        bench.core.muscles(read, now)
+        bench.core.take(reading(read), now)
         bench.core.estimated(REST, now)
         sent.append(bench.core.step(now, time))
     return values(sent), bench.condition

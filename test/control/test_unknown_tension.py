@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from exact_mae import ExactMae
+from readings import reading
 from robots import write_robot
 
 from musculoskeletal_ae.conditions import ConditionKind
@@ -48,16 +49,14 @@ def test_the_emulator_measures_no_tension_and_the_stream_keeps_it_unknown():
     assert np.isnan(read.tension).all()
     # Without a tension source, the stream ignores whatever tension a message contains.
     for tension in (read.tension, np.zeros(COUNT), np.full(COUNT, 77.0)):
-        sample = MuscleStream(ROBOT, window=3).take_states(
-            np.array([read.length, tension, read.temperature]), 0.0
+        sample = MuscleStream(ROBOT, window=3).take(
+            reading([read.length, tension, read.temperature]), 0.0
         )
         assert np.isnan(sample.motor_tension).all()
         np.testing.assert_array_equal(sample.model_tension, ROBOT.actuation.assumed_tension)
         np.testing.assert_array_equal(sample.bone_tension, ROBOT.actuation.assumed_tension)
     with pytest.raises(RejectionError):  # lengths are still checked
-        MuscleStream(ROBOT).take_states(
-            np.array([read.length + 5.0, read.tension, read.temperature]), 0.0
-        )
+        MuscleStream(ROBOT).take(reading([read.length + 5.0, read.tension, read.temperature]), 0.0)
 
 
 def test_muscle_stiffness_control_without_a_tension_is_refused(tmp_path):
@@ -140,7 +139,7 @@ def test_the_estimator_estimates_from_lengths_and_names_what_is_unknown(trained)
     for n in range(100):
         noisy = length + 1e-4 * shake.normal(size=COUNT)
         states = np.array([noisy, np.full(COUNT, np.nan), np.full(COUNT, 25.0)])
-        output = core.step(states, 0.01 * n, 0.01 * n)
+        output = core.take(reading(states), 0.01 * n, 0.01 * n)
     assert core.cause == ''
     assert np.abs(output.state.theta - THETA).max() < 0.05
     assert output.contact is None

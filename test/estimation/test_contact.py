@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from exact_mae import ExactMae
+from readings import reading
 
 from musculoskeletal_ae.estimation.contact import CONTACT, ContactEstimator
 from musculoskeletal_ae.estimation.estimator import Estimator
@@ -148,7 +149,9 @@ def test_motion_during_a_gap_in_the_messages_is_no_contact(robot, mae):
         torque = robot.kinematics.inverse_dynamics(theta, velocity, acceleration)
         jacobian = mae.muscle_jacobian(theta, np.full(robot.muscle_count, 60.0))
         tension = TensionProgramme(jacobian, torque, 10.0, 400.0).nearest(60.0)
-        contact = core.step(states(tension, mae.lengths(theta, tension)), time, time).contact
+        contact = core.take(
+            reading(states(tension, mae.lengths(theta, tension))), time, time
+        ).contact
         assert n < 60 or contact.distance < CONTACT
 
 
@@ -205,15 +208,15 @@ def test_the_estimator_reports_contacts(robot, mae):
     core.use(replace(mae, touch=statistics))
     tension, length = pulling(theta, (10.0, 0.0, 10.0), robot)
     for n in range(100):
-        estimate = core.step(states(tension, length), n * DT, n * DT)
+        estimate = core.take(reading(states(tension, length)), n * DT, n * DT)
     assert estimate.contact.is_contact
     values = core.report(1.0).values
     assert values['contacts'] == '1' and values['contact'].endswith('N at the hand')
     core.calibrate_lengths(tuple(theta.tolist()))
-    core.step(states(tension, length), 1.0, 1.0)
+    core.take(reading(states(tension, length)), 1.0, 1.0)
     # During a length calibration the lengths are unknown, so no contact can be estimated.
     assert 'contact' not in core.report(1.0).values
     core = Estimator(robot)
     core.use(mae)
-    core.step(states(tension, length), 1.0, 1.0)
+    core.take(reading(states(tension, length)), 1.0, 1.0)
     assert core.report(1.0).values['contact'] == 'not calibrated'

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pinocchio as pin
 import pytest
+from readings import reading
 
 from musculoskeletal_ae.estimation.detectors.missing_values import SILENT
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME
@@ -35,7 +36,7 @@ class EstimatorBench:
         estimates = []
         for _ in range(times):
             self.now += dt
-            estimates.append(self.core.step(states(message), self.now, self.now))
+            estimates.append(self.core.take(reading(states(message)), self.now, self.now))
         return estimates
 
     def move(self, message):
@@ -56,7 +57,7 @@ def stepped(robot, calibrated):
 
 def test_the_estimator_waits_for_a_checkpoint(robot, healthy):
     core = Estimator(robot)
-    assert core.step(states(healthy), 0.0, 0.0) is None
+    assert core.take(reading(states(healthy)), 0.0, 0.0) is None
     (condition,) = core.conditions(0.0)
     assert condition.identifier == 'no_checkpoint' and condition.level == 'warn'
 
@@ -172,7 +173,7 @@ def test_a_muscle_without_numbers_is_isolated_only_if_it_lacks_them_in_all_messa
         assert not isolates(now)
         for _ in range(good):
             now += pause
-            core.step(sound, now, now)
+            core.take(reading(sound), now, now)
         now += max(pause, SILENT)
         assert not isolates(now)
         now += 10.0

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from readings import reading
 
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.settings import Detection
@@ -98,7 +99,7 @@ class Loop:
             way = message.length - self.length
             self.length = self.length + np.clip(way, -LIMITS.step, LIMITS.step)
             states = np.array([self.length + 1e-4 * stir, tension, np.full(6, 25.0)])
-            self.core.step(states, self.now, self.now)
+            self.core.take(reading(states), self.now, self.now)
 
 
 @pytest.fixture
@@ -241,7 +242,7 @@ def test_a_sensor_that_stands_still_while_the_arm_moves_is_detected(robot, calib
             length = robot.muscle_lengths(theta, healthy.tension) + noise
             length[frozen] -= share * (length[frozen] - healthy.length[frozen])
             tension = healthy.tension + rng.standard_normal(6)
-            core.step(np.array([length, tension, np.full(6, 25.0)]), n * DT, n * DT)
+            core.take(reading([length, tension, np.full(6, 25.0)]), n * DT, n * DT)
         assert bool(core.cause) == broken
     assert core.cause == f'{robot.muscles[frozen]}: a sensor is frozen while the arm moves'
 
@@ -257,7 +258,7 @@ def test_a_tension_that_stays_exactly_at_the_bias_is_no_sensor_fault(robot, cali
         tension = healthy.tension + rng.standard_normal(6)
         tension[paid_out] = robot.tension.bias[paid_out]
         length = robot.muscle_lengths(theta, tension) + 1e-4 * rng.standard_normal(6)
-        core.step(np.array([length, tension, np.full(6, 25.0)]), n * DT, n * DT)
+        core.take(reading([length, tension, np.full(6, 25.0)]), n * DT, n * DT)
     assert core.cause == ''
 
 
@@ -275,7 +276,7 @@ def test_a_muscle_whose_length_jumps_is_isolated_as_a_suspect_if_suspects_are_is
         length[jumped] += 0.05 * (n >= 20)
         tension = healthy.tension + rng.standard_normal(6)
         try:
-            core.step(np.array([length, tension, np.full(6, 25.0)]), n * DT, n * DT)
+            core.take(reading([length, tension, np.full(6, 25.0)]), n * DT, n * DT)
         except RejectionError:
             rejected += 1
     assert rejected > 50

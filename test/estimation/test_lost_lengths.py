@@ -7,6 +7,7 @@ from copy import deepcopy
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.estimator import Estimator
@@ -51,7 +52,7 @@ class MovingArm:
                 self.core.joints(theta + self.joint_off, self.time)
             states = np.array([length, tension, np.full_like(length, 25.0)])
             with suppress(RejectionError):
-                self.core.step(states[:, self.order], self.time, self.time)
+                self.core.take(reading(states[:, self.order]), self.time, self.time)
 
     @property
     def kind(self):

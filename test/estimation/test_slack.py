@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.emulator.arm import EmulatedArm
@@ -121,7 +122,7 @@ def test_an_emulated_slow_winch_takes_up_slack_without_an_anomaly(
         read = arm.sense()
         slack += read.tension[MUSCLE] < 1.0
         states = np.array([read.length, read.tension, read.temperature])
-        estimator.step(states, n * DT, n * DT)
+        estimator.take(reading(states), n * DT, n * DT)
         assert not estimator.cause
         arm.step(DT)
     assert slack * DT > 0.5

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from readings import reading
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.estimator import Estimator
@@ -78,7 +79,7 @@ def test_a_recording_is_estimated_as_by_the_estimator(arm26, mae, plain):
     core.use(mae)
     for now, tension, length in zip(times(len(plain.length)), plain.tension, plain.length):
         states = np.array([length, tension, np.full(arm26.muscle_count, 25.0)])
-        estimated.append(core.step(states, now, now).state.theta)
+        estimated.append(core.take(reading(states), now, now).state.theta)
     tension = end_tensions(mae, plain)
     np.testing.assert_allclose(mae.estimate(tension, plain.length).theta, estimated, atol=1e-6)
     # Tendon friction must have had an effect, because the comparison would be trivial otherwise.

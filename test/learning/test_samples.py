@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rest detection, friction, novelty, the store with its budget, and rejected samples."""
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from readings import reading as message
 
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.collector import SampleCollector
@@ -15,6 +17,7 @@ from musculoskeletal_ae.learning.settings import DEFAULT
 from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.muscle_stream import RejectionError
 
 DT = 0.01
 SLIDES = np.array([1.0, RACK])  # travel per radian if the second joint is prismatic
@@ -185,9 +188,10 @@ class Messages:
         """Send one message to the collector; return the new samples."""
         self.time += dt
         self.collector.joints(self.time, theta)
-        states = np.array([length, pull, np.full(6, np.nan)])
-        paired = self.collector.muscles(self.time, states)
-        return [] if paired is None else self.collector.collect(paired)
+        with suppress(RejectionError):  # the collector counts it
+            paired = self.collector.take(self.time, message([length, pull, np.full(6, np.nan)]))
+            return [] if paired is None else self.collector.collect(paired)
+        return []
 
     def rest(self, theta, seconds, tension=60.0, dt=DT):
         """Send messages of an arm that rests for some seconds, the first one after `dt` seconds.

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from exact_mae import ExactMae
+from readings import reading
 from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.control.controller import Controller
@@ -76,7 +77,7 @@ def test_scale_offset_and_drive_friction_are_removed_by_the_direction_of_motion(
         for n in range(100):
             states = np.stack([np.zeros(COUNT), read, np.full(COUNT, 30.0)])
             states[0] -= way * 1e-4 * n
-            sample = stream.take_states(states, (n + 100.0 * (way < 0.0)) * PERIOD)
+            sample = stream.take(reading(states, ROBOT), (n + 100.0 * (way < 0.0)) * PERIOD)
         np.testing.assert_allclose(sample.tension_read, read)
         np.testing.assert_allclose(sample.motor_tension, pull, rtol=1e-2)
         np.testing.assert_allclose(sample.bone_tension, pull * np.exp(-0.1 * way), rtol=1e-2)
@@ -87,11 +88,11 @@ def test_a_drive_that_pays_out_against_its_friction_does_not_make_a_tendon_push(
     stream = MuscleStream(ROBOT)
     states = np.stack([np.zeros(COUNT), np.full(COUNT, -15.0), np.full(COUNT, 30.0)])
     # −15 N is legal for a motor current: the drive brakes while it pays out.
-    sample = stream.take_states(states, 0.0)
+    sample = stream.take(reading(states, ROBOT), 0.0)
     assert (sample.motor_tension == 0.0).all() and (sample.bone_tension == 0.0).all()
     assert (sample.tension_read == -15.0).all()
     with pytest.raises(RejectionError, match='tension beyond the maximum'):
-        stream.take_states(states * np.array([[1.0], [200.0], [1.0]]), PERIOD)
+        stream.take(reading(states * np.array([[1.0], [200.0], [1.0]]), ROBOT), PERIOD)
 
 
 @pytest.mark.parametrize('reality', ['kin', 'foreign'])

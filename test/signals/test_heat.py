@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 from numba import njit
+from readings import reading
 
 from musculoskeletal_ae.emulator import modules
 from musculoskeletal_ae.emulator.arm import EmulatedArm
@@ -88,7 +89,7 @@ class ObservedMotors(Motors):
             return
         length = ROBOT.muscle_lengths(POSTURE, self.pulled)
         self.now += self.period
-        self.core.step(np.array([length, self.pulled, self.read]), self.now, self.now)
+        self.core.take(reading([length, self.pulled, self.read]), self.now, self.now)
 
     def learn(self):
         """Let the thermal model learn the constants of all modules."""

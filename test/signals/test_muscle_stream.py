@@ -8,13 +8,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from readings import reading
 
+from musculoskeletal_ae import validity
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals import plausibility, readings
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets, Trust
 from musculoskeletal_ae.signals.friction import Transmission
 from musculoskeletal_ae.signals.limits import LIMITS, longest_lengths
 from musculoskeletal_ae.signals.message_delay import MessageDelay
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
+from musculoskeletal_ae.signals.readings import QUANTITIES, Presence, Quantity
 
 ROBOT = Robot.load('arm26')
 M = ROBOT.muscle_count
@@ -53,6 +57,24 @@ def test_a_sound_message_becomes_a_sample_with_the_length_offset_removed():
     assert sample.time == 1.5 and sample.usable.all()
 
 
+def test_an_optional_quantity_is_one_entry_of_the_layout(monkeypatch):
+    voltage = Quantity(
+        'voltage', 'V', 'impossible voltage', lambda _: (5.0, 60.0), Presence.OPTIONAL
+    )
+    for module in (readings, validity):
+        monkeypatch.setattr(module, 'QUANTITIES', (*QUANTITIES, voltage))
+    monkeypatch.setattr(plausibility, 'QUANTITIES', (*QUANTITIES, voltage))
+    stream, volts = MuscleStream(ROBOT), np.full(M, 24.0)
+    sample = stream.take(message([*resting(), volts]), 0.0)
+    np.testing.assert_array_equal(sample.newest[-1], volts)
+    for lacking in (resting(), np.array([*resting(), np.full(M, np.nan)])):
+        assert np.isnan(stream.take(message(lacking), 0.1).newest[-1]).all()
+    with pytest.raises(RejectionError, match=r'impossible voltage: .* 90 V, legal: 5 to 60 V'):
+        stream.take(message([*resting(), 90.0 + 0.0 * volts]), 0.2)
+    with pytest.raises(RejectionError, match='wrong length'):
+        stream.take(message(resting()[:2]), 0.3)
+
+
 @pytest.mark.parametrize(
     ('states', 'reason'),
     [
@@ -82,23 +104,23 @@ def test_a_ruptured_muscle_may_be_wound_in_beyond_any_posture_but_not_without_en
     stream, shortest = MuscleStream(ROBOT), -longest_lengths(ROBOT)[0]
     end = shortest - LIMITS.slack_length_margin
     for n, length in enumerate(np.arange(0.0, end, -0.01)):
-        stream.take_states(resting(length=(0, length), tension=(0, 0.0)), n * PERIOD)
+        stream.take(reading(resting(length=(0, length), tension=(0, 0.0))), n * PERIOD)
     with pytest.raises(RejectionError, match='length beyond what the joints allow'):
-        stream.take_states(resting(length=(0, end - 0.01), tension=(0, 0.0)), (n + 1) * PERIOD)
+        stream.take(reading(resting(length=(0, end - 0.01), tension=(0, 0.0))), (n + 1) * PERIOD)
 
 
 def test_lengths_are_not_judged_while_the_offsets_are_unknown():
     body = HEALTHY.with_offsets(LengthOffsets.unknown(M))
     stream = MuscleStream(ROBOT, body)
     for n, length in enumerate((0.0, 5.0)):
-        stream.take_states(resting(length=(0, length)), n * PERIOD)
+        stream.take(reading(resting(length=(0, length))), n * PERIOD)
 
 
 def test_a_jump_of_one_length_is_rejected_until_it_has_lasted_and_names_its_muscle():
     stream, jumped, rejected = MuscleStream(ROBOT), [], 0
     for n in range(200):
         try:
-            sample = stream.take_states(resting(length=(1, 0.08 * (n >= 20))), n * PERIOD)
+            sample = stream.take(reading(resting(length=(1, 0.08 * (n >= 20)))), n * PERIOD)
         except RejectionError as rejection:
             rejected += rejection.reason == 'length jumped'
         else:
@@ -112,7 +134,7 @@ def test_a_jump_is_named_even_if_the_module_winds_the_length_back():
     for n in range(300):
         length = max(0.08 - 0.25 * PERIOD * (n - 20), 0.0) if n >= 20 else 0.0
         with suppress(RejectionError):
-            jumped += stream.take_states(resting(length=(1, length)), n * PERIOD).jumped
+            jumped += stream.take(reading(resting(length=(1, length))), n * PERIOD).jumped
     assert jumped == [1]
 
 
@@ -122,7 +144,7 @@ def test_a_length_that_jumps_back_is_accepted_at_once_although_the_arm_has_moved
         states = resting(length=(1, 0.08 * (20 <= n < 60)))
         states[0, 2:] += 0.001 * n
         try:
-            assert stream.take_states(states, n * PERIOD).jumped == ()
+            assert stream.take(reading(states), n * PERIOD).jumped == ()
         except RejectionError:
             rejected.append(n)
     assert rejected == [*range(20, 60)]
@@ -134,7 +156,7 @@ def test_a_rejected_message_contains_the_tensions_that_last():
         states = resting(length=(1, 0.1 * (n >= 20)), tension=(1, 300.0))
         states[1, 2] = 400.0 * (n == 25)  # a glitch of a single message
         try:
-            stream.take_states(states, n * PERIOD)
+            stream.take(reading(states), n * PERIOD)
         except RejectionError as rejection:
             pull = rejection.pull
     assert pull[1, 1] == 300.0 and pull[0, 1] == 0.1
@@ -149,7 +171,7 @@ def jump_together(stream, size=0.05, pause=0.0):
         states = resting()
         states[0, :3] += size * (n >= 20) * np.array([1.0, -1.0, 0.8])
         with suppress(RejectionError):
-            jumped += stream.take_states(states, stream_time).jumped
+            jumped += stream.take(reading(states), stream_time).jumped
     return jumped
 
 
@@ -183,7 +205,7 @@ def taken(stream, deliveries):
         delay = delays.step(received, round(1e9 * (sent + 50.0)))
         accepted.append(False)
         with suppress(RejectionError):
-            stream.take_states(resting(length=(1, length)), received, delay=delay)
+            stream.take(reading(resting(length=(1, length))), received, delay=delay)
             accepted[-1] = True
     return accepted
 
@@ -218,7 +240,7 @@ def test_hot_readings_that_arrive_apart_but_were_sent_together_are_not_believed(
     for received, sent, degrees in ((0.0, 0.0, 199.0), (0.5, 0.01, 199.0), (0.51, 0.51, 30.0)):
         delay = delays.step(received, round(1e9 * (sent + 1.0)))
         states = resting(temperature=(0, degrees))
-        sample = stream.take_states(states, received, delay=delay)
+        sample = stream.take(reading(states), received, delay=delay)
         assert not sample.temperature[0] > 100.0
 
 
@@ -229,7 +251,7 @@ def jumps_of_a_winding_tendon(by, tension):
         if not 20 <= n < 60:
             wound = resting(length=(1, by), tension=(1, tension))
             with suppress(RejectionError):
-                jumped += stream.take_states(wound if n > 20 else resting(), n * PERIOD).jumped
+                jumped += stream.take(reading(wound if n > 20 else resting()), n * PERIOD).jumped
     return jumped
 
 
@@ -255,7 +277,7 @@ def jumps_of_a_restarting_module(pause, boots=0.5):
             states[1, 1] *= time > 1.0 + pause + boots
         if not 1.0 <= time < 1.0 + pause:
             with suppress(RejectionError):
-                jumped += stream.take_states(states, time).jumped
+                jumped += stream.take(reading(states), time).jumped
     return jumped
 
 
@@ -279,10 +301,10 @@ def test_implausible_messages_are_a_fault_once_they_outlast_a_glitch():
     hot = resting(temperature=(0, 500.0))
     for n in range(20):
         with pytest.raises(RejectionError):
-            stream.take_states(hot, n * PERIOD)
+            stream.take(reading(hot), n * PERIOD)
         lasts = n * PERIOD > LIMITS.glitch
         assert bool(stream.implausible(n * PERIOD)) == lasts
-    stream.take_states(resting(), 20 * PERIOD)
+    stream.take(reading(resting()), 20 * PERIOD)
     assert stream.implausible(20 * PERIOD) == ''
 
 
@@ -290,7 +312,7 @@ def test_a_glitch_is_no_lasting_fault_because_the_next_message_is_late():
     stream = MuscleStream(ROBOT)
     for received, delay in ((0.0, 0.0), (0.3, 0.29)):
         with pytest.raises(RejectionError):
-            stream.take_states(resting(temperature=(0, 500.0)), received, delay=delay)
+            stream.take(reading(resting(temperature=(0, 500.0))), received, delay=delay)
         assert stream.implausible(received) == ''
         assert stream.implausible(received + 0.25) == ''
 
@@ -299,7 +321,7 @@ def test_the_median_of_three_hides_a_glitch_that_the_newest_values_show():
     stream = MuscleStream(ROBOT, window=3)
     tension = ROBOT.tension.bias[0]
     for n, spike in enumerate((0.0, 0.0, 60.0, 0.0)):
-        sample = stream.take_states(resting(tension=(0, tension + spike)), n * PERIOD)
+        sample = stream.take(reading(resting(tension=(0, tension + spike))), n * PERIOD)
         assert sample.motor_tension[0] == pytest.approx(tension)
         assert sample.newest[1, 0] == pytest.approx(tension + spike)
 
@@ -310,13 +332,13 @@ def test_tendon_friction_is_removed_by_the_direction_of_sliding():
     for n in range(100):  # every tendon is wound in, so the motor-side tension exceeds T_end
         states = resting()
         states[0] -= 1e-4 * n
-        sample = stream.take_states(states, n * PERIOD)
+        sample = stream.take(reading(states), n * PERIOD)
     np.testing.assert_allclose(sample.sliding, 1.0, atol=1e-3)
     np.testing.assert_allclose(sample.bone_tension, np.exp(-0.1) * ROBOT.tension.bias, rtol=1e-3)
 
 
 def test_samples_and_body_states_cannot_be_changed():
-    sample = MuscleStream(ROBOT).take_states(resting(), 0.0)
+    sample = MuscleStream(ROBOT).take(reading(resting()), 0.0)
     for value, name in ((sample, 'length'), (HEALTHY, 'isolated')):
         with pytest.raises(AttributeError):
             setattr(value, name, None)

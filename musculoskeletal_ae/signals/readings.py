@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a muscle module reports: one row for each quantity, in the order of `QUANTITIES`.
+
+A message of `muscle_states` has these rows, with one column for each muscle. To add a quantity, add
+its entry to `QUANTITIES`. Messages, recordings and the emulator then have one more row; its values
+are checked, and `MuscleSample.newest` contains them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Enum, IntEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.limits import LIMITS, longest_lengths, reading_range
+
+
+class Presence(Enum):
+    """Which values of a quantity a message may lack."""
+
+    REQUIRED = 'each value is a finite number'
+    MEASURED_OR_NAN = 'a value that is not measured is NaN'
+    OPTIONAL = 'a value that is not measured is NaN, and messages may lack the row'
+
+
+class Quantity(NamedTuple):
+    """A quantity that muscle modules report.
+
+    Attributes:
+        name: Its name in messages to users, and that of its argument of `muscle_reading`.
+        unit: Its unit in messages to users.
+        reason: Reason under which messages with impossible values are counted.
+        possible: Function of the robot that returns the lowest and the highest possible value of
+            each muscle; each is a number, or an array (M,).
+        presence: Which values a message may lack. Optional quantities come last.
+    """
+
+    name: str
+    unit: str
+    reason: str
+    possible: Callable[[Robot], tuple[Array | float, Array | float]]
+    presence: Presence = Presence.REQUIRED
+
+
+def _possible_lengths(robot: Robot) -> tuple[Array, Array]:
+    longest = longest_lengths(robot)
+    return -longest, longest
+
+
+def _possible_temperatures(_: Robot) -> tuple[float, float]:
+    return LIMITS.lowest_temperature, LIMITS.highest_temperature
+
+
+QUANTITIES: tuple[Quantity, ...] = (
+    Quantity('length', 'm', 'length beyond what the joints allow', _possible_lengths),
+    Quantity('tension', 'N', 'tension beyond the maximum', reading_range),
+    Quantity(
+        'temperature', '°C', 'impossible temperature', _possible_temperatures,
+        Presence.MEASURED_OR_NAN,
+    ),
+)  # fmt: skip
+
+
+class Row(IntEnum):
+    """Rows of the quantities that this package uses."""
+
+    LENGTH = 0
+    TENSION = 1
+    TEMPERATURE = 2
+
+
+def possible_readings(robot: Robot) -> tuple[Array, Array]:
+    """Return the lowest and the highest possible value of each quantity, (Q, M) each."""
+    possible = np.empty((2, len(QUANTITIES), robot.muscle_count))
+    for row, quantity in enumerate(QUANTITIES):
+        possible[0, row], possible[1, row] = quantity.possible(robot)
+    return possible[0], possible[1]
+
+
+class Layout(NamedTuple):
+    """The layout of a `MuscleReading`: no named dimensions and no offset."""
+
+    dim: tuple[()] = ()
+    data_offset: int = 0
+
+
+class MuscleReading(NamedTuple):
+    """One reading of all muscle modules, with the fields of a `muscle_states` message."""
+
+    data: Array  # (Q·M,): one row of M values for each of the Q quantities
+    layout: Layout = Layout()
+
+
+def reading_rows(robot: Robot, **values: Array) -> Array:
+    """Return the rows of a message of `muscle_states`, (Q, M).
+
+    Args:
+        robot: The robot; if its modules report motor currents, tensions are converted to currents.
+        values: The values of each quantity by its name, (M,), with tensions in N. Quantities that
+            are not given are NaN.
+    """
+    rows = np.full((len(QUANTITIES), robot.muscle_count), np.nan)
+    for row, quantity in enumerate(QUANTITIES):
+        if quantity.name in values:
+            rows[row] = values[quantity.name]
+    rows[Row.TENSION] = robot.tension_source.to_message(rows[Row.TENSION])
+    return rows
+
+
+def muscle_reading(robot: Robot, **values: Array) -> MuscleReading:
+    """Return a reading that was not received as a message; arguments as of `reading_rows`."""
+    return MuscleReading(reading_rows(robot, **values).ravel())

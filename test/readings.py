@@ -1,0 +1,17 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Readings of muscle modules for tests of cores."""
+
+import numpy as np
+
+from musculoskeletal_ae.signals.readings import MuscleReading
+
+
+def reading(states, robot=None):
+    """Return the rows of l [m], T [N] and temperature [°C], (3, M), as a message.
+
+    A `robot` that measures motor currents reports currents instead of tensions.
+    """
+    rows = np.array(states, dtype=float)
+    if robot is not None:
+        rows[1] = robot.tension_source.to_message(rows[1])
+    return MuscleReading(rows.ravel())
