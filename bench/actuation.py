@@ -20,11 +20,11 @@ network. With the learned network, the bench measures:
 Tensions are the true ones of the emulated arm, whatever its sensors measure.
 """
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from bench.learned_arm import initial_network
 from musculoskeletal_ae.control.exploration_steps import TRIES, holdable_postures
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
@@ -32,8 +32,6 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_TIME, ClosedLoop
 from musculoskeletal_ae.experiments.resilience import IsolatingLoop
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.robot.description import with_modules
@@ -226,7 +224,7 @@ def main(argv: list[str]) -> int:
     add('--modules', type=names, default=tuple(KINDS), help=f'kinds: {", ".join(KINDS)}')
     add('--seconds', type=positive, default=EXPLORED, help='time of exploration [s]')
     add('--held', type=positive, default=HELD, help='time for each target [s]')
-    add('--initial', type=Path, help='initial checkpoint (default: train one)')
+    parser.add_initial()
     options = parser.parse_args(argv)
     if wrong := set(options.modules) - set(KINDS):
         raise MusculoskeletalError(
@@ -234,10 +232,7 @@ def main(argv: list[str]) -> int:
         )
     share = (0.25 if options.quick else 1.0) * options.seconds / EXPLORED
     robot = Robot.load(options.robot)
-    if options.initial is None:
-        initial = initial_mae(robot).mae
-    else:
-        initial = checkpoint.load(options.initial, robot)
+    initial = initial_network(robot, options.initial)
     print(HEAD)
     for reality in options.realities:
         rows: dict[str, list[Result]] = {kind: [] for kind in options.modules}

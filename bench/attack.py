@@ -2,6 +2,7 @@
 """Attacks the running system with messages, requests, kills, faults and files; counts what breaks.
 
     python -m bench attack [--quick] [--seeds 0,1,2,3,4] [--kinds 'false zeros',…]
+    python -m bench attack --parts kills,files
 
 The whole system runs on an emulated arm, once for each seed. Each run has three parts:
 
@@ -12,8 +13,9 @@ The whole system runs on an emulated arm, once for each seed. Each run has three
 3. Messages of a hostile node. It publishes on every topic that a node subscribes to (modified
    genuine messages, and random ones), and calls every service with illegal content.
 
-Every command, tension and status is recorded and checked. The bench also reads hostile files and,
-unless `--quick`, kills a learner as in `kills`.
+Every command, tension and status is recorded and checked. The bench also kills learners, which
+must lose nothing that they had saved (`attack_kills`; not with `--quick`), and reads hostile files
+(`attack_files`). `--parts` selects some of these: graph, kills, files.
 
 The bench prints a table: promise, number of trials, number of violations. The exit status is 1 if
 there is any violation. The hostile node does not do what every node on an open graph may do:
@@ -28,7 +30,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from bench import attack_files, kills
+from bench import attack_files, attack_kills
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae import checkpoint
@@ -63,9 +65,10 @@ class Size(NamedTuple):
     rate: float = 100.0  # rate of the muscle modules' messages [Hz]
 
 
-FULL = Size(None, 2000, messages=100_000, node_kills=40, learner_kills=12, files=600, episodes=20)
+FULL = Size(None, 2000, messages=100_000, node_kills=40, learner_kills=50, files=600, episodes=20)
 QUICK = Size(1, 2, messages=300, node_kills=1, learner_kills=0, files=7, episodes=1, rate=50.0)
 SEEDS = 0, 1, 2, 3, 4
+GRAPH, KILLS, FILES = PARTS = 'graph', 'kills', 'files'
 EVENTS_IN_A_ROW = 50  # number of random events between two recoveries of the arm
 
 
@@ -304,12 +307,15 @@ def main(argv: list[str]) -> int:
         type=whole(1, 10_000_000),
         help='number of hostile messages (default: 100 000; with --quick 300)',
     )
-    parser.add_argument('--out', type=Path, help='folder of the logs (default: a temporary one)')
-    parser.add_argument('--initial', type=Path, help='initial checkpoint (default: train one)')
+    parser.add_out('DIR', 'folder of the logs (default: a temporary one)', is_optional=True)
+    parser.add_initial()
     text = 'random seeds (default: 0,1,2,3,4; with --quick 0)'
     parser.add_argument('--seeds', type=numbers, help=text)
     parser.add_argument('--kinds', type=names, help='names of the attacks to run (default: all)')
+    parser.add_argument('--parts', type=names, default=PARTS, help='parts of the bench to run')
     options = parser.parse_args(argv)
+    if unknown := set(options.parts) - set(PARTS):
+        parser.error(f'--parts: unknown parts {", ".join(unknown)}; legal: {", ".join(PARTS)}')
     size, begun = QUICK if options.quick else FULL, time.monotonic()
     size = size._replace(messages=options.messages or size.messages)
     seeds = [int(seed) for seed in options.seeds or (SEEDS[:1] if options.quick else SEEDS)]
@@ -329,18 +335,19 @@ def main(argv: list[str]) -> int:
             node_kills=-(-size.node_kills // len(seeds)),
             episodes=-(-size.episodes // len(seeds)),
         )
-        for number, seed in enumerate(seeds):
+        for number, seed in enumerate(seeds if GRAPH in options.parts else ()):
             print(f'seed {seed}', flush=True)
             mine = planned[number :: len(seeds)]
             rows += attack_graph(folder / f'seed_{seed}', initial, share, seed, mine)
             print_rows(together(rows))
         rows = together(rows)
-        if count := size.learner_kills:
-            lost = kills.run(robot, Path(name) / 'killed', initial, count, seeds[0])
+        if KILLS in options.parts and (count := size.learner_kills):
+            lost = attack_kills.run(robot, Path(name) / 'killed', initial, count, seeds[0])
             rows.append(Row('a killed learner loses nothing', count, lost))
-    tried, broken, outcomes = attack_files.attack(size.files, seeds[0])
-    print(', '.join(f'{count} {what}' for what, count in sorted(outcomes.items())))
-    rows.append(Row('each damaged file is used or refused in time', tried, broken))
+    if FILES in options.parts:
+        tried, broken, outcomes = attack_files.attack(size.files, seeds[0])
+        print(', '.join(f'{count} {what}' for what, count in sorted(outcomes.items())))
+        rows.append(Row('each damaged file is used or refused in time', tried, broken))
     print_rows(rows)
     print(f'{time.monotonic() - begun:.0f} s')
     return int(any(row.broken for row in rows))

@@ -23,14 +23,12 @@ therefore has a standard error of up to √(0.95 · 0.05 / 10) = 0.07.
 """
 
 from collections import defaultdict
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from bench.learned_arm import initial
+from bench.learned_arm import initial_network
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.exploration import Exploration
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
@@ -130,18 +128,13 @@ def main(argv: list[str]) -> None:
     parser.add_argument(
         '--scale', type=number(0.01, 100.0), default=1.0, help='factor of each covariance'
     )
-    parser.add_argument(
-        '--folder', type=Path, help='folder that keeps the initial network for the next run'
-    )
+    parser.add_initial()
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
 
     robot = Robot.load(args.robot)
     rows = defaultdict[tuple[str, str], list[Honesty]](list)
-    with TemporaryDirectory() as scratch:
-        folder = args.folder or Path(scratch)
-        folder.mkdir(parents=True, exist_ok=True)
-        driver = initial(robot, folder)
+    driver = initial_network(robot, args.initial)
     print('with joint sensors; without joint sensors')
     for reality in args.realities:
         for seed in args.seeds:

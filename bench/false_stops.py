@@ -18,16 +18,14 @@ lost, and the longest delay of a message. An individual's hour ends with its fir
 stop. The exit status is 1 if there was one.
 """
 
-from pathlib import Path
 from typing import NamedTuple
 
 import torch
 
 from bench.lab import CORES, SAMPLE_TIME, Lab
+from bench.learned_arm import initial_network
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import KIN, make_arm
-from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser, number, positive
 from musculoskeletal_ae.robot.robot import Robot
@@ -112,15 +110,12 @@ def main(argv: list[str]) -> int:
     parser.add_argument(
         '--reality', default=KIN, help='emulator model: kin, foreign or an MJCF file'
     )
-    parser.add_argument('--initial', type=Path, help='initial checkpoint (default: train one)')
+    parser.add_initial()
     parser.add_quick('a minute of each arm')
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
     robot = Robot.load(options.robot)
-    if options.initial is None:
-        initial = initial_mae(robot).mae
-    else:
-        initial = checkpoint.load(options.initial, robot)
+    initial = initial_network(robot, options.initial)
     seconds = 60.0 if options.quick else 3600.0 * options.hours
     print(HEAD)
     problems = 0

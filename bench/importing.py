@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Imports public robot models, compares muscle lengths with the source, and trains networks.
+"""Imports public robot models, and compares their muscle lengths with the source.
 
-    python -m bench importing FILE… [--out DIR] [--learn [--minutes 10]]
+    python -m bench importing FILE… [--out DIR]
 
 The files are public models that you have downloaded; none is part of this repository. The bench
 prints one row for each file:
@@ -12,11 +12,6 @@ prints one row for each file:
   its model.urdf with a site at each via point. Muscles of a cardsflow.xml that wrap are left out,
 - the largest moment arm error over 200 postures, and the number of muscles with a wrong sign there,
 - the verdict of `check_robot` over 100 postures.
-
-With --learn, the experiments `online_learning` and `control` run on an individual of each robot.
-The row then continues with the estimation error on the held-out motion before and after learning,
-that of the oracle (mean norms over the joints), and the target error of `proposed`. If the arm
-cannot hold any posture, it has no targets, and the cell gives the reason.
 """
 
 import tempfile
@@ -30,25 +25,20 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.experiments import control, online_learning
-from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.importing.cardsflow import ROUND
 from musculoskeletal_ae.importing.convert import check_verdict, import_robot, read_source
 from musculoskeletal_ae.importing.source import Comparison, Source, compare, refuse
 from musculoskeletal_ae.options import Parser
-from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
-INDIVIDUAL = 0
 DRAWN = 'visual', 'collision'  # elements of a link that do not affect muscle lengths
-IMPORTED = (
+HEAD = (
     'model', 'joints', 'muscles', 'wrap', 'max error [mm]', 'median [mm]', 'moment arm [mm]',
     'wrong signs', 'check_robot',
 )  # fmt: skip
-LEARNED = ('before [rad]', 'after', 'oracle', '`proposed`')
 
 
 def lengths_of_cardsflow(file: Path, source: Source) -> Callable[[dict[str, Array]], Any]:
@@ -123,11 +113,8 @@ def compared(file: Path, robot: Robot, comparison: Comparison | None) -> Compari
     return compare(source, robot)
 
 
-def row(file: Path, out: Path, minutes: float | None) -> list[str]:
-    """Import one file, and return the cells of its row.
-
-    If `minutes` is given, a network also learns an individual of the robot for this time.
-    """
+def row(file: Path, out: Path) -> list[str]:
+    """Import one file, and return the cells of its row."""
     name = f'{file.parent.name}/{file.name}'
     try:
         robot, notes, comparison = import_robot(file, out)
@@ -141,26 +128,7 @@ def row(file: Path, out: Path, minutes: float | None) -> list[str]:
     check = check_verdict(check_robot(robot, 100)).removeprefix('check_robot: ')
     wraps = len(set(robot.routes.muscle[robot.routes.wrapping].tolist()))
     counts = (robot.joint_count, robot.muscle_count, wraps)
-    cells = [name, *map(str, counts), *errors, f'{check} ({len(set(notes))} notes)']
-    return cells if minutes is None else cells + learned(robot, minutes, out)
-
-
-def learned(robot: Robot, minutes: float, out: Path) -> list[str]:
-    """Let a network learn an individual of the robot, and return the cells with the results."""
-    study = Study(robot, 'default', (INDIVIDUAL,), minutes, quick=False, folder=out)
-    for preset in PRESETS:
-        online_learning.train_initial(study, preset)
-    cells = list[str]()
-    for keys, experiment in (
-        (('before_rad', 'after_rad', 'oracle_rad'), online_learning.measure),
-        (('proposed',), control.measure),
-    ):
-        try:
-            numbers = experiment(study, INDIVIDUAL).numbers
-        except MusculoskeletalError as error:
-            return [*cells, str(error)]
-        cells += [f'{numbers[k]["error_rad"] if k == "proposed" else numbers[k]:.4f}' for k in keys]
-    return cells
+    return [name, *map(str, counts), *errors, f'{check} ({len(set(notes))} notes)']
 
 
 def main(argv: list[str]) -> None:
@@ -169,20 +137,13 @@ def main(argv: list[str]) -> None:
     parser.add_argument(
         'files', nargs='+', type=Path, metavar='FILE', help='model to import as a robot'
     )
-    parser.add_argument(
-        '--out', type=Path, metavar='DIR', help='folder that keeps the robot directories'
-    )
-    parser.add_argument(
-        '--learn', action='store_true', help='also learn an emulated individual of each robot'
-    )
-    parser.add_minutes('duration of the exploration', 10.0)
+    parser.add_out('DIR', 'folder that keeps the robot directories', is_optional=True)
     args = parser.parse_args(argv)
 
-    head = IMPORTED + LEARNED * args.learn
-    print(f'| {" | ".join(head)} |\n{"|---" * len(head)}|')
+    print(f'| {" | ".join(HEAD)} |\n{"|---" * len(HEAD)}|')
     with tempfile.TemporaryDirectory() as folder:
         for i, file in enumerate(args.files):
             out = (args.out or Path(folder)) / f'{i}_{file.resolve().parent.name}_{file.stem}'
-            cells = row(file, out, args.minutes if args.learn else None)
-            cells += [''] * (len(head) - len(cells))
+            cells = row(file, out)
+            cells += [''] * (len(HEAD) - len(cells))
             print(f'| {" | ".join(cells)} |', flush=True)

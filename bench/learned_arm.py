@@ -49,6 +49,11 @@ class LearnedArm(NamedTuple):
     exploring: Recording
 
 
+def initial_network(robot: Robot, file: Path | None) -> Mae:
+    """Return the network that `--initial` names, or train that of the geometric model."""
+    return initial_mae(robot).mae if file is None else checkpoint.load(file, robot)
+
+
 def initial(robot: Robot, folder: Path) -> Mae:
     """Return the network of the geometric model, from the cache in `folder` if it is there."""
     file = folder / 'initial.safetensors'

@@ -21,7 +21,6 @@ import pinocchio as pin
 from bench.lab import CONTROLLER, ESTIMATOR, LEARNER, CommandFault, Lab, Packet, ReadingFault
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.remedy import Step
 
@@ -730,34 +729,24 @@ def lost_module(lab: Lab, rng: Rng) -> Case:
 # -- arm and people --------------------------------------------------------------------------------
 
 
-def _set_gravity(lab: Lab, gravity: Array) -> None:
-    """Set the true gravity of the arm [m/s²] in the axes of its root link, (3,)."""
-    arm: Any = lab.arm
-    if isinstance(arm, EmulatedArm):
-        arm._model.gravity = pin.Motion(gravity, np.zeros(3))
-    else:
-        arm._model.opt.gravity[:] = gravity
-
-
 def mounted(least: float, most: float) -> Callable[[Lab, Rng], Case]:
     """Return a mishap by which the base is mounted at a random angle [rad] to the vertical."""
 
     def begin(lab: Lab, rng: Rng) -> Case:
-        right = lab.arm.robot.kinematics.model.gravity.linear.copy()
         around, angle = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(least, most)
         axis = np.array([math.cos(around), math.sin(around), 0.0])
         start, took = lab.now, 3.0
 
         def turn(lab: Lab) -> None:
             share = min(1.0, (lab.now - start) / took)
-            _set_gravity(lab, pin.exp3(share * angle * axis) @ right)
+            lab.arm.faults.mount = pin.exp3(-share * angle * axis)
             if share == 1.0:
                 lab.before_step.remove(turn)
 
         def mend(lab: Lab) -> None:
             if turn in lab.before_step:
                 lab.before_step.remove(turn)
-            _set_gravity(lab, right)
+            lab.arm.faults.mount = np.eye(3)
 
         lab.before_step.append(turn)
         return Case(f'{math.degrees(angle):.0f}°', mend, is_visible=_since(start + took))
@@ -805,17 +794,8 @@ def pushed(lab: Lab, rng: Rng) -> Case:
 
 def more_friction(lab: Lab, _: Rng) -> Case:
     """Dust doubles the friction of the tendons, or of the joints in the other emulator model."""
-    arm: Any = lab.arm
-    friction = arm.individual.tendon_friction if isinstance(arm, EmulatedArm) else None
-    if friction is None:
-        friction = arm._model.dof_frictionloss
-    before = friction.copy()
-    friction *= 2.0
-
-    def mend(_: Lab) -> None:
-        friction[:] = before
-
-    return Case('× 2', mend, lasts=30.0)
+    lab.arm.set_friction(2.0)
+    return Case('× 2', lambda lab: lab.arm.set_friction(1.0), lasts=30.0)
 
 
 def stop_of_verification(lab: Lab, rng: Rng) -> Case:

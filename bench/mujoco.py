@@ -293,7 +293,7 @@ def main(argv: list[str]) -> None:
         'example arm=myoarm.xml:joints=elbow_flexion,pro_sup'
     )
     parser.add_argument('models', nargs='+', type=parse, metavar='NAME=FILE…', help=text)
-    parser.add_argument('--out', type=Path, required=True, metavar='DIR', help='a new directory')
+    parser.add_out('DIR', 'a new directory')
     parser.add_argument('--seeds', type=seeds, default=(0, 1, 2), help='seeds of the individuals')
     parser.add_minutes('duration of the exploration', 10.0)
     parser.add_quick('short initial training and held-out motion, to try things out')

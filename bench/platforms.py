@@ -349,7 +349,7 @@ def _options(argv: list[str]) -> argparse.Namespace:
         '--node', type=Path, metavar='CHECKPOINT',
         help='check only the core and one node with this checkpoint of arm26, without torch',
     )  # fmt: skip
-    parser.add_argument('--folder', type=Path, help='working folder (default: a temporary one)')
+    parser.add_folder('working folder (default: a temporary one)')
     parser.add_argument(
         '--tests', nargs='+', metavar='TEST',
         help='tests for pytest (default: those that depend on the platform)',

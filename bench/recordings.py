@@ -38,12 +38,24 @@ from bench.recordings_learn import (
     polynomial,
 )
 from bench.recordings_read import Files, Recording, Repository, Run, fitted, repositories
-from bench.recordings_table import ALL_ROWS, Result, tables
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 HALF = slice(0, None, 2)  # every other rest is for training
+ALL_ROWS = ', of all rows'
+#: label of the one row that stands for all polynomials fitted to all rows of the training runs
+OF_ALL_ROWS = 'best polynomial of all training rows (chosen by its test error)'
+
+
+class Result(NamedTuple):
+    """The error of one model on one split."""
+
+    recording: str
+    split: str
+    samples: int
+    model: str
+    error_rad: float
 
 
 class Split(NamedTuple):
@@ -198,6 +210,47 @@ def observations(recording: Recording) -> dict[str, Any]:
     return shown
 
 
+def table(results: list[Result]) -> str:
+    """Return the errors of one recording as a Markdown table.
+
+    The polynomials that were fitted to all rows share one row of the table, which contains the
+    smallest of their errors for each split. The best model from the rest samples is in bold.
+    """
+    errors, samples = dict[tuple[str, str], float](), dict[str, int]()
+    for result in results:
+        label = OF_ALL_ROWS if result.model.endswith(ALL_ROWS) else result.model
+        before = errors.get((result.split, label), np.inf)
+        errors[result.split, label] = min(before, result.error_rad)
+        samples[result.split] = result.samples
+    labels = [*dict.fromkeys(label for _, label in errors if label != OF_ALL_ROWS)]
+    best = {s: min(e for (k, m), e in errors.items() if k == s and m in labels) for s in samples}
+    heads = [f'{split} ({count} rests)' for split, count in samples.items()]
+    lines = [f'| mean error [rad] | {" | ".join(heads)} |', '|---' * (len(heads) + 1) + '|']
+    if any(label == OF_ALL_ROWS for _, label in errors):
+        labels.append(OF_ALL_ROWS)
+    for label in labels:
+        cells = []
+        for split in samples:
+            value = errors.get((split, label), np.nan)
+            text = '–' if np.isnan(value) else f'{value:.3f}' if value < 1.0 else '> 1'
+            cells.append(f'**{text}**' if value == best[split] else text)
+        lines.append(f'| {label} | {" | ".join(cells)} |')
+    return '\n'.join(lines)
+
+
+def tables(document: dict[str, Any]) -> str:
+    """Return the tables of a result.json of `bench recordings` as Markdown."""
+    results = [Result(**row) for row in document['errors']]
+    parts = []
+    for repository in repositories():
+        own = [result for result in results if result.recording == repository.recording]
+        if own:
+            link = f'[{repository.name}](https://github.com/{repository.name})'
+            head = f'**{link}** ({repository.licence}): {repository.robot}.'
+            parts.append(f'{head}\n\n{table(own)}')
+    return '\n\n'.join(parts)
+
+
 def clone_of(repository: Repository, clones: Path, fetch: bool) -> Path | None:
     """Return the path of a repository's clone; None if there is none.
 
@@ -225,7 +278,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument('--fetch', action='store_true', help='clone missing data from GitHub')
     text = 'use only repositories whose name contains this text'
     parser.add_argument('--only', default='', metavar='TEXT', help=text)
-    parser.add_argument('--out', type=Path, default=Path('doc/results/recordings'))
+    parser.add_out('DIR', default=Path('doc/results/recordings'))
     args = parser.parse_args(argv)
     rows, shown = list[dict[str, Any]](), dict[str, Any]()
     for repository in repositories():

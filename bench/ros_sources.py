@@ -196,10 +196,8 @@ def _options(argv: list[str]) -> argparse.Namespace:
         'packages', nargs='+', type=_requirement, metavar='PACKAGE[==VERSION]',
         help=', '.join(RELEASES),
     )  # fmt: skip
-    parser.add_argument(
-        '--folder', type=Path, metavar='DIR', default=ROOT / 'build' / 'ros_sources',
-        help='working folder with sources, build and wheels (default: build/ros_sources)',
-    )  # fmt: skip
+    text = 'working folder with sources, build and wheels'
+    parser.add_folder(text, Path('build/ros_sources'))
     return parser.parse_args(argv)
 
 

@@ -19,11 +19,11 @@ Exit status 1 in any of these cases:
 
 import os
 import time
-from pathlib import Path
 
 import numpy as np
 import torch
 
+from bench.learned_arm import initial_network
 from bench.processes import memory
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
@@ -37,8 +37,6 @@ from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.settings import STEPS
 from musculoskeletal_ae.learning.trainer import Trainer
-from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
@@ -131,11 +129,11 @@ def main(argv: list[str]) -> int:
         '--steps', type=int, default=STEPS, help='number of training steps of an update'
     )
     parser.add_seed('of the individual')
-    parser.add_argument('--initial', type=Path, help='initial checkpoint (default: train one)')
+    parser.add_initial()
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     robot = Robot.load(args.robot)
-    mae = checkpoint.load(args.initial, robot) if args.initial else initial_mae(robot).mae
+    mae = initial_network(robot, args.initial)
     held_out = record(EmulatedArm(robot, args.seed), mae, HELD_OUT_STREAM, PART)
     learner = Learner(robot, mae, seed=args.seed, steps=args.steps, trainer=RareTrainer)
     trainer = learner.trainer

@@ -19,11 +19,11 @@ healthy arm stopped.
 """
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from bench.learned_arm import initial_network
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.exploration_steps import TRIES, holdable_postures
 from musculoskeletal_ae.control.settings import METHODS, Settings
@@ -40,8 +40,6 @@ from musculoskeletal_ae.experiments.recording import (
     record,
 )
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.robot.robot import Robot
@@ -174,14 +172,11 @@ def main(argv: list[str]) -> int:
     parser.add_argument(
         '--seconds', type=positive, default=EXPLORED, help='time of exploration [s]'
     )
-    parser.add_argument('--initial', type=Path, help='initial checkpoint (default: train one)')
+    parser.add_initial()
     options = parser.parse_args(argv)
     share = 0.25 if options.quick else 1.0
     robot = Robot.load(options.robot)
-    if options.initial is None:
-        initial = initial_mae(robot).mae
-    else:
-        initial = checkpoint.load(options.initial, robot)
+    initial = initial_network(robot, options.initial)
     methods = [] if '-' in options.methods else options.methods
     if wrong := set(methods) - set(METHODS):
         raise MusculoskeletalError(

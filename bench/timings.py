@@ -4,8 +4,7 @@
     python -m bench timings [--robot NAME|DIR] [--preset NAME] [--device cuda]
 
 The torch side runs the same algorithm on the same input. Its network runs in torch, and autograd
-computes the gradients. Further rows of the simulator also have the mechanics in torch
-(`eager_simulation`). The column "bound" estimates a lower bound: the time that this machine needs
+computes the gradients. The column "bound" estimates a lower bound: the time that this machine needs
 for the multiply-adds of the network alone, as matrix products. The products have one row for a
 single call, and a batch of rows for many arms.
 """
@@ -19,7 +18,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bench.eager_simulation import EagerSimulation
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control import methods as control
 from musculoskeletal_ae.control.command import msc_compensation
@@ -39,7 +37,6 @@ from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 MANY, LONGEST = 4096, 0.05  # number of arms in a batch; longest duration of a round [s]
-ALL_TORCH = 'compared with all of it in torch'
 
 
 class Row(NamedTuple):
@@ -289,8 +286,6 @@ def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
     return [
         Row(one, step(arms(1)), step(arms(1, network)), 1, work),
         Row(many, step(arms(MANY)), step(arms(MANY, network)), MANY, work),
-        Row(f'{one}, {ALL_TORCH}', step(arms(1)), step(EagerSimulation(arms(1)))),
-        Row(f'{many}, {ALL_TORCH}', step(arms(MANY)), step(EagerSimulation(arms(MANY))), MANY),
         *there,
         Row('loading a new network into the simulator', partial(Simulation(robot, mae).use, mae)),
     ]

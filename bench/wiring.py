@@ -214,12 +214,7 @@ def main(argv: list[str]) -> int:
     parser = Parser('wiring', 'Exchanges muscles, or reverses a sign, in a live driver.')
     parser.add_robot()
     parser.add_seeds((0, 1, 2, 3, 4))
-    parser.add_argument(
-        '--folder',
-        type=Path,
-        default=Path('bench_wiring'),
-        help='folder that keeps the learned networks for the next run',
-    )
+    parser.add_folder('folder that keeps the learned networks', Path('bench_wiring'))
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     robot, outcomes = Robot.load(args.robot), Counter[str]()

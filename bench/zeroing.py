@@ -150,13 +150,8 @@ def main(argv: list[str]) -> int:
     parser = Parser('zeroing', 'Tests length calibration after power-on.')
     parser.add_robot()
     parser.add_seeds((0, 1, 2, 3, 4))
-    parser.add_argument(
-        '--folder',
-        type=Path,
-        default=Path('bench_zeroing'),
-        help='folder that keeps the learned networks for the next run',
-    )
-    parser.add_argument('--out', type=Path, help='JSON file for the results')
+    parser.add_folder('folder that keeps the learned networks', Path('bench_zeroing'))
+    parser.add_out('FILE', 'JSON file for the results', is_optional=True)
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     robot, numbers, passed = Robot.load(args.robot), dict[str, Any](), True

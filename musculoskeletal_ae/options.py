@@ -158,12 +158,25 @@ class Parser(argparse.ArgumentParser):
         text: str = 'where to write',
         default: Path | None = None,
         read: Callable[[str], Path] = Path,
+        is_optional: bool = False,
     ) -> None:
-        """Add `--out`, a file or directory; it is required unless it has a default."""
-        required = default is None
+        """Add `--out`, a file or directory; it is required unless it has a default or is optional.
+
+        An optional one is None if it is not given.
+        """
+        required = default is None and not is_optional
         self.add_argument(
             '--out', type=read, metavar=metavar, default=default, required=required, help=text
         )
+
+    def add_folder(self, text: str, default: Path | None = None) -> None:
+        """Add `--folder`, a folder that keeps what later runs can use; the text says what it is."""
+        self.add_argument('--folder', type=Path, metavar='DIR', default=default, help=text)
+
+    def add_initial(self) -> None:
+        """Add `--initial`, a checkpoint to start from; None if it is not given."""
+        text = 'initial checkpoint (default: train one)'
+        self.add_argument('--initial', type=Path, metavar='FILE', help=text)
 
     def add_plot(self, text: str) -> None:
         """Add `--plot`, the file of a picture for `save_plot`; the text says what it shows."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import covariance, false_stops, lab, sim_pictures
+from bench import covariance, false_stops, lab, pictures
 from bench.__main__ import benches, main
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot
@@ -41,7 +41,7 @@ def test_an_unknown_bench_ends_with_status_2(capsys):
 
 
 def test_what_the_package_refuses_is_one_line_and_status_1(capsys):
-    assert main(['kills', '--robot', 'nowhere']) == 1
+    assert main(['soak', '--robot', 'nowhere']) == 1
     error = capsys.readouterr().err
     assert error.startswith("error: robot 'nowhere'") and error.count('\n') == 1
 
@@ -68,7 +68,7 @@ def test_a_healthy_arm_on_a_busy_computer_is_neither_suspected_nor_stopped(train
 
 
 def test_pictures_of_an_arm_at_rest_and_loaded_are_written(trained, tmp_path):
-    files = sim_pictures.save_both(Robot.load('arm26'), trained['default'], tmp_path / 'new')
+    files = pictures.draw_simulated(Robot.load('arm26'), trained['default'], tmp_path)
     assert [file.name for file in files] == ['sim_at_rest.png', 'sim_loaded.png']
     assert all(file.read_bytes().startswith(b'\x89PNG') for file in files)
 

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.recordings import main
+from bench.recordings import Result, main, table
 from bench.recordings_learn import Statics, effort_slope, error, joined, polynomial
 from bench.recordings_read import Files, Run, SoftLink, fitted, soft_arm
-from bench.recordings_table import Result, table
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 

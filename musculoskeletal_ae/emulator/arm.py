@@ -243,6 +243,15 @@ class EmulatedArm(modules.Arm):
         placed = load.se3Action(pin.SE3(np.eye(3), self._body.effector))
         self._model.inertias[self._body.effector_joint] = self._bare_inertia + placed
 
+    @property
+    def tendon_friction(self) -> Array:
+        """Friction μ of each tendon along its route, shape (M,)."""
+        return self.individual.tendon_friction.copy()
+
+    @property
+    def _varying_friction(self) -> Array:
+        return self.individual.tendon_friction
+
     def _turn_gravity(self, mount: Array) -> None:
         self._model.gravity.linear = mount.T @ self.robot.kinematics.model.gravity.linear
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The effects of the emulator model `foreign` and their sizes; size 0 switches an effect off.
 
-    Effects()                            calibrated sizes (`python -m bench second_body`)
+    Effects()                            calibrated sizes (notes/removed_benches.md, `second_body`)
     replace(Effects(), hysteresis=0.0)   one effect off; all other draws stay the same
     NONE                                 no effect: the body of the description or the MJCF file
 

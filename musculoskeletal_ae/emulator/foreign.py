@@ -417,6 +417,17 @@ class ForeignArm(Arm):
         turn = self._root.rotation @ mount.T @ self._root.rotation.T
         self._model.opt.gravity[:] = turn @ self._upright_gravity
 
+    @property
+    def tendon_friction(self) -> Array:
+        """Friction μ of each tendon along its route in the present posture, shape (M,)."""
+        friction: Array = self.tendons.friction * (tendons.GUIDES + self._memory.bend)
+        return friction
+
+    @property
+    def _varying_friction(self) -> Array:
+        friction: Array = self._model.dof_frictionloss
+        return friction
+
     def set_payload(self, mass: float) -> None:
         """Attach a mass [kg] to the hand, as a ball of 5 cm radius at the end effector."""
         self._model.body_mass[self._hand] = mass

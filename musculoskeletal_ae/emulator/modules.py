@@ -247,6 +247,7 @@ class Arm(ABC):
         self._drive_friction: Array = share * robot.description.tension.limit
         self._mount = self.faults.mount  # turn of the base that the simulation uses
         self._wrench = np.zeros(6)
+        self._friction_factor = 1.0  # friction that varies, as a multiple of the individual's own
         self._command = Command(
             np.zeros(robot.muscle_count), length_bias.copy(), self.faults.stuck,
             self.faults.slack, self.faults.zero, self.faults.hot, self.faults.ceiling,
@@ -328,6 +329,11 @@ class Arm(ABC):
         return self._muscle.end_tension.copy()
 
     @property
+    @abstractmethod
+    def tendon_friction(self) -> Array:
+        """Friction μ of each tendon along its route in the present posture, shape (M,)."""
+
+    @property
     def winding(self) -> Array:
         """True temperatures of the motor windings [°C], shape (M,)."""
         return self._muscle.winding.copy()
@@ -369,6 +375,20 @@ class Arm(ABC):
     @abstractmethod
     def set_payload(self, mass: float) -> None:
         """Attach a mass [kg] to the hand, as a ball of 5 cm radius at the end effector."""
+
+    @property
+    @abstractmethod
+    def _varying_friction(self) -> Array:
+        """The friction that `set_friction` changes in place."""
+
+    def set_friction(self, factor: float) -> None:
+        """Set the friction of the tendons (`kin`) or of the joints (`foreign`).
+
+        `factor` is the multiple of the individual's own friction, and above 0.
+        """
+        friction = self._varying_friction
+        friction *= factor / self._friction_factor
+        self._friction_factor = factor
 
     def set_wrench(self, wrench: Array) -> None:
         """Apply a force [N] and torque [N·m] to the end effector, in the root link's axes, (6,)."""

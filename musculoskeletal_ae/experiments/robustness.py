@@ -28,7 +28,7 @@ import numpy as np
 
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN
-from musculoskeletal_ae.emulator.tendons import GUIDES, load_cell, spooled
+from musculoskeletal_ae.emulator.tendons import load_cell, spooled
 from musculoskeletal_ae.experiments import online_learning, plots
 from musculoskeletal_ae.experiments.least_squares import EVERY, nominal, oracle
 from musculoskeletal_ae.experiments.recording import (
@@ -132,7 +132,7 @@ def _informed_oracle_error(arm: Any, recording: Recording) -> float:
     body, part = arm.individual, recording.part(EVERY)
     if (tendons := getattr(arm, 'tendons', None)) is None:
         tension = np.maximum(part.tension - body.tension_bias, 0.0) / body.tension_gain
-        length, friction = part.length - body.length_bias, body.tendon_friction
+        length = part.length - body.length_bias
     else:
         # Invert the sensor characteristics with tables.
         tensions = np.linspace(0.0, 2.0 * arm.robot.tension.max.max(), 2000)
@@ -143,8 +143,7 @@ def _informed_oracle_error(arm: Any, recording: Recording) -> float:
             length_readings = [spooled(tendons, m, each) for each in lengths]
             tension[:, m] = np.interp(part.tension[:, m], tension_readings, tensions)
             length[:, m] = np.interp(part.length[:, m], length_readings, lengths)
-        friction = tendons.friction * (GUIDES + arm._memory.bend)
-    estimator = replace(oracle(arm.robot, body), friction=friction)
+    estimator = replace(oracle(arm.robot, body), friction=arm.tendon_friction)
     return estimator.error(part._replace(tension=tension, length=length), np.s_[:])
 
 

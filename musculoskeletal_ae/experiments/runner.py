@@ -19,7 +19,7 @@ from concurrent.futures.process import BrokenProcessPool
 from importlib import import_module
 from typing import Any
 
-from musculoskeletal_ae.experiments import NAMES, online_learning
+from musculoskeletal_ae.experiments import NAMES, kept, online_learning
 from musculoskeletal_ae.experiments.study import Measured, Study, round_numbers
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.stop_signals import STOP, Reaction, interrupts_blocked
@@ -223,8 +223,12 @@ def _measure(name: str, study: Study, seed: int) -> Measured:
         measured = EXPERIMENTS[name].measure(study, seed)
         return measured._replace(numbers=round_numbers(measured.numbers))
 
-    result: Measured = study.remember(f'{name}_{seed}', measure)
-    return result
+    part = f'{name}_{seed}'
+    result = study.remember(part, measure)
+    numbers, traces = (getattr(result, key, None) for key in Measured._fields)
+    if not isinstance(numbers, dict) or not isinstance(traces, dict):
+        raise kept.unusable(study.folder / part, 'expected numbers and traces')
+    return Measured(numbers, traces)
 
 
 def _start() -> None:

@@ -10,20 +10,17 @@ add its name to `NAMES`, and add its rows to table.yaml.
 """
 
 import math
-import pickle
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.experiments import kept
 from musculoskeletal_ae.experiments.recording import Recording
-from musculoskeletal_ae.files import write_whole
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.names import PAPER_PRESET
@@ -53,16 +50,14 @@ class Study:
     reality: str = 'kin'  # emulator model of the individuals, see `make_arm`
 
     def remember(self, part: str, measure: Callable[[], Any]) -> Any:
-        """Return the saved result of a part of the run, or measure and save the result.
+        """Return the saved result of a part of the run; measure and save it first if needed.
 
-        Results are pickled, so a folder from an untrusted source must not be reused.
+        The result is read from the file in both cases (`kept`), so a continued run cannot differ.
         """
-        file = self.folder / f'{part}.pickle'
-        if file.is_file():
-            return pickle.loads(file.read_bytes())  # noqa: S301 (a file of this user's own run)
-        result = measure()
-        write_whole(file, pickle.dumps(result))
-        return result
+        file = self.folder / f'{part}.npz'
+        if not file.is_file():
+            kept.write(file, measure())
+        return kept.read(file)
 
     @property
     def presets(self) -> tuple[str, ...]:
@@ -97,19 +92,25 @@ class Study:
     def save(self, seed: int, **arrays: Recording | RestSamples) -> None:
         """Save an individual's streams `exploring` and `held_out`, or the learner's `rests`."""
         for name, values in arrays.items():
-            np.savez(self.folder / f'{name}_{seed}.npz', *values)
+            kept.write(self._stream_file(seed, name), values)
 
     def stream(self, seed: int, name: str) -> Recording:
         """Load a saved stream."""
-        return Recording(*self._load(seed, name))
+        return Recording(**self._load(seed, name, Recording._fields))
 
     def rests(self, seed: int) -> RestSamples:
         """Load the saved rest samples."""
-        return RestSamples(*self._load(seed, 'rests'))
+        return RestSamples(**self._load(seed, 'rests', RestSamples._fields))
 
-    def _load(self, seed: int, name: str) -> list[Array]:
-        with np.load(self.folder / f'{name}_{seed}.npz') as arrays:
-            return list(arrays.values())
+    def _stream_file(self, seed: int, name: str) -> Path:
+        return self.folder / f'{name}_{seed}.npz'
+
+    def _load(self, seed: int, name: str, fields: Sequence[str]) -> dict[str, Array]:
+        file = self._stream_file(seed, name)
+        arrays = getattr(kept.read(file), '__dict__', {})
+        if set(arrays) != set(fields):
+            raise kept.unusable(file, f'expected arrays with the names {", ".join(fields)}')
+        return arrays
 
     def with_prefix(self, preset: str, numbers: Mapping[str, Any]) -> dict[str, Any]:
         """Return a preset's numbers under their keys in result.json.
@@ -130,7 +131,8 @@ class Measured(NamedTuple):
 
     #: contents of result.json: nested dictionaries of finite numbers, text, lists or None
     numbers: dict[str, Any]
-    traces: dict[str, Any]  # data of the plots
+    #: data of the plots: values that `kept` can write, read from the file of this part
+    traces: dict[str, Any]
 
 
 def round_numbers(value: Any, path: str = '') -> Any:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executor that runs the callbacks of nodes and tools.
+"""The executor that runs the callbacks of nodes and tools, and other names private to rclpy.
 
 rclpy's `SingleThreadedExecutor` rebuilds its wait set, in Python, for every message, and runs each
 callback as a task. At 200 Hz this takes half of a node's CPU time. `LeanExecutor` keeps the wait
@@ -10,6 +10,10 @@ rclpy's `EventsExecutor` cannot replace it: up to rclpy 7.1.7 it runs no callbac
 passes a message and its information as one tuple to callbacks that take both.
 
 The environment variable MUSCULOSKELETAL_AE_EXECUTOR overrides the choice: lean or single.
+
+No other file of this package uses names that rclpy does not publish. The few that other files need
+are therefore here as well: `RCLError`, the base class of errors that rcl returns, for example for
+an invalid topic name, two kinds of errors for ROS arguments, and `parameter_overrides`.
 """
 
 import os
@@ -30,6 +34,7 @@ from rclpy.executors import (
     SingleThreadedExecutor,
     TimeoutException,
 )
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.task import Task
@@ -37,7 +42,10 @@ from rclpy.timer import Timer
 from rclpy.waitable import NumberOfEntities
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.rclpy_names import WaitSet
+
+RCLError = rclpy_implementation.RCLError
+RCLInvalidROSArgsError = rclpy_implementation.RCLInvalidROSArgsError
+UnknownROSArgsError = rclpy_implementation.UnknownROSArgsError
 
 VARIABLE = 'MUSCULOSKELETAL_AE_EXECUTOR'
 CHOICES = ('lean', 'single')
@@ -193,7 +201,7 @@ class LeanExecutor(SingleThreadedExecutor):
         for action in self._actions:
             self._handles.enter_context(action)
             count += action.get_num_entities()
-        new = self._wait_set = WaitSet(
+        new = self._wait_set = rclpy_implementation.WaitSet(
             count.num_subscriptions, count.num_guard_conditions, count.num_timers,
             count.num_clients, count.num_services, count.num_events, self.context.handle,
         )  # fmt: skip
@@ -236,6 +244,15 @@ def make_executor(context: Context | None = None) -> Executor:
             f'{_dotted(TESTED[0])} to {_dotted(TESTED[1])}, and this is {installed}'
         )
     return SingleThreadedExecutor(context=context)
+
+
+def parameter_overrides(node: Node) -> list[str]:
+    """Return the names of the parameters that the command line or a file sets for a node.
+
+    They include names that the node does not declare. The result is empty if rclpy has no such
+    list.
+    """
+    return list(getattr(node, '_parameter_overrides', {}))
 
 
 def _rclpy_version() -> tuple[int, ...]:

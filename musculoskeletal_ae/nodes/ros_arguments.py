@@ -6,7 +6,7 @@ from itertools import pairwise
 
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 
-from musculoskeletal_ae.nodes.rclpy_names import RCLInvalidROSArgsError, UnknownROSArgsError
+from musculoskeletal_ae.nodes.executor import RCLInvalidROSArgsError, UnknownROSArgsError
 
 NO_REASON = 'error not set'  # the message of rcl for an error without a reason
 #: exceptions of rclpy for a wrong ROS argument: an unknown argument, or a parameter value of the

@@ -17,9 +17,8 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
-from musculoskeletal_ae.nodes.executor import make_executor
+from musculoskeletal_ae.nodes.executor import RCLError, make_executor
 from musculoskeletal_ae.nodes.parameters import OF_RCLPY
-from musculoskeletal_ae.nodes.rclpy_names import RCLError
 from musculoskeletal_ae.nodes.ros_arguments import PARAMETER_ERRORS, parameters_given, reason
 from musculoskeletal_ae.options import exit_status
 from musculoskeletal_ae.stop_signals import STOP, Reaction

@@ -45,11 +45,11 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.anomaly_latch import AnomalyLatch
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, CheckpointQueue
 from musculoskeletal_ae.nodes.diagnostics import MANY_REPORTS, PERIOD, Diagnostics
+from musculoskeletal_ae.nodes.executor import RCLError, parameter_overrides
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.nodes.needed_topics import NeededTopics
 from musculoskeletal_ae.nodes.node_parameters import NodeParameters, naming_parameter
 from musculoskeletal_ae.nodes.parameters import MOTORS, check_names
-from musculoskeletal_ae.nodes.rclpy_names import RCLError
 from musculoskeletal_ae.nodes.ros_arguments import reason
 from musculoskeletal_ae.nodes.sources import (
     AUTHORS,
@@ -114,7 +114,7 @@ class Shell(Node):
         """
         super().__init__(name, **options)
         self.parameters = NodeParameters(self, name)
-        check_names(getattr(self, '_parameter_overrides', {}))
+        check_names(parameter_overrides(self))
         self.robot = Robot.load(self.parameter('robot'))
         self.rate: float = self.parameter('rate')  # rate of the muscle modules [Hz]
         settings = MotorSettings(**{name: self.parameter(name) for name in MOTORS})

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`check_robot`: checks whether a robot description is sound, and names its faults."""
 
-from pathlib import Path
-
 from musculoskeletal_ae.options import Parser, exit_status, number, whole
 from musculoskeletal_ae.stop_signals import import_heavy
 
@@ -26,7 +24,7 @@ def main(argv: list[str] | None = None) -> int:
     text = 'search for the smallest change of via points that makes the robot sound (takes minutes)'
     parser.add_argument('--suggest', action='store_true', help=text)
     text = 'new directory for the arm that --suggest finds and a picture of the changed routes'
-    parser.add_argument('--out', type=Path, metavar='DIR', help=text)
+    parser.add_out('DIR', text, is_optional=True)
     text = f'how far --suggest may move a via point [m] (default: {REACH:g})'
     parser.add_argument('--reach', type=number(1e-3, 1.0), help=text)
     args = parser.parse_args(argv)

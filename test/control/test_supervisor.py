@@ -180,6 +180,13 @@ TestArm = Arm.TestCase
 TestArm.settings = settings(max_examples=80, stateful_step_count=50, deadline=None)
 
 
+@pytest.mark.thorough
+class TestArmForLong(Arm.TestCase):
+    """200 000 random events."""
+
+    settings = settings(max_examples=2000, stateful_step_count=100, deadline=None)
+
+
 def test_the_table_names_every_state_and_event():
     sources = {source for source, _ in TRANSITIONS}
     assert sources == set(StopState) == {*TRANSITIONS.values()}

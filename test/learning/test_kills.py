@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A learner that is killed loses nothing: the quick form of `bench.kills`."""
+"""A learner that is killed loses nothing: the quick form of a part of `bench attack`."""
 
-from bench.kills import digest, grown, run, samples
+from bench.attack_kills import digest, grown, run, samples
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae import checkpoint
 

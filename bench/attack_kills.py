@@ -1,19 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kills a learner with SIGKILL at random moments, and checks its saved state.
-
-python -m bench kills [--kills 50] [--seed 0]
+"""Kills of a learner by SIGKILL at random moments, with a check of its saved state.
 
 A child process runs the `Learner` of the node, with its training process, on random samples. It
 reports each accepted sample and each published network. After a kill, the next child must load all
-accepted samples, and a network that is not older than the last published one. The exit status is 1
-if anything was lost.
+accepted samples, and a network that is not older than the last published one.
 """
 
-import argparse
 import copy
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 import zlib
@@ -27,7 +22,6 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.trainer import TrainerProcess
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 LONGEST = 6.0  # latest time of a kill [s]; by then, a child has started, trained and saved
@@ -86,8 +80,8 @@ class Child:
 
     def __init__(self, robot: Path, directory: Path, initial: Path, life: int) -> None:
         """Start the process."""
-        words = [sys.executable, '-m', 'bench', 'kills', '--robot', str(robot)]
-        words += ['--live', str(life), '--directory', str(directory), '--initial', str(initial)]
+        words = [sys.executable, '-m', 'bench.attack_kills', str(robot), str(directory)]
+        words += [str(initial), str(life)]
         self._process = subprocess.Popen(
             words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
@@ -186,24 +180,5 @@ def grown(store: SampleStore, robot: Robot, life: int, accepted: int) -> list[Sa
     return [store, more]
 
 
-def main(argv: list[str]) -> int:
-    """Run the bench; return the exit status."""
-    parser = Parser('kills', 'Kills a learner at random moments, and checks its saved state.')
-    parser.add_robot(default='arm26')
-    parser.add_argument('--kills', type=int, default=50, help='number of kills')
-    parser.add_seed('of the times of the kills')
-    parser.add_argument('--initial', type=Path, help='initial checkpoint (default: train one)')
-    parser.add_argument('--live', type=int, help=argparse.SUPPRESS)
-    parser.add_argument('--directory', type=Path, help=argparse.SUPPRESS)
-    args = parser.parse_args(argv)
-    robot = Robot.load(args.robot)
-    if args.live is not None:
-        live(robot, args.directory, args.initial, args.live)
-    with tempfile.TemporaryDirectory() as folder:
-        initial = args.initial
-        if initial is None:
-            from musculoskeletal_ae.mae.initial_training import initial_mae
-
-            initial = Path(folder) / 'initial.safetensors'
-            checkpoint.save(initial_mae(robot).mae, initial)
-        return int(bool(run(robot, Path(folder) / 'state', initial, args.kills, args.seed)))
+if __name__ == '__main__':
+    live(Robot.load(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4]))

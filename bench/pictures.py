@@ -1,18 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records the film of the README: the running system on its page, in a headless Chromium.
+"""Makes the pictures of README and documents that need a running system or a simulator.
 
-    python -m bench film [--out doc/images]
+    python -m bench pictures [--only film,simulation] [--out doc/images]
 
-It runs `./bringup.sh --view` with `on_anomaly: isolate` and takes screenshots of the page:
+`film` runs `./bringup.sh --view` with `on_anomaly: isolate`, and takes screenshots of the page:
 
 1. The arm explores and learns; the estimate converges to the measured arm.
 2. A click on the button "Rupture" ruptures the muscle that is selected on the page.
 3. The estimator isolates the muscle, and the arm moves on.
 
-All data in the film come over ROS topics from the nodes of a real run. The bench requires Chromium
-and takes about three minutes; a busy machine takes fewer pictures. It writes `view.gif` and three
-of its pictures: `view.png` at the end of learning, `view_rupture.png` when the ruptured muscle is
-named, and `view_isolated.png` when the arm moves on.
+All data in the film come over ROS topics from the nodes of a real run. This requires Chromium and
+takes about three minutes; a busy machine takes fewer pictures. `view.gif` is the film, `view.png`
+its picture at the end of learning, `view_rupture.png` that when the ruptured muscle is named, and
+`view_isolated.png` that when the arm moves on.
+
+`simulation` draws the simulated arm at rest (`sim_at_rest.png`), and with a weight in the hand
+(`sim_loaded.png`). `render --topic sim/markers` draws a running simulator in the same way.
+
+`python doc/make.py` makes the charts, `muscles.png` and `elastic_unit.png`. `arm.png` is a picture
+by `render`, and `mujoco.png` a screenshot of `./bringup.sh --mujoco FILE.xml --view`.
 """
 
 import io
@@ -27,11 +33,19 @@ from collections.abc import Callable
 from pathlib import Path
 from threading import Thread
 
+import numpy as np
 from PIL import Image
 
 from bench.processes import end_processes
+from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.options import Parser, whole
+from musculoskeletal_ae.mae.initial_training import initial_mae
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.options import DEFAULT_ROBOT, Parser, names, positive, whole
+from musculoskeletal_ae.robot.drawing import draw_arm, save_picture
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import least_tension
+from musculoskeletal_ae.simulation.simulation import Simulation
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / 'test' / 'view'))
@@ -48,6 +62,8 @@ FRAME = 110  # time for which a picture of the film is shown [ms]
 LAST = 1500  # time for which the last picture is shown [ms]
 SETTLE = 3.0  # time from the first status until the whole page is drawn [s]
 PATIENCE = 600.0  # longest wait for the start and for each event of the film [s]
+KINDS = ('film', 'simulation')
+LOAD = -50.0  # vertical force on the hand of the simulated arm [N], as in the paper's simulation
 
 
 def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[str, int]]:
@@ -116,16 +132,8 @@ def write(frames: list[Image.Image], kept: dict[str, int], out: Path) -> None:
     print(f'{film}: {len(small)} pictures, {film.stat().st_size / 1e6:.2f} MB')
 
 
-def main(argv: list[str]) -> int:
-    """Run the system, record its page and write the film."""
-    parser = Parser('film', 'Records the film of the README from the running system.')
-    text = 'port of the page that is recorded'
-    parser.add_argument('--port', type=whole(1, 65535), default=8099, metavar='N', help=text)
-    text = 'time of learning before a muscle ruptures [s]'
-    parser.add_argument('--learning', type=float, default=LEARNING, metavar='S', help=text)
-    parser.add_argument('--frames', type=Path, metavar='DIR', help='folder that keeps every frame')
-    parser.add_out('DIR', default=ROOT / 'doc' / 'images')
-    options = parser.parse_args(argv)
+def film(options: Namespace) -> None:
+    """Run the system, record its page, and write the film and its pictures."""
     command = ['./bringup.sh', '--view', '--port', str(options.port)]
     command += ['-p', 'estimator:on_anomaly:=isolate']
     with tempfile.TemporaryDirectory() as folder, subprocess.Popen(
@@ -148,4 +156,53 @@ def main(argv: list[str]) -> int:
         options.frames.mkdir(parents=True, exist_ok=True)
         frame.save(options.frames / f'{i:04d}.png')
     write(frames, kept, options.out)
-    return 0
+
+
+def draw_simulated(robot: Robot, mae: Mae, folder: Path) -> list[Path]:
+    """Draw the simulated arm in mid-range, at rest and with a loaded hand; return both files."""
+    simulated = Simulation(robot, mae)
+    theta = 0.5 * (robot.lower + robot.upper)
+    tension, _ = least_tension(
+        mae.muscle_jacobian(theta, np.full(robot.muscle_count, robot.tension.bias)),
+        robot.kinematics.holding_torque(theta),
+        robot.tension.bias,
+        robot.tension.limit,
+    )
+    simulated.command = first_command(robot, mae, theta, tension)[None]
+    files = []
+    for name, force, load in (
+        ('at_rest', 0.0, 'nothing in the hand'),
+        ('loaded', LOAD, f'{LOAD:g} N in z at the hand'),
+    ):
+        simulated.wrench = np.array([[0.0, 0.0, force, 0.0, 0.0, 0.0]])
+        state = simulated.settle()
+        lines = draw_arm(robot, state.theta[0], state.tension[0])
+        title = (
+            f'simulated arm, {load}: '
+            f'{state.tension.min():.0f} to {state.tension.max():.0f} N '
+            '(green at bias, red at the limit)'
+        )
+        files.append(folder / f'sim_{name}.png')
+        save_picture(lines, files[-1], title)
+    return files
+
+
+def main(argv: list[str]) -> None:
+    """Make the pictures that the options name."""
+    parser = Parser('pictures', (__doc__ or '').partition('\n')[0])
+    parser.add_argument('--only', type=names, default=KINDS, help='pictures to make')
+    text = 'port of the page that is recorded'
+    parser.add_argument('--port', type=whole(1, 65535), default=8099, metavar='N', help=text)
+    text = 'time of learning before a muscle ruptures [s]'
+    parser.add_argument('--learning', type=positive, default=LEARNING, metavar='S', help=text)
+    parser.add_argument('--frames', type=Path, metavar='DIR', help='folder that keeps every frame')
+    parser.add_out('DIR', default=ROOT / 'doc' / 'images')
+    options = parser.parse_args(argv)
+    if unknown := set(options.only) - set(KINDS):
+        parser.error(f'--only: unknown pictures {", ".join(unknown)}; legal: {", ".join(KINDS)}')
+    options.out.mkdir(parents=True, exist_ok=True)
+    if 'film' in options.only:
+        film(options)
+    if 'simulation' in options.only:
+        robot = Robot.load(DEFAULT_ROBOT)
+        print(*draw_simulated(robot, initial_mae(robot).mae, options.out), sep='\n')
