@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.parameters import PRESET, settable
+from musculoskeletal_ae.parameters import PRESET, CheckedSettings, settable
 
 UNREACHABLE = ('refuse', 'nearest')  # legal values of the setting `unreachable`
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness', 'float')
@@ -14,7 +14,7 @@ MOST_STIFFNESS = 1000.0  # largest desired stiffness of a revolute joint [N·m/r
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(CheckedSettings):
     """Settings of control; `Controller.configure` applies changed settings."""
 
     method: str = settable(

@@ -3,13 +3,13 @@
 
 from dataclasses import dataclass
 
-from musculoskeletal_ae.parameters import settable
+from musculoskeletal_ae.parameters import CheckedSettings, settable
 
 STOP, ISOLATE = ON_ANOMALY = ('stop', 'isolate')
 
 
 @dataclass(frozen=True)
-class Detection:
+class Detection(CheckedSettings):
     """Settings of the detectors, of winding in slack, and of the reaction to an anomaly."""
 
     anomaly_threshold: float = settable(

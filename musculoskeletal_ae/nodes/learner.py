@@ -21,10 +21,9 @@ from musculoskeletal_ae.learning.settings import Settings
 from musculoskeletal_ae.learning.trainer import TrainerProcess
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.messages import LATCHED, SENSOR, bytes_message, serve
-from musculoskeletal_ae.nodes.node_parameters import naming_parameter
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.sources import SEVERAL, LinkSensors, publishers_of
-from musculoskeletal_ae.parameters import parameters_of
+from musculoskeletal_ae.parameters import naming_parameter, parameters_of
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.validity import read_imu
 

@@ -47,7 +47,7 @@ from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, Chec
 from musculoskeletal_ae.nodes.diagnostics import MANY_REPORTS, PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.nodes.needed_topics import NeededTopics
-from musculoskeletal_ae.nodes.node_parameters import NodeParameters, naming_parameter
+from musculoskeletal_ae.nodes.node_parameters import NodeParameters
 from musculoskeletal_ae.nodes.parameters import MOTORS, check_names
 from musculoskeletal_ae.nodes.rclpy_names import RCLError
 from musculoskeletal_ae.nodes.ros_arguments import reason
@@ -59,6 +59,7 @@ from musculoskeletal_ae.nodes.sources import (
     Sources,
     Twins,
 )
+from musculoskeletal_ae.parameters import naming_parameter
 from musculoskeletal_ae.reception import SHOWN, Reception
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import Report

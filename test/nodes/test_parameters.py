@@ -162,6 +162,23 @@ def test_a_word_that_is_not_legal_is_refused_with_those_that_are():
         Parameter('one', 'a word', legal=('one', 'two')).checked('other')
 
 
+@pytest.mark.parametrize(
+    ('parameter', 'wrong'),
+    [
+        (Parameter(1.0, 'a number', 'm', (0.0, 2.0)), [2.5, -0.1, float('nan'), '1', True, None]),
+        (Parameter(1, 'a count', '', (0, 2)), [3, 1.5, '1', True]),
+        (Parameter(True, 'a switch'), [1, 'true', None]),
+        (Parameter('', 'a text'), [1, None, ['text']]),
+        (Parameter(('',), 'names'), ['name', [1], None]),
+    ],
+)
+def test_a_value_of_the_wrong_kind_or_out_of_range_is_refused_without_ros(parameter, wrong):
+    for value in wrong:
+        with pytest.raises(MusculoskeletalError, match='; legal: '):
+            parameter.checked(value)
+    assert parameter.checked(parameter.default) is not None
+
+
 def test_empty_names_are_no_names():
     assert Parameter(('',), 'names').checked(['', 'biceps', '']) == ('biceps',)
 
