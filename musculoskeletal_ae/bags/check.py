@@ -18,7 +18,6 @@ from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError, printa
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.collector import SampleCollector
 from musculoskeletal_ae.learning.samples import SampleStore
-from musculoskeletal_ae.learning.settings import DEFAULT
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.directories import shipped_robots
@@ -103,9 +102,9 @@ def motion_text(robot: Robot, recording: Pairs) -> str:
 
 def _resting_postures(robot: Robot, recording: Pairs) -> int:
     radian = robot.kinematics.radian
-    samples = SampleStore(DEFAULT, radian=radian)
-    healthy = Reservoir(robot.muscle_count, 0, DEFAULT, radian=radian)
-    collector = SampleCollector(robot, samples, healthy, DEFAULT)
+    samples = SampleStore(radian=radian)
+    healthy = Reservoir(robot.muscle_count, 0, radian=radian)
+    collector = SampleCollector(robot, samples, healthy)
     isolated: tuple[int, ...] = ()
     with ProgressBar('counting resting postures', len(recording.time)) as bar:
         for time, theta, length, tension, row in zip(*recording, strict=True):

@@ -7,7 +7,6 @@ muscle_states, robot_description, hardware_emulator/markers; on request marker_p
 
 import time
 from collections.abc import Iterable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -51,7 +50,6 @@ class HardwareEmulator(Arm):
         self.arm.step(0.01)
         self.marker_pose_rate = self.pose_due = self.remainder = 0.0
         self.reading = self.arm.sense()
-        self.follow_parameter('command_timeout', partial(setattr, self.arm, 'command_timeout'))
         self.follow_parameter('ruptured_muscles', self.arm.set_ruptured)
         self.follow_parameter('payload', self.arm.set_payload)
         self.follow_parameter('length_offset', self.arm.set_length_offset)

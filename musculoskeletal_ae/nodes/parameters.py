@@ -20,11 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from musculoskeletal_ae.control.settings import Settings as ControlSettings
-from musculoskeletal_ae.estimation.settings import Detection
+from musculoskeletal_ae.estimation.settings import Settings as EstimationSettings
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.files import read_yaml
-from musculoskeletal_ae.learning.settings import STEPS
-from musculoskeletal_ae.learning.settings import Settings as LearningSettings
 from musculoskeletal_ae.parameters import (
     CHECKPOINT,
     DEVICES,
@@ -80,7 +78,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             False, 'calibrate length offsets at the start, for winches without absolute encoders'
         ),
         'state_directory': STATE_DIRECTORY,
-        **parameters_of(Detection),
+        **parameters_of(EstimationSettings),
         'isolate_muscles': Parameter(
             ('',),
             'muscles to isolate at the start, or when estimator/isolate is called, until '
@@ -137,13 +135,6 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             0.0, 'rate of marker_pose (0: none)', 'Hz', (0.0, 100.0), settable=True
         ),
         'imu_link': Parameter('', 'link that carries an accelerometer (empty: none)'),
-        'command_timeout': Parameter(
-            0.5,
-            'time without a command after which the muscle modules enter their safe state',
-            's',
-            (0.01, 60),
-            settable=True,
-        ),
     },
     'sim': {
         **NETWORK,
@@ -174,8 +165,6 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             settable=True,
         ),
         'state_directory': STATE_DIRECTORY,
-        **parameters_of(LearningSettings),
-        'update_steps': Parameter(STEPS, 'number of mini-batches in an update', '', (1, 100_000)),
         'device': Parameter(
             'cpu',
             'device that trains the network (the CPU if torch cannot use the device)',

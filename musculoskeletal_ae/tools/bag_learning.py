@@ -19,7 +19,7 @@ from musculoskeletal_ae.estimation.finding import Finding, observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.exceptions import BagError, CheckpointError, MusculoskeletalError
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.settings import DEFAULT
+from musculoskeletal_ae.learning.rest import REST_TIME
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.parameters import motor_settings
@@ -148,7 +148,7 @@ def _nothing_learned(learner: Learner) -> str:
         'nothing was learned (0 updates). Different resting postures in the recordings: '
         f'{len(learner.samples)}; learning begins with {learner.scheduler.least_samples}. '
         'Record some minutes in which the healthy arm moves from posture to posture and rests in '
-        f'each for at least {DEFAULT.rest_time:g} s, as with controller/explore'
+        f'each for at least {REST_TIME:g} s, as with controller/explore'
     )
 
 

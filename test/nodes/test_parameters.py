@@ -122,8 +122,8 @@ def test_an_arm_of_one_joint_may_stand_at_0_to_find_its_zeros(graph, tmp_path):
     [
         (
             HardwareEmulator,
-            {'command_timeout': 1.0, 'faults': ['melt']},
-            lambda node: node.arm.command_timeout,
+            {'marker_pose_rate': 1.0, 'faults': ['melt']},
+            lambda node: node.marker_pose_rate,
         ),
         # Setting `checkpoint` would replace the network in use, which may have learned much.
         (

@@ -183,9 +183,7 @@ def test_with_use_sim_time_a_trajectory_follows_the_clock(graph, arm26, trained_
         Controller,
         robot='arm26',
         checkpoint=trained_file,
-        target_duration=0.0,
         first_duration=1.0,
-        feedback_gain=0.0,
         max_age=10.0,
         use_sim_time=True,
     )
