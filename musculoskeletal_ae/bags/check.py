@@ -13,7 +13,7 @@ import numpy as np
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
-from musculoskeletal_ae.bags.topics import NO_MOTORS, interface_topics
+from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError, printable
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.collector import SampleCollector
@@ -21,8 +21,8 @@ from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.directories import shipped_robots
+from musculoskeletal_ae.robot.motors import NO_MOTORS, motor_topics
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.signals.wiring import Wiring, judge
 
 _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
@@ -40,12 +40,7 @@ class BagCheck:
         return '\n'.join(map(printable, lines))
 
 
-def check_bag(
-    path: Path,
-    robot: str | None = None,
-    namespace: str | None = None,
-    motors: MotorSettings = NO_MOTORS,
-) -> BagCheck:
+def check_bag(path: Path, robot: str | None = None, namespace: str | None = None) -> BagCheck:
     """Read a recording, and report its contents, completeness and fit to a robot.
 
     If the recording cannot be read, the report lists the error as a fault. The progress is printed
@@ -55,7 +50,6 @@ def check_bag(
         path: The bag.
         robot: A shipped robot or a directory, or None to report which of the shipped robots fit.
         namespace: The namespace to check; required only if the bag has several.
-        motors: How the motors of a ros2_control robot are connected.
     """
     check = BagCheck()
     try:
@@ -64,13 +58,12 @@ def check_bag(
             bag = Bag.open(path)
             check.faults += [f'unfinished: {reason}; {_RECOVER}' for reason in bag.unfinished]
             check.lines += _contents(bag, bar.add)
-        interface_topics(bag, namespace, motors)
+        interface_topics(bag, namespace, motor_topics(robot) if robot else NO_MOTORS)
     except MusculoskeletalError as error:
         check.faults.append(str(error))
         return check
     results = {
-        name: _fit(bag, name, namespace, motors)
-        for name in ([robot] if robot else shipped_robots())
+        name: _fit(bag, name, namespace) for name in ([robot] if robot else shipped_robots())
     }
     fits = [name for name, fit in results.items() if not fit.faults]
     if robot:
@@ -166,12 +159,12 @@ class _Fit(NamedTuple):
     motion: str = ''  # text on the motion that can be learned from
 
 
-def _fit(bag: Bag, name: str, namespace: str | None, motors: MotorSettings) -> _Fit:
+def _fit(bag: Bag, name: str, namespace: str | None) -> _Fit:
     """Return the reasons why a bag does not fit a robot, and remarks on messages left unused."""
     try:
         robot = Robot.load(name)
         with ProgressBar(f'comparing {bag.path} with {name}') as bar:
-            streams = read_streams(bag, robot, namespace, motors, bar.add)
+            streams = read_streams(bag, robot, namespace, bar.add)
     except BagError as error:
         return _Fit([f'does not fit {name}: {error}'], [])
     except MusculoskeletalError as error:

@@ -75,7 +75,7 @@ class Controller(Shell):
         if self.memory.found is not None:
             self.core.stop(self.memory.found.kind, BEFORE)
         self.recording: StopRecording = StopRecording(
-            self.resolve_topic_name, topics=topics_with(self.motors.settings)
+            self.resolve_topic_name, topics=topics_with(self.motors.topics)
         )
         #: cause of the latched stop after its recording has begun; None otherwise
         self.recorded: ConditionKind | None = None

@@ -34,7 +34,6 @@ from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes import diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, joint_message
-from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, message_class, run_tool, start_ros
 from musculoskeletal_ae.nodes.situation import LARGEST_AGE, Situation, figures, nodes_in_graph
 from musculoskeletal_ae.options import Parser, whole
@@ -90,7 +89,7 @@ class View(Node):
                 'the page needs viser; install it with: pip install -r requirements.txt'
             ) from error
         self.robot = robot
-        self.motors = MotorInterface(motor_settings(options.params_file), robot.muscles)
+        self.motors = MotorInterface(robot.description.motors)
         self.requests: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         address, request = (options.host, options.port), lambda *what: self.requests.put(what)
         self.page = page.Page(robot, *address, options.read_only, request)
@@ -389,7 +388,6 @@ def _parse(arguments: list[str]) -> Namespace:
     what = 'Shows a running arm on a web page, and lets visitors move it.'
     parser = Parser('view', what, ROS_HELP)
     parser.add_robot()
-    parser.add_motors()
     add = parser.add_argument
     host = 'address to listen on; with 0.0.0.0 the whole network can move the arm'
     add('--port', type=whole(1, 65535), default=8080, metavar='N', help='port of the page')
