@@ -401,7 +401,7 @@ if [ $hardware = true ]; then
   wait_for check_driver || exit 1
 elif [ -z "$bag" ]; then
   camera=()
-  [ "$joint_source" != marker ] || camera=(-p marker_pose_rate:=10.0)
+  [ "$joint_source" != marker ] || camera=(-p 'sensors:=["joints", "marker:10"]')
   deviates=false
   [[ $reality =~ ^(kin|foreign)$ ]] || ! is_given --seed || deviates=true
   start_node hardware_emulator -p "reality:=$(quoted "$reality")" -p "deviates:=$deviates" \

@@ -105,28 +105,18 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             'publish /clock, which runs slower if the computer is too slow for real time; all '
             'nodes then need use_sim_time',
         ),
-        'ruptured_muscles': Parameter(
-            ('',), 'names of ruptured muscles ([""]: none)', settable=True
-        ),
         'payload': Parameter(0.0, 'mass in the hand', 'kg', (0.0, 20.0), settable=True),
-        'length_offset': Parameter(
-            (0.0,),
-            'offset of the length sensors; one value for all muscles, or one for each',
-            'm',
-            (-1.0, 1.0),
-            settable=True,
-        ),
         'faults': Parameter(
             ('',),
-            'faults, each KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE], such as bias:tension:40 '
+            'faults, each KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE], such as rupture:MUSCLE '
             '([""]: none; doc/reference/topics_and_services.md lists the kinds)',
             settable=True,
         ),
-        'joint_sensors': Parameter(True, 'publish joint_states'),
-        'marker_pose_rate': Parameter(
-            0.0, 'rate of marker_pose (0: none)', 'Hz', (0.0, 100.0), settable=True
+        'sensors': Parameter(
+            ('joints',),
+            'sensors besides those of the muscle modules: joints (joint_states), marker[:RATE] '
+            '(marker_pose, at 10 Hz unless RATE is stated) and imu:LINK (imu) ([""]: none)',
         ),
-        'imu_link': Parameter('', 'link that carries an accelerometer (empty: none)'),
     },
     'sim': {
         **NETWORK,
@@ -192,6 +182,8 @@ MOVED = dict.fromkeys(
     ),
     'motors.yaml in the robot directory (doc/howto/ros2_control.md)',
 )  # fmt: skip
+MOVED |= dict.fromkeys(('ruptured_muscles', 'length_offset'), 'the parameter `faults`')
+MOVED |= dict.fromkeys(('joint_sensors', 'marker_pose_rate', 'imu_link'), 'the parameter `sensors`')
 
 #: parameters that rclpy declares for every node
 OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides')

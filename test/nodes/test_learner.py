@@ -388,7 +388,7 @@ def test_a_killed_learner_resumes_from_its_saved_state_and_ctrl_c_ends_it_with_i
 @pytest.mark.usefixtures('here')
 def test_learning_works_with_a_marker_instead_of_joint_sensors(graph, arm26, trained_file):
     common = {'robot': 'arm26', 'checkpoint': trained_file}
-    graph.host(HardwareEmulator, robot='arm26', joint_sensors=False, marker_pose_rate=30.0)
+    graph.host(HardwareEmulator, robot='arm26', sensors=['marker:30'])
     graph.host(Estimator, **common)
     graph.host(Controller, **common, explore=True, max_age=10.0)
     learner = graph.host(Learner, **common, state_directory='', joint_source='marker')

@@ -121,9 +121,9 @@ def test_an_arm_of_one_joint_may_stand_at_0_to_find_its_zeros(graph, tmp_path):
     ('kind', 'parameters', 'kept'),
     [
         (
-            HardwareEmulator,
-            {'marker_pose_rate': 1.0, 'faults': ['melt']},
-            lambda node: node.marker_pose_rate,
+            Estimator,
+            {'zero_posture': [0.0, -1.0], 'isolate_muscles': ['tail']},
+            lambda node: node.posture,
         ),
         # Setting `checkpoint` would replace the network in use, which may have learned much.
         (
