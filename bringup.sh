@@ -52,9 +52,7 @@ doc/howto/your_robot.md is the guide for your own robot.
                              the hand, or none (the first network then takes 20 samples, about two
                              minutes); the status line still compares with the emulator's angles
                              (default: sensor)
-  --params-file FILE         parameters of the nodes, in the format of config/nodes.yaml, including
-                             the connection of the motors of a ros2_control robot
-                             (doc/howto/ros2_control.md)
+  --params-file FILE         parameters of the nodes, in the format of config/nodes.yaml
   -p NODE:NAME:=VALUE        one parameter of one node, such as -p estimator:on_anomaly:=isolate;
                              like --params-file, it may be repeated, and overrides other options
   --namespace NS             run everything under /NS
@@ -217,7 +215,7 @@ use_udp
 [ ${#parameters[@]} = 0 ] || "$python" -m musculoskeletal_ae.nodes.parameters "${parameters[@]}" || exit
 if [ -n "$bag" ]; then
   say "reading $bag"
-  "$python" -m musculoskeletal_ae.tools.recorded_robot "$bag" "$robot" "${parameter_files[@]}" || exit 2
+  "$python" -m musculoskeletal_ae.tools.recorded_robot "$bag" "$robot" || exit 2
 fi
 
 # A namespace contains one arm. The lock is held until the last process has ended, which takes a
@@ -395,19 +393,15 @@ common=(--ros-args "${under[@]}" --params-file "$repository/config/nodes.yaml"
   -p "checkpoint:=$(quoted "$checkpoint")")
 if [ -n "$bag" ] || [ $own_clock = true ]; then common+=(-p use_sim_time:=true); fi
 
-# Tools need these files for the connection of the motors of a ros2_control robot.
-files=()
-for file in "${parameter_files[@]}"; do files+=(--params-file "$file"); done
-
 if [ $hardware = true ]; then
   # Start no node that could move the arm before the driver has passed the check.
-  check=(--robot "$robot" --wait --seconds 3 --rate "$(chosen_value rate)" "${files[@]}")
+  check=(--robot "$robot" --wait --seconds 3 --rate "$(chosen_value rate)")
   [[ ! $(chosen_value zero_at_start) =~ ^([Tt]rue|yes|on)$ ]] || check+=(--unzeroed)
   launch check_driver "${check[@]}" --ros-args "${under[@]}"
   wait_for check_driver || exit 1
 elif [ -z "$bag" ]; then
   camera=()
-  [ "$joint_source" != marker ] || camera=(-p marker_pose_rate:=10.0)
+  [ "$joint_source" != marker ] || camera=(-p 'sensors:=["joints", "marker:10"]')
   deviates=false
   [[ $reality =~ ^(kin|foreign)$ ]] || ! is_given --seed || deviates=true
   start_node hardware_emulator -p "reality:=$(quoted "$reality")" -p "deviates:=$deviates" \
@@ -424,13 +418,13 @@ if [ $learner = true ]; then
   kept_in learner
   start_node learner "${kept[@]}" -p "joint_source:=$joint_source"
 fi
-[ -z "$record" ] || start record -o "$record" "${files[@]}" --ros-args "${under[@]}"
+[ -z "$record" ] || start record -o "$record" --robot "$robot" --ros-args "${under[@]}"
 if [ -n "$bag" ]; then
   # A recording contains time and commands, so no controller is started. These nodes receive every
   # message, however slow this computer is.
   receivers=estimator
   [ $learner = false ] || receivers+=,learner
-  start replay "$bag" --clock --wait-for "$receivers" "${files[@]}" --ros-args "${under[@]}"
+  start replay "$bag" --robot "$robot" --clock --wait-for "$receivers" --ros-args "${under[@]}"
 elif [ $controller = true ]; then
   [ -n "$explore" ] || explore=$([ $hardware = true ] && echo false || echo true)
   kept_in controller
@@ -442,8 +436,7 @@ elif [ $controller = true ]; then
   start_node $name "${moving[@]}"
 fi
 if [ $view = true ]; then
-  start view --robot "$robot" --port "$port" "${read_only[@]}" "${files[@]}" \
-    --ros-args "${under[@]}"
+  start view --robot "$robot" --port "$port" "${read_only[@]}" --ros-args "${under[@]}"
   # The page prints its address when it is ready.
   tail -n +1 -s 0.2 -f --pid="$!" "$logs/view.log" </dev/null 2>/dev/null |
     sed -un 's/^http:/-- the page is on http:/p' &

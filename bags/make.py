@@ -133,18 +133,16 @@ def rupture(arm: Arm) -> None:
     arm.spend(60.0)
     arm.set('payload', 3.6)
     arm.spend(60.0)
-    arm.set('ruptured_muscles', ['deltoid_anterior'])
+    arm.set('faults', ['rupture:deltoid_anterior'])
     arm.spend(20.0)
 
 
 def faults(arm: Arm) -> None:
     """Two minutes of motion with faults of the sensors: a shifted length, broken messages."""
     arm.spend(40.0)
-    offset = [0.0] * 10
-    offset[4] = 0.010
-    arm.set('length_offset', offset)
+    arm.set('faults', [f'offset:{Robot.load(ROBOT).muscles[4]}:0.01'])
     arm.spend(40.0)
-    arm.set('length_offset', [0.0])
+    arm.set('faults', [''])
     broken = arm.node.create_publisher(Float64MultiArray, 'muscle_states', 10)
     for data in ([float('nan')] * 30, [0.0] * 29, [], [float('inf')] + [0.0] * 29):
         arm.spend(10.0)
@@ -187,11 +185,11 @@ def isolation(arm: Arm) -> None:
     joints, muscle = Robot.load(ROBOT).joints, 'deltoid_middle'
     arm.set('on_anomaly', 'isolate', 'estimator')
     arm.spend(25.0)
-    arm.set('ruptured_muscles', [muscle])
+    arm.set('faults', [f'rupture:{muscle}'])
     arm.spend(15.0)
     targets.publish(JointState(name=joints, position=POSTURE))
     arm.spend(10.0)
-    arm.set('ruptured_muscles', [''])
+    arm.set('faults', [''])
     arm.spend(3.0)
     arm.call('estimator/restore')
     options = f'state_directory:={arm.scratch}', f"relearn_muscles:=['{muscle}']"

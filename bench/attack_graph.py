@@ -211,7 +211,7 @@ class Attack:
             'controller': ['max_age:=1.0', 'explore:=true', saved],
             'estimator': [saved],
             'learner': [saved],
-            'hardware_emulator': ['marker_pose_rate:=10.0'],
+            'hardware_emulator': ['sensors:=["joints", "marker:10"]'],
         }
         parameters = ['robot:=arm26', f'rate:={float(self.rate)}', *own.get(name, [])]
         if 'checkpoint' in PARAMETERS[name]:
@@ -546,6 +546,7 @@ KINDS_OF = {'muscle_states': 'Float64MultiArray', 'anomaly': 'Float64'}
 
 
 MECHANICAL = (
+    'rupture',
     'stuck_motor',
     'slack',
     'winch_speed',
@@ -553,7 +554,6 @@ MECHANICAL = (
 )  # faults that leave sensor readings correct
 #: parameters of an arm without faults
 HEALTHY: tuple[tuple[str, str, Any], ...] = (
-    ('hardware_emulator', 'ruptured_muscles', ['']),
     ('controller', 'method', 'proposed'),
     ('estimator', 'on_anomaly', 'stop'),
 )

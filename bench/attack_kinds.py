@@ -34,7 +34,6 @@ REPORT_TIME = 2.0  # longest time from the start of a problem to its report in t
 #: steps that end the faults of the emulated arm
 REPAIRS = {
     Step.REPAIR_MUSCLE,
-    Step.REPAIR_EMULATED_RUPTURE,
     Step.REPAIR_EMULATED_FAULT,
     Step.FREE_ARM,
     Step.CHECK_SENSOR,
@@ -159,7 +158,6 @@ class Scene:
             attack.end_strangers()
         elif step in REPAIRS:
             attack.set_faults([])
-            self.set('hardware_emulator', 'ruptured_muscles', [''])
             attack.spin(1.0)
         elif step is Step.WAIT_UNTIL_COOL:
             attack.spin(3.0)
@@ -274,7 +272,7 @@ def deny_an_anomaly(scene: Scene) -> None:
     """Publish that there is no anomaly while a muscle is ruptured."""
     attack = scene.attack
     muscle = attack.robot.muscles[scene.rng.randrange(attack.robot.muscle_count)]
-    scene.set('hardware_emulator', 'ruptured_muscles', [muscle])
+    scene.set('hardware_emulator', 'faults', [f'rupture:{muscle}'])
     with scene.wrong():
         attack.wait(
             lambda: attack.situation.detected, 'a rupture is detected', f'rupture of {muscle}'
@@ -288,7 +286,7 @@ def deny_an_anomaly(scene: Scene) -> None:
 def deny_and_go(scene: Scene) -> None:
     """Publish that there is no anomaly, and leave the graph before the reset."""
     attack = scene.attack
-    scene.set('hardware_emulator', 'ruptured_muscles', [attack.robot.muscles[0]])
+    scene.set('hardware_emulator', 'faults', [f'rupture:{attack.robot.muscles[0]}'])
     with scene.wrong():
         attack.wait(
             lambda: attack.situation.detected,
@@ -431,7 +429,7 @@ def stop_a_verification(scene: Scene) -> None:
     """Stop the arm as an operator while a suspect muscle is verified."""
     attack = scene.attack
     scene.set('estimator', 'on_anomaly', 'isolate')
-    scene.set('hardware_emulator', 'ruptured_muscles', [attack.robot.muscles[1]])
+    scene.set('hardware_emulator', 'faults', [f'rupture:{attack.robot.muscles[1]}'])
     with scene.wrong():
         attack.wait(
             lambda: attack.situation.detected,
@@ -440,7 +438,7 @@ def stop_a_verification(scene: Scene) -> None:
         )
         attack.call(Trigger, 'controller/stop')
         attack.spin(2.0 * LASTING)
-    scene.set('hardware_emulator', 'ruptured_muscles', [''])
+    scene.set('hardware_emulator', 'faults', [''])
     scene.set('estimator', 'on_anomaly', 'stop')
     attack.spin(1.0)
     attack.call(Trigger, 'estimator/restore')

@@ -45,7 +45,7 @@ from musculoskeletal_ae.experiments.recording import (
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.samples import CAPACITY, Observations
-from musculoskeletal_ae.learning.settings import STEPS
+from musculoskeletal_ae.learning.scheduler import STEPS
 from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import one_thread, random_states

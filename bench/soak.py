@@ -35,7 +35,7 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.settings import STEPS
+from musculoskeletal_ae.learning.scheduler import STEPS
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser

@@ -225,14 +225,6 @@ class ConditionKind(Enum):
         'the modules are in their safe state, because no commands arrive',
         (Step.START_CONTROLLER,),
     )
-    EMULATED_RUPTURE = Declaration(
-        'emulated_rupture',
-        'hardware_emulator',
-        'ok',
-        'the parameter `ruptured_muscles` of the emulator names muscles',
-        'the emulator ruptures muscles',
-        (Step.REPAIR_EMULATED_RUPTURE,),
-    )
     EMULATED_FAULT = Declaration(
         'emulated_fault',
         'hardware_emulator',

@@ -40,6 +40,10 @@ class RobotDescriptionError(MusculoskeletalError):
     """
 
 
+class ParameterError(MusculoskeletalError):
+    """A parameter has a value that is not legal; the text begins with the name of the parameter."""
+
+
 class CheckpointError(MusculoskeletalError):
     """A checkpoint is damaged or does not fit the robot."""
 

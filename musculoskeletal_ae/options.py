@@ -113,18 +113,6 @@ class Parser(argparse.ArgumentParser):
             flag, default=default, help=text, **(kind if flag.startswith('-') else {})
         )
 
-    def add_motors(self) -> None:
-        """Add `--params-file`: parameter files that state how the motors are connected."""
-        self.add_argument(
-            '--params-file',
-            type=Path,
-            action='append',
-            default=[],
-            metavar='FILE',
-            help='parameter file of the nodes, which states how the motors of a ros2_control robot '
-            'are connected (doc/howto/ros2_control.md); may be given several times',
-        )
-
     def add_preset(self, text: str = 'network, learning and solver') -> None:
         """Add `--preset`; the text says what the preset determines."""
         self.add_argument('--preset', choices=PRESET_NAMES, default=DEFAULT, help=text)

@@ -4,22 +4,26 @@
 Settings that a user may choose are a frozen dataclass whose fields are parameters:
 
     @dataclass(frozen=True)
-    class Settings:
-        hold_time: float = Parameter(
-            0.5, 'time for which a stop holds the last command', 's', (0.0, 60.0)
-        ).field()
+    class Settings(CheckedSettings):
+        hold_time: float = settable(
+            0.5, 'time for which a stop holds the last command', 's', 0.0, 60.0
+        )
 
-`nodes/parameters.py` assembles the parameters of each node from such classes.
+`nodes/parameters.py` assembles the parameters of each node from such classes. `Parameter.checked`
+is the only function that validates a value. The constructor of settings calls it, and so do the
+nodes.
 """
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exceptions import MusculoskeletalError, ParameterError
 from musculoskeletal_ae.options import DEFAULT_ROBOT
 from musculoskeletal_ae.presets.names import DEFAULT, PRESET_NAMES
 
@@ -69,26 +73,70 @@ class Parameter:
     def checked(self, value: Any) -> Any:
         """Return a value if it is legal; a list is returned as a tuple, without empty names.
 
-        The type and the range of a single number are not checked here, because ROS checks them.
-
         Raises:
             MusculoskeletalError: If the value is not legal.
         """
         if self.legal and value not in self.legal:
             raise MusculoskeletalError(f'{value!r}; legal: {", ".join(self.legal)}')
-        if self.is_number_list:
-            low, high = self.within or (-sys.float_info.max, sys.float_info.max)
-            legal = f'a list of finite numbers, {self.legal_values}'.removesuffix(', ')
-            # ROS represents an empty list as the byte array b''.
-            numbers = [] if value == b'' else value
-            if hasattr(numbers, 'tolist'):  # ROS represents lists of numbers as arrays
-                numbers = numbers.tolist()
-            try:
-                kind = tuple[Annotated[float, Meta(ge=low, le=high)], ...]
-                return msgspec.convert(numbers, kind)
-            except msgspec.ValidationError as error:
-                raise MusculoskeletalError(f'{value!r}; legal: {legal}') from error
-        return tuple(filter(None, value)) if isinstance(self.default, tuple) else value
+        # ROS represents lists of numbers as arrays, and an empty list as the byte array b''.
+        given = value.tolist() if hasattr(value, 'tolist') else value
+        given = [] if isinstance(given, bytes) and not given else given
+        try:
+            checked = msgspec.convert(given, self._type)
+        except msgspec.ValidationError as error:
+            legal = f'{self._kind}, {self.legal_values}'.removesuffix(', ')
+            raise MusculoskeletalError(f'{value!r}; legal: {legal}') from error
+        return tuple(filter(None, checked)) if self._is_name_list else checked
+
+    @property
+    def _is_name_list(self) -> bool:
+        return isinstance(self.default, tuple) and not self.is_number_list
+
+    @property
+    def _type(self) -> Any:
+        """The type of legal values, as msgspec checks it."""
+        if self._is_name_list:
+            return tuple[str, ...]
+        if isinstance(self.default, str | bool):
+            return type(self.default)
+        low, high = self.within or (-sys.float_info.max, sys.float_info.max)
+        if isinstance(self.default, int):
+            return Annotated[int, Meta(ge=int(low), le=int(high))]
+        number = Annotated[float, Meta(ge=low, le=high)]
+        return tuple[number, ...] if self.is_number_list else number
+
+    @property
+    def _kind(self) -> str:
+        """The kind of value, as text for users."""
+        if isinstance(self.default, tuple):
+            return 'a list of finite numbers' if self.is_number_list else 'a list of names'
+        kinds = {bool: 'true or false', int: 'a whole number', float: 'a finite number'}
+        return kinds.get(type(self.default), 'a text')
+
+
+@contextmanager
+def naming_parameter(name: str) -> Iterator[None]:
+    """Prefix the messages of errors in this context with the name of the parameter."""
+    try:
+        yield
+    except ParameterError:  # its message already names the parameter
+        raise
+    except (MusculoskeletalError, OSError) as error:
+        raise ParameterError(f'parameter {name}: {error}') from error
+
+
+class CheckedSettings:
+    """Base class of settings: the constructor checks each field that is a parameter."""
+
+    def __post_init__(self) -> None:
+        """Check the fields, and turn lists into tuples.
+
+        Raises:
+            ParameterError: If a value is not legal.
+        """
+        for name, parameter in parameters_of(type(self)).items():
+            with naming_parameter(name):
+                object.__setattr__(self, name, parameter.checked(getattr(self, name)))
 
 
 def settable(
@@ -108,8 +156,11 @@ def settable(
 
 
 def parameters_of(settings: type) -> dict[str, Parameter]:
-    """Return the parameters of a settings dataclass by name."""
-    return {f.name: f.metadata['parameter'] for f in fields(settings)}
+    """Return the parameters of a settings dataclass by name.
+
+    Fields without a parameter are left out: experiments vary them, but users do not.
+    """
+    return {f.name: f.metadata['parameter'] for f in fields(settings) if 'parameter' in f.metadata}
 
 
 ROBOT = Parameter(DEFAULT_ROBOT, 'a shipped robot, or a directory with robot.urdf and muscles.yaml')

@@ -26,13 +26,9 @@ class Step(Enum):
         'correct the order of the muscles, or the sign of the length, in the driver',
     )
     REPAIR_MUSCLE = 'repair_muscle', 'repair tendon, winch or sensor of the named muscle'
-    REPAIR_EMULATED_RUPTURE = (
-        'repair_emulated_rupture',
-        "set ruptured_muscles of hardware_emulator to [''], or press Repair on the page",
-    )
     REPAIR_EMULATED_FAULT = (
         'repair_emulated_fault',
-        "set faults of hardware_emulator to ['']",
+        "set faults of hardware_emulator to [''], or press Repair on the page for a tendon",
     )
     FREE_ARM = 'free_arm', 'remove what pulls at the arm'
     CHECK_SENSOR = (

@@ -62,7 +62,6 @@ class ControlledArm:
             'controller',
             checkpoint=self.checkpoint,
             first_duration=1.0,
-            second_duration=0.5,
             rate_limit=RATE_LIMIT,
             max_age=PATIENT,
             **parameters,

@@ -10,6 +10,7 @@ from typing import Any
 import yaml
 
 from musculoskeletal_ae.robot.directories import find_robot
+from musculoskeletal_ae.robot.motors import FILE
 from musculoskeletal_ae.robot.robot import Robot
 
 # The chain is listed from the hand to the base, and contains a fixed joint and a rotated frame.
@@ -181,3 +182,16 @@ def chain(links: int) -> str:
         for i in range(links)
     )
     return f'<robot name="r"><link name="l0"/>{joints}</robot>'
+
+
+def arm_with_motors(folder: Path, **content: Any) -> Path:
+    """Write a copy of arm26 whose motors are joints of ros2_control; return its directory.
+
+    Args:
+        folder: Directory in which the copy is made.
+        content: Content of motors.yaml.
+    """
+    directory = folder / 'arm26'
+    shutil.copytree(find_robot('arm26'), directory)
+    (directory / FILE).write_text(yaml.safe_dump(content), encoding='utf-8')
+    return directory

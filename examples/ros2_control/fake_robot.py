@@ -5,7 +5,7 @@
 
 The node replaces a controller_manager with the file controllers.yaml of this directory. The
 hardware is an emulated arm whose motors are joints named MUSCLE_motor. Half of the spools wind in
-the opposite direction, and every encoder reads a different angle at the zero posture. nodes.yaml
+the opposite direction, and every encoder reads a different angle at the zero posture. motors.yaml
 corrects for both differences. doc/howto/ros2_control.md describes the connection.
 """
 

@@ -14,17 +14,16 @@ import numpy as np
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
-from musculoskeletal_ae.bags.topics import NO_MOTORS, interface_topics
+from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError, printable
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.collector import SampleCollector
 from musculoskeletal_ae.learning.samples import SampleStore
-from musculoskeletal_ae.learning.settings import DEFAULT
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.directories import shipped_robots
+from musculoskeletal_ae.robot.motors import NO_MOTORS, motor_topics
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.signals.readings import muscle_reading
 from musculoskeletal_ae.signals.wiring import Wiring, judge
@@ -44,12 +43,7 @@ class BagCheck:
         return '\n'.join(map(printable, lines))
 
 
-def check_bag(
-    path: Path,
-    robot: str | None = None,
-    namespace: str | None = None,
-    motors: MotorSettings = NO_MOTORS,
-) -> BagCheck:
+def check_bag(path: Path, robot: str | None = None, namespace: str | None = None) -> BagCheck:
     """Read a recording, and report its contents, completeness and fit to a robot.
 
     If the recording cannot be read, the report lists the error as a fault. The progress is printed
@@ -59,7 +53,6 @@ def check_bag(
         path: The bag.
         robot: A shipped robot or a directory, or None to report which of the shipped robots fit.
         namespace: The namespace to check; required only if the bag has several.
-        motors: How the motors of a ros2_control robot are connected.
     """
     check = BagCheck()
     try:
@@ -68,13 +61,12 @@ def check_bag(
             bag = Bag.open(path)
             check.faults += [f'unfinished: {reason}; {_RECOVER}' for reason in bag.unfinished]
             check.lines += _contents(bag, bar.add)
-        interface_topics(bag, namespace, motors)
+        interface_topics(bag, namespace, motor_topics(robot) if robot else NO_MOTORS)
     except MusculoskeletalError as error:
         check.faults.append(str(error))
         return check
     results = {
-        name: _fit(bag, name, namespace, motors)
-        for name in ([robot] if robot else shipped_robots())
+        name: _fit(bag, name, namespace) for name in ([robot] if robot else shipped_robots())
     }
     fits = [name for name, fit in results.items() if not fit.faults]
     if robot:
@@ -106,9 +98,9 @@ def motion_text(robot: Robot, recording: Pairs) -> str:
 
 def _resting_postures(robot: Robot, recording: Pairs) -> int:
     radian = robot.kinematics.radian
-    samples = SampleStore(DEFAULT, radian=radian)
-    healthy = Reservoir(robot.muscle_count, 0, DEFAULT, radian=radian)
-    collector = SampleCollector(robot, samples, healthy, DEFAULT)
+    samples = SampleStore(radian=radian)
+    healthy = Reservoir(robot.muscle_count, 0, radian=radian)
+    collector = SampleCollector(robot, samples, healthy)
     isolated: tuple[int, ...] = ()
     with ProgressBar('counting resting postures', len(recording.time)) as bar:
         for time, theta, length, tension, row in zip(*recording, strict=True):
@@ -172,12 +164,12 @@ class _Fit(NamedTuple):
     motion: str = ''  # text on the motion that can be learned from
 
 
-def _fit(bag: Bag, name: str, namespace: str | None, motors: MotorSettings) -> _Fit:
+def _fit(bag: Bag, name: str, namespace: str | None) -> _Fit:
     """Return the reasons why a bag does not fit a robot, and remarks on messages left unused."""
     try:
         robot = Robot.load(name)
         with ProgressBar(f'comparing {bag.path} with {name}') as bar:
-            streams = read_streams(bag, robot, namespace, motors, bar.add)
+            streams = read_streams(bag, robot, namespace, bar.add)
     except BagError as error:
         return _Fit([f'does not fit {name}: {error}'], [])
     except MusculoskeletalError as error:

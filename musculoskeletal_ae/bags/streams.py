@@ -16,14 +16,13 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.bags.bunches import Bunch, bunches
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LATEST
-from musculoskeletal_ae.bags.topics import NO_MOTORS, interface_topics
+from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
 from musculoskeletal_ae.signals.message_delay import MessageDelay
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
-from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream
 from musculoskeletal_ae.signals.pairing import Pairing
 from musculoskeletal_ae.validity import (
@@ -132,17 +131,16 @@ class _ArmStreams:
             it was received.
     """
 
-    def __init__(self, robot: Robot, motors: MotorSettings, ignore: Callable[[str], None]) -> None:
+    def __init__(self, robot: Robot, ignore: Callable[[str], None]) -> None:
         """Prepare empty streams.
 
         Args:
             robot: The robot, whose joints and muscles the messages must have.
-            motors: How the motors of a ros2_control robot are connected.
             ignore: Function that is called with a text for each position in joint_states that is
                 not finite and therefore not used.
         """
         self._robot, self._ignore = robot, ignore
-        self._interface = MotorInterface(motors, robot.muscles)
+        self._interface = MotorInterface(robot.description.motors)
         self._muscle_stream = MuscleStream(robot)
         self.had_offsets: list[bool] = []
         muscles = robot.muscle_count
@@ -196,7 +194,6 @@ def read_streams(
     bag: Bag,
     robot: Robot,
     namespace: str | None = None,
-    motors: MotorSettings = NO_MOTORS,
     progress: Callable[[float], None] = lambda _: None,
     stop: int = LATEST,
 ) -> Streams:
@@ -214,7 +211,6 @@ def read_streams(
         bag: The recording.
         robot: The robot, whose joints and muscles the messages must have.
         namespace: The namespace of the arm; required only if the bag has several.
-        motors: How the motors of a ros2_control robot are connected.
         progress: Called after each message with its share of all messages, which add up to 1.
         stop: Latest log time [ns] of the messages to read.
 
@@ -222,11 +218,11 @@ def read_streams(
         BagError: If no message of a topic fits the robot, the bag is damaged, or `interface_topics`
             raises an error.
     """
-    recorded = interface_topics(bag, namespace, motors)
+    recorded = interface_topics(bag, namespace, robot.description.motor_topics)
     labels = _labels(recorded)
     warnings = list[str]()
     reception = Reception(warnings.append)
-    arm = _ArmStreams(robot, motors, lambda part: reception.ignore(labels['joint_states'], part))
+    arm = _ArmStreams(robot, lambda part: reception.ignore(labels['joint_states'], part))
     used = {labels[name]: stream for name, stream in arm.by_topic.items() if name in recorded}
     takers = defaultdict[str, dict[str, Callable[[Any], None]]](dict)
     for name, stream in arm.by_topic.items():

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.files import read_table
-from musculoskeletal_ae.signals.motor_settings import ARRAY, JOINT_STATE, MotorSettings
+from musculoskeletal_ae.robot.motors import ARRAY, FILE, JOINT_STATE, NO_MOTORS, MotorTopics
 
 
 class Topic(NamedTuple):
@@ -25,23 +25,21 @@ DEFAULT, ALL = 'default', 'all'  # selections of topics
 
 TOPICS = read_table(__file__, 'topics.yaml', dict[str, Topic])
 SENT = [name for name, topic in TOPICS.items() if topic.sent]
-#: settings of a robot that publishes muscle_states, and therefore has no topics of motors
-NO_MOTORS = MotorSettings()
 
 
-def topics_with(motors: MotorSettings) -> dict[str, Topic]:
+def topics_with(motors: MotorTopics) -> dict[str, Topic]:
     """Return all topics of the interface, and the motor topics of a ros2_control robot, by name."""
     topics = dict(TOPICS)
-    if motors.motor_state_topic:
-        topics.setdefault(motors.motor_state_topic, Topic(JOINT_STATE, sent=True))
-    if motors.motor_command_topic:
+    if motors.states:
+        topics.setdefault(motors.states, Topic(JOINT_STATE, sent=True))
+    if motors.commands:
         # Not `sent`, so that a replay does not move the motors of a connected robot by default.
-        topics.setdefault(motors.motor_command_topic, Topic(ARRAY))
+        topics.setdefault(motors.commands, Topic(ARRAY))
     return topics
 
 
 def interface_topics(
-    bag: Bag, namespace: str | None = None, motors: MotorSettings = NO_MOTORS
+    bag: Bag, namespace: str | None = None, motors: MotorTopics = NO_MOTORS
 ) -> dict[str, str]:
     """Return the recorded name of each topic of the interface, by its relative name.
 
@@ -51,7 +49,7 @@ def interface_topics(
     Args:
         bag: The recording.
         namespace: The namespace of the arm; required only if the bag has several.
-        motors: How the motors of a ros2_control robot are connected.
+        motors: Topics of the motors of a ros2_control robot.
 
     Raises:
         BagError: If the namespace is ambiguous or not in the bag, if the topic of the motors is
@@ -62,9 +60,9 @@ def interface_topics(
     ours = {relative: name for name, relative in names.items() if relative in topics}
     for relative, name in ours.items():
         _compare_type(bag, name, topics[relative].type)
-    if state_topic := motors.motor_state_topic:
+    if state_topic := motors.states:
         if state_topic not in ours:
-            problem = f'topic {state_topic}, which motor_state_topic names, is not in the bag'
+            problem = f'topic {state_topic}, which {FILE} names, is not in the bag'
             raise BagError(bag.path, problem, _topics_of(bag))
         recorded = ours['muscle_states'] = ours[state_topic]
         if interface_name(recorded) == 'joint_states':
@@ -77,7 +75,7 @@ def select(
     wanted: Sequence[str],
     namespace: str | None,
     keep_names: bool,
-    motors: MotorSettings = NO_MOTORS,
+    motors: MotorTopics = NO_MOTORS,
 ) -> dict[str, str]:
     """Select the topics to replay.
 
@@ -89,7 +87,7 @@ def select(
         namespace: The namespace of the arm; required only if the bag has several and `keep_names`
             is False.
         keep_names: Whether to publish on the recorded names.
-        motors: How the motors of a ros2_control robot are connected.
+        motors: Topics of the motors of a ros2_control robot.
 
     Returns:
         For each selected topic, by its recorded name, the name to publish on.
@@ -106,7 +104,7 @@ def select(
         names = _relative_names(bag, namespace, motors)
     topics_of_bag = _topics_of(bag)
     if list(wanted) in ([DEFAULT], [ALL]):
-        sent = [*SENT, motors.motor_state_topic]
+        sent = [*SENT, motors.states]
         relevant = sent if wanted[0] == DEFAULT else [*topics]
         chosen = [name for name, relative in names.items() if relative in relevant]
         if not chosen:
@@ -164,13 +162,13 @@ def interface_name(name: str) -> str:
     return max(endings, key=len, default=name)
 
 
-def _motor_topics(bag: Bag, motors: MotorSettings) -> dict[str, str]:
-    """Return the name in the motor settings of each recorded motor topic, by recorded name.
+def _motor_topics(bag: Bag, motors: MotorTopics) -> dict[str, str]:
+    """Return the name in motors.yaml of each recorded motor topic, by recorded name.
 
-    The motor settings may use a relative name that the interface uses too, such as `joint_states`.
+    The file may use a relative name that the interface uses too, such as `joint_states`.
     Such a topic counts as one of the interface and is left out.
     """
-    stated = [motors.motor_state_topic, motors.motor_command_topic]
+    stated = [motors.states, motors.commands]
     return {
         name: topic
         for name in bag.topics
@@ -184,18 +182,18 @@ def _topics_of(bag: Bag) -> str:
 
 
 def _relative_names(
-    bag: Bag, namespace: str | None, motors: MotorSettings = NO_MOTORS
+    bag: Bag, namespace: str | None, motors: MotorTopics = NO_MOTORS
 ) -> dict[str, str]:
     """Return the name of each recorded topic relative to a namespace, by recorded name.
 
-    Names outside the namespace stay absolute, and so do motor topics that the motor settings state
-    with their absolute names. A topic of the interface that the namespace lacks may be taken from
+    Names outside the namespace stay absolute, and so do motor topics that motors.yaml states with
+    their absolute names. A topic of the interface that the namespace lacks may be taken from
     an enclosing namespace.
 
     Args:
         bag: The recording.
         namespace: The namespace, or None for the one that the bag has.
-        motors: How the motors of a ros2_control robot are connected.
+        motors: Topics of the motors of a ros2_control robot.
 
     Raises:
         BagError: If the namespace is not in the bag, or if it is None and the bag has several.

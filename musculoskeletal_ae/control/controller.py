@@ -37,7 +37,7 @@ from musculoskeletal_ae.control.exploration import Exploration, Exploring
 from musculoskeletal_ae.control.follower import Follower
 from musculoskeletal_ae.control.holding import HoldingCheck
 from musculoskeletal_ae.control.limiter import CommandLimiter
-from musculoskeletal_ae.control.method_choice import by_follower, check_method
+from musculoskeletal_ae.control.method_choice import by_follower, check_settings
 from musculoskeletal_ae.control.planner import Plan, Planner
 from musculoskeletal_ae.control.ramps import LengthRamps, RampedTarget
 from musculoskeletal_ae.control.settings import Settings
@@ -205,7 +205,7 @@ class Controller:
     def __init__(self, robot: Robot, settings: Settings | None = None, seed: int = 0) -> None:
         """Control `robot`; `seed` is the random seed of the exploration."""
         self.robot, self.settings = robot, settings or Settings()
-        check_method(robot, self.settings)
+        check_settings(robot, self.settings)
         self.mae: Mae | None = None
         self.stream = MuscleStream(robot, window=WINDOW)
         self.sample: MuscleSample | None = None
@@ -241,9 +241,9 @@ class Controller:
         target anew, starting from the present tensions.
 
         Raises:
-            MusculoskeletalError: If the joint stiffness or the method does not fit the robot.
+            ParameterError: If the joint stiffness or the method does not fit the robot.
         """
-        check_method(self.robot, settings)
+        check_settings(self.robot, settings)
         before, radian = self.settings, self.robot.kinematics.radian
         stiffness = settings.desired_stiffness(radian)
         self.settings = settings

@@ -51,6 +51,8 @@ from musculoskeletal_ae.control.winches import Winches
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
+#: gain of the rest feedback, which reduces posture error and needless tension at rest [1/s]
+FEEDBACK_GAIN = 0.5
 BLENDING = 0.3  # time in which the previous command is blended into the new plan [s]
 SETTLING = 0.8  # time after a trajectory for which the feedback of the motion continues [s]
 #: The limiter holds a muscle back if it has made the command longer by more than this [m].
@@ -221,6 +223,6 @@ class Follower(ActivityControl):
             jacobian = mae.muscle_jacobian(theta, plan.tension.bone)
             self._held = HeldPosture(plan.length(mae, theta), jacobian)
         length, jacobian = self._held
-        gain = 0.0 if plan.is_stiff else self._settings.feedback_gain
+        gain = 0.0 if plan.is_stiff else FEEDBACK_GAIN
         feedback.step(self.progress.error, jacobian, inputs.pull, inputs.limit, gain, inputs.dt)
         return length + feedback.shift(jacobian)

@@ -7,7 +7,7 @@ and holdable with the learned G; otherwise the pose is refused. With `unreachabl
 target is the posture within the joint limits in which the hand is nearest to the pose. If this
 posture is not holdable, the arm stops on the straight path to it (`reach.nearest_held`).
 
-The hand moves to a single pose at `hand_speed` or more slowly. Poses in quick succession form a
+The hand moves to a single pose at HAND_SPEED or more slowly. Poses in quick succession form a
 path, which the hand follows at the speed at which they arrive. A pose is reached when the next pose
 is due, and the arm comes to rest at the last pose. A twist moves the hand for TWIST_TIMEOUT
 seconds.
@@ -30,6 +30,7 @@ from musculoskeletal_ae.validity import TrajectoryPoints
 WHOLE, POSITION = np.repeat([2e-4, 2e-3], 3), np.repeat([2e-4, 100.0], 3)
 FAR = 0.005  # a pose is unreachable if the hand remains further away than this [m]
 TURNED = 0.05  # a pose is unreachable if the hand's orientation differs by more than this [rad]
+HAND_SPEED = 0.25  # largest speed of the hand on the way to a single pose [m/s]
 SHORTEST = 0.3  # shortest duration of a movement to a single pose [s]
 PEAK = 1.875  # ratio of peak to mean speed of a minimum-jerk motion
 PATH_INTERVAL = 0.25  # longest interval between two poses that form a path [s]
@@ -88,7 +89,7 @@ class Hand:
             raise MessageError(kind, f'{reason}; {remedy}')
         return theta, reason
 
-    def towards(self, start: Setpoint, theta: Array, speed: float, now: float) -> Trajectory:
+    def towards(self, start: Setpoint, theta: Array, now: float) -> Trajectory:
         """Return the trajectory to a received pose.
 
         If poses arrive in quick succession, the trajectory continues the path of the earlier ones.
@@ -96,7 +97,6 @@ class Hand:
         Args:
             start: Setpoint from which the trajectory starts.
             theta: Posture in which the hand has the pose, θ [rad], (D,).
-            speed: Largest speed of the hand to a single pose [m/s].
             now: Time at which the pose was received [s].
         """
         robot, last = self._robot, self._last
@@ -123,7 +123,7 @@ class Hand:
                 )
         self._interval = 0.0
         distance = float(np.linalg.norm(where - here))
-        return Trajectory.to(start, theta, max(SHORTEST, PEAK * distance / speed))
+        return Trajectory.to(start, theta, max(SHORTEST, PEAK * distance / HAND_SPEED))
 
     def again(self, now: float) -> None:
         """Record that the last pose was received again at `now` [s]."""

@@ -1,25 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Determines whether a robot can use a control method, and which code implements the method."""
+"""Determines whether settings fit a robot, and which code implements a control method."""
 
 from collections.abc import Mapping
 
 from musculoskeletal_ae.control.methods import LengthMethod
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.parameters import naming_parameter
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
 
-def check_method(robot: Robot, settings: Settings) -> None:
-    """Check that the robot's muscle modules measure the tensions that the method needs.
+def check_settings(robot: Robot, settings: Settings) -> None:
+    """Check that settings fit a robot: the desired stiffness its joints, the method its modules.
 
     Raises:
-        MusculoskeletalError: If they do not; the text names the reason and the legal methods.
+        ParameterError: If they do not; the text names the reason and the legal values.
     """
+    with naming_parameter('joint_stiffness'):
+        settings.desired_stiffness(robot.kinematics.radian)
+    with naming_parameter('method'):
+        _check_method(robot, settings)
+
+
+def _check_method(robot: Robot, settings: Settings) -> None:
+    """Check that the robot's muscle modules measure the tensions that the method needs."""
     if robot.tension_source.is_current and settings.method in BY_TENSION:
         legal = tuple(method for method in METHODS if method not in BY_TENSION)
         raise MusculoskeletalError(
-            f'method {settings.method!r} requires measured tensions, but tension_source in '
+            f'{settings.method!r} requires measured tensions, but tension_source in '
             'muscles.yaml is `current`: the friction of a resting drive hides the force of a hand; '
             f'legal: {", ".join(legal)}'
         )
@@ -28,7 +37,7 @@ def check_method(robot: Robot, settings: Settings) -> None:
     legal = preset_named(settings.preset).methods_without_tension
     if settings.method not in legal:
         raise MusculoskeletalError(
-            f'method {settings.method!r} requires tensions, but tension_source in muscles.yaml is '
+            f'{settings.method!r} requires tensions, but tension_source in muscles.yaml is '
             f'`none`; legal with preset {settings.preset!r}: {", ".join(legal)}'
         )
 

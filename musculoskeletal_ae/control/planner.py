@@ -125,7 +125,7 @@ class Planner:
             now: Time at which the pose was received [s].
         """
         theta, problem = self._hand.posture(mae, pose, whole, start.theta, self.takes_nearest)
-        towards = self._hand.towards(start, theta, self._settings.hand_speed, now)
+        towards = self._hand.towards(start, theta, now)
         planned = self._within_limits(mae, towards)
         self._last_pose = pose, whole, planned
         return Plan(planned, problem and f'{problem}; the arm goes to the nearest posture')

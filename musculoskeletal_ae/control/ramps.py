@@ -220,13 +220,12 @@ class RampedTarget(ActivityControl):
         return self.ramps.missing_torque
 
     def _goals(self) -> list[Goal]:
-        chosen, limits = self._settings, self._robot.tension
+        chosen = self._settings
         method = length_methods(chosen).get(chosen.method)
         if self._target is None or method is None:
             return []
-        constant = np.clip(chosen.constant_tension, limits.bias, limits.limit)
-        constant = np.full(self._robot.muscle_count, constant)
-        first = Goal(FIRST, *self._target, chosen.first_duration, constant)
+        # T_const of method `first` is T_bias.
+        first = Goal(FIRST, *self._target, chosen.first_duration, self._robot.tension.bias)
         if chosen.method == FIRST:
             return [first]
         if method.follows_first:

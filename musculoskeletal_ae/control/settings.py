@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.parameters import PRESET, settable
+from musculoskeletal_ae.parameters import PRESET, CheckedSettings, settable
 
 UNREACHABLE = ('refuse', 'nearest')  # legal values of the setting `unreachable`
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness', 'float')
@@ -14,7 +14,7 @@ MOST_STIFFNESS = 1000.0  # largest desired stiffness of a revolute joint [N·m/r
 
 
 @dataclass(frozen=True)
-class Settings:
+class Settings(CheckedSettings):
     """Settings of control; `Controller.configure` applies changed settings."""
 
     method: str = settable(
@@ -40,57 +40,12 @@ class Settings:
         0.1,
         60.0,
     )
-    second_duration: float = settable(
-        2.0,
-        'duration of the second movement of method `second`, and of the movement after a new '
-        'checkpoint',
-        's',
-        0.1,
-        60.0,
-    )
-    target_duration: float = settable(
-        1.2,
-        'duration of a movement to a target with method `stiffness`, or with method `proposed` of '
-        'preset `default`; it is extended if the muscle modules are too slow or the muscles too '
-        'weak (0: first_duration)',
-        's',
-        0.0,
-        60.0,
-    )
-    constant_tension: float = settable(
-        0.0, 'T_const of method `first`, clamped to [T_bias, T_limit]', 'N', 0.0, 1000.0
-    )
     rate_limit: float = settable(
         0.1,
         'largest rate of change of a length command (tension commands: times K_stiff)',
         'm/s',
         0.001,
         1.0,
-    )
-    position_gain: float = settable(
-        10.0,
-        'position gain of method `tension` (0: none; for prismatic joints divided by 0.06²)',
-        'N·m/rad',
-        0.0,
-        200.0,
-    )
-    velocity_gain: float = settable(
-        0.5,
-        'velocity gain of method `tension` (0: none; for prismatic joints divided by 0.06²)',
-        'N·m·s/rad',
-        0.0,
-        20.0,
-    )
-    feedback_gain: float = settable(
-        0.5,
-        'gain of the rest feedback of method `proposed`, which reduces posture error and needless '
-        'tension at rest (0: none)',
-        '1/s',
-        0.0,
-        2.0,
-    )
-    hand_speed: float = settable(
-        0.25, 'largest speed of the hand on the way to a single target_pose', 'm/s', 0.01, 2.0
     )
     unreachable: str = settable(
         'refuse',
@@ -120,6 +75,13 @@ class Settings:
         40.0,
         200.0,
     )
+
+    # Durations that experiments vary, and users do not.
+    #: of the second movement of method `second`, and of the movement after a new checkpoint [s]
+    second_duration: float = 2.0
+    #: of a movement to a target with method `stiffness`, or with method `proposed` of preset
+    #: `default`; extended if muscle modules or muscles are too weak; 0 for first_duration [s]
+    target_duration: float = 1.2
 
     def desired_stiffness(self, radian: Iterable[float]) -> tuple[float, ...]:
         """Return the desired stiffness of each joint [N·m/rad or N/m]; 0 for unconstrained joints.

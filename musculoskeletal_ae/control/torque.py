@@ -12,6 +12,10 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
+# Gains of the method `tension`. For prismatic joints, they apply to a pinion of radius
+# `kinematics.RACK`.
+POSITION_GAIN = 10.0  # K_p [N·m/rad]
+VELOCITY_GAIN = 0.5  # K_d [N·m·s/rad]
 SMOOTHING = 0.05  # time constant of the low-pass filter on the noisy estimate [s]
 
 # Constants of gravity compensation. For prismatic joints, they apply to a pinion of radius
@@ -31,9 +35,7 @@ class TorqueControl(ActivityControl):
             whose torque −Gᵀ T is nearest to τ
 
     The network computes G at (θ, T) (paper, §III-E, muscle tension-based control; Kawamura 2016),
-    and θ is the low-pass-filtered estimate. For prismatic joints, K_p and K_d apply to a pinion of
-    radius `kinematics.RACK`. With both gains zero, the muscles only compensate gravity and exert
-    `effort`; the arm then does not keep its posture.
+    and θ is the low-pass-filtered estimate.
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
@@ -73,8 +75,8 @@ class TorqueControl(ActivityControl):
 
     @property
     def has_arrived(self) -> bool:
-        """Whether the arm should be at its target: always, unless no gain pulls it there."""
-        return self._settings.position_gain > 0.0
+        """Whether the arm should be at its target: always, because the position gain pulls it."""
+        return True
 
     @property
     def missing_torque(self) -> Array:
@@ -104,9 +106,8 @@ class TorqueControl(ActivityControl):
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
         """Return the feedback torque [N·m], (D,), from posture and velocity."""
-        chosen, radian = self._settings, self._robot.kinematics.radian
-        torque = chosen.position_gain * (target - theta) - chosen.velocity_gain * velocity
-        return torque / radian**2
+        torque = POSITION_GAIN * (target - theta) - VELOCITY_GAIN * velocity
+        return torque / self._robot.kinematics.radian**2
 
 
 class GravityCompensation(TorqueControl):

@@ -24,7 +24,6 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals import joint_sensors, wiring
 from musculoskeletal_ae.signals.limits import length_range
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
-from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.signals.readings import QUANTITIES, Presence, Row, possible_readings
 from musculoskeletal_ae.signals.wiring import Judgement, Wiring
 from musculoskeletal_ae.validity import (
@@ -72,8 +71,7 @@ UNITS = {
 
 MOTOR_NOTE = (
     'l and T are computed from positions and efforts; to correct their unit, sign, zero or order, '
-    'set the parameters spool_radius, motor_direction, motor_zero, motor_names, '
-    'tension_per_effort and effort_zero'
+    'change spool_radius, direction, zero, joint, tension_per_effort and effort_zero in motors.yaml'
 )
 
 
@@ -98,7 +96,7 @@ class Listening:
             motors: How the motors of a ros2_control robot are connected, or None for muscle_states.
         """
         self._robot, self._zeroed, self._pace = robot, zeroed, Pace(rate)
-        self._motors = motors or MotorInterface(MotorSettings(), robot.muscles)
+        self._motors = motors or MotorInterface(None)
         self._stated = posture is not None
         self._theta = np.full(robot.joint_count, math.nan) if posture is None else np.array(posture)
         self._not_finite: Counter[str] = Counter()  # positions that are not finite, by joint

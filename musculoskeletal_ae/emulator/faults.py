@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.readings import QUANTITIES, MuscleReading, muscle_reading
@@ -35,6 +35,7 @@ class Kind(NamedTuple):
     unit: str = ''
     of_muscle: bool = True
     of_quantity: bool = False
+    signed: bool = False  # whether the size may be negative
 
 
 #: size of a spike or bias of each quantity (theta: joint angles): default, largest, unit
@@ -56,9 +57,11 @@ KINDS = {
     'drift': Kind('sensors drift at this rate', *RATES['length'], of_quantity=True),
     'burst': Kind('sensors read this value in bursts', *SIZES['length'], of_quantity=True),
     'exchange': Kind('two joint sensors are exchanged', of_muscle=False),
+    'rupture': Kind('tendons are ruptured'),
     'stuck_motor': Kind('motors are jammed'),
     'winch_speed': Kind('motors are limited to this speed', 0.009, SPEED_LIMIT, 'm/s'),
     'unzeroed': Kind('lengths have offsets of 0.4 to 1 times this size', 0.13, 1.0, 'm'),
+    'offset': Kind('lengths have this offset', 0.05, 1.0, 'm', signed=True),
     'slack': Kind('tendons are longer by this size', 0.05, 1.0, 'm'),
     'overheat': Kind('modules have at least this temperature', 90.0, 1e3, '°C'),
     'saturate': Kind('tension sensors read at most this tension', 150.0, 1e4, 'N'),
@@ -118,7 +121,8 @@ def read_fault(line: str, robot: Robot) -> Fault:
             raise MusculoskeletalError(f'{line[:80]!r}; legal: {legal}')
         return Fault(name, ('theta',), np.array([robot.joints.index(word) for word in words]), 0.0)
     quantities: tuple[str, ...] = SENSED if kind.of_quantity else ()
-    size, largest, unit, smallest = kind.size, kind.largest, kind.unit, 0.0
+    size, largest, unit = kind.size, kind.largest, kind.unit
+    smallest = -largest if kind.signed else 0.0
     if kind.of_quantity and words and words[0] in SENSED:
         quantities = (words.pop(0),)
     elif kind.of_quantity and words and words[0] in ('theta', *robot.joints):
@@ -171,6 +175,7 @@ class Faults:
         count = robot.muscle_count
         self.stuck, self.slack, self.zero, self.hot, self.ceiling = np.zeros((5, count))
         size, sign = rng.spawn(1)[0].uniform(0.4, 1.0, (2, robot.muscle_count))
+        self.ruptured: Bools = np.zeros(count, dtype=bool)  # whether each tendon is ruptured
         #: turn of the base: the rotation matrix from its frame to that of `robot.urdf`, (3, 3)
         self.mount: Array = np.eye(3)
         self._unzeroed_factor = np.where(sign < 0.7, -1.0, 1.0) * size
@@ -210,6 +215,11 @@ class Faults:
             for fault in self._of(kind):
                 sizes[fault.which] = fault.size
         self.zero *= self._unzeroed_factor
+        for fault in self._of('offset'):
+            self.zero[fault.which] += fault.size
+        self.ruptured = np.zeros(len(self.stuck), dtype=bool)
+        for fault in self._of('rupture'):
+            self.ruptured[fault.which] = True
         self.mount = np.eye(3)
         for fault in self._of('mount_x', 'mount_y'):
             axis = np.array([fault.kind == 'mount_x', fault.kind == 'mount_y', False], dtype=float)

@@ -277,7 +277,8 @@ class Arm(ABC):
         """Put the arm at rest and at ambient temperature, and repair ruptured tendons.
 
         The external wrench ends. All muscles carry T_bias, and the modules wait for the first
-        command. Payload, length offsets and `faults` do not change.
+        command. Payload, length offsets and `faults` do not change; a tendon that one of the faults
+        ruptures stays ruptured.
 
         Args:
             theta: Joint angles [rad], (D,), which are clipped to the joint limits; by default 0.
@@ -286,7 +287,7 @@ class Arm(ABC):
         self._stand(np.clip(posture, self.robot.lower, self.robot.upper))
         self._wrench[:] = 0.0
         self._muscle.sliding[:] = 0.0
-        self._muscle.ruptured[:] = 0.0
+        self._muscle.ruptured[:] = self.faults.ruptured
         self._muscle.reference[:] = self.robot.tension.bias
         self._muscle.winding[:] = AMBIENT
         self._muscle.housing[:] = AMBIENT
@@ -423,14 +424,17 @@ class Arm(ABC):
     def set_faults(self, lines: Iterable[str]) -> None:
         """Activate the faults that the lines describe, and end all other faults.
 
-        Muscles whose tendon becomes shorter, because a fault 'slack' ends, return to T_bias.
+        Muscles whose tendon becomes shorter or whole, because a fault 'slack' or 'rupture' ends,
+        return to T_bias.
 
         Raises:
             MusculoskeletalError: If a line is not legal; nothing changes then.
         """
-        before = self.faults.slack.copy()
+        slack, ruptured = self.faults.slack.copy(), self.faults.ruptured
         self.faults.set(lines)
-        self._attach((self.faults.slack < before) & (self._muscle.ruptured == 0.0))
+        self._attach((self.faults.slack < slack) & (self._muscle.ruptured == 0.0))
+        if (self.faults.ruptured != ruptured).any():
+            self.set_ruptured(self.robot.muscles[m] for m in np.flatnonzero(self.faults.ruptured))
 
     def step(self, duration: float) -> None:
         """Advance the time by `duration` [s], rounded to whole steps of 1 ms."""

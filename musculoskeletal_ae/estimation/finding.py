@@ -11,7 +11,6 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.conditions import ConditionKind, Revokes
-from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.estimation.state_estimator import Estimate, estimate_of
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
@@ -115,9 +114,6 @@ class Detector:
 
     def use(self, mae: Mae) -> None:
         """Use another network; its isolated muscles are ignored."""
-
-    def configure(self, settings: Detection) -> None:
-        """Use these settings from the next message on."""
 
     def reset(self) -> None:
         """Reset the detector, for example after a jump of the clock or a reset by the user."""

@@ -16,7 +16,6 @@ from musculoskeletal_ae.estimation.detectors.saturated_sensor import SaturatedSe
 from musculoskeletal_ae.estimation.detectors.thermal_drift import ThermalDrift
 from musculoskeletal_ae.estimation.exchange import ExchangeCheck
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
-from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
@@ -29,14 +28,12 @@ class HealthMonitor:
     Attributes:
         residual: The detector of the residual distance, which also names the most suspect muscle.
         joints: The detector of lengths that disagree with joint sensors.
-        settings: Settings of the detectors.
     """
 
     def __init__(
         self,
         robot: Robot,
         preset: str = 'default',
-        settings: Detection | None = None,
         heat: Heat | None = None,
     ) -> None:
         """Start without a network.
@@ -44,12 +41,10 @@ class HealthMonitor:
         Args:
             robot: The nominal body.
             preset: Preset that provides the residual-based and physics-based detectors.
-            settings: Settings of the detectors.
             heat: Thermal models of the muscle modules, which the caller updates.
         """
-        self.settings = settings or Detection()
         chosen = preset_named(preset)
-        self.residual, by_physics = chosen.residual_detectors(robot, self.settings)
+        self.residual, by_physics = chosen.residual_detectors(robot)
         self.joints = JointDisagreement(robot)
         self._exchange = ExchangeCheck(robot)
         self._detectors: list[Detector] = [
@@ -68,12 +63,6 @@ class HealthMonitor:
         for detector in self._detectors:
             detector.use(mae)
         self._exchange.use(mae)
-
-    def configure(self, settings: Detection) -> None:
-        """Use these settings from the next message on."""
-        self.settings = settings
-        for detector in self._detectors:
-            detector.configure(settings)
 
     def reset(self) -> None:
         """Reset all detectors, for example after a jump of the clock or a reset by the user."""

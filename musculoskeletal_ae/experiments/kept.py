@@ -31,9 +31,9 @@ def write(file: Path, value: Any) -> None:
         TypeError: If a part of the value has another type than those that the module names.
     """
     arrays = dict[str, Array]()
-    document = json.dumps(_encoded(value, arrays))
+    parts: dict[str, Any] = {DOCUMENT: np.array(json.dumps(_encoded(value, arrays))), **arrays}
     stream = BytesIO()
-    np.savez(stream, **{DOCUMENT: np.array(document)}, **arrays)
+    np.savez(stream, **parts)
     write_whole(file, stream.getvalue())
 
 

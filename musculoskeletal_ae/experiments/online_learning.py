@@ -51,7 +51,7 @@ from musculoskeletal_ae.experiments.study import (
 )
 from musculoskeletal_ae.learning.collector import SENSOR
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.settings import STEPS
+from musculoskeletal_ae.learning.scheduler import STEPS
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae

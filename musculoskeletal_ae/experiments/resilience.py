@@ -38,7 +38,7 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.settings import Detection
+from musculoskeletal_ae.estimation.settings import Settings as EstimatorSettings
 from musculoskeletal_ae.exceptions import (
     InfeasibleError,
     MessageError,
@@ -75,7 +75,7 @@ class IsolatingLoop(ClosedLoop):
     def __init__(self, arm: Arm, mae: Mae, seed: int = 0) -> None:
         """Connect an arm at rest."""
         self.estimator = Estimator(arm.robot, mae.preset)
-        self.estimator.configure(Detection(on_anomaly='isolate'))
+        self.estimator.configure(EstimatorSettings(on_anomaly='isolate'))
         self._latched, self.isolated = False, tuple[int, ...]()
         #: isolated muscles and the reason, after each verification
         self.verdicts: list[tuple[tuple[int, ...], str]] = []

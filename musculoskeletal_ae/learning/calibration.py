@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE, NORM
 from musculoskeletal_ae.learning.samples import Observations, Sample, SampleStore
-from musculoskeletal_ae.learning.settings import DEFAULT, Settings
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, anomaly, residuals
 
@@ -72,7 +71,6 @@ class Reservoir:
         self,
         muscles: int,
         seed: int = 0,
-        settings: Settings = DEFAULT,
         capacity: int = CAPACITY,
         radian: Array | float = 1.0,
     ) -> None:
@@ -81,7 +79,6 @@ class Reservoir:
         Args:
             muscles: Number of muscles.
             seed: Seed of the random selection.
-            settings: Thresholds by which rests count as distinct.
             capacity: Largest number of messages.
             radian: 1 rad for a revolute joint, and for a prismatic joint the displacement [m] that
                 counts as 1 rad, (D,).
@@ -92,7 +89,7 @@ class Reservoir:
         self._offered, self._since = 0, 0.0
         self.time = 0.0  # healthy time [s]
         self._missing: frozenset[int] = frozenset()  # muscles that were isolated in some messages
-        self._rests = SampleStore(settings, radian=radian)
+        self._rests = SampleStore(radian=radian)
 
     def step(self, reading: Sample, dt: float) -> None:
         """Add a message to the selection with a probability that keeps the selection uniform.

@@ -20,9 +20,8 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.margin import AnomalyMargin
-from musculoskeletal_ae.learning.rest import RestDetector
+from musculoskeletal_ae.learning.rest import REST_TIME, RestDetector
 from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
-from musculoskeletal_ae.learning.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.joint_stream import IMPOSSIBLE, JointStream
@@ -57,7 +56,6 @@ class SampleCollector:
         robot: Robot,
         samples: SampleStore,
         healthy: Reservoir,
-        settings: Settings,
         period: float = 0.01,
         joint_source: str = SENSOR,
     ) -> None:
@@ -67,7 +65,6 @@ class SampleCollector:
             robot: The nominal body.
             samples: Stores new samples.
             healthy: Stores messages of the healthy arm.
-            settings: Thresholds for rest.
             period: Period of the muscle modules' messages [s].
             joint_source: Source of θ: `SENSOR`, `MARKER` or `NONE`.
         """
@@ -81,14 +78,14 @@ class SampleCollector:
         self._joint_stream = JointStream(robot)
         self.joint_trust = JointTrust.full(robot.joint_count)
         self._pairing = Pairing[MuscleSample](period)
-        self._detector = RestDetector(settings, joint_source != SENSOR, radian)
+        self._detector = RestDetector(joint_source != SENSOR, radian)
         self._margin = AnomalyMargin()
         self._spread = SPREAD * radian if joint_source == MARKER else NOTHING
         # θ and the directions of gravity (see `Sample`) are paired as one array.
         self._unmeasured = np.full(
             robot.joint_count + 3 * len(robot.kinematics.tree.parent), np.nan
         )
-        self._longest_pause = max(LIMITS.pause, settings.rest_time)
+        self._longest_pause = max(LIMITS.pause, REST_TIME)
 
     @property
     def body(self) -> BodyState:

@@ -36,8 +36,7 @@ from musculoskeletal_ae.learning.keeper import CheckpointKeeper
 from musculoskeletal_ae.learning.offset_history import HELD_TIME, OffsetHistory
 from musculoskeletal_ae.learning.report import learner_conditions, learner_report
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
-from musculoskeletal_ae.learning.scheduler import LEAST_BLIND, UpdateScheduler
-from musculoskeletal_ae.learning.settings import DEFAULT, STEPS, Settings
+from musculoskeletal_ae.learning.scheduler import LEAST_BLIND, STEPS, UpdateScheduler
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.report import Report
@@ -71,7 +70,6 @@ class Learner:
         *,
         steps: int = STEPS,
         period: float = 0.01,
-        settings: Settings = DEFAULT,
         joint_source: str = SENSOR,
         trainer: Callable[[Robot, str, int], Trainer] = Trainer,
         directory: Path | None = None,
@@ -85,7 +83,6 @@ class Learner:
             seed: Random seed.
             steps: Training steps per update, for preset `default`.
             period: Period of the muscle modules' messages [s].
-            settings: Thresholds for rest and for new samples.
             joint_source: Source of θ, one of the constants `SENSOR`, `MARKER` and `NONE` of the
                 module `collector`.
             trainer: Creates the trainer.
@@ -110,9 +107,9 @@ class Learner:
         self.trainer = trainer(robot, preset, seed)
         own_preset = self.trainer.preset
         radian = robot.kinematics.radian
-        samples = SampleStore(settings, radian=radian)
-        healthy = Reservoir(robot.muscle_count, seed, settings, radian=radian)
-        self.collector = SampleCollector(robot, samples, healthy, settings, period, joint_source)
+        samples = SampleStore(radian=radian)
+        healthy = Reservoir(robot.muscle_count, seed, radian=radian)
+        self.collector = SampleCollector(robot, samples, healthy, period, joint_source)
         least = own_preset.least_samples
         self.scheduler = UpdateScheduler(
             least if joint_source == SENSOR else max(least, LEAST_BLIND), steps

@@ -2,9 +2,10 @@
 """Detects when the arm is at rest, and averages the messages of each rest.
 
 The arm is at rest while the means of the two halves of a short window differ by no more than the
-settings' rates allow. Sensor noise is taken into account, because θ from a camera is much noisier
-than θ from a joint sensor. A long rest is averaged in parts of `LONGEST_PART`. For an arm without
-joint sensors (`blind`) only the muscles have to be at rest; θ is averaged where it was measured.
+rates of a resting arm allow. Sensor noise is taken into account, because θ from a camera is much
+noisier than θ from a joint sensor. A long rest is averaged in parts of `LONGEST_PART`. For an arm
+without joint sensors (`blind`) only the muscles have to be at rest; θ is averaged where it was
+measured.
 
 The slow start and end of a motion cannot be distinguished from rest, but they disturb the direction
 of gravity that an accelerometer measures. Therefore gravity is used only if the arm was still in
@@ -20,13 +21,16 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.samples import NOTHING, Sample
-from musculoskeletal_ae.learning.settings import Settings
 
+REST_TIME = 0.3  # count the arm as resting after it has been still for this long [s]
+#: count a joint as moving above this speed [rad/s]; for prismatic joints times 0.06 m
+JOINT_RATE = 0.02
+LENGTH_RATE = 0.002  # count a muscle as moving above this speed [m/s]
 LONGEST_PART = 1.0  # longest part of a rest that one sample averages [s]
 #: largest number of readings in a rest, which bounds the memory if the clock stands still
 MOST_READINGS = 20_000
 #: Smallest number of readings in each half of the window. With fewer readings, noise could hide a
-#: drift. If messages are slow, the window is therefore longer than `rest_time`.
+#: drift. If messages are slow, the window is therefore longer than REST_TIME.
 LEAST_READINGS = 4
 NOISE_FACTOR = 3.0  # largest difference of means that counts as noise, in standard errors
 
@@ -113,18 +117,15 @@ class OpenRest:
 class RestDetector:
     """Turns a stream of readings into one mean for each rest."""
 
-    def __init__(
-        self, settings: Settings, blind: bool = False, radian: Array | float = 1.0
-    ) -> None:
+    def __init__(self, blind: bool = False, radian: Array | float = 1.0) -> None:
         """Start with an empty window.
 
         Args:
-            settings: Thresholds for rest.
             blind: Whether the arm has no joint sensors.
             radian: 1 rad for a revolute joint, and for a prismatic joint the displacement [m] that
                 counts as 1 rad, (D,).
         """
-        self.settings, self.blind, self._radian = settings, blind, radian
+        self.blind, self._radian = blind, radian
         self._window = ReadingWindow()
         self.reset()
 
@@ -154,7 +155,7 @@ class RestDetector:
             self._read_at = self._time
         # Use the shorter of the last two periods, so that a single gap does not count.
         readings = (2 * LEAST_READINGS + 1) * min(self._periods)
-        needed = max(self.settings.rest_time, readings)
+        needed = max(REST_TIME, readings)
         self._window.drop_before(self._time - needed - 1e-9)
         rest = self._rest
         if not self._is_still(needed):
@@ -182,7 +183,7 @@ class RestDetector:
             return False
         halves = self._window.parts(self._time - half)
         muscles = len(self._window.readings[0][1].length)
-        if not _unmoved([h[:, :muscles] for h in halves], self.settings.rest_length_rate * half):
+        if not _unmoved([h[:, :muscles] for h in halves], LENGTH_RATE * half):
             return False
         angles = [part[:, muscles:] for part in halves]
         angles = [part[~np.isnan(part).all(axis=1)] for part in angles]
@@ -192,7 +193,7 @@ class RestDetector:
         enough = np.minimum(*(part.sum(axis=0) for part in known)) >= LEAST_READINGS
         if not enough.any():
             return self.blind
-        rate = self.settings.rest_joint_rate * half * self._radian
+        rate = JOINT_RATE * half * self._radian
         allowed, whole = np.broadcast_to(rate, enough.shape), known[0].all(0) & known[1].all(0)
         # Only some messages may contain a joint, for example if two nodes publish joints. Compare
         # the means of such a joint separately.

@@ -19,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.learning.settings import DEFAULT, Settings
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.signals.friction import Transmission
 
@@ -30,8 +29,9 @@ CREEP_SHARE = 0.5
 NOTHING: Array = np.zeros(0)  # stands for a quantity that was not measured
 #: typical moment arm, which converts lengths to angles where not all joint angles were measured [m]
 MOMENT_ARM = 0.04
-#: smallest threshold [rad or N]; it replaces a threshold of 0, with which any sample is new
-LEAST_DISTANCE = 1e-6
+#: count two samples as different if an angle differs by more [rad]; prismatic joints: times 0.06 m
+JOINT_DISTANCE = 0.05
+TENSION_DISTANCE = 10.0  # count two samples as different if a tension differs by more [N]
 
 
 class Sample(NamedTuple):
@@ -120,21 +120,15 @@ class Observations:
 class SampleStore:
     """Keeps up to `capacity` samples in the order in which they were accepted."""
 
-    def __init__(
-        self,
-        settings: Settings = DEFAULT,
-        capacity: int = CAPACITY,
-        radian: Array | float = 1.0,
-    ) -> None:
+    def __init__(self, capacity: int = CAPACITY, radian: Array | float = 1.0) -> None:
         """Create an empty store.
 
         Args:
-            settings: Thresholds above which a sample differs from the stored ones.
             capacity: Largest number of samples.
             radian: 1 rad for a revolute joint, and for a prismatic joint the displacement [m] that
                 counts as 1 rad, (D,).
         """
-        self._settings, self._radian = settings, radian
+        self._radian = radian
         self.capacity = capacity
         self.accepted = 0  # number of samples ever accepted
         #: samples that are held back because their length offsets are in doubt, and these offsets
@@ -279,12 +273,10 @@ class SampleStore:
         NaN.
         """
         theta, tension, length = (np.array(part) for part in [*zip(*samples, strict=True)][:3])
-        distances = self._settings.new_joint_distance, self._settings.new_tension_distance
-        joint, newton = (max(distance, LEAST_DISTANCE) for distance in distances)
         unread = np.isnan(theta).any(axis=1, keepdims=True)
         # Where not all joint angles were measured, compare the muscle lengths as well.
-        by_length = np.where(unread, length / (MOMENT_ARM * joint), np.nan)
-        by_angle, by_tension = theta / (joint * self._radian), tension / newton
+        by_length = np.where(unread, length / (MOMENT_ARM * JOINT_DISTANCE), np.nan)
+        by_angle, by_tension = theta / (JOINT_DISTANCE * self._radian), tension / TENSION_DISTANCE
         return np.concatenate([by_angle, by_tension, by_length], axis=1)
 
     def _dispensable(self) -> int:

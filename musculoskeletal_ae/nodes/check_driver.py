@@ -22,7 +22,6 @@ from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR, array_message, motor_command
-from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.nodes.ros_tool import (
     ROS_HELP,
     Spinner,
@@ -68,7 +67,8 @@ class CheckDriver:
         self.node = Node('check_driver')
         self.robot, self.options = robot, options
         self.has_listened = False
-        self.motors = _motors(robot, options)
+        kind: Any = import_heavy('musculoskeletal_ae.signals.motor_interface').MotorInterface
+        self.motors: MotorInterface = kind(robot.description.motors)
         command = self.motors.command_topic or 'muscle_length_command'
         resolve = self.node.resolve_topic_name
         self.topic, self.command = resolve(self.motors.state_topic), resolve(command)
@@ -207,17 +207,6 @@ class CheckDriver:
             verdict.failed('silence', gap=SILENCE)
 
 
-def _motors(robot: Robot, options: Namespace) -> MotorInterface:
-    """Return the interface to the motors that the parameter files in the options describe.
-
-    Raises:
-        MusculoskeletalError: If a parameter file cannot be used, or does not fit the muscles.
-    """
-    kind: Any = import_heavy('musculoskeletal_ae.signals.motor_interface').MotorInterface
-    interface: MotorInterface = kind(motor_settings(options.params_file), robot.muscles)
-    return interface
-
-
 def _winding(robot: Robot, verdict: Verdict, options: Namespace) -> Any:
     """Return the motion test of the muscles that the options name, or of all muscles.
 
@@ -282,7 +271,6 @@ def _parse(arguments: list[str]) -> Namespace:
         ROS_HELP,
     )
     parser.add_robot()
-    parser.add_motors()
     add = parser.add_argument
     add('--seconds', type=positive, default=30.0, metavar='S', help='how long to listen [s]')
     add(

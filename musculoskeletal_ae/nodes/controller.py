@@ -10,8 +10,6 @@ follow_joint_trajectory, where control_msgs is installed.
 import time
 from collections.abc import Iterable
 from contextlib import suppress
-from dataclasses import replace
-from functools import partial
 from importlib import import_module
 from typing import Any
 
@@ -28,7 +26,7 @@ from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller as Core
-from musculoskeletal_ae.control.method_choice import check_method
+from musculoskeletal_ae.control.method_choice import check_settings
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.control.stop_memory import BEFORE, StopMemory
 from musculoskeletal_ae.estimation.verification import LONGEST
@@ -44,7 +42,7 @@ from musculoskeletal_ae.nodes.messages import (
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.sources import AUTHORS
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
-from musculoskeletal_ae.parameters import parameters_of
+from musculoskeletal_ae.parameters import naming_parameter, parameters_of
 from musculoskeletal_ae.reception import Stamps, Streams
 from musculoskeletal_ae.remedy import Step, sentence
 from musculoskeletal_ae.report import Report
@@ -68,12 +66,16 @@ class Controller(Shell):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('controller', **options)
-        self.core = Core(self.robot, seed=self.parameter('seed'))
+        self.publishers_of = {
+            kind: self.create_publisher(Float64MultiArray, f'muscle_{kind}_command', RELIABLE)
+            for kind in (LENGTH, TENSION)
+        }
+        self.core = Core(self.robot, self._settings(), self.parameter('seed'))
         self.memory = StopMemory(self.state_directory())
         if self.memory.found is not None:
             self.core.stop(self.memory.found.kind, BEFORE)
         self.recording: StopRecording = StopRecording(
-            self.resolve_topic_name, topics=topics_with(self.motors.settings)
+            self.resolve_topic_name, topics=topics_with(self.motors.topics)
         )
         #: cause of the latched stop after its recording has begun; None otherwise
         self.recorded: ConditionKind | None = None
@@ -82,19 +84,16 @@ class Controller(Shell):
         self.published_mode = ''
         self.estimate_stamps = Stamps()
         self.requests = Streams()  # accepted requests for motion
-        self.publishers_of = {
-            kind: self.create_publisher(Float64MultiArray, f'muscle_{kind}_command', RELIABLE)
-            for kind in (LENGTH, TENSION)
-        }
         self.motor_commands = None
         if topic := self.motors.command_topic:
             self.motor_commands = self.create_publisher(Float64MultiArray, topic, RELIABLE)
-        checks = {'joint_stiffness': self._check_stiffness, 'method': self._check_method}
-        for name in parameters_of(Settings):
-            self.follow_parameter(name, partial(self._configure, name), checks.get(name))
         self.follow_accepted_checkpoints(
             self.core.use, lambda reason: self.core.stop(ConditionKind.UNFIT_CHECKPOINT, reason)
         )
+        # Settings of one request are applied together, because they may end a motion, which a
+        # rollback would not restore.
+        for name in parameters_of(Settings):
+            self.parameters.on_change(name, self.core.configure, lambda _: self._settings())
         self.needed.add('muscle_states', 'estimated_joint_states')
         self.follow_offsets(self._use_body)
         self.sources.watch(*AUTHORS)
@@ -129,22 +128,20 @@ class Controller(Shell):
         self.memory.close()
         super().destroy_node()
 
-    def _configure(self, name: str, value: Any) -> None:
-        self.core.configure(replace(self.core.settings, **{name: value}))
+    def _settings(self) -> Settings:
+        """Return the settings in the parameters, checked for the robot and its driver."""
+        settings = Settings(**{name: self.parameter(name) for name in parameters_of(Settings)})
+        check_settings(self.robot, settings)
+        with naming_parameter('method'):
+            self._check_driver(settings.method)
+        return settings
 
-    def _check_stiffness(self, value: Any) -> Any:
-        # Check this before the other parameters of the same request are set, because their setters
-        # may end a motion, which a rollback would not restore.
-        checked = replace(self.core.settings, joint_stiffness=value)
-        checked.desired_stiffness(self.robot.kinematics.radian)
-        return value
-
-    def _check_method(self, value: Any) -> Any:
-        check_method(self.robot, replace(self.core.settings, method=value))
-        if value in BY_TENSION and self.motor_commands is not None:
+    def _check_driver(self, method: str) -> None:
+        """Check that the driver or the motors can follow the commands of a method."""
+        if method in BY_TENSION and self.motors.command_topic:
             legal = ', '.join(method for method in METHODS if method not in BY_TENSION)
             problem = (
-                f'{value!r} commands tensions, but the motors on {self.motors.command_topic} '
+                f'{method!r} commands tensions, but the motors on {self.motors.command_topic} '
                 'follow lengths only'
             )
             raise MusculoskeletalError(f'{problem}; legal: {legal}')
@@ -154,18 +151,17 @@ class Controller(Shell):
         }
         # Position-controlled modules need no tension commands, because the limiter turns tensions
         # into lengths.
-        by_tension = value in BY_TENSION and self.robot.actuation.follows_tensions
+        by_tension = method in BY_TENSION and self.robot.actuation.follows_tensions
         if by_tension and followed[LENGTH] and not followed[TENSION]:
             # Refuse the method, because a driver that gets no commands pays the muscles out.
             legal = ', '.join(method for method in METHODS if method not in BY_TENSION)
             problem = (
-                f'{value!r} commands tensions, but the driver subscribes to muscle_length_command '
+                f'{method!r} commands tensions, but the driver subscribes to muscle_length_command '
                 'only'
             )
             raise MusculoskeletalError(
                 f'{problem}; legal: {legal}; or let the driver subscribe to muscle_tension_command'
             )
-        return value
 
     def _use_body(self) -> None:
         self.core.use_body(self.body)

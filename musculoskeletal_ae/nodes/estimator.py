@@ -12,7 +12,6 @@ checkpoints, and by the detectors that compare them with the lengths.
 
 import time
 from collections.abc import Iterable
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -29,7 +28,7 @@ from musculoskeletal_ae.estimation.estimator import Output
 from musculoskeletal_ae.estimation.length_calibration import check_stated_posture
 from musculoskeletal_ae.estimation.length_trust import Evidence
 from musculoskeletal_ae.estimation.offset_memory import OffsetMemory
-from musculoskeletal_ae.estimation.settings import Detection
+from musculoskeletal_ae.estimation.settings import Settings
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.arm import Frames, Markers
@@ -45,7 +44,6 @@ from musculoskeletal_ae.nodes.messages import (
 )
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.nodes.sources import AUTHORS
-from musculoskeletal_ae.parameters import parameters_of
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.signals.joint_trust import JointTrust
@@ -90,8 +88,9 @@ class Estimator(Shell):
         self.candidates.follow()
         if self.parameter('isolate_muscles'):
             self._isolate(set(self.muscles_to_isolate))
-        for name in parameters_of(Detection):
-            self.follow_parameter(name, partial(self._configure, name))
+        self.follow_parameter(
+            'on_anomaly', lambda value: self.core.configure(Settings(on_anomaly=value))
+        )
         self.follow_muscle_messages(self._on_muscles)
         self.follow_posture('joint_states', self._on_joints, some=True)
         self._publish_offsets()
@@ -136,9 +135,6 @@ class Estimator(Shell):
         self._publish_isolated()
         if Evidence.NOT_CALIBRATED in self.core.trust.evidence:  # it waits for the first network
             self.core.calibrate_lengths(self.posture)
-
-    def _configure(self, name: str, value: float) -> None:
-        self.core.configure(replace(self.core.health.settings, **{name: value}))
 
     def _on_posture(self, posture: tuple[float, ...]) -> None:
         check_stated_posture(self.robot, posture)

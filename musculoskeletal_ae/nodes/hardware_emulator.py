@@ -7,7 +7,6 @@ muscle_states, robot_description, hardware_emulator/markers; on request marker_p
 
 import time
 from collections.abc import Iterable
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,12 +21,12 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.emulator.reality import make_arm
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.emulator.sensors import read_sensors
 from musculoskeletal_ae.nodes.arm import Arm, Markers
 from musculoskeletal_ae.nodes.messages import RELIABLE, serve
+from musculoskeletal_ae.parameters import naming_parameter
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
-from musculoskeletal_ae.robot.kinematics import body_frames
 
 PACE_TIME = 5.0  # time over which the real-time factor is averaged [s]
 
@@ -49,24 +48,16 @@ class HardwareEmulator(Arm):
         # Simulate one step to load the compiled code, which would otherwise delay the first
         # messages.
         self.arm.step(0.01)
-        self.marker_pose_rate = self.pose_due = self.remainder = 0.0
+        self.pose_due = self.remainder = 0.0
         self.reading = self.arm.sense()
-        self.follow_parameter('command_timeout', partial(setattr, self.arm, 'command_timeout'))
-        self.follow_parameter('ruptured_muscles', self.arm.set_ruptured)
         self.follow_parameter('payload', self.arm.set_payload)
-        self.follow_parameter('length_offset', self.arm.set_length_offset)
         self.follow_parameter('faults', self.arm.set_faults)
-        self.follow_parameter('marker_pose_rate', self._set_marker_pose_rate)
-        self.advertise('', self.parameter('joint_sensors'), description=True)
+        with naming_parameter('sensors'):
+            self.sensors = read_sensors(self.parameter('sensors'), self.robot)
+        self.advertise('', self.sensors.joints, description=True)
         self.pose = self.create_publisher(PoseStamped, 'marker_pose', RELIABLE)
         self.imu = None
-        if link := self.parameter('imu_link'):
-            links = [frame.name for frame in body_frames(self.robot.kinematics.model)]
-            if link not in links:
-                legal = ', '.join(links)
-                raise MusculoskeletalError(
-                    f'parameter imu_link: unknown link {link!r}; legal: {legal}'
-                )
+        if self.sensors.imu_link:
             self.imu = self.create_publisher(Imu, 'imu', RELIABLE)
         self.follow_length_commands(self.arm.command_length)
         if self.robot.actuation.follows_tensions:
@@ -85,11 +76,7 @@ class HardwareEmulator(Arm):
 
     def _reset(self, _: Trigger.Request) -> str:
         self.arm.reset()
-        self.arm.set_ruptured(self.parameter('ruptured_muscles'))
         return 'the arm is at rest without a wrench; the modules are cool and in their safe state'
-
-    def _set_marker_pose_rate(self, rate: float) -> None:
-        self.marker_pose_rate, self.pose_due = rate, 0.0
 
     def _tick(self) -> None:
         now = time.monotonic()
@@ -114,12 +101,12 @@ class HardwareEmulator(Arm):
             self.publish_state(*reading)
         if self.imu is not None:
             self._publish_imu(self.imu)
-        if self.marker_pose_rate > 0.0 and now >= self.pose_due:
-            self.pose_due = max(self.pose_due + 1.0 / self.marker_pose_rate, now)
+        if self.sensors.marker_rate > 0.0 and now >= self.pose_due:
+            self.pose_due = max(self.pose_due + 1.0 / self.sensors.marker_rate, now)
             self._publish_pose()
 
     def _publish_imu(self, publisher: Publisher) -> None:
-        link, message = self.parameter('imu_link'), Imu()
+        link, message = self.sensors.imu_link, Imu()
         message.header.stamp = self.get_clock().now().to_msg()
         message.header.frame_id = self.parameter('frame_prefix') + link
         message.orientation_covariance[0] = -1.0  # no orientation is measured
@@ -149,9 +136,7 @@ class HardwareEmulator(Arm):
             yield kind.EMULATION_DIVERGED.condition()
         elif self.arm.safe:
             yield kind.MODULES_IN_SAFE_STATE.condition()
-        if ruptured := list(filter(None, self.parameter('ruptured_muscles'))):
-            yield kind.EMULATED_RUPTURE.condition(', '.join(ruptured), ruptured)
-        if faults := list(filter(None, self.parameter('faults'))):
+        if faults := self.parameter('faults'):
             yield kind.EMULATED_FAULT.condition(', '.join(faults))
 
     def status(self) -> Report:

@@ -17,14 +17,12 @@ from std_srvs.srv import SetBool, Trigger
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.learning import learner
-from musculoskeletal_ae.learning.settings import Settings
 from musculoskeletal_ae.learning.trainer import TrainerProcess
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.messages import LATCHED, SENSOR, bytes_message, serve
-from musculoskeletal_ae.nodes.node_parameters import naming_parameter
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.sources import SEVERAL, LinkSensors, publishers_of
-from musculoskeletal_ae.parameters import parameters_of
+from musculoskeletal_ae.parameters import naming_parameter
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.validity import read_imu
 
@@ -45,9 +43,7 @@ class Learner(Shell):
             self.robot,
             preset=value('preset'),
             seed=value('seed'),
-            steps=value('update_steps'),
             period=1.0 / self.rate,
-            settings=Settings(**{name: value(name) for name in parameters_of(Settings)}),
             joint_source=value('joint_source'),
             trainer=partial(TrainerProcess, device=value('device')),
             directory=self.state_directory(),

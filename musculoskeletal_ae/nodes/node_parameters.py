@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parameters of one node: declared from `PARAMETERS`, checked, and passed to setters."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 from rcl_interfaces.msg import (
@@ -16,7 +15,7 @@ from rclpy.parameter import Parameter as RosParameter
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
-from musculoskeletal_ae.parameters import Parameter
+from musculoskeletal_ae.parameters import Parameter, naming_parameter
 
 
 class NodeParameters:
@@ -135,15 +134,6 @@ class NodeParameters:
         finally:
             self._proposed = {}
         return SetParametersResult(successful=True)
-
-
-@contextmanager
-def naming_parameter(name: str) -> Iterator[None]:
-    """Prefix the messages of errors in this context with the name of the parameter."""
-    try:
-        yield
-    except (MusculoskeletalError, OSError) as error:
-        raise MusculoskeletalError(f'parameter {name}: {error}') from error
 
 
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:

@@ -15,16 +15,10 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
-from itertools import chain
-from pathlib import Path
-from typing import Any
 
 from musculoskeletal_ae.control.settings import Settings as ControlSettings
-from musculoskeletal_ae.estimation.settings import Detection
+from musculoskeletal_ae.estimation.settings import Settings as EstimationSettings
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
-from musculoskeletal_ae.files import read_yaml
-from musculoskeletal_ae.learning.settings import STEPS
-from musculoskeletal_ae.learning.settings import Settings as LearningSettings
 from musculoskeletal_ae.parameters import (
     CHECKPOINT,
     DEVICES,
@@ -35,12 +29,10 @@ from musculoskeletal_ae.parameters import (
     Parameter,
     parameters_of,
 )
-from musculoskeletal_ae.signals.motor_settings import MotorSettings
 
 FRAME_PREFIX = Parameter('', 'prefix of every published frame name, such as "left/"')
-MOTORS = parameters_of(MotorSettings)  # parameters of the interface to the motors
 #: parameters of every node
-SHARED = {'robot': ROBOT, 'rate': RATE, 'frame_prefix': FRAME_PREFIX, **MOTORS}
+SHARED = {'robot': ROBOT, 'rate': RATE, 'frame_prefix': FRAME_PREFIX}
 #: parameters of every node that uses a network
 NETWORK = {**SHARED, 'checkpoint': CHECKPOINT, 'preset': PRESET}
 
@@ -50,8 +42,6 @@ STATE_DIRECTORY = Parameter(
     'stop, and the estimator its length offsets (auto: below XDG_STATE_HOME; empty: nothing is '
     'saved)',
 )
-
-ALL_NODES = '/**'  # name of the section for all nodes in a parameter file
 
 #: all parameters, by node and by name
 PARAMETERS: dict[str, dict[str, Parameter]] = {
@@ -80,7 +70,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             False, 'calibrate length offsets at the start, for winches without absolute encoders'
         ),
         'state_directory': STATE_DIRECTORY,
-        **parameters_of(Detection),
+        **parameters_of(EstimationSettings),
         'isolate_muscles': Parameter(
             ('',),
             'muscles to isolate at the start, or when estimator/isolate is called, until '
@@ -115,34 +105,17 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             'publish /clock, which runs slower if the computer is too slow for real time; all '
             'nodes then need use_sim_time',
         ),
-        'ruptured_muscles': Parameter(
-            ('',), 'names of ruptured muscles ([""]: none)', settable=True
-        ),
         'payload': Parameter(0.0, 'mass in the hand', 'kg', (0.0, 20.0), settable=True),
-        'length_offset': Parameter(
-            (0.0,),
-            'offset of the length sensors; one value for all muscles, or one for each',
-            'm',
-            (-1.0, 1.0),
-            settable=True,
-        ),
         'faults': Parameter(
             ('',),
-            'faults, each KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE], such as bias:tension:40 '
+            'faults, each KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE], such as rupture:MUSCLE '
             '([""]: none; doc/reference/topics_and_services.md lists the kinds)',
             settable=True,
         ),
-        'joint_sensors': Parameter(True, 'publish joint_states'),
-        'marker_pose_rate': Parameter(
-            0.0, 'rate of marker_pose (0: none)', 'Hz', (0.0, 100.0), settable=True
-        ),
-        'imu_link': Parameter('', 'link that carries an accelerometer (empty: none)'),
-        'command_timeout': Parameter(
-            0.5,
-            'time without a command after which the muscle modules enter their safe state',
-            's',
-            (0.01, 60),
-            settable=True,
+        'sensors': Parameter(
+            ('joints',),
+            'sensors besides those of the muscle modules: joints (joint_states), marker[:RATE] '
+            '(marker_pose, at 10 Hz unless RATE is stated) and imu:LINK (imu) ([""]: none)',
         ),
     },
     'sim': {
@@ -174,8 +147,6 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
             settable=True,
         ),
         'state_directory': STATE_DIRECTORY,
-        **parameters_of(LearningSettings),
-        'update_steps': Parameter(STEPS, 'number of mini-batches in an update', '', (1, 100_000)),
         'device': Parameter(
             'cpu',
             'device that trains the network (the CPU if torch cannot use the device)',
@@ -203,6 +174,17 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
 #: executables that run several nodes in one process, and the names of these nodes
 COMBINED = {'combined': ('estimator', 'controller')}
 
+#: what states now what a parameter of this name stated before
+MOVED = dict.fromkeys(
+    (
+        'motor_state_topic', 'motor_command_topic', 'motor_names', 'motor_command_order',
+        'spool_radius', 'motor_direction', 'motor_zero', 'tension_per_effort', 'effort_zero',
+    ),
+    'motors.yaml in the robot directory (doc/howto/ros2_control.md)',
+)  # fmt: skip
+MOVED |= dict.fromkeys(('ruptured_muscles', 'length_offset'), 'the parameter `faults`')
+MOVED |= dict.fromkeys(('joint_sensors', 'marker_pose_rate', 'imu_link'), 'the parameter `sensors`')
+
 #: parameters that rclpy declares for every node
 OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 
@@ -223,7 +205,9 @@ def check_names(names: Iterable[str], node: str = '') -> None:
     for name in names:
         users = [user for user, table in PARAMETERS.items() if name in table]
         problem = ''
-        if name.split('.')[0] not in every:
+        if name in MOVED:
+            problem = f'{name!r} is no parameter any more; state it in {MOVED[name]}'
+        elif name.split('.')[0] not in every:
             legal = [key for one in own for key in PARAMETERS[one]] or every
             near = get_close_matches(name, legal, 1) or ['none, see doc/reference/parameters.md']
             problem = f'no node has a parameter {name!r}; nearest: {near[0]}'
@@ -231,69 +215,6 @@ def check_names(names: Iterable[str], node: str = '') -> None:
             problem = f'{node} has no parameter {name!r}; only {users[0]} has one of this name'
         if problem:
             raise MusculoskeletalError(printable(problem))
-
-
-def motor_settings(files: Iterable[Path]) -> MotorSettings:
-    """Return the motor parameters in ROS parameter files, for tools that have no ROS parameters.
-
-    Args:
-        files: The files; values in later files replace those in earlier ones.
-
-    Raises:
-        MusculoskeletalError: If a file cannot be read, has no section for all nodes, names a
-            parameter that no node has, or sets a motor parameter for a single node.
-    """
-    values = dict[str, Any]()
-    for file in files:
-        document = read_yaml(file, _unreadable)
-        sections = document if isinstance(document, dict) else {}
-        for node, section in sections.items():
-            if node == ALL_NODES:
-                continue
-            if names := sorted(_keys(section) & MOTORS.keys()):
-                problem = f'{names[0]!r} is under {node!r}, but all nodes must use the same value'
-                raise _unreadable(file, f'{problem}; state it under {ALL_NODES!r}')
-        section = sections.get(ALL_NODES)
-        parameters = section.get('ros__parameters') if isinstance(section, dict) else None
-        if not isinstance(parameters, dict):
-            problem = f'expected a section {ALL_NODES!r} with a mapping `ros__parameters`'
-            raise _unreadable(file, f'{problem}; config/nodes.yaml is an example')
-        try:
-            check_names(map(str, parameters))
-            for name in MOTORS.keys() & parameters.keys():
-                values[name] = _motor_value(name, parameters[name])
-        except MusculoskeletalError as error:
-            raise _unreadable(file, str(error)) from error
-    return MotorSettings(**values)
-
-
-def _motor_value(name: str, value: Any) -> Any:
-    """Check and return the value of a motor parameter.
-
-    In nodes, ROS checks it already. Programs that read the file without a node need this check.
-    """
-    parameter = MOTORS[name]
-    is_list = isinstance(parameter.default, tuple)
-    words = value if isinstance(value, list) else [value]
-    if not parameter.is_number_list:
-        legal = 'a list of names' if is_list else 'a name'
-        if isinstance(value, list) != is_list or not all(isinstance(word, str) for word in words):
-            raise MusculoskeletalError(f'parameter {name}: {value!r}; legal: {legal}')
-    try:
-        return parameter.checked(value)
-    except MusculoskeletalError as error:
-        raise MusculoskeletalError(f'parameter {name}: {error}') from error
-
-
-def _keys(value: Any) -> set[str]:
-    """Return the keys of a mapping and of all mappings in it."""
-    if not isinstance(value, dict):
-        return set()
-    return {*map(str, value), *chain.from_iterable(map(_keys, value.values()))}
-
-
-def _unreadable(file: Path, problem: str) -> MusculoskeletalError:
-    return MusculoskeletalError(f'{file}: {problem}')
 
 
 HELP_TAIL = """\

@@ -23,10 +23,10 @@ from musculoskeletal_ae.bags.metadata import offered_qos
 from musculoskeletal_ae.bags.topics import Topic, topics_with
 from musculoskeletal_ae.bags.writer import COMPRESSIONS, BagWriter, recover
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, message_class, run_tool, start_ros
 from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.report import load_text
+from musculoskeletal_ae.robot.motors import NO_MOTORS, motor_topics
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
 #: time between writes to disk [s]; a killed recorder loses the messages since the last write
@@ -220,7 +220,8 @@ def parse(arguments: list[str]) -> Namespace:
     add('directory', nargs='?', type=Path, metavar='DIR', help=directory_help)
     add('-o', '--out', type=Path, metavar='DIR', help='another way to state DIR')
     add('--topics', type=names, metavar='LIST', help='topics, separated by commas (default: all)')
-    parser.add_motors()
+    text = 'robot whose motors.yaml names topics of motors (doc/howto/ros2_control.md)'
+    add('--robot', metavar='NAME|DIR', help=text)
     add('--duration', type=positive, metavar='S', help='stop after this time [s]')
     compression_help = 'compression of the chunks of the mcap file'
     add('--compression', choices=COMPRESSIONS, default='zstd', help=compression_help)
@@ -237,9 +238,9 @@ def parse(arguments: list[str]) -> Namespace:
     options.out = options.out or options.directory
     options.are_chosen = bool(options.topics)
     try:
-        topics = topics_with(motor_settings(options.params_file))
+        topics = topics_with(motor_topics(options.robot) if options.robot else NO_MOTORS)
     except MusculoskeletalError as error:
-        parser.error(f'--params-file: {error}')
+        parser.error(f'--robot: {error}')
     if unknown := [name for name in options.topics or () if name not in topics]:
         parser.error(f'--topics: unknown topic {unknown[0]!r}; legal: {", ".join(topics)}')
     options.topics = {name: topics[name] for name in options.topics or topics}

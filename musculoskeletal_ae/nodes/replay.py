@@ -37,7 +37,6 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes.diagnostics import MANY_REPORTS, PERIOD, Diagnostics
 from musculoskeletal_ae.nodes.lockstep import Lockstep
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, array_message, serve
-from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.nodes.rejections import Rejections
 from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, Spinner, message_class, run_tool, start_ros
 from musculoskeletal_ae.nodes.taught_motion import ACKNOWLEDGE_TIME, send_taught_motion
@@ -53,6 +52,7 @@ from musculoskeletal_ae.report import (
     Report,
     with_load,
 )
+from musculoskeletal_ae.robot.motors import NO_MOTORS, motor_topics
 from musculoskeletal_ae.signals.motor_interface import STATES
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 
@@ -125,7 +125,7 @@ class Replay(Node):
         if options.wait_for:
             self._lockstep = Lockstep(self, options.wait_for, _warn)
         topics = [publisher.topic_name for publisher in self._publisher.values()]
-        if options.params_file:  # nodes count messages of motors as muscle_states
+        if options.motors.states:  # nodes count messages of motors as muscle_states
             topics.append(self.resolve_topic_name(STATES))
         if DIAGNOSTICS not in topics:  # otherwise the reports may be recorded ones
             rejections = Rejections(topics, str(options.bag), _warn)
@@ -328,8 +328,8 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
         print(f'warning: {options.bag} is unfinished: {reason}', file=sys.stderr)
     if options.as_trajectory:
         return send_taught_motion(bag, options, arguments)
-    motors = motor_settings(options.params_file)
-    names = select(bag, options.topics, options.from_namespace, options.keep_names, motors)
+    options.motors = motor_topics(options.robot) if options.robot else NO_MOTORS
+    names = select(bag, options.topics, options.from_namespace, options.keep_names, options.motors)
     if options.loop and not options.clock:
         problem = (
             'nodes do not notice that time jumps back; add --clock, and set use_sim_time in '
@@ -366,13 +366,16 @@ def parse(arguments: list[str]) -> Namespace:
     add('bag', type=Path, metavar='BAG', help='a bag directory, or one mcap or sqlite3 file')
     check = 'check the contents without playing them (exit status 1: faults)'
     add('--check', action='store_true', help=check)
-    add('--robot', help='for --check: a shipped robot or a directory that the bag must fit')
+    robot = (
+        'a shipped robot or a directory: with --check, the robot that the bag must fit; otherwise '
+        'the robot whose motors.yaml names topics of motors (doc/howto/ros2_control.md)'
+    )
+    add('--robot', metavar='NAME|DIR', help=robot)
     topics = (
         f'{DEFAULT}: topics of hardware, vision, user and controller; {ALL}: also the topics that '
         'nodes compute; or names of topics, separated by commas'
     )
     add('--topics', type=names, default=[DEFAULT], metavar='LIST', help=topics)
-    parser.add_motors()
     keep = 'publish on the recorded names, of all arms of the bag unless --from-namespace is given'
     add('--keep-names', action='store_true', help=keep)
     arm = 'namespace of the arm to play, if the bag has several arms'
@@ -414,13 +417,11 @@ def _check_combination(parser: Parser, options: Namespace) -> None:
             '--wait-for needs --clock, and nodes with use_sim_time, because recorded time stands '
             'still while the replay waits; add --clock'
         )
-    if options.robot and not options.check:
-        parser.error('--robot requires --check; add it, or remove --robot')
     if options.check:
         changed = {
             name for name, value in vars(options).items() if value != parser.get_default(name)
         }
-        if ignored := sorted(changed - {'bag', 'check', 'robot', 'from_namespace', 'params_file'}):
+        if ignored := sorted(changed - {'bag', 'check', 'robot', 'from_namespace'}):
             parser.error(f'--check plays nothing: remove --{ignored[0].replace("_", "-")}')
     if options.as_trajectory and (options.loop or options.clock or options.paused):
         parser.error('--as-trajectory sends one message: remove --loop, --clock and --paused')
@@ -436,8 +437,7 @@ def _work(options: Namespace, arguments: list[str]) -> int:
         # Imported here, because loading the robot model takes a second that playback does not need.
         from musculoskeletal_ae.bags.check import check_bag
 
-        motors = motor_settings(options.params_file)
-        check = check_bag(options.bag, options.robot, options.from_namespace, motors)
+        check = check_bag(options.bag, options.robot, options.from_namespace)
         print(check)
         return 1 if check.faults else 0
     try:

@@ -22,7 +22,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType, JumpThreshold
 from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
-from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, QoSProfile
@@ -45,12 +44,11 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.anomaly_latch import AnomalyLatch
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, CheckpointQueue
 from musculoskeletal_ae.nodes.diagnostics import MANY_REPORTS, PERIOD, Diagnostics
-from musculoskeletal_ae.nodes.executor import RCLError, parameter_overrides
+from musculoskeletal_ae.nodes.executor import parameter_overrides
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.nodes.needed_topics import NeededTopics
-from musculoskeletal_ae.nodes.node_parameters import NodeParameters, naming_parameter
-from musculoskeletal_ae.nodes.parameters import MOTORS, check_names
-from musculoskeletal_ae.nodes.ros_arguments import reason
+from musculoskeletal_ae.nodes.node_parameters import NodeParameters
+from musculoskeletal_ae.nodes.parameters import check_names
 from musculoskeletal_ae.nodes.sources import (
     AUTHORS,
     CLOCK,
@@ -67,7 +65,6 @@ from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
 from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.message_delay import MessageDelay
 from musculoskeletal_ae.signals.motor_interface import STATES, MotorInterface
-from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.validity import (
     joints_not_finite,
     read_array,
@@ -117,13 +114,9 @@ class Shell(Node):
         check_names(parameter_overrides(self))
         self.robot = Robot.load(self.parameter('robot'))
         self.rate: float = self.parameter('rate')  # rate of the muscle modules [Hz]
-        settings = MotorSettings(**{name: self.parameter(name) for name in MOTORS})
-        self.motors = MotorInterface(settings, self.robot.muscles)
+        self.motors = MotorInterface(self.robot.description.motors)
         #: topics of a ros2_control robot, by the names of the topics that they replace
         self._wires = {STATES: self.motors.state_topic, MOTOR_COMMAND: self.motors.command_topic}
-        for name in ('motor_state_topic', 'motor_command_topic'):
-            with naming_parameter(name):
-                self._check_topic_name(self.parameter(name))
         #: name of the root link's frame in published messages
         self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
         warn = self.get_logger().warning
@@ -403,12 +396,6 @@ class Shell(Node):
             return ''
         name = self._wires.get(topic, topic)
         return self.resolve_topic_name(name) if name else ''
-
-    def _check_topic_name(self, name: str) -> None:
-        try:
-            self.resolve_topic_name(name or STATES)
-        except (InvalidTopicNameException, RCLError) as error:
-            raise MusculoskeletalError(f'{name!r}: {reason(error)}') from error
 
     def listen(
         self, kind: type, topic: str, callback: Callable[[Any], object], qos: QoSProfile

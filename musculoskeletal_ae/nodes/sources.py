@@ -30,7 +30,7 @@ from rclpy.node import Node
 from musculoskeletal_ae.exceptions import MessageError
 
 _ESTIMATOR, _CONTROLLER, _DRIVER = 'the estimator', 'the controller', 'the driver'
-MOTOR_COMMAND = 'motor_command'  # stands for the topic of the parameter motor_command_topic
+MOTOR_COMMAND = 'motor_command'  # stands for the topic of commands in motors.yaml
 CLOCK = '/clock'
 #: topics that must have one publisher, with the node that publishes them. A ros2_control robot has
 #: other topics for some of these, which `Shell.full_name` returns. Messages on /clock go to rclpy,

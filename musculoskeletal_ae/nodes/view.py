@@ -34,7 +34,6 @@ from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes import diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, joint_message
-from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, message_class, run_tool, start_ros
 from musculoskeletal_ae.nodes.situation import LARGEST_AGE, Situation, figures, nodes_in_graph
 from musculoskeletal_ae.options import Parser, whole
@@ -63,6 +62,7 @@ ARM_TOPICS = {
     'estimated': 'estimated_joint_states',
     'simulated': 'sim/joint_states',
 }
+RUPTURE = 'rupture'  # kind of fault (`emulator/faults.py`)
 SET = 'hardware_emulator/set_parameters'
 GET = 'hardware_emulator/get_parameters'
 #: Trigger services that visitors may call
@@ -90,7 +90,7 @@ class View(Node):
                 'the page needs viser; install it with: pip install -r requirements.txt'
             ) from error
         self.robot = robot
-        self.motors = MotorInterface(motor_settings(options.params_file), robot.muscles)
+        self.motors = MotorInterface(robot.description.motors)
         self.requests: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         address, request = (options.host, options.port), lambda *what: self.requests.put(what)
         self.page = page.Page(robot, *address, options.read_only, request)
@@ -104,7 +104,7 @@ class View(Node):
         self.subscribed: list[Any] = []  # subscriptions, while somebody views the page
         #: monotonic time [s] of the last update of texts, check of the graph, and report
         self.texts_at = self.graph_at = self.reported_at = -math.inf
-        self.ruptured: list[str] = []
+        self.faults: list[str] = []  # faults of the emulated arm
         self.payload = 0.0
         self.reset_at = math.inf  # time of a reset whose outcome has not been shown yet [s]
         #: service requests without a response: time sent [s], future, callback
@@ -229,7 +229,7 @@ class View(Node):
 
     def _kinds(self) -> Ints:
         suspects = list(self.situation.suspects)
-        groups = self._places(suspects), self._isolated(), self._places(self.ruptured)
+        groups = self._places(suspects), self._isolated(), self._places(self._ruptured())
         kinds = np.zeros(self.robot.muscle_count, dtype=int)
         for kind, muscles in enumerate(groups, 1):  # the numbers are values of `body.Kind`
             kinds[muscles] = kind
@@ -276,7 +276,7 @@ class View(Node):
     def _reset(self) -> None:
         """Reset anomaly and stop, unless a ruptured muscle of the emulated arm is not isolated."""
         isolated = set(self.robot.names(self._isolated()).split(', '))
-        if remaining := [name for name in self.ruptured if name not in isolated]:
+        if remaining := [name for name in self._ruptured() if name not in isolated]:
             problem = f'ruptured muscles ({", ".join(remaining)}) would stop the arm again'
             self.page.notify(f'{problem}; press "Repair" first', False)
             return
@@ -304,12 +304,18 @@ class View(Node):
         if any(push.get_subscription_count() for push in self.pushes):
             running.add('pushed')
         self.page.offer(running, self._newest('mode', math.inf) in EXPLORING)
-        self._ask(GET, self._on_emulator_state, quiet=True, names=['ruptured_muscles', 'payload'])
+        self._ask(GET, self._on_emulator_state, quiet=True, names=['faults', 'payload'])
 
     def _on_emulator_state(self, answer: Any) -> None:
         match [parameter_value_to_python(value) for value in answer.values]:
-            case [[*ruptured], float(payload)]:
-                self.ruptured, self.payload = [str(name) for name in ruptured if name], payload
+            case [[*faults], float(payload)]:
+                self.faults, self.payload = [str(line) for line in faults if line], payload
+
+    def _ruptured(self) -> list[str]:
+        """Return the names of the muscles that the emulator ruptures."""
+        lines = [line.partition(':') for line in self.faults]
+        names = [name for kind, _, name in lines if kind == RUPTURE]
+        return names if all(names) else [*self.robot.muscles]  # no name stands for all muscles
 
     def _ask(
         self,
@@ -366,10 +372,12 @@ class View(Node):
                 for publisher in self.pushes:
                     publisher.publish(wrench)
             case 'rupture' | 'repair':
-                others = [name for name in self.ruptured if name != value]
-                self.ruptured = [*others, value] if what == 'rupture' else others
-                self._do('ruptured_muscles', self.ruptured or [''])
-            case 'ruptured_muscles' | 'payload' | 'position':
+                names = [name for name in self._ruptured() if name != value]
+                names += [value] if what == 'rupture' else []
+                others = [line for line in self.faults if line.partition(':')[0] != RUPTURE]
+                self.faults = [*others, *(f'{RUPTURE}:{name}' for name in names)]
+                self._do('faults', self.faults or [''])
+            case 'faults' | 'payload' | 'position':
                 parameter = Parameter(what, value=value).to_parameter_msg()
                 service = 'replay/set_parameters' if what == 'position' else SET
                 self._ask(service, parameters=[parameter])
@@ -389,7 +397,6 @@ def _parse(arguments: list[str]) -> Namespace:
     what = 'Shows a running arm on a web page, and lets visitors move it.'
     parser = Parser('view', what, ROS_HELP)
     parser.add_robot()
-    parser.add_motors()
     add = parser.add_argument
     host = 'address to listen on; with 0.0.0.0 the whole network can move the arm'
     add('--port', type=whole(1, 65535), default=8080, metavar='N', help='port of the page')

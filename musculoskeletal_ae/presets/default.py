@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.control.methods import LengthMethod
     from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
     from musculoskeletal_ae.estimation.finding import Detector
-    from musculoskeletal_ae.estimation.settings import Detection
     from musculoskeletal_ae.learning.updater import Updater
     from musculoskeletal_ae.mae.mae import Mae
     from musculoskeletal_ae.mae.training import Progress, TrainedNetwork
@@ -61,9 +60,7 @@ class DefaultPreset:
 
         return BodyUpdater(robot, mae, seed)
 
-    def residual_detectors(
-        self, robot: Robot, settings: Detection
-    ) -> tuple[ResidualDistance, list[Detector]]:
+    def residual_detectors(self, robot: Robot) -> tuple[ResidualDistance, list[Detector]]:
         """Return the detectors of large residuals, and of slack tendons and jammed modules."""
         from musculoskeletal_ae.estimation.detectors.jammed_module import (
             JammedModule,
@@ -75,9 +72,9 @@ class DefaultPreset:
             StretchedTendon,
         )
 
-        slack = robot.actuation.choose(SlackTendon, StretchedTendon)(robot, settings)
+        slack = robot.actuation.choose(SlackTendon, StretchedTendon)(robot)
         jammed = robot.actuation.choose(JammedModule, JammedPosition)(robot)
-        return ResidualDistance(robot, settings, slack), [slack, jammed]
+        return ResidualDistance(robot, slack), [slack, jammed]
 
     def length_methods(self) -> Mapping[str, LengthMethod]:
         """Return the paper's methods except `proposed`.

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.control.methods import LengthMethod
     from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
     from musculoskeletal_ae.estimation.finding import Detector
-    from musculoskeletal_ae.estimation.settings import Detection
     from musculoskeletal_ae.learning.updater import Updater
     from musculoskeletal_ae.mae.mae import Mae
     from musculoskeletal_ae.mae.training import Progress, TrainedNetwork
@@ -66,13 +65,11 @@ class PaperPreset:
 
         return OnlineLearning(robot, mae, seed)
 
-    def residual_detectors(
-        self, robot: Robot, settings: Detection
-    ) -> tuple[ResidualDistance, list[Detector]]:
+    def residual_detectors(self, robot: Robot) -> tuple[ResidualDistance, list[Detector]]:
         """Return a detector that decides by A alone (§III-D), and no physics-based detectors."""
         from musculoskeletal_ae.paper.state_estimation import AnomalyNorm
 
-        return AnomalyNorm(robot, settings), []
+        return AnomalyNorm(robot), []
 
     def length_methods(self) -> Mapping[str, LengthMethod]:
         """Return the paper's four control methods (§III-E)."""

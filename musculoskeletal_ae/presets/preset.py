@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.control.methods import LengthMethod
     from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
     from musculoskeletal_ae.estimation.finding import Detector
-    from musculoskeletal_ae.estimation.settings import Detection
     from musculoskeletal_ae.learning.updater import Updater
     from musculoskeletal_ae.mae.mae import Mae
     from musculoskeletal_ae.mae.training import Progress, TrainedNetwork
@@ -65,9 +64,7 @@ class Preset(Protocol):
 
     # -- anomalies ------------------------------------------------------------------------------
 
-    def residual_detectors(
-        self, robot: Robot, settings: Detection
-    ) -> tuple[ResidualDistance, list[Detector]]:
+    def residual_detectors(self, robot: Robot) -> tuple[ResidualDistance, list[Detector]]:
         """Return the detector that decides by the network's residual, and physics-based detectors.
 
         The physics-based detectors, if there are any, take precedence.

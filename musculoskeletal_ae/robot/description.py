@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read and check a robot description: a directory with `robot.urdf` and `muscles.yaml`.
 
-All faults of the two files are detected here or by `muscle_file` and `urdf`. The error message
-names the file, the entry and the legal values. Code that uses a description does not check it
-again.
+All faults of the files are detected here or by `muscle_file`, `motors` and `urdf`. The error
+message names the file, the entry and the legal values. Code that uses a description does not check
+it again.
 """
 
 import math
@@ -27,6 +27,7 @@ from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.joint_tree import PRISMATIC, REVOLUTE, Coupling, resolved
 from musculoskeletal_ae.robot.kinematics import body_frames
+from musculoskeletal_ae.robot.motors import NO_MOTORS, Motors, MotorTopics, read_motors
 from musculoskeletal_ae.robot.muscle_file import (
     POSITION,
     MuscleEntry,
@@ -145,12 +146,19 @@ class RobotDescription:
     end_effectors: tuple[str, ...]  # names of links; `end_effector` is the first of them
     couplings: dict[str, Coupling]  # coupling of each joint that follows another one
     joint_elasticity: JointElasticity  # springs and dampers of the joints
+    #: how the motors of a ros2_control robot are connected; None for a robot with a driver
+    motors: Motors | None
     warnings: tuple[str, ...]  # texts about questionable entries that were accepted
 
     @property
     def end_effector(self) -> str:
         """The link to which poses, external wrenches and the marker refer."""
         return self.end_effectors[0]
+
+    @property
+    def motor_topics(self) -> MotorTopics:
+        """Topics of the motors; without names if the robot publishes muscle_states."""
+        return NO_MOTORS if self.motors is None else self.motors.topics
 
     @property
     def held_joints(self) -> tuple[str, ...]:
@@ -168,6 +176,12 @@ class RobotDescription:
             lines.append(f'tension_source is none: {NO_TENSION}')
         if (scale := self.tension_source.newton_per_ampere) is not None:
             lines.append(f'tension_source is current, {shown(scale)} N per A: {BY_CURRENT}')
+        if self.motors is not None:
+            commands = self.motors.topics.commands or 'no topic'
+            lines.append(
+                f'its motors are joints of ros2_control: states on {self.motors.topics.states}, '
+                f'commands on {commands} (motors.yaml)'
+            )
         if held := ', '.join(self.held_joints):
             lines.append(f'held fixed at 0: {held}')
         return lines
@@ -228,12 +242,13 @@ def load_description(robot: str | Path) -> RobotDescription:
         speed.append(_or(muscle.speed, speed_default))
         release.append(_or(muscle.release, _or(content.release, math.nan)))
     order = [link.get('name', '') for link in tree.iter('link')]
+    muscles = tuple(muscle.name for muscle in content.muscles)
     return RobotDescription(
         directory=directory,
         urdf=urdf,
         model=model,
         joints=content.joints,
-        muscles=tuple(muscle.name for muscle in content.muscles),
+        muscles=muscles,
         routes=tuple(routes),
         series_elastic=SeriesElastic(**_columns(elastic)),
         stiffness=np.array(stiffness),
@@ -245,6 +260,7 @@ def load_description(robot: str | Path) -> RobotDescription:
         end_effectors=_read_end_effectors(content, model, couplings, order, fail),
         couplings=couplings,
         joint_elasticity=_read_joint_elasticity(content, couplings, fail),
+        motors=read_motors(directory, muscles),
         warnings=tuple(warnings),
     )
 

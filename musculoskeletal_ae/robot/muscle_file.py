@@ -14,20 +14,20 @@ import numpy as np
 from msgspec import UNSET, Meta, UnsetType, field
 
 from musculoskeletal_ae.exceptions import printable
+from musculoskeletal_ae.robot.entry_types import (
+    LONGEST_LIST,
+    Name,
+    Names,
+    NotNegative,
+    Number,
+    Positive,
+    Vector,
+)
 from musculoskeletal_ae.robot.joint_tree import MOST_TERMS
 from musculoskeletal_ae.schema import Strict
 
 STIFFNESS, POSITION = 'stiffness', 'position'  # values of `actuation`
-LARGEST = 1e8  # largest absolute value of any number [SI units]
-LONGEST_LIST = 1000  # largest number of entries of a list: muscles, points of a route, joints
 SHORTEST_AXIS = 1e-6  # length below which a vector defines no direction
-
-Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
-Positive = Annotated[float, Meta(gt=0.0, le=LARGEST)]
-NotNegative = Annotated[float, Meta(ge=0.0, le=LARGEST)]
-Vector = tuple[Number, Number, Number]
-Name = Annotated[str, Meta(min_length=1, max_length=200)]
-Names = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=LONGEST_LIST)]
 
 
 class ElasticEntry(Strict, frozen=True):

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Converts between messages of ros2_control and lengths and tensions of muscles.
 
-The motors of the muscles are joints of a ros2_control hardware interface. With the direction
-s = ±1, the radius r of the spool, the position q and the effort e of a motor, a muscle has
-
-    l = s r (q − q₀),   T = k (e − e₀)
+The motors of the muscles are joints of a ros2_control hardware interface. `robot/motors.py` has the
+equations that connect them with the muscles.
 
 joint_state_broadcaster publishes q and e as a JointState: in any order, mixed with other joints,
 and with NaN for interfaces that the hardware does not have. forward_command_controller takes a
@@ -14,15 +12,15 @@ The tension of a motor without effort is unknown, and so is every temperature. U
 NaN, never 0.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
+from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.reception import Stamps
-from musculoskeletal_ae.signals.motor_settings import ARRAY, JOINT_STATE, MotorSettings
+from musculoskeletal_ae.robot.motors import ARRAY, JOINT_STATE, NO_MOTORS, Motors
 from musculoskeletal_ae.signals.readings import QUANTITIES, MuscleReading, Row
 from musculoskeletal_ae.validity import joint_names, read_array
 
@@ -33,68 +31,39 @@ class MotorInterface:
     """Converts the messages of one arm; keep one object for each subscription.
 
     Attributes:
-        settings: The parameters.
+        topics: Topics of the motors.
         is_ros2_control: Whether states arrive as JointState; otherwise as muscle_states.
         state_topic: Topic of the states.
         state_type: Type of the messages on `state_topic`.
         command_topic: Topic of the motor commands, or '' if there are none.
     """
 
-    def __init__(self, settings: MotorSettings, muscles: Sequence[str]) -> None:
-        """Assign motors to muscles according to the parameters.
+    def __init__(self, motors: Motors | None) -> None:
+        """Start without a message.
 
         Args:
-            settings: The parameters.
-            muscles: Names of the muscles.
-
-        Raises:
-            MusculoskeletalError: If a parameter does not fit the muscles.
+            motors: How the motors are connected to the muscles; None for a robot with a driver,
+                which publishes muscle_states.
         """
-        count = len(muscles)
-        self.settings = settings
-        self._motors = tuple(filter(None, settings.motor_names)) or tuple(muscles)
-        self.is_ros2_control = bool(settings.motor_state_topic)
-        self.state_topic = settings.motor_state_topic or STATES
+        self.topics = NO_MOTORS if motors is None else motors.topics
+        self.is_ros2_control = motors is not None
+        self.state_topic = self.topics.states or STATES
         self.state_type = JOINT_STATE if self.is_ros2_control else ARRAY
-        self.command_topic = settings.motor_command_topic
-        if self.command_topic and not self.is_ros2_control:
-            problem = 'needs motor_state_topic, which is empty; set both, or none'
-            raise _refused('motor_command_topic', problem)
-        if len(self._motors) != count:
-            legal = f'a motor for each of the {count} muscles: {", ".join(muscles)}'
-            raise _refused('motor_names', f'got {len(self._motors)} names; expected {legal}')
-        if len(set(self._motors)) < count:
-            twice = max(self._motors, key=self._motors.count)
-            problem = f'{twice!r} is listed twice; each muscle needs a motor of its own'
-            raise _refused('motor_names', problem)
-        order = tuple(filter(None, settings.motor_command_order)) or self._motors
-        if sorted(order) != sorted(self._motors):
-            wrong = sorted({*order} ^ {*self._motors}) or [max(order, key=order.count)]
-            legal = f'each of {", ".join(self._motors)} once'
-            problem = f'{wrong[0]!r} is missing, unknown or repeated; expected {legal}'
-            raise _refused('motor_command_order', problem)
-        #: index of the muscle to which each value of a command belongs, (M,)
-        self._order: Ints = np.array([self._motors.index(name) for name in order])
-        each = {
-            name: _each(name, getattr(settings, name), count)
-            for name in (
-                'spool_radius', 'motor_direction', 'motor_zero', 'tension_per_effort', 'effort_zero'
-            )
-        }  # fmt: skip
-        for name, legal in (
-            ('motor_direction', '1 or -1'),
-            ('tension_per_effort', 'a number other than 0'),
-        ):
-            values = np.abs(each[name])
-            fits = values == 1.0 if name == 'motor_direction' else values > 0.0
-            if not fits.all():
-                raise _refused(name, f'got {each[name][~fits][0]:g}; expected {legal}')
-        self._length_per_position = each['motor_direction'] * each['spool_radius']
-        self._zero, self._effort_zero = each['motor_zero'], each['effort_zero']
-        self._tension_per_effort = each['tension_per_effort']
-        self._names: list[str] = []  # names of the joints in the last message
-        self._places = np.zeros(count, dtype=int)  # places of the motors among these names, (M,)
+        self.command_topic = self.topics.commands
+        if motors is not None:
+            self._connect(motors)
         self.reset()
+
+    def _connect(self, motors: Motors) -> None:
+        self._motors = motors.joints
+        #: index of the muscle to which each value of a command belongs, (M,)
+        self._order: Ints = np.array([motors.joints.index(name) for name in motors.command_order])
+        self._length_per_position = motors.direction * motors.spool_radius
+        self._zero, self._effort_zero = motors.zero, motors.effort_zero
+        self._tension_per_effort = motors.tension_per_effort
+        self._names: list[str] = []  # names of the joints in the last message
+        #: places of the motors among these names, (M,)
+        self._places: Ints = np.zeros(len(motors.joints), dtype=int)
 
     def reset(self) -> None:
         """Discard the last stamp, for example after a jump of the clock."""
@@ -160,7 +129,7 @@ class MotorInterface:
             tension: Tensions [N], (M,).
         """
         effort = tension / self._tension_per_effort + self._effort_zero
-        return tuple(self._motors), self._position(length), effort
+        return self._motors, self._position(length), effort
 
     def _position(self, length: Array) -> Array:
         position: Array = length / self._length_per_position + self._zero
@@ -177,15 +146,3 @@ class MotorInterface:
             if names.count(motor) > 1:
                 raise MessageError('duplicate motor', f'{motor!r} is in the message more than once')
         return np.array([places[motor] for motor in self._motors])
-
-
-def _refused(name: str, problem: str) -> MusculoskeletalError:
-    return MusculoskeletalError(f'parameter {name}: {problem}')
-
-
-def _each(name: str, values: Sequence[float], count: int) -> Array:
-    """Return one value for each muscle, (M,); a single value in `values` is for all muscles."""
-    if len(values) not in (1, count):
-        raise _refused(name, f'got {len(values)} values; expected 1, or {count} for all muscles')
-    each: Array = np.full(count, values[0]) if len(values) == 1 else np.array(values)
-    return each

@@ -14,21 +14,18 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
-from musculoskeletal_ae.bags.topics import NO_MOTORS
 from musculoskeletal_ae.estimation.estimator import LONGEST_PERIOD
 from musculoskeletal_ae.estimation.finding import Finding, observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.exceptions import BagError, CheckpointError, MusculoskeletalError
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.settings import DEFAULT
+from musculoskeletal_ae.learning.rest import REST_TIME
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.options import DEFAULT_SEED
 from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
-from musculoskeletal_ae.signals.motor_settings import MotorSettings
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 from musculoskeletal_ae.signals.readings import MuscleReading, muscle_reading
 from musculoskeletal_ae.stop_signals import STOP, Reaction
@@ -46,10 +43,8 @@ def train(args: Namespace) -> None:
     """Learn from recordings in order; print the errors on them and on held-out recordings."""
     robot = prepare(args)
     # All bags are read first, because training takes minutes and a bag may be unusable.
-    motors = motor_settings(args.params_file)
     recordings = {
-        path: read(path, robot, args.from_namespace, motors)
-        for path in (*args.from_bag, *args.hold_out)
+        path: read(path, robot, args.from_namespace) for path in (*args.from_bag, *args.hold_out)
     }
     warnings = [
         f'{path}: {text}'
@@ -150,7 +145,7 @@ def _nothing_learned(learner: Learner) -> str:
         'nothing was learned (0 updates). Different resting postures in the recordings: '
         f'{len(learner.samples)}; learning begins with {learner.scheduler.least_samples}. '
         'Record some minutes in which the healthy arm moves from posture to posture and rests in '
-        f'each for at least {DEFAULT.rest_time:g} s, as with controller/explore'
+        f'each for at least {REST_TIME:g} s, as with controller/explore'
     )
 
 
@@ -252,16 +247,13 @@ def anomaly_in(
     return ''
 
 
-def read(
-    path: Path, robot: Robot, namespace: str | None = None, motors: MotorSettings = NO_MOTORS
-) -> Pairs:
+def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
     """Return the paired messages of a bag, and print progress, and warnings about unused messages.
 
     Args:
         path: The bag.
         robot: The recorded robot.
         namespace: The namespace of the arm; required only if the bag has several.
-        motors: How the motors of a ros2_control robot are connected.
 
     Raises:
         BagError: If the bag is unusable or has no pair of simultaneous messages.
@@ -269,7 +261,7 @@ def read(
     with ProgressBar(f'reading {path}') as bar:
         bar.announce()
         bag = Bag.open(path)
-        streams = read_streams(bag, robot, namespace, motors, bar.add)
+        streams = read_streams(bag, robot, namespace, bar.add)
     for reason in bag.unfinished:
         print(f'warning: {path} is unfinished: {reason}', file=sys.stderr)
     for reason, count in streams.rejected.items():

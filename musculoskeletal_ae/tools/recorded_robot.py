@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tell whether a recording is one of a given robot, and otherwise of which.
 
-    python -m musculoskeletal_ae.tools.recorded_robot BAG ROBOT [PARAMS_FILE…]
+    python -m musculoskeletal_ae.tools.recorded_robot BAG ROBOT
 
 ends with status 1 and one line if the nodes of the robot could not use the recording. `bringup.sh`
 calls it before it starts anything. It only reads the beginning of a recording that fits;
@@ -14,45 +14,44 @@ from pathlib import Path
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LATEST
 from musculoskeletal_ae.bags.streams import read_streams
-from musculoskeletal_ae.bags.topics import NO_MOTORS, interface_topics
+from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError, printable
-from musculoskeletal_ae.nodes.parameters import motor_settings
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
-from musculoskeletal_ae.signals.motor_settings import MotorSettings
 
 BEGINNING = 2_000_000_000  # first part of a recording, in which most wrong robots are noticed [ns]
 
 
-def misfit(bag: Bag, name: str, motors: MotorSettings = NO_MOTORS) -> str:
+def misfit(bag: Bag, name: str) -> str:
     """Return why a recording is not one of a robot, and what to pass instead; '' if it is one.
 
     Args:
         bag: The recording.
         name: A shipped robot or a robot directory.
-        motors: How the motors of a ros2_control robot are connected.
 
     Raises:
         MusculoskeletalError: If the robot or the recording is unusable.
     """
     robot = Robot.load(name)
-    interface_topics(bag, motors=motors)  # raises errors that have nothing to do with the robot
+    interface_topics(
+        bag, motors=robot.description.motor_topics
+    )  # raises errors that have nothing to do with the robot
     # The first messages may be bad ones, so the whole recording is read before it is refused.
     for stop in bag.start + BEGINNING, LATEST:
-        problem = _problem(bag, robot, motors, stop)
+        problem = _problem(bag, robot, stop)
         if not problem:
             return ''
     fits = [
         other
         for other in shipped_robots()
-        if not _problem(bag, Robot.load(other), motors, bag.start + BEGINNING)
+        if not _problem(bag, Robot.load(other), bag.start + BEGINNING)
     ]
     if fits:
         remedy = f'it fits {", ".join(fits)}; pass --robot {fits[0]}'
     else:
         remedy = 'pass --robot with the directory of the robot that was recorded'
-        recorded, joints = _described(bag, motors)
+        recorded, joints = _described(bag, robot)
         if joints:
             stated = f'its robot_description is that of {recorded!r}, with the joints '
             remedy = f'{stated}{", ".join(joints)}; {remedy}'
@@ -60,24 +59,24 @@ def misfit(bag: Bag, name: str, motors: MotorSettings = NO_MOTORS) -> str:
     return f'{bag.path} is not a recording of {robot_name}: {problem}; {remedy}'
 
 
-def _problem(bag: Bag, robot: Robot, motors: MotorSettings, stop: int) -> str:
+def _problem(bag: Bag, robot: Robot, stop: int) -> str:
     """Return why the messages up to a log time [ns] do not fit a robot; '' if they do."""
     try:
-        streams = read_streams(bag, robot, motors=motors, stop=stop)
+        streams = read_streams(bag, robot, stop=stop)
     except BagError as error:
         return error.problem
     if len(streams.joints.time):
         return ''
     # Without joint sensors, only the number of muscles is known to fit.
-    _, described = _described(bag, motors)
+    _, described = _described(bag, robot)
     if described and not set(robot.joints) <= set(described):
         return f'its robot_description has the joints {", ".join(described)}'
     return ''
 
 
-def _described(bag: Bag, motors: MotorSettings) -> tuple[str, list[str]]:
+def _described(bag: Bag, robot: Robot) -> tuple[str, list[str]]:
     """Return the name and the movable joints of the recorded URDF; '' and [] without one."""
-    topic = interface_topics(bag, motors=motors).get('robot_description')
+    topic = interface_topics(bag, motors=robot.description.motor_topics).get('robot_description')
     for message in bag.messages([topic] if topic else []):
         try:
             root = parse_xml(bag.path, bag.decode(message).data)
@@ -94,9 +93,9 @@ def _described(bag: Bag, motors: MotorSettings) -> tuple[str, list[str]]:
 
 def main(arguments: list[str]) -> int:
     """Print why a recording does not fit a robot; return the exit status."""
-    path, robot, *files = arguments
+    path, robot = arguments
     try:
-        problem = misfit(Bag.open(path), robot, motor_settings(map(Path, files)))
+        problem = misfit(Bag.open(Path(path)), robot)
     except (MusculoskeletalError, OSError) as error:
         problem = str(error)
     if problem:

@@ -34,14 +34,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('--checkpoint', type=Path, metavar='FILE', help=text)
     text = 'with --from-bag: namespace of the arm if the bags have several'
     parser.add_argument('--from-namespace', metavar='NS', help=text)
-    parser.add_motors()
     text = 'device for training; it must be one that torch can use'
     parser.add_argument('--device', choices=DEVICES, default='cpu', help=text)
     parser.add_quick('a tenth of the training, for a first try')
     args = parser.parse_args(argv)
-    of_bags = args.hold_out, args.checkpoint, args.from_namespace, args.params_file
+    of_bags = args.hold_out, args.checkpoint, args.from_namespace
     if not args.from_bag and any(of_bags):
-        options = '--hold-out, --checkpoint, --from-namespace and --params-file'
+        options = '--hold-out, --checkpoint and --from-namespace'
         parser.error(f'use {options} with --from-bag only')
     if args.checkpoint and args.quick:
         parser.error('--quick shortens the initial training; do not use it with --checkpoint')

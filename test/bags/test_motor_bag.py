@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings of a ros2_control robot, whose muscles are joints of a JointState."""
 
+import tempfile
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from robots import arm_with_motors
 
 from bags.arm_bag import ARRAY, JOINTS, PERIOD, Arm, array
 from bags.bag_samples import encode, message_class
@@ -12,8 +16,8 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import read_streams
 from musculoskeletal_ae.bags.topics import interface_topics, select
 from musculoskeletal_ae.exceptions import BagError
+from musculoskeletal_ae.robot.motors import MotorTopics
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.motor_settings import MotorSettings
 
 ROBOT = Robot.load('arm26')
 MOTORS = tuple(f'{muscle}_motor' for muscle in ROBOT.muscles)
@@ -21,14 +25,23 @@ RADIUS = 0.01  # radius of the spools [m]
 COUNT = 40
 
 
-def settings(topic='/joint_states'):
-    return MotorSettings(
-        motor_state_topic=topic,
-        motor_command_topic='/tendons/commands',
-        motor_names=MOTORS,
-        spool_radius=(RADIUS,),
-        motor_direction=(-1.0,),
-    )
+@pytest.fixture
+def robot(tmp_path):
+    """Return a function that makes arm26 with motors on a topic."""
+
+    def make(topic='/joint_states', **changes):
+        motors = {muscle: {'joint': motor} for muscle, motor in zip(ROBOT.muscles, MOTORS)}
+        content = {
+            'state_topic': topic,
+            'command_topic': '/tendons/commands',
+            'spool_radius': RADIUS,
+            'direction': -1,
+            'motors': motors,
+        }
+        folder = Path(tempfile.mkdtemp(dir=tmp_path))
+        return Robot.load(arm_with_motors(folder, **content | changes))
+
+    return make
 
 
 def joint_state(names, position, effort, stamp):
@@ -64,9 +77,11 @@ def recording(path, topic='/joint_states', joints=ROBOT.joints, stamps=range(1, 
         ('/tendons/states', '/tendons/states'),
     ],
 )
-def test_motors_are_read_as_muscles_and_the_joints_beside_them_as_joints(tmp_path, topic, stated):
+def test_motors_are_read_as_muscles_and_the_joints_beside_them_as_joints(
+    robot, tmp_path, topic, stated
+):
     arm = recording(tmp_path / 'bag', topic)
-    streams = read_streams(Bag.open(tmp_path / 'bag'), ROBOT, motors=settings(stated))
+    streams = read_streams(Bag.open(tmp_path / 'bag'), robot(stated))
     assert_allclose(streams.muscles.values[:, :2], np.stack([arm.length, arm.tension], axis=1))
     assert np.isnan(streams.muscles.values[:, 2]).all()
     assert_allclose(streams.length_commands.values, arm.length)
@@ -75,9 +90,9 @@ def test_motors_are_read_as_muscles_and_the_joints_beside_them_as_joints(tmp_pat
         assert_allclose(streams.pairs().theta, arm.theta)
 
 
-def test_a_robot_without_joint_sensors_is_read_and_what_was_not_used_is_counted(tmp_path):
+def test_a_robot_without_joint_sensors_is_read_and_what_was_not_used_is_counted(robot, tmp_path):
     recording(tmp_path / 'bag', joints=(), stamps=[1, 1, 0, *range(2, COUNT - 1)])
-    streams = read_streams(Bag.open(tmp_path / 'bag'), ROBOT, motors=settings())
+    streams = read_streams(Bag.open(tmp_path / 'bag'), robot())
     assert len(streams.muscles.time) == COUNT - 2 and not len(streams.joints.time)
     assert streams.rejected == {
         '/joint_states as muscle_states: repeated stamp': 1,
@@ -86,25 +101,28 @@ def test_a_robot_without_joint_sensors_is_read_and_what_was_not_used_is_counted(
     }
 
 
-def test_what_is_recorded_of_another_robot_is_refused_with_the_motors_that_are_missing(tmp_path):
+def test_what_is_recorded_of_another_robot_is_refused_with_the_motors_that_are_missing(
+    robot, tmp_path
+):
     recording(tmp_path / 'bag')
-    other = MotorSettings(motor_state_topic='/joint_states')
+    other = robot(motors={})
     with pytest.raises(
         BagError, match=r'missing motor: deltoid_anterior, .* the message contains '
     ):
-        read_streams(Bag.open(tmp_path / 'bag'), ROBOT, motors=other)
-    with pytest.raises(BagError, match='/states, which motor_state_topic names, is not in the'):
-        interface_topics(Bag.open(tmp_path / 'bag'), motors=settings('/states'))
-    assert not check_bag(tmp_path / 'bag', 'arm26', motors=settings()).faults
-    assert check_bag(tmp_path / 'bag', 'arm26', motors=other).faults
+        read_streams(Bag.open(tmp_path / 'bag'), other)
+    with pytest.raises(BagError, match=r'/states, which motors\.yaml names, is not in the'):
+        interface_topics(Bag.open(tmp_path / 'bag'), motors=MotorTopics('/states'))
+    assert not check_bag(tmp_path / 'bag', str(robot().description.directory)).faults
+    assert check_bag(tmp_path / 'bag', str(other.description.directory)).faults
 
 
 def test_a_replay_publishes_what_the_motors_measured_and_never_what_moves_them(tmp_path):
     topic = '/joint_state_broadcaster/joint_states'
     recording(tmp_path / 'bag', topic)
+    motors = MotorTopics(topic, '/tendons/commands')
     for keep_names in (False, True):
-        chosen = select(Bag.open(tmp_path / 'bag'), ['default'], None, keep_names, settings(topic))
+        chosen = select(Bag.open(tmp_path / 'bag'), ['default'], None, keep_names, motors)
         assert chosen[topic] == topic and '/tendons/commands' not in chosen
         assert set(chosen) == {topic, '/muscle_length_command'}
-    named = select(Bag.open(tmp_path / 'bag'), ['/tendons/commands'], None, True, settings(topic))
+    named = select(Bag.open(tmp_path / 'bag'), ['/tendons/commands'], None, True, motors)
     assert set(named) == {'/tendons/commands'}

@@ -243,11 +243,11 @@ def has_learned(output):
 def a_rupture_is_shown_and_a_dead_node_named(graph, arm, run):
     emulator = f'{arm}/hardware_emulator'
     detected = graph.listen(Bool, f'{arm}/anomaly_detected', LATCHED)
-    assert graph.set_parameter(emulator, 'ruptured_muscles', ['brachialis'])[0]
+    assert graph.set_parameter(emulator, 'faults', ['rupture:brachialis'])[0]
     graph.wait(lambda: detected and detected[-1].data, 'the detection')
     line = run.wait_for_output(': brachialis: ')
     assert Step.REPAIR_MUSCLE.text in line and 'estimator/reset' in line
-    assert graph.set_parameter(emulator, 'ruptured_muscles', [''])[0]
+    assert graph.set_parameter(emulator, 'faults', [''])[0]
     graph.wait(
         lambda: (
             graph.call(Trigger, f'{arm}/estimator/reset').success

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.control import follower
 from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.feedback import REPLAN
@@ -91,10 +92,10 @@ def test_second_runs_after_first_and_reads_the_tension_once():
     np.testing.assert_allclose(bench.step(200)[-1].value, wanted + 0.01, atol=1e-9)
 
 
-def test_method_first_plans_with_the_constant_tension():
-    bench = Bench(method='first', first_duration=1.0, constant_tension=70.0)
+def test_method_first_plans_with_the_tension_bias():
+    bench = Bench(method='first', first_duration=1.0)
     bench.target(REST)
-    wanted = ROBOT.muscle_lengths(REST, np.full(ROBOT.muscle_count, 70.0)) - 40.0 / ROBOT.stiffness
+    wanted = ROBOT.muscle_lengths(REST, ROBOT.tension.bias)
     np.testing.assert_allclose(bench.step(200)[-1].value, wanted, atol=1e-9)
 
 
@@ -196,8 +197,9 @@ def test_a_network_that_answers_nan_stops_the_arm_and_no_command_is_nan():
     assert bench.cause == ''
 
 
-def test_after_reset_the_last_target_is_resumed_by_a_ramp():
-    bench = Bench(first_duration=0.5, feedback_gain=0.0)
+def test_after_reset_the_last_target_is_resumed_by_a_ramp(monkeypatch):
+    monkeypatch.setattr(follower, 'FEEDBACK_GAIN', 0.0)
+    bench = Bench(first_duration=0.5)
     bench.target(OTHER)
     goal = bench.step(200)[-1].value
     bench.stop()

@@ -90,7 +90,7 @@ class Loop:
         Returns:
             The stop cause that made the controller refuse the reset; None if the reset succeeded.
         """
-        self.arm.faults.set([])
+        self.arm.set_faults([])
         self.arm.reset(self.arm.theta)
         self.run(3.0)
         self.estimator.reset()
@@ -143,6 +143,8 @@ OTHERS = [
     pytest.param(f'dead_sensor:tension:{MUSCLE}', 2.5, None, marks=thorough),
     (f'stuck_motor:{MUSCLE}', 1.5, None),
     (f'slack:{MUSCLE}', 1.5, None),
+    pytest.param(f'rupture:{MUSCLE}', 1.5, None, marks=thorough),
+    pytest.param(f'offset:{MUSCLE}:0.1', 1.0, 'length', marks=thorough),
     pytest.param(f'saturate:{MUSCLE}:60', 1.5, None, marks=thorough),
     (f'winch_speed:{MUSCLE}:0.009', 1.5, None),
     # The cause is either an implausible length or a jump.
@@ -162,7 +164,7 @@ def check_that_no_command_jumped(loop):
 def test_under_tolerable_faults_the_arm_goes_on_and_no_command_jumps(loop):
     held = loop.arm.theta
     for fault, seconds in TOLERATED.items():
-        loop.arm.faults.set([fault])
+        loop.arm.set_faults([fault])
         loop.run(seconds)
         assert loop.cause == '', fault
     check_that_no_command_jumped(loop)
@@ -174,7 +176,7 @@ def test_under_other_faults_no_command_jumps_and_the_arm_resumes_after_the_repai
     loop, fault, seconds, cause
 ):
     held = loop.arm.theta
-    loop.arm.faults.set([fault])
+    loop.arm.set_faults([fault])
     loop.run(seconds)
     assert cause is None or cause in loop.cause
     check_that_no_command_jumped(loop)

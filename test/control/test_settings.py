@@ -1,4 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -14,10 +17,26 @@ def test_joint_stiffness_left_empty_demands_nothing_of_any_joint(stiffness):
     assert Settings(joint_stiffness=(5.0, 0.0)).desired_stiffness((1.0, 1.0)) == (5.0, 0.0)
 
 
-@pytest.mark.parametrize('stiffness', [(1.0, 2.0, 3.0), (1.0, -1.0), (np.nan, 1.0)])
-def test_joint_stiffness_needs_one_number_of_at_least_0_for_each_joint(stiffness):
+def test_joint_stiffness_needs_one_number_for_each_joint():
     with pytest.raises(MusculoskeletalError, match='legal: 2 numbers of at least 0'):
-        Settings(joint_stiffness=stiffness).desired_stiffness((1.0, 1.0))
+        Settings(joint_stiffness=(1.0, 2.0, 3.0)).desired_stiffness((1.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ('wrong', 'legal'),
+    [
+        ({'joint_stiffness': (1.0, -1.0)}, 'a list of finite numbers, 0 to '),
+        ({'joint_stiffness': (np.nan, 1.0)}, 'a list of finite numbers'),
+        ({'method': 'magic'}, 'legal: geometric, first'),
+        ({'max_age': 60.0}, 'a finite number, 0.01 to 10 s'),
+        ({'rate_limit': '0.1'}, 'a finite number, 0.001 to 1 m/s'),
+    ],
+)
+def test_settings_are_checked_wherever_they_are_made(wrong, legal):
+    (name,) = wrong
+    for make in (partial(Settings, **wrong), partial(replace, Settings(), **wrong)):
+        with pytest.raises(MusculoskeletalError, match=f'^parameter {name}: .*{legal}'):
+            make()
 
 
 def test_the_limit_of_joint_stiffness_of_a_prismatic_joint_is_that_of_a_pinion():
@@ -26,5 +45,5 @@ def test_the_limit_of_joint_stiffness_of_a_prismatic_joint_is_that_of_a_pinion()
     stiffness = parameter.checked([1000.0, 1000.0 / RACK**2])
     assert Settings(joint_stiffness=stiffness).desired_stiffness(radian) == stiffness
     for beyond in ((1001.0, 0.0), (0.0, 1001.0 / RACK**2)):
-        with pytest.raises(MusculoskeletalError, match='at most 1000, 277778 '):
+        with pytest.raises(MusculoskeletalError, match=r'at most 1000, 277778 |0 to 277778 '):
             Settings(joint_stiffness=beyond).desired_stiffness(radian)

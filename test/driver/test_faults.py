@@ -23,11 +23,11 @@ from musculoskeletal_ae.driver.verdict import CHECKS, FAULTS, Verdict
 from musculoskeletal_ae.driver.winding import Winding
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import TensionRange, with_modules
+from musculoskeletal_ae.robot.motors import Motors, MotorTopics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.signals import motor_interface
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
-from musculoskeletal_ae.signals.motor_settings import MotorSettings
 
 ROBOT = Robot.load('arm26')
 POSITION = Robot(with_modules(ROBOT.description, actuation='position'))
@@ -388,10 +388,18 @@ def ros2_control(**wrong):
 
     The settings are right, except those in `wrong`.
     """
-    right = MotorSettings(
-        motor_state_topic='joint_states', spool_radius=(0.012,), motor_direction=(-1.0,)
+    ones, muscles = np.ones(ROBOT.muscle_count), ROBOT.muscles
+    right = Motors(
+        MotorTopics('joint_states'),
+        joints=muscles,
+        command_order=muscles,
+        spool_radius=0.012 * ones,
+        direction=-ones,
+        zero=0.0 * ones,
+        tension_per_effort=ones,
+        effort_zero=0.0 * ones,
     )
-    interface = MotorInterface(right, ROBOT.muscles)
+    interface = MotorInterface(right)
 
     def message(rows, now):
         names, position, effort = interface.joint_values(rows[0], rows[1])
@@ -400,7 +408,7 @@ def ros2_control(**wrong):
         arrays = {'position': position, 'velocity': [], 'effort': effort}
         return SimpleNamespace(header=header, name=list(names), **arrays)
 
-    motors = MotorInterface(replace(right, **wrong), ROBOT.muscles)
+    motors = MotorInterface(replace(right, **wrong))
     return heard(moved=True, message=message, motors=motors)
 
 
@@ -412,14 +420,22 @@ def test_the_motors_of_ros2_control_are_judged_as_muscles():
 @pytest.mark.parametrize(
     ('wrong', 'check', 'reported'),
     [
-        ({'motor_direction': (1.0,)}, 'sign', 'set the parameters spool_radius, motor_direction'),
-        ({'spool_radius': (0.036,)}, 'unit', 'times the change that the route predicts'),
-        ({'motor_zero': (8.0,)}, 'zero', 'from the length that the route predicts in this posture'),
-        ({'tension_per_effort': (0.224,)}, 'unit', 'tensions look like'),
-        ({'motor_names': tuple('abcdef')}, 'order', 'correct the parameter motor_names'),
+        ({'direction': np.ones(6)}, 'sign', 'change spool_radius, direction, zero'),
+        ({'spool_radius': np.full(6, 0.036)}, 'unit', 'times the change that the route predicts'),
+        (
+            {'zero': np.full(6, 8.0)},
+            'zero',
+            'from the length that the route predicts in this posture',
+        ),
+        ({'tension_per_effort': np.full(6, 0.224)}, 'unit', 'tensions look like'),
+        (
+            {'joints': tuple('abcdef'), 'command_order': tuple('abcdef')},
+            'order',
+            'correct `joint` in motors.yaml',
+        ),
     ],
 )
-def test_a_wrong_parameter_of_the_motors_is_found(wrong, check, reported):
+def test_a_wrong_entry_of_the_motors_is_found(wrong, check, reported):
     verdict = ros2_control(**wrong)
     assert check in verdict.wrong, str(verdict)
     assert reported in str(verdict)

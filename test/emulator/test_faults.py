@@ -8,6 +8,7 @@ from emulator.commands import to_mid_range
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.faults import KINDS, Faults, Readings, read_fault
 from musculoskeletal_ae.emulator.reality import make_arm
+from musculoskeletal_ae.emulator.sensors import Sensors, read_sensors
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 MUSCLE = 2
@@ -148,6 +149,57 @@ def test_ending_slack_causes_no_peak_of_tension(robot, reality):
     assert arm.tension[MUSCLE] == pytest.approx(robot.tension.bias[MUSCLE])
     arm.step(0.01)
     assert arm.tension[MUSCLE] > 0.5 * robot.tension.bias[MUSCLE]
+
+
+def test_a_ruptured_tendon_stays_ruptured_until_the_fault_ends(arm, robot):
+    arm.set_faults([f'rupture:{robot.muscles[MUSCLE]}', 'drop:0.1'])
+    for change in (lambda: None, arm.reset, lambda: arm.set_faults(['rupture', 'drop'])):
+        change()
+        arm.step(0.01)
+        assert arm.tension[MUSCLE] == 0.0
+    arm.set_faults(['drop'])
+    arm.step(0.01)
+    assert arm.tension[MUSCLE] > 0.5 * robot.tension.bias[MUSCLE]
+
+
+def test_an_offset_of_either_sign_shifts_the_length_of_one_muscle(arm, robot):
+    before = arm.sense().length
+    arm.set_faults([f'offset:{robot.muscles[MUSCLE]}:-0.02'])
+    expected = -0.02 * (np.arange(robot.muscle_count) == MUSCLE)
+    np.testing.assert_allclose(arm.sense().length - before, expected, atol=2e-3)
+    for wrong in ('offset:2', 'offset:-2', 'offset:nan'):
+        with pytest.raises(MusculoskeletalError, match='sizes from -1 to 1 m'):
+            arm.set_faults([wrong])
+
+
+@pytest.mark.parametrize(
+    ('lines', 'sensors'),
+    [
+        ([], Sensors()),
+        (['joints'], Sensors(joints=True)),
+        (['imu:hand', 'marker'], Sensors(marker_rate=10.0, imu_link='hand')),
+        (['marker:0.5'], Sensors(marker_rate=0.5)),
+    ],
+)
+def test_lines_describe_the_sensors_of_an_arm(robot, lines, sensors):
+    assert read_sensors(lines, robot) == sensors
+
+
+@pytest.mark.parametrize(
+    ('lines', 'legal'),
+    [
+        (['radar'], "'radar'; legal: joints, marker"),
+        (['joints:3'], 'legal: joints, marker'),
+        (['marker:0'], 'above 0 to 100 Hz'),
+        (['marker:nan'], 'above 0 to 100 Hz'),
+        (['marker:fast'], 'above 0 to 100 Hz'),
+        (['imu:knee'], "unknown link 'knee'; legal: .*forearm"),
+        (['imu:hand', 'imu:forearm'], 'the second sensor of its kind'),
+    ],
+)
+def test_a_line_that_describes_no_sensor_is_refused(robot, lines, legal):
+    with pytest.raises(MusculoskeletalError, match=legal):
+        read_sensors(lines, robot)
 
 
 def test_a_slow_winch_keeps_its_speed(robot):

@@ -7,10 +7,9 @@ import pytest
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE, IN_A_ROW, NORM
-from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME
+from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME, SLACK_LENGTH
 from musculoskeletal_ae.estimation.finding import observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
-from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.mae.units import State
 
 DT = 0.01
@@ -19,9 +18,9 @@ DT = 0.01
 class MonitorBench:
     """A health monitor with a network, and the tensions commanded to its modules."""
 
-    def __init__(self, robot, mae, threshold=0.0, preset='default'):
+    def __init__(self, robot, mae, preset='default'):
         self.mae, self.demand = mae, None
-        self.health = HealthMonitor(robot, preset, Detection(threshold))
+        self.health = HealthMonitor(robot, preset)
         self.health.use(mae)
 
     def step(self, message, state=None):
@@ -38,8 +37,8 @@ class MonitorBench:
 
 @pytest.fixture
 def watch(robot):
-    def make(mae, threshold=0.0, preset='default'):
-        return MonitorBench(robot, mae, threshold, preset)
+    def make(mae, preset='default'):
+        return MonitorBench(robot, mae, preset)
 
     return make
 
@@ -76,18 +75,15 @@ def test_statistics_of_the_geometric_model_detect_no_anomaly(mae, watch, wound):
     assert not any(watched.findings(wound, 3 * IN_A_ROW))
 
 
-@pytest.mark.parametrize(('threshold', 'named'), [(0.0, 'd = '), (0.2, 'A = ')])
-def test_an_anomaly_takes_five_messages_in_a_row(
-    calibrated, watch, healthy, wound, threshold, named
-):
-    watched = watch(calibrated, threshold)
+def test_an_anomaly_takes_five_messages_in_a_row(calibrated, watch, healthy, wound):
+    watched = watch(calibrated)
     assert not any(watched.findings(healthy, IN_A_ROW))
     assert not any(watched.findings(wound, IN_A_ROW - 1))
     assert watched.findings(healthy) == [None]
     *before, finding = watched.findings(wound, IN_A_ROW)
     assert not any(before)
     assert (finding.muscle, finding.kind) == (1, ConditionKind.RESIDUAL_DISTANCE)
-    assert finding.evidence.startswith(named)
+    assert finding.evidence.startswith('d = ')
 
 
 def test_a_reset_restarts_the_count(calibrated, watch, wound):
@@ -125,7 +121,7 @@ def test_shortening_by_motion_of_the_arm_does_not_count_as_slack_taken_up(robot,
     length = robot.routes.relative_lengths(theta)
     shortest = int((length[-1] - length[0]).argmin())
     length = length[:, shortest]
-    assert (np.diff(length) < 0.0).all() and length[0] - length[-1] > Detection().slack_length
+    assert (np.diff(length) < 0.0).all() and length[0] - length[-1] > SLACK_LENGTH
     tension, kinds = np.full(6, 60.0), set()
     tension[shortest] = 0.0
     for n in range(steps):
@@ -176,7 +172,8 @@ def test_preset_paper_decides_by_a_alone_once_it_is_calibrated(
     assert not any(watched.findings(healthy, IN_A_ROW))
     # A never reaches this threshold, so only the detectors that do not use A could find something.
     # The preset `paper` has none of them.
-    watched.health.configure(Detection(1e6))
+    statistics = replace(statistics, thresholds={NORM: 1e6})
+    watched.health.use(replace(calibrated, anomaly=statistics))
     assert not any(watched.findings(slack, round(2 * DEAD_TIME / DT)))
 
 

@@ -11,7 +11,6 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.detectors.jammed_module import JAM_TIME, JammedPosition
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME, StretchedTendon
 from musculoskeletal_ae.estimation.finding import observe
-from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.estimation.verification import Outcome, PositionLaw, Verification
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
@@ -37,7 +36,7 @@ def readings(mae, shorter=0.0):
 
 @pytest.mark.parametrize(('shorter', 'is_found'), [(0.06, True), (0.0, False), (-0.02, False)])
 def test_only_a_tendon_that_has_to_pull_and_does_not_is_ruptured(mae, shorter, is_found):
-    detector = StretchedTendon(ROBOT, Detection())
+    detector = StretchedTendon(ROBOT)
     detector.use(mae)
     length, tension = readings(mae, shorter)
     message = observe(mae, length, tension, tension, DT)
@@ -63,7 +62,7 @@ def findings_after_tension(mae, before, after, spread=0.0):
         after: Additional length of MUSCLE in the next second [m].
         spread: Standard deviation of the tensions [N].
     """
-    detector = StretchedTendon(ROBOT, Detection())
+    detector = StretchedTendon(ROBOT)
     detector.use(mae)
     findings = []
     for is_taut in (True, False):
@@ -93,7 +92,7 @@ def test_a_tendon_that_is_paid_out_until_it_is_slack_is_healthy(mae):
 
 def test_an_error_of_an_unlearned_network_is_no_stretch(mae):
     # Nothing is known of this tendon, because it has never been taut.
-    detector = StretchedTendon(ROBOT, Detection())
+    detector = StretchedTendon(ROBOT)
     detector.use(mae)
     length, tension = readings(mae, shorter=3.1 * elongation(BIAS[MUSCLE]))
     message = observe(mae, length, tension, tension, DT)
@@ -106,7 +105,7 @@ def test_a_motor_current_that_does_not_exclude_tension_is_no_evidence_of_a_ruptu
 
 
 def test_tendons_that_do_not_determine_the_posture_are_no_evidence_of_a_rupture(mae):
-    detector = StretchedTendon(ROBOT, Detection())
+    detector = StretchedTendon(ROBOT)
     detector.use(mae)
     length, tension = readings(mae, shorter=0.06)
     tension[np.arange(ROBOT.muscle_count) != 0] = 0.0

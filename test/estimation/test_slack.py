@@ -9,11 +9,10 @@ from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME
+from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME, SLACK_LENGTH
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.finding import observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
-from musculoskeletal_ae.estimation.settings import Detection
 
 DT = 0.01
 MUSCLE = 2
@@ -23,19 +22,18 @@ MUSCLE = 2
 def noticed(robot, mae, slack):
     """Return a function that measures how long it takes until a slack muscle is reported."""
 
-    def run(speed, until, longest=20.0, settings=None):
+    def run(speed, until, longest=20.0):
         """Wind in muscle MUSCLE without tension, and return the time of the finding [s].
 
         Args:
             speed: Speed of winding in [m/s].
             until: Length after which the winding stops [m].
             longest: Time after which the test ends [s].
-            settings: Settings of detection; None for the default.
 
         Returns:
             The time, or infinity if there is no finding.
         """
-        health, rng = HealthMonitor(robot, settings=settings), np.random.default_rng(0)
+        health, rng = HealthMonitor(robot), np.random.default_rng(0)
         health.use(mae)
         state = mae.estimate(*slack)
         for n in range(round(longest / DT)):
@@ -64,14 +62,8 @@ def test_a_slow_winch_is_given_time_to_take_up_slack(noticed, speed):
 
 @pytest.mark.parametrize('speed', [0.009, 0.036, 0.25])
 def test_slack_beyond_the_limit_is_a_rupture(noticed, speed):
-    longest = Detection().slack_length
-    expected = max(DEAD_TIME, longest / speed)
+    expected = max(DEAD_TIME, SLACK_LENGTH / speed)
     assert expected - 2 * DT <= noticed(speed, 1.0) <= expected + DEAD_TIME
-
-
-def test_the_limits_of_slack_are_parameters(noticed):
-    assert noticed(0.036, 0.2, settings=Detection(slack_length=0.15)) >= 0.15 / 0.036 - DT
-    assert noticed(0.036, 0.2, settings=Detection(slack_speed=0.05)) <= DEAD_TIME + DT
 
 
 def test_noise_of_the_length_sensor_does_not_count_as_winding_in(noticed):

@@ -2,7 +2,6 @@
 """Rest detection, friction, novelty, the store with its budget, and rejected samples."""
 
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,6 @@ from musculoskeletal_ae.learning.collector import SampleCollector
 from musculoskeletal_ae.learning.margin import MARGIN
 from musculoskeletal_ae.learning.rest import RestDetector
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
-from musculoskeletal_ae.learning.settings import DEFAULT
 from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.signals.limits import LIMITS
@@ -49,21 +47,21 @@ def each_some(t, still=True):
 
 
 def test_joint_angles_published_by_two_nodes_are_averaged():
-    (rest_sample, *_) = run(RestDetector(DEFAULT), 3.5, each_some)
+    (rest_sample, *_) = run(RestDetector(), 3.5, each_some)
     np.testing.assert_allclose(rest_sample.theta, [0.3, 0.3])
-    assert run(RestDetector(DEFAULT), 3.5, lambda t: each_some(t, still=False)) == []
+    assert run(RestDetector(), 3.5, lambda t: each_some(t, still=False)) == []
 
 
 def test_a_still_arm_gives_its_mean_once_a_second():
-    rest_sample = run(RestDetector(DEFAULT), 3.5, lambda _: 0.3, lambda _: 0.01)
+    rest_sample = run(RestDetector(), 3.5, lambda _: 0.3, lambda _: 0.01)
     assert len(rest_sample) == 3
     np.testing.assert_allclose(rest_sample[0].theta, 0.3)
     np.testing.assert_allclose(rest_sample[0].length, 0.01)
 
 
 def test_a_moving_joint_or_tendon_is_no_rest():
-    assert run(RestDetector(DEFAULT), 3.0, theta=lambda t: 0.05 * t) == []
-    assert run(RestDetector(DEFAULT), 3.0, length=lambda t: 0.01 * t) == []
+    assert run(RestDetector(), 3.0, theta=lambda t: 0.05 * t) == []
+    assert run(RestDetector(), 3.0, length=lambda t: 0.01 * t) == []
 
 
 @pytest.mark.parametrize('before', [0.1, 0.7, 3.0, 12.3])
@@ -76,20 +74,20 @@ def test_a_rest_does_not_depend_on_what_was_before_it(before):
         (rest_sample,) = run(detector, before + 3.0, *[lambda t: theta(t - before)] * 2)
         return rest_sample
 
-    used = RestDetector(DEFAULT)
+    used = RestDetector()
     for _ in range(2):
-        rest_sample, expected = rest(used, before), rest(RestDetector(DEFAULT), 0.0)
+        rest_sample, expected = rest(used, before), rest(RestDetector(), 0.0)
         np.testing.assert_allclose(rest_sample.length, expected.length, atol=1e-9)
         used.reset()
 
 
 def test_a_prismatic_joint_at_a_centimetre_a_second_is_no_rest():
-    assert run(RestDetector(DEFAULT), 3.0, theta=lambda t: 0.01 * t)
-    assert run(RestDetector(DEFAULT, radian=SLIDES), 3.0, theta=lambda t: 0.01 * t) == []
+    assert run(RestDetector(), 3.0, theta=lambda t: 0.01 * t)
+    assert run(RestDetector(radian=SLIDES), 3.0, theta=lambda t: 0.01 * t) == []
 
 
 def test_a_rest_that_ends_early_still_counts():
-    rests = run(RestDetector(DEFAULT), 2.0, theta=lambda t: max(0.0, t - 0.6))
+    rests = run(RestDetector(), 2.0, theta=lambda t: max(0.0, t - 0.6))
     assert len(rests) == 1
     np.testing.assert_allclose(rests[0].theta, 0.0, atol=0.01)
 
@@ -97,7 +95,7 @@ def test_a_rest_that_ends_early_still_counts():
 def test_sparse_noisy_angles_of_a_camera_are_averaged():
     rng = np.random.default_rng(0)
     rests = run(
-        RestDetector(DEFAULT),
+        RestDetector(),
         10.0,
         theta=lambda _: 0.5 + 0.02 * rng.standard_normal(),
         measured=lambda n: n % 3 == 0,
@@ -107,12 +105,9 @@ def test_sparse_noisy_angles_of_a_camera_are_averaged():
     assert np.std(errors) < 0.01
 
 
-@pytest.mark.parametrize(
-    ('rate', 'rest_time'),
-    [(1.0, 0.3), (18.9, 0.3), (100.0, 0.0)],
-)
-def test_rest_is_detected_at_any_message_rate_and_rest_time(rate, rest_time):
-    detector = RestDetector(replace(DEFAULT, rest_time=rest_time))
+@pytest.mark.parametrize('rate', [1.0, 18.9, 100.0])
+def test_rest_is_detected_at_any_message_rate(rate):
+    detector = RestDetector()
     rests = [detector.step(reading(0.3, 0.01), 1.0 / rate) for _ in range(round(13.0 * rate))]
     assert any(rest is not None for rest in rests)
     detector.reset()
@@ -123,24 +118,12 @@ def test_rest_is_detected_at_any_message_rate_and_rest_time(rate, rest_time):
 
 
 def test_rest_is_detected_with_rare_joint_angles():
-    assert len(run(RestDetector(DEFAULT), 10.0, measured=lambda n: n % 20 == 0)) >= 5
-    assert (
-        run(RestDetector(DEFAULT), 10.0, lambda t: 0.05 * t, measured=lambda n: n % 20 == 0) == []
-    )
-
-
-def test_without_a_least_distance_every_different_sample_is_new():
-    zero = replace(DEFAULT, new_joint_distance=0.0, new_tension_distance=0.0)
-    store, rng = SampleStore(zero), np.random.default_rng(0)
-    for _ in range(20):
-        sample = Sample(rng.uniform(size=2), rng.uniform(30.0, 60.0, 6), np.zeros(6), np.zeros(6))
-        assert store.is_new(sample)
-        store.add(sample)
-        assert not store.is_new(sample)
+    assert len(run(RestDetector(), 10.0, measured=lambda n: n % 20 == 0)) >= 5
+    assert run(RestDetector(), 10.0, lambda t: 0.05 * t, measured=lambda n: n % 20 == 0) == []
 
 
 def test_no_rest_without_joint_angles():
-    assert run(RestDetector(DEFAULT), 3.0, measured=lambda _: False) == []
+    assert run(RestDetector(), 3.0, measured=lambda _: False) == []
 
 
 def at(*theta):
@@ -182,7 +165,7 @@ class Messages:
 
     def __init__(self, robot):
         self.robot, self.time = robot, 0.0
-        self.collector = SampleCollector(robot, SampleStore(), Reservoir(6), DEFAULT)
+        self.collector = SampleCollector(robot, SampleStore(), Reservoir(6))
 
     def send(self, theta, pull, length, dt=DT):
         """Send one message to the collector; return the new samples."""

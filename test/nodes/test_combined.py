@@ -31,8 +31,8 @@ def test_both_nodes_of_one_process_move_the_arm_and_end_by_one_signal(graph, tra
         graph.wait(lambda node=node: graph.report(node).message != 'not heard of', node)
     graph.wait(lambda: graph.report('controller').message == 'exploring', 'exploration')
     assert os.getpriority(os.PRIO_PROCESS, process.process.pid) == os.nice(0)
-    done, why = graph.set_parameter('estimator', 'anomaly_threshold', -1.0)
-    assert not done and 'anomaly_threshold' in why
+    done, why = graph.set_parameter('estimator', 'on_anomaly', 'panic')
+    assert not done and 'on_anomaly' in why
     assert graph.ended(process, signal.SIGINT)[0] == 0
 
 

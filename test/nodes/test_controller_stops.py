@@ -141,15 +141,17 @@ def test_after_a_killed_controller_or_a_stop_a_new_controller_waits_for_a_reset(
 
 def test_an_anomaly_stops_the_arm_until_estimator_and_controller_are_reset(moving):
     arm = moving()
-    # With a very low threshold, even a healthy arm has an anomaly, so nothing has to be repaired.
-    assert arm.graph.set_parameter('estimator', 'anomaly_threshold', 1e-4)[0]
+    muscle = arm.hardware.robot.muscles[0]
+    assert arm.graph.set_parameter('hardware_emulator', 'faults', [f'rupture:{muscle}'])[0]
     arm.says('anomaly_detected')
     answer = reset(arm)
     assert not answer.success
     assert 'the estimator has found a fault' in answer.message
-    assert arm.graph.set_parameter('estimator', 'anomaly_threshold', 0.0)[0]
+    assert arm.graph.set_parameter('hardware_emulator', 'faults', [''])[0]
     assert not reset(arm).success
-    assert arm.graph.call(Trigger, 'estimator/reset').success
+    arm.graph.wait(
+        lambda: arm.graph.call(Trigger, 'estimator/reset').success, 'the reset of the estimator'
+    )
     arm.graph.wait(lambda: reset(arm).success, 'the reset')
 
 
@@ -172,7 +174,7 @@ def test_an_unfit_accepted_checkpoint_stops_the_controller(graph, trained_file):
 
 
 def test_the_arm_moves_without_joint_sensors_and_learner(moving):
-    arm = moving(joint_sensors=False)
+    arm = moving(sensors=[''])
     arm.graph.wait(lambda: arm.count() > 100, 'commands')
     assert 'stopped' not in arm.state().message
     assert len(arm.graph.received['joint_states']) == 0

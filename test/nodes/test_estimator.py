@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from rclpy.exceptions import InvalidParameterValueException
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, Float64MultiArray
 from std_srvs.srv import Trigger
@@ -160,18 +159,19 @@ def test_a_checkpoint_is_replaced_by_parameter_and_topic_and_an_unfit_one_refuse
 
 
 def test_an_anomaly_is_published_logged_and_latched_until_reset(estimator, healthy):
-    assert estimator.set_parameter('estimator', 'anomaly_threshold', 0.2)[0]
+    command = estimator.publisher(Float64MultiArray, 'muscle_tension_command')
     detected = estimator.received['anomaly_detected']
     sick = deepcopy(healthy)
-    sick.data[0] -= 0.025  # a larger change would count as a jump, and revoke the length offsets
+    sick.data[6] = 0.0
 
     def observed():
+        command.publish(array_message(np.full(6, 60.0), 'muscle'))
         answer(estimator, sick)
         return detected and detected[-1].data
 
     estimator.wait(observed, 'the detection')
     estimator.wait(lambda: estimator.report('estimator').level == 'error', 'the report of an error')
-    assert 'residual_distance' in estimator.report('estimator').identifiers
+    assert 'slack_tendon' in estimator.report('estimator').identifiers
     for _ in range(8):
         answer(estimator, healthy)
     assert detected[-1].data
@@ -249,7 +249,7 @@ def test_a_marker_pose_becomes_joint_angles_with_the_stamp_of_the_picture(estima
     [
         ({'robot': 'no_such_arm'}, MusculoskeletalError, 'musashi_left_arm'),
         ({'preset': 'magic'}, MusculoskeletalError, r'parameter preset: .*default, paper'),
-        ({'anomaly_threshold': -1.0}, InvalidParameterValueException, 'anomaly_threshold'),
+        ({'on_anomaly': 'panic'}, MusculoskeletalError, r'parameter on_anomaly: .*stop, isolate'),
     ],
 )
 def test_a_wrong_parameter_is_refused_by_name(graph, parameters, error, expected):

@@ -81,25 +81,25 @@ def test_length_commands_move_the_arm_and_their_absence_makes_it_safe(arm, arm26
 
 def test_a_muscle_is_ruptured_and_repaired_at_run_time(arm, arm26):
     name = arm26.muscles[3]
-    success, reason = arm.set_parameter('hardware_emulator', 'ruptured_muscles', ['biceps'])
+    success, reason = arm.set_parameter('hardware_emulator', 'faults', ['rupture:biceps'])
     assert not success
     assert name in reason  # the reason lists the legal names
-    assert arm.set_parameter('hardware_emulator', 'ruptured_muscles', [name])[0]
+    assert arm.set_parameter('hardware_emulator', 'faults', [f'rupture:{name}'])[0]
     before = rows(arm, arm26)
     assert before[1, 3] == 0.0
-    assert Step.REPAIR_EMULATED_RUPTURE in arm.emulator.report().steps
+    assert Step.REPAIR_EMULATED_FAULT in arm.emulator.report().steps
     arm.wait(lambda: rows(arm, arm26)[0, 3] < before[0, 3] - 0.01, 'winding in')
-    assert arm.set_parameter('hardware_emulator', 'ruptured_muscles', [''])[0]
+    assert arm.set_parameter('hardware_emulator', 'faults', [''])[0]
     arm.wait(lambda: rows(arm, arm26)[1, 3] > 15.0, 'tension')
-    assert Step.REPAIR_EMULATED_RUPTURE not in arm.emulator.report().steps
+    assert Step.REPAIR_EMULATED_FAULT not in arm.emulator.report().steps
 
 
 def test_payload_offset_and_wrench_act(arm, arm26):
     start = rows(arm, arm26)[0]
-    assert arm.set_parameter('hardware_emulator', 'length_offset', [0.01])[0]
+    assert arm.set_parameter('hardware_emulator', 'faults', ['offset:0.01'])[0]
     np.testing.assert_allclose(rows(arm, arm26)[0], start + 0.01, atol=3e-3)
-    for wrong in ([0.1, 0.2], [float('nan')]):
-        assert not arm.set_parameter('hardware_emulator', 'length_offset', wrong)[0]
+    for wrong in ('offset:2.0', 'offset:nan'):
+        assert not arm.set_parameter('hardware_emulator', 'faults', [wrong])[0]
     assert arm.set_parameter('hardware_emulator', 'payload', 2.0)[0]
     assert not arm.set_parameter('hardware_emulator', 'payload', -1.0)[0]
     push = arm.publisher(WrenchStamped, 'hardware_emulator/external_wrench')
@@ -114,10 +114,11 @@ def test_payload_offset_and_wrench_act(arm, arm26):
     arm.wait(moved, 'the push')
 
 
-def test_a_marker_pose_is_published_on_request(arm, arm26):
-    assert arm.set_parameter('hardware_emulator', 'marker_pose_rate', 0.001)[0]
-    arm.next('marker_pose')
-    assert arm.set_parameter('hardware_emulator', 'marker_pose_rate', 30.0)[0]
+def test_a_marker_pose_is_published_on_request(graph, arm26):
+    for kind, topic in ((JointState, 'joint_states'), (PoseStamped, 'marker_pose')):
+        graph.listen(kind, topic)
+    arm = graph
+    arm.host(HardwareEmulator, robot='arm26', sensors=['joints', 'marker:30'])
     pose = arm.next('marker_pose', 3)
     assert pose.header.frame_id == arm26.root_link
     theta = np.array(arm.received['joint_states'][-1].position)
@@ -179,7 +180,7 @@ def test_faults_are_switched_at_run_time(arm, arm26):
 
 def test_without_joint_sensors_there_are_no_joint_states(graph):
     graph.listen(Float64MultiArray, 'muscle_states')
-    graph.host(HardwareEmulator, robot='arm26', joint_sensors=False)
+    graph.host(HardwareEmulator, robot='arm26', sensors=[''])
     graph.next('muscle_states', 10)
     assert graph.node.count_publishers('joint_states') == 0
 
@@ -193,16 +194,16 @@ def test_the_foreign_emulator_has_the_same_topics(graph, arm26):
     drive(graph, start - 0.02, lambda: rows(graph, arm26)[1].max() > 60.0, 'tension')
     assert tuple(graph.next('joint_states').name) == arm26.joints
     assert graph.next('hardware_emulator/markers').markers
-    for wrong in (['front'], [arm26.muscles[0], 'front']):
-        assert not graph.set_parameter('hardware_emulator', 'ruptured_muscles', wrong)[0]
+    for wrong in (['rupture:front'], [f'rupture:{arm26.muscles[0]}', 'rupture:front']):
+        assert not graph.set_parameter('hardware_emulator', 'faults', wrong)[0]
 
 
 def test_an_accelerometer_is_published_on_request(graph):
-    graph.host(HardwareEmulator, robot='arm26', imu_link='hand', frame_prefix='left/')
+    graph.host(HardwareEmulator, robot='arm26', sensors=['imu:hand'], frame_prefix='left/')
     read = graph.listen(Imu, 'imu')
     message = graph.wait(lambda: read and read[-1], 'the accelerometer')
     assert message.header.frame_id == 'left/hand'
     held = message.linear_acceleration
     assert abs(np.linalg.norm([held.x, held.y, held.z]) - 9.81) < 0.5
-    with pytest.raises(MusculoskeletalError, match='forearm'):
-        graph.host(HardwareEmulator, robot='arm26', imu_link='knee')
+    with pytest.raises(MusculoskeletalError, match=r'parameter sensors: .*forearm'):
+        graph.host(HardwareEmulator, robot='arm26', sensors=['imu:knee'])

@@ -30,7 +30,7 @@ def test_a_ruptured_muscle_is_verified_isolated_and_restored(arm):
     graph, name = arm.graph, arm.robot.muscles[3]
     assert graph.received['isolated_muscles'][-1].data == ''
     assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
-    assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', [name])[0]
+    assert graph.set_parameter('hardware_emulator', 'faults', [f'rupture:{name}'])[0]
     graph.wait(lambda: graph.received['anomaly_detected'][-1].data, 'the anomaly')
     graph.wait(lambda: arm.state().values['mode'] == 'verifying', 'the verification')
     graph.wait(
@@ -46,7 +46,7 @@ def test_a_ruptured_muscle_is_verified_isolated_and_restored(arm):
     arm.target(THERE)
     arm.goes_to(THERE)
     assert arm.estimator.core.cause == ''
-    assert graph.set_parameter('hardware_emulator', 'ruptured_muscles', [''])[0]
+    assert graph.set_parameter('hardware_emulator', 'faults', [''])[0]
     # It is refused as long as the newest message is from before the repair.
     answer = graph.wait(
         lambda: (reply := graph.call(Trigger, 'estimator/restore')).success and reply,

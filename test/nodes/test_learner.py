@@ -29,8 +29,6 @@ from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 from musculoskeletal_ae.nodes.running import NICENESS
 
-# With shorter rests and fewer training steps than on a robot, a test takes only seconds.
-QUICK = {'rest_time': 0.4, 'update_steps': 20}
 REST, MOVE = 0.8, 0.1  # duration of a rest, and of the motion between two rests [s]
 DT = 0.02
 
@@ -84,7 +82,7 @@ class HostedLearner:
 
     def __init__(self, graph, robot, **parameters):
         self.graph = graph
-        self.node = graph.host(Learner, robot='arm26', **{**QUICK, **parameters})
+        self.node = graph.host(Learner, robot='arm26', **parameters)
         graph.listen(UInt8MultiArray, 'mae_checkpoint', LATCHED)
         self.arm = Arm(graph, robot)
         self.node.now = lambda: self.arm.time
@@ -342,7 +340,7 @@ def test_the_learner_gives_up_the_joint_sensors_that_the_estimator_doubts(host, 
 
 def start(graph, **parameters):
     """Start a learner and listen to it."""
-    process = graph.start('learner', robot='arm26', **{**QUICK, **parameters})
+    process = graph.start('learner', robot='arm26', **parameters)
     graph.listen(UInt8MultiArray, 'mae_checkpoint', LATCHED)
     graph.listen(DiagnosticArray, '/diagnostics')
     return process
@@ -390,7 +388,7 @@ def test_a_killed_learner_resumes_from_its_saved_state_and_ctrl_c_ends_it_with_i
 @pytest.mark.usefixtures('here')
 def test_learning_works_with_a_marker_instead_of_joint_sensors(graph, arm26, trained_file):
     common = {'robot': 'arm26', 'checkpoint': trained_file}
-    graph.host(HardwareEmulator, robot='arm26', joint_sensors=False, marker_pose_rate=30.0)
+    graph.host(HardwareEmulator, robot='arm26', sensors=['marker:30'])
     graph.host(Estimator, **common)
     graph.host(Controller, **common, explore=True, max_age=10.0)
     learner = graph.host(Learner, **common, state_directory='', joint_source='marker')

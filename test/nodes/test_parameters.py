@@ -121,9 +121,9 @@ def test_an_arm_of_one_joint_may_stand_at_0_to_find_its_zeros(graph, tmp_path):
     ('kind', 'parameters', 'kept'),
     [
         (
-            HardwareEmulator,
-            {'command_timeout': 1.0, 'faults': ['melt']},
-            lambda node: node.arm.command_timeout,
+            Estimator,
+            {'zero_posture': [0.0, -1.0], 'isolate_muscles': ['tail']},
+            lambda node: node.posture,
         ),
         # Setting `checkpoint` would replace the network in use, which may have learned much.
         (
@@ -160,6 +160,23 @@ def test_of_parameters_set_together_none_is_taken_if_one_is_refused(
 def test_a_word_that_is_not_legal_is_refused_with_those_that_are():
     with pytest.raises(MusculoskeletalError, match="'other'; legal: one, two"):
         Parameter('one', 'a word', legal=('one', 'two')).checked('other')
+
+
+@pytest.mark.parametrize(
+    ('parameter', 'wrong'),
+    [
+        (Parameter(1.0, 'a number', 'm', (0.0, 2.0)), [2.5, -0.1, float('nan'), '1', True, None]),
+        (Parameter(1, 'a count', '', (0, 2)), [3, 1.5, '1', True]),
+        (Parameter(True, 'a switch'), [1, 'true', None]),
+        (Parameter('', 'a text'), [1, None, ['text']]),
+        (Parameter(('',), 'names'), ['name', [1], None]),
+    ],
+)
+def test_a_value_of_the_wrong_kind_or_out_of_range_is_refused_without_ros(parameter, wrong):
+    for value in wrong:
+        with pytest.raises(MusculoskeletalError, match='; legal: '):
+            parameter.checked(value)
+    assert parameter.checked(parameter.default) is not None
 
 
 def test_empty_names_are_no_names():

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A ros2_control robot on the graph: its messages reach the nodes, and their commands reach it."""
 
+import shutil
 import signal
 import sys
 from functools import partial
@@ -21,16 +22,26 @@ from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.sim import Sim
+from musculoskeletal_ae.robot.directories import find_robot
 
 EXAMPLE = Path(__file__).parents[2] / 'examples' / 'ros2_control'
-NODES = EXAMPLE / 'nodes.yaml'
-PARAMETERS = yaml.safe_load(NODES.read_text(encoding='utf-8'))['/**']['ros__parameters']
-STATES, COMMANDS = PARAMETERS['motor_state_topic'], PARAMETERS['motor_command_topic']
-MOTORS = PARAMETERS['motor_names']
+CONNECTED = yaml.safe_load((EXAMPLE / 'motors.yaml').read_text(encoding='utf-8'))
+STATES, COMMANDS = CONNECTED['state_topic'], CONNECTED['command_topic']
+MOTORS = [motor['joint'] for motor in CONNECTED['motors'].values()]
 
 
-def host(graph, kind, **more):
-    return graph.host(kind, robot='arm26', **PARAMETERS, **more)
+@pytest.fixture(scope='module')
+def robot_directory(tmp_path_factory):
+    """Return a copy of arm26 with the motors of the example."""
+    directory = tmp_path_factory.mktemp('robots') / 'arm26'
+    shutil.copytree(find_robot('arm26'), directory)
+    shutil.copy(EXAMPLE / 'motors.yaml', directory)
+    return str(directory)
+
+
+@pytest.fixture
+def host(graph, robot_directory):
+    return lambda kind, **more: graph.host(kind, robot=robot_directory, **more)
 
 
 def joint_values(graph, field='position'):
@@ -49,13 +60,13 @@ def start_fake_robot(graph):
     return robot
 
 
-def test_the_files_of_controllers_and_nodes_state_the_same_motors():
+def test_the_files_of_controllers_and_motors_state_the_same_motors():
     controllers = yaml.safe_load((EXAMPLE / 'controllers.yaml').read_text(encoding='utf-8'))
     joints = controllers['tendon_controller']['ros__parameters']['joints']
-    assert PARAMETERS['motor_command_order'] == joints
+    assert CONNECTED['command_order'] == joints
 
 
-@pytest.mark.parametrize('name', ['controllers.yaml', 'nodes.yaml'])
+@pytest.mark.parametrize('name', ['controllers.yaml', 'motors.yaml'])
 def test_the_guide_shows_the_files_of_the_example(name):
     guide = (EXAMPLE.parents[1] / 'doc' / 'howto' / 'ros2_control.md').read_text(encoding='utf-8')
     text = (EXAMPLE / name).read_text(encoding='utf-8')
@@ -63,20 +74,20 @@ def test_the_guide_shows_the_files_of_the_example(name):
 
 
 def test_the_fake_robot_passes_check_driver_and_is_estimated_and_moved_by_the_nodes(
-    graph, trained_file, arm26
+    graph, host, robot_directory, trained_file, arm26
 ):
     robot = start_fake_robot(graph)
     assert arm26.description.directory.name in robot.wait_for_output('Hz')
     commands = graph.listen(Float64MultiArray, COMMANDS)
     options = ['--seconds', '1', '--wait', '--move', '--muscles', 'brachialis']
-    process = graph.run('check_driver', '--robot', 'arm26', '--params-file', str(NODES), *options)
+    process = graph.run('check_driver', '--robot', robot_directory, *options)
     graph.wait(lambda: not process.alive(), 'the end of check_driver')
     status, output = process.ended()
     faults = [line.split()[1] for line in output.splitlines() if line.startswith('fault: ')]
     assert set(faults) <= {'latency', 'rate'} and (status == 0 or faults), output
     assert commands and len(commands[0].data) == len(MOTORS)
 
-    estimator = host(graph, Estimator, checkpoint=trained_file)
+    estimator = host(Estimator, checkpoint=trained_file)
     estimates = graph.listen(JointState, 'estimated_joint_states')
     graph.wait(lambda: estimates, 'an estimate')
     measured = [joint_values(graph)[joint] for joint in arm26.joints]
@@ -84,7 +95,7 @@ def test_the_fake_robot_passes_check_driver_and_is_estimated_and_moved_by_the_no
     assert not estimator.rejected
 
     # On a loaded machine messages arrive late. A large max_age avoids pauses.
-    controller = host(graph, Controller, checkpoint=trained_file, max_age=10.0)
+    controller = host(Controller, checkpoint=trained_file, max_age=10.0)
     commands.clear()
     lengths = graph.listen(Float64MultiArray, 'muscle_length_command')
     before = joint_values(graph, 'effort')
@@ -104,8 +115,8 @@ def test_the_fake_robot_passes_check_driver_and_is_estimated_and_moved_by_the_no
     robot.ends_silently(signal.SIGINT)
 
 
-def test_a_second_publisher_of_the_motors_is_named(graph):
-    estimator = host(graph, Estimator)
+def test_a_second_publisher_of_the_motors_is_named(graph, host):
+    estimator = host(Estimator)
     graph.publisher(JointState, STATES)
     stranger = Node('stranger', context=graph.context, namespace=graph.namespace)
     stranger.create_publisher(JointState, STATES, 10)
@@ -115,8 +126,8 @@ def test_a_second_publisher_of_the_motors_is_named(graph):
     stranger.destroy_node()
 
 
-def test_the_emulator_plays_the_same_robot(graph, arm26):
-    emulator = host(graph, HardwareEmulator)
+def test_the_emulator_plays_the_same_robot(graph, host, arm26):
+    emulator = host(HardwareEmulator)
     graph.listen(JointState, STATES)
     position = joint_values(graph)
     assert {*MOTORS, *arm26.joints} == position.keys()
@@ -134,18 +145,18 @@ def test_the_emulator_plays_the_same_robot(graph, arm26):
     graph.wait(pulls, 'motors that pull')
 
 
-def test_our_nodes_command_the_emulator_by_its_motors(graph, trained_file):
-    emulator = host(graph, HardwareEmulator)
-    host(graph, Estimator, checkpoint=trained_file)
-    host(graph, Controller, checkpoint=trained_file, max_age=10.0, explore=True)
+def test_our_nodes_command_the_emulator_by_its_motors(graph, host, trained_file):
+    emulator = host(HardwareEmulator)
+    host(Estimator, checkpoint=trained_file)
+    host(Controller, checkpoint=trained_file, max_age=10.0, explore=True)
     graph.wait(lambda: not emulator.arm.safe, 'a command to the motors')
     assert not emulator.rejected
 
 
 def test_the_simulator_takes_the_place_of_the_robot_with_the_same_messages(
-    graph, trained_file, arm26
+    graph, host, trained_file, arm26
 ):
-    sim = host(graph, Sim, checkpoint=trained_file, as_robot=True)
+    sim = host(Sim, checkpoint=trained_file, as_robot=True)
     graph.listen(JointState, STATES)
     assert {*MOTORS, *arm26.joints} == joint_values(graph).keys()
     commands = graph.publisher(Float64MultiArray, COMMANDS)
@@ -159,8 +170,8 @@ def test_the_simulator_takes_the_place_of_the_robot_with_the_same_messages(
     graph.wait(followed, 'the command')
 
 
-def test_what_is_wrong_with_the_messages_is_counted_with_the_reason(graph, trained_file):
-    estimator = host(graph, Estimator, checkpoint=trained_file)
+def test_what_is_wrong_with_the_messages_is_counted_with_the_reason(graph, host, trained_file):
+    estimator = host(Estimator, checkpoint=trained_file)
     graph.listen(DiagnosticArray, '/diagnostics')
     states = graph.publisher(JointState, STATES)
     message = JointState(name=MOTORS, position=[0.0] * 6, effort=[0.5] * 6)
@@ -187,8 +198,8 @@ def test_what_is_wrong_with_the_messages_is_counted_with_the_reason(graph, train
     )
 
 
-def test_a_second_publisher_of_motor_commands_stops_the_arm(graph, trained_file):
-    controller = host(graph, Controller, checkpoint=trained_file)
+def test_a_second_publisher_of_motor_commands_stops_the_arm(graph, host, trained_file):
+    controller = host(Controller, checkpoint=trained_file)
     graph.node.create_publisher(Float64MultiArray, COMMANDS, 10)
     graph.wait(
         lambda: COMMANDS in controller.core.watchdog.second_publisher,
@@ -196,8 +207,8 @@ def test_a_second_publisher_of_motor_commands_stops_the_arm(graph, trained_file)
     )
 
 
-def test_a_topic_of_joints_and_motors_is_named_once_if_two_nodes_publish_it(graph):
-    node = host(graph, Estimator)
+def test_a_topic_of_joints_and_motors_is_named_once_if_two_nodes_publish_it(graph, host):
+    node = host(Estimator)
     for name in ('first', 'second'):
         other = graph.host(partial(Node, name))
         other.create_publisher(JointState, STATES, 10)
@@ -205,23 +216,14 @@ def test_a_topic_of_joints_and_motors_is_named_once_if_two_nodes_publish_it(grap
     assert node.intruders.startswith(f'{STATES} come from ')
 
 
-def test_methods_that_command_tensions_are_refused(graph):
-    controller = host(graph, Controller)
+def test_methods_that_command_tensions_are_refused(host):
+    controller = host(Controller)
     for method in ('tension', 'float'):
         result = controller.set_parameters([Parameter('method', value=method)])[0]
         assert not result.successful and f'{COMMANDS} follow lengths only' in result.reason
 
 
-@pytest.mark.parametrize(
-    ('changes', 'problem'),
-    [
-        ({'motor_names': MOTORS[:5]}, '5 names; expected a motor for each of the 6 muscles'),
-        (
-            {'motor_state_topic': 'joint states'},
-            r"motor_state_topic: 'joint states': .*must not",
-        ),
-    ],
-)
-def test_parameters_that_do_not_fit_end_a_node_with_the_reason(graph, changes, problem):
-    with pytest.raises(MusculoskeletalError, match=problem):
-        graph.host(Estimator, robot='arm26', **{**PARAMETERS, **changes})
+@pytest.mark.parametrize('name', ['motor_names', 'spool_radius', 'motor_state_topic'])
+def test_a_parameter_file_that_still_connects_motors_ends_a_node_with_the_new_place(graph, name):
+    with pytest.raises(MusculoskeletalError, match=f'{name}.*motors.yaml in the robot directory'):
+        graph.host(Estimator, robot='arm26', **{name: 'value'})

@@ -37,7 +37,7 @@ def test_a_node_uses_exactly_the_rights_of_the_policy(graph, name, tmp_path):
     extra = {
         'learner': {'state_directory': str(tmp_path)},
         'estimator': {'mirror_muscles': True},
-        'hardware_emulator': {'imu_link': 'forearm'},
+        'hardware_emulator': {'sensors': ['joints', 'imu:forearm']},
     }
     node = graph.host(kind, robot='arm26', **extra.get(name, {}))
     private = f'{graph.namespace}/{name}/'

@@ -13,7 +13,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import topics_with
 from musculoskeletal_ae.nodes import stop_recording
 from musculoskeletal_ae.nodes.stop_recording import FILE, SECONDS, StopRecording
-from musculoskeletal_ae.signals.motor_settings import MotorSettings
+from musculoskeletal_ae.robot.motors import MotorTopics
 
 
 @pytest.fixture
@@ -121,8 +121,7 @@ def test_an_incomplete_recording_on_a_full_disk_is_deleted_and_reported(
 
 
 def test_the_motors_of_ros2_control_are_kept_as_they_were_received(tmp_path):
-    motors = MotorSettings(motor_state_topic='/joint_states')
-    recording = StopRecording(str, tmp_path, topics_with(motors))
+    recording = StopRecording(str, tmp_path, topics_with(MotorTopics('/joint_states')))
     data = serialize_message(JointState(name=['motor'], position=[0.5]))
     recording.heard('/joint_states', data)
     recording.save('a cause', 10)

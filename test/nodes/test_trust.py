@@ -164,7 +164,7 @@ def test_a_second_driver_of_the_same_name_stops_the_arm(arm):
 
 def test_impossible_lengths_stop_the_arm_with_their_cause_and_without_a_jump(arm):
     arm.goes_to(HERE)
-    done, _ = arm.graph.set_parameter('hardware_emulator', 'length_offset', [0.15])
+    done, _ = arm.graph.set_parameter('hardware_emulator', 'faults', ['offset:0.15'])
     assert done
     # The reported cause is a jump of a length or an implausible length, whatever is noticed first.
     arm.says('stopped: muscle_states are implausible: length ')
@@ -183,9 +183,7 @@ def test_with_use_sim_time_a_trajectory_follows_the_clock(graph, arm26, trained_
         Controller,
         robot='arm26',
         checkpoint=trained_file,
-        target_duration=0.0,
         first_duration=1.0,
-        feedback_gain=0.0,
         max_age=10.0,
         use_sim_time=True,
     )
@@ -221,7 +219,7 @@ def test_with_use_sim_time_a_trajectory_follows_the_clock(graph, arm26, trained_
 def test_a_muscle_ruptured_before_the_start_is_detected(graph, trained_file):
     # With this muscle ruptured, the estimate is so wrong that the controller does not start.
     muscle = 'deltoid_anterior'
-    hardware = graph.host(HardwareEmulator, robot='arm26', seed=0, ruptured_muscles=[muscle])
+    hardware = graph.host(HardwareEmulator, robot='arm26', seed=0, faults=[f'rupture:{muscle}'])
     hardware.arm.step(3.0)
     detected = graph.listen(Bool, 'anomaly_detected', LATCHED)
     estimator = graph.host(Estimator, robot='arm26', checkpoint=trained_file)

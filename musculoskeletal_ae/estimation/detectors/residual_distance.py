@@ -21,9 +21,6 @@ without which the remaining residual is most likely. If tendons are slack, only 
 Slack. While a slack tendon is being wound in, its measured length is longer than the restored
 length, and messages do not count. The measured length of a ruptured tendon is shorter than the
 restored length, so its messages do count.
-
-If the parameter `anomaly_threshold` is set, A is compared with this parameter, and d is not
-compared with its threshold.
 """
 
 import math
@@ -35,7 +32,6 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.detectors.slack_tendon import SlackTendon
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
-from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, residuals
 from musculoskeletal_ae.report import distinct
@@ -71,18 +67,16 @@ class ResidualDistance(Detector):
 
     symbol, threshold_name = 'd', DISTANCE
 
-    def __init__(self, robot: Robot, settings: Detection, slack: SlackTendon | None = None) -> None:
+    def __init__(self, robot: Robot, slack: SlackTendon | None = None) -> None:
         """Start without a network.
 
         Args:
             robot: The nominal body.
-            settings: If `anomaly_threshold` is above 0, the anomaly score A is compared with it,
-                and d is not used.
             slack: The detector that knows which slack tendons are being wound in. Meanwhile,
                 messages do not count. If it is None, all messages count.
         """
         self._robot = self._complete_robot = robot
-        self._settings, self._slack = settings, slack
+        self._slack = slack
         self._mae: Mae | None = None
         self._statistics: AnomalyStatistics | None = None
         self.threshold = np.inf
@@ -104,10 +98,6 @@ class ResidualDistance(Detector):
         self._robot = self._complete_robot.without(mae.isolated)
         if statistics is not None and statistics.calibrated:
             self.threshold = statistics.thresholds.get(self.threshold_name, np.inf)
-
-    def configure(self, settings: Detection) -> None:
-        """Use these settings from the next message on."""
-        self._settings = settings
 
     def reset(self) -> None:
         """Discard the count of consecutive messages above the threshold."""
@@ -198,24 +188,22 @@ class ResidualDistance(Detector):
             has_slack: Whether a tendon is slack, so that the threshold does not grow.
             waits: Whether the message does not count, because a slack tendon is being wound in.
         """
-        limit, value, name = self._settings.anomaly_threshold, observation.estimate.anomaly, 'A'
-        where = ''
-        if limit <= 0.0:
-            if not self.is_calibrated:
-                return ''
-            limit = self.threshold
-            value, name = self.statistic(observation, distance), self.symbol
-            if value > limit and not has_slack:
-                theta, tension = observation.estimate.state.theta, observation.sample.model_tension
-                wider = self.limit(theta, tension)
-                if wider > limit:
-                    limit = wider
-                    where = ' (raised for an unfamiliar posture or a tension above tension.limit)'
+        if not self.is_calibrated:
+            return ''
+        limit, where = self.threshold, ''
+        value = self.statistic(observation, distance)
+        if value > limit and not has_slack:
+            theta, tension = observation.estimate.state.theta, observation.sample.model_tension
+            wider = self.limit(theta, tension)
+            if wider > limit:
+                limit = wider
+                where = ' (raised for an unfamiliar posture or a tension above tension.limit)'
         self._beyond = self._beyond + 1 if value > limit and not waits else 0
         if self._beyond < IN_A_ROW:
             return ''
         reached, most = distinct(value, limit)
-        return f'{name} = {reached} exceeded {most}{where} in {IN_A_ROW} consecutive messages'
+        exceeded = f'{self.symbol} = {reached} exceeded {most}{where}'
+        return f'{exceeded} in {IN_A_ROW} consecutive messages'
 
     def _least_likely(self, bone_tension: Array, length: Array, candidates: Bools) -> int:
         """Return the index of the most suspect muscle among the candidates.

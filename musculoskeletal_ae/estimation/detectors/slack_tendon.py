@@ -5,9 +5,9 @@
 
 T is the measured and T_ref the demanded tension. The rule needs no statistics, because a healthy
 module maintains at least T_bias. A slow winch takes time to wind in slack. The detector waits while
-the winch moves at `slack_speed` or faster, until it has wound in `slack_length`. Changes of length
-that are due to the motion of the arm do not count towards `slack_length`, but they do count towards
-the speed.
+the winch moves at SLACK_SPEED or faster, until it has wound in SLACK_LENGTH. Changes of length that
+are due to the motion of the arm do not count towards SLACK_LENGTH, but they do count towards the
+speed.
 
 A position-controlled module maintains no tension, so a healthy tendon is slack if a long length is
 commanded. Such a module is reported if its tendon is stretched, but has no tension:
@@ -33,7 +33,6 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.estimation.length_errors import LengthErrors, Prediction
-from musculoskeletal_ae.estimation.settings import Detection
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS, share_outside
@@ -47,6 +46,8 @@ SURE = 2.0
 #: Number of consecutive messages in which a tendon has to be taut. The first of them then certainly
 #: came before the tendon began to lose its tension.
 RECENT = 5
+SLACK_LENGTH = 0.06  # wait until a muscle module has wound in this much slack [m]
+SLACK_SPEED = 0.005  # count a muscle module as stationary below this winding speed [m/s]
 DEAD_TIME = 0.5  # time without tension after which a muscle is reported [s]
 
 
@@ -57,9 +58,8 @@ class SlackTendon(Detector):
         is_winding_in: Whether each tendon is slack and being wound in, (M,).
     """
 
-    def __init__(self, robot: Robot, settings: Detection) -> None:
+    def __init__(self, robot: Robot) -> None:
         self._robot = self._complete_robot = robot
-        self._settings = settings
         muscle_count = robot.muscle_count
         self._slack_time: Array = np.zeros(muscle_count)  # time without tension [s]
         #: time without tension and without winding in [s]
@@ -72,10 +72,6 @@ class SlackTendon(Detector):
         """Monitor the muscles that are not isolated in this network."""
         self._mae = mae
         self._robot = self._complete_robot.without(mae.isolated)
-
-    def configure(self, settings: Detection) -> None:
-        """Use these settings from the next message on."""
-        self._settings = settings
 
     def reset(self) -> None:
         """Restart the measurement of how long tendons have been slack."""
@@ -103,12 +99,12 @@ class SlackTendon(Detector):
         excess = length - self._robot.routes.relative_lengths(theta) if is_slack.any() else length
         self._taut_excess = np.where(begins, excess, self._taut_excess)
         self._slack_time = np.where(is_slack, self._slack_time + dt, 0.0)
-        # The winch is winding in if l decreases by at least slack_speed · DEAD_TIME in DEAD_TIME.
-        advance = self._settings.slack_speed * DEAD_TIME
+        # The winch is winding in if l decreases by at least SLACK_SPEED · DEAD_TIME in DEAD_TIME.
+        advance = SLACK_SPEED * DEAD_TIME
         winds = begins | (length < self._wound_length - advance)
         self._wound_length = np.where(winds, length, self._wound_length)
         self._idle_time = np.where(winds | ~is_slack, 0.0, self._idle_time + dt)
-        has_wound_all = excess < self._taut_excess - self._settings.slack_length
+        has_wound_all = excess < self._taut_excess - SLACK_LENGTH
         has_ended = (self._idle_time >= DEAD_TIME - dt) | has_wound_all
         self.is_winding_in = is_slack & ~has_ended
         is_dead = (self._slack_time >= DEAD_TIME) & has_ended
@@ -146,8 +142,8 @@ class StretchedTendon(SlackTendon):
     `is_winding_in` stays False.
     """
 
-    def __init__(self, robot: Robot, settings: Detection) -> None:
-        super().__init__(robot, settings)
+    def __init__(self, robot: Robot) -> None:
+        super().__init__(robot)
         self._recent: deque[MuscleSample] = deque(maxlen=RECENT)
         #: number of consecutive messages in which each tendon has been taut, (M,)
         self._taut_count: Ints = np.zeros(robot.muscle_count, dtype=int)

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which sensors an emulated arm has besides those of its muscle modules.
+
+A line describes a sensor: 'joints' (joint angles), 'marker[:RATE]' (pose of a marker at the hand,
+as a camera sees it) or 'imu:LINK' (an accelerometer on a link).
+"""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.kinematics import body_frames
+from musculoskeletal_ae.robot.robot import Robot
+
+MARKER_RATE, HIGHEST_RATE = 10.0, 100.0  # default and largest rate of the marker [Hz]
+LEGAL = f'joints, marker[:RATE] (above 0 to {HIGHEST_RATE:g} Hz) and imu:LINK, each once'
+
+
+class Sensors(NamedTuple):
+    """The sensors of an emulated arm."""
+
+    joints: bool = False  # whether there are joint sensors
+    marker_rate: float = 0.0  # rate of the marker's pose [Hz]; 0: there is no marker
+    imu_link: str = ''  # link that carries an accelerometer; '': there is none
+
+
+def read_sensors(lines: Iterable[str], robot: Robot) -> Sensors:
+    """Return the sensors that the lines describe.
+
+    Raises:
+        MusculoskeletalError: If a line is not legal; the message lists the legal forms.
+    """
+    sensors, seen = Sensors(), set[str]()
+    for line in lines:
+        kind, _, detail = (word.strip() for word in line.partition(':'))
+        if kind == 'joints' and not detail:
+            sensors = sensors._replace(joints=True)
+        elif kind == 'marker':
+            sensors = sensors._replace(marker_rate=_rate(line, detail))
+        elif kind == 'imu':
+            links = [str(frame.name) for frame in body_frames(robot.kinematics.model)]
+            if detail not in links:
+                problem = f'{line[:80]!r}: unknown link {detail[:80]!r}'
+                raise MusculoskeletalError(f'{problem}; legal: {", ".join(links)}')
+            sensors = sensors._replace(imu_link=detail)
+        else:
+            raise MusculoskeletalError(f'{line[:80]!r}; legal: {LEGAL}')
+        if kind in seen:
+            raise MusculoskeletalError(f'{line[:80]!r} is the second sensor of its kind; {LEGAL}')
+        seen.add(kind)
+    return sensors
+
+
+def _rate(line: str, word: str) -> float:
+    try:
+        rate = float(word) if word else MARKER_RATE
+    except ValueError:
+        rate = 0.0
+    if not 0.0 < rate <= HIGHEST_RATE:
+        raise MusculoskeletalError(f'{line[:80]!r}; legal: {LEGAL}')
+    return rate

@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Types of values that the files of a robot directory have in common, with their legal ranges."""
+
+from typing import Annotated
+
+from msgspec import Meta
+
+LARGEST = 1e8  # largest absolute value of any number [SI units]
+LONGEST_LIST = 1000  # largest number of entries of a list: muscles, points of a route, joints
+
+Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Meta(gt=0.0, le=LARGEST)]
+NotNegative = Annotated[float, Meta(ge=0.0, le=LARGEST)]
+Vector = tuple[Number, Number, Number]
+Name = Annotated[str, Meta(min_length=1, max_length=200)]
+Names = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=LONGEST_LIST)]
