@@ -9,10 +9,9 @@ t₀ is the time of the last start, jump, pause or resumption. A motion that was
 becomes a smoothed trajectory, whose points are evenly spaced in time.
 """
 
-import heapq
 import math
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from itertools import chain
 from typing import NamedTuple
@@ -20,9 +19,9 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.bags.bunches import Bunch
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import BagMessage
+from musculoskeletal_ae.bags.timed_messages import TimedMessages
 from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
 from musculoskeletal_ae.validity import MOST_ENTRIES, read_target
@@ -60,13 +59,7 @@ def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
     return first, min(bag.end, first + round(duration * 1e9))
 
 
-def lap(
-    bag: Bag,
-    topics: Collection[str],
-    start: int,
-    stop: int,
-    bunched: Mapping[str, Bunch] | None = None,
-) -> Iterator[BagMessage]:
+def lap(messages: TimedMessages, start: int, stop: int) -> Iterator[BagMessage]:
     """Yield the messages that playback publishes from one recorded time to another [ns].
 
     In these messages, the log time is the time at which to publish the message. The last message
@@ -74,42 +67,25 @@ def lap(
     would receive it.
 
     Args:
-        bag: The recording.
-        topics: Recorded names of the topics to play.
+        messages: The messages of the topics to play.
         start: Recorded time of the first messages [ns].
         stop: Recorded time of the last messages [ns].
-        bunched: Topics whose messages are timed by publication.
 
     Raises:
         BagError: If a message cannot be decoded; replay must not publish it.
     """
+    bag, topics = messages.bag, messages.topics
     latched: dict[str, BagMessage] = {}
     if start > bag.start:
-        for message in bag.messages(latched_topics(bag) & set(topics), stop=start - 1):
+        for message in messages.messages(latched_topics(bag) & topics, stop=start - 1):
             latched[message.topic] = message._replace(log_time=start - 1)
-    for message in chain(latched.values(), _timed(bag, topics, start, stop, bunched or {})):
+    played = (
+        message._replace(log_time=max(message.log_time, start))
+        for message in messages.messages(topics, start, stop)
+    )
+    for message in chain(latched.values(), played):
         bag.decode(message)
         yield message
-
-
-def _timed(
-    bag: Bag, topics: Collection[str], start: int, stop: int, bunched: Mapping[str, Bunch]
-) -> Iterator[BagMessage]:
-    """Yield messages in the order of the times at which they are to be published."""
-    longest = max((bunch.longest for bunch in bunched.values()), default=0)
-    waiting: list[tuple[int, int, BagMessage]] = []  # a heap
-    for n, message in enumerate(bag.messages(topics, start, stop + longest)):
-        # Later messages of the bag are to be published after this time.
-        while waiting and waiting[0][0] < message.log_time - longest:
-            yield heapq.heappop(waiting)[2]
-        bunch = bunched.get(message.topic)
-        time = message.log_time if bunch is None else bunch.time(message)
-        if start == bag.start:
-            time = max(time, start)
-        if start <= time <= stop:
-            heapq.heappush(waiting, (time, n, message._replace(log_time=time)))
-    while waiting:
-        yield heapq.heappop(waiting)[2]
 
 
 class Timeline:
@@ -179,7 +155,7 @@ def taught_motion(bag: Bag, topic: str, start: int, stop: int) -> TaughtMotion:
             than 1 s, or if it is too long for one trajectory.
     """
     postures = defaultdict[tuple[str, ...], list[tuple[float, Array]]](list)
-    for message in bag.messages([topic], start, stop):
+    for message in TimedMessages(bag, [topic]).messages([topic], start, stop):
         joint_state = bag.decode(message)
         with suppress(MessageError):  # skip invalid messages, as a node does
             names = sorted(joint_state.name)

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.bags.bunches import Bunch, bunches
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LATEST
+from musculoskeletal_ae.bags.timed_messages import TimedMessages
 from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.reception import Reception
@@ -228,17 +228,14 @@ def read_streams(
     for name, stream in arm.by_topic.items():
         if name in recorded:
             takers[recorded[name]][labels[name]] = stream.take
-    bunched = bunches(bag, takers, stop)
+    messages = TimedMessages(bag, takers, stop)
     early = [recorded[name] for name in BODY_TOPICS if name in recorded]
-    _deliver(bag, takers, early, bunched, reception, progress, stop)
+    _deliver(messages, takers, early, reception, progress, stop)
     # A topic of motors that also counts as joint_states need not contain joint angles, because the
     # joints may have no sensors.
     optional = f'{recorded.get("joint_states")} as joint_states'
     _check_fit(bag, {key: each for key, each in used.items() if key != optional}, warnings)
-    notes = [
-        f'{topic}: the recorder wrote messages late and in bunches; their publish times are used'
-        for topic in bunched
-    ]
+    notes = (messages.note,) if messages.note else ()
     joints, states, lengths, tensions, isolated, _ = (
         stream.series() for stream in arm.by_topic.values()
     )
@@ -248,7 +245,7 @@ def read_streams(
         reception.rejected[reason] += int((~is_known).sum())
         states = Series(states.time[is_known], states.values[is_known])
     series = joints, states, lengths, tensions, isolated
-    return Streams(*series, reception.rejected, reception.ignored, tuple(notes))
+    return Streams(*series, reception.rejected, reception.ignored, notes)
 
 
 def _labels(recorded: Mapping[str, str]) -> dict[str, str]:
@@ -269,34 +266,32 @@ def _labels(recorded: Mapping[str, str]) -> dict[str, str]:
 
 
 def _deliver(
-    bag: Bag,
+    messages: TimedMessages,
     takers: Mapping[str, Mapping[str, Callable[[Any], None]]],
     early: Sequence[str],
-    bunched: Mapping[str, Bunch],
     reception: Reception,
     progress: Callable[[float], None],
     stop: int,
 ) -> None:
-    """Read the messages of a bag, and pass each one to the functions for its topic.
+    """Read messages, and pass each one to the functions for its topic.
 
     The functions receive pairs (arrival, decoded content).
 
     Args:
-        bag: The recording.
+        messages: The messages to read.
         takers: For each recorded topic, the functions to call, by the name under which `reception`
             counts the messages.
         early: Recorded names of the topics that are read before the other topics.
-        bunched: Topics whose messages are timed by publication; messages of other topics are timed
-            by their log times.
         reception: Rejects messages for which a function raises a MessageError, and counts them.
         progress: Called after each message with its share of all messages.
         stop: Latest log time [ns] of the messages to read.
     """
+    bag = messages.bag
     count = sum(bag.topics[topic].message_count for topic in takers)
     receive = dict[tuple[str, ...], list[Callable[[Any, dict[str, Any]], Any]]]()
     delays = defaultdict[tuple[str, ...], MessageDelay](MessageDelay)
     for message in chain(
-        bag.messages(early, stop=stop), bag.messages(takers.keys() - early, stop=stop)
+        messages.messages(early, stop=stop), messages.messages(takers.keys() - early, stop=stop)
     ):
         decoded = bag.decode(message)
         # Publishers of different joints on one topic may have different clocks.
@@ -306,10 +301,8 @@ def _deliver(
                 reception.of(label, take, lambda: 1)
                 for label, take in takers[message.topic].items()
             ]
-        bunch = bunched.get(message.topic)
-        came = message.log_time if bunch is None else bunch.time(message)
         sent = {'source_timestamp': message.publish_time, 'publication_sequence_number': 0}
-        time = (came - bag.start) / 1e9
+        time = (message.log_time - bag.start) / 1e9
         arrival = _Arrival(time, delays[sender].step(time, message.publish_time))
         for take in receive[sender]:
             take((arrival, decoded), sent)

@@ -22,7 +22,6 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 from tqdm import tqdm
 
-from musculoskeletal_ae.bags.bunches import Bunch, bunches
 from musculoskeletal_ae.bags.playback import (
     LONGEST_LAG,
     TAUGHT_TOPIC,
@@ -31,6 +30,7 @@ from musculoskeletal_ae.bags.playback import (
     window,
 )
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.timed_messages import TimedMessages
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, DIAGNOSTICS, latched_topics, select
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
@@ -75,19 +75,16 @@ SHORTEST_CLOCK_PERIOD = 0.001
 class Replay(Node):
     """Publishes recorded messages, as serialized bytes, at their recorded times."""
 
-    def __init__(
-        self, bag: Bag, names: dict[str, str], bunched: dict[str, Bunch], options: Namespace
-    ) -> None:
+    def __init__(self, messages: TimedMessages, names: dict[str, str], options: Namespace) -> None:
         """Advertise the topics.
 
         Args:
-            bag: The recording.
+            messages: The messages to play.
             names: The topic on which to publish, by recorded topic.
-            bunched: Topics whose messages are played at the times of their publication.
             options: Options of the command line.
         """
         super().__init__('replay')
-        self._bag, self._names, self._bunched = bag, names, bunched
+        self._messages, bag = messages, messages.bag
         self._start, self._stop = window(bag, options.start, options.duration)
         self.length = (self._stop - self._start) / 1e9  # duration of the played part [s]
         self._before = (self._start - bag.start) / 1e9  # skipped time at the start of the bag [s]
@@ -167,7 +164,7 @@ class Replay(Node):
             self._seek_time = time.monotonic()
             # Jump to just before the first message, so that it is not due while playback is paused.
             self._timeline.jump(start - 1, time.monotonic())
-            for message in lap(self._bag, self._names, start, self._stop, self._bunched):
+            for message in lap(self._messages, start, self._stop):
                 if not self._wait(message.log_time, progress):
                     break
                 self._wait_for_nodes(message.log_time)
@@ -277,7 +274,7 @@ class Replay(Node):
     def _seek(self, parameters: list[Parameter]) -> None:
         for parameter in parameters:
             if parameter.name == 'position':
-                self._sought = self._bag.start + int(1e9 * parameter.value)
+                self._sought = self._messages.bag.start + int(1e9 * parameter.value)
 
     def pause(self, _: Trigger.Request) -> str:
         """Pause playback; return a message that states the present position."""
@@ -336,13 +333,12 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
             'the nodes'
         )
         print(f'warning: --loop: {problem}', file=sys.stderr)
-    bunched = bunches(bag, names)
-    if bunched:
-        problem = 'the recorder wrote messages late and in bunches; their publish times are used'
-        print(f'note: {", ".join(bunched)}: {problem}', file=sys.stderr)
+    messages = TimedMessages(bag, names)
+    if messages.note:
+        print(f'note: {messages.note}', file=sys.stderr)
     with STOP.reacting(Reaction.REMEMBER):
         start_ros(arguments)
-        node = Replay(bag, names, bunched, options)
+        node = Replay(messages, names, options)
         bar = '{percentage:3.0f}%|{bar}| {n:.1f}/{total:.1f} s'
         with tqdm(
             total=node.length, bar_format=bar, disable=not is_bar_visible(), leave=False

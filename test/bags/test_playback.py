@@ -7,7 +7,6 @@ from numpy.testing import assert_array_equal
 
 from bags import bag_samples as samples
 from bags.arm_bag import JOINTS, Arm, joints
-from musculoskeletal_ae.bags.bunches import bunches
 from musculoskeletal_ae.bags.playback import (
     LONGEST_LAG,
     TAUGHT_TOPIC,
@@ -17,6 +16,7 @@ from musculoskeletal_ae.bags.playback import (
     window,
 )
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.timed_messages import TimedMessages
 from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.robot.robot import Robot
@@ -62,7 +62,7 @@ def test_after_a_long_stop_of_the_process_it_goes_on_instead_of_catching_up():
 
 def test_a_lap_is_everything_from_start_to_stop_in_order(bag, content):
     opened = Bag.open(bag)
-    played = list(lap(opened, opened.topics, opened.start, opened.end))
+    played = list(lap(TimedMessages(opened, opened.topics), opened.start, opened.end))
     assert [message.data for message in played] == [sample.data for sample in content]
 
 
@@ -80,12 +80,12 @@ def test_messages_that_a_recorder_wrote_in_bunches_are_played_as_they_were_publi
         recorded.append(first._replace(log_time=log, publish_time=sent))
     samples.write_ours(tmp_path / 'bunched', recorded, 'none', finish=True)
     bag = Bag.open(tmp_path / 'bunched')
-    found = bunches(bag, bag.topics)
-    times = [message.log_time for message in lap(bag, bag.topics, bag.start, bag.end, found)]
+    timed = TimedMessages(bag, bag.topics)
+    times = [message.log_time for message in lap(timed, bag.start, bag.end)]
     assert len(times) == count
     assert_array_equal(np.diff(times), samples.PERIOD)
     # A part that begins and ends among late messages is played completely.
-    part = lap(bag, bag.topics, times[30], times[75], found)
+    part = lap(timed, times[30], times[75])
     assert [message.log_time for message in part] == times[30:76]
 
 
@@ -107,20 +107,21 @@ def test_what_was_latched_before_the_start_comes_first(bag, content):
     )  # fmt: skip
     assert latched_topics(opened) == {f'/left_arm/{name}' for name in names}
     last = [next(s for s in content[39::-1] if s.topic.endswith(name)) for name in names]
-    played = list(lap(opened, opened.topics, content[40].log_time, opened.end))
+    played = list(lap(TimedMessages(opened, opened.topics), content[40].log_time, opened.end))
     assert sorted(m.data for m in played[: len(names)]) == sorted(sample.data for sample in last)
     # These messages are due at the start, so that the recorded time does not run backwards.
     assert {m.log_time for m in played[: len(names)]} == {content[40].log_time - 1}
     assert [m.data for m in played[len(names) :]] == [sample.data for sample in content[40:]]
 
 
-def motion(tmp_path, times, first=()):
+def motion(tmp_path, times, first=(), bunch=0):
     """Return the motion that a recorded demonstration contains.
 
     Args:
         tmp_path: Folder of the bag.
         times: Times at which the bag contains positions of the robot's joints [s].
         first: Times of messages that contain only an unknown joint [s].
+        bunch: The recorder writes all messages of this time at its end [ns]; 0: at once.
     """
     arm = Arm(Robot.load('arm26'), count=1)
     for at in first:
@@ -129,6 +130,10 @@ def motion(tmp_path, times, first=()):
         arm.add(
             f'/{TAUGHT_TOPIC}', JOINTS, at, joints(['shoulder', 'elbow'], [0.5 + 0.1 * at, 1.0])
         )
+    if bunch:
+        arm.content = [
+            sample._replace(log_time=-(-sample.log_time // bunch) * bunch) for sample in arm.content
+        ]
     bag = Bag.open(arm.write(tmp_path / 'bag'))
     return taught_motion(bag, f'/{TAUGHT_TOPIC}', bag.start, bag.end)
 
@@ -138,6 +143,14 @@ def test_a_demonstration_contains_the_joints_that_most_messages_name(tmp_path):
     assert taught.joints == ('elbow', 'shoulder')
     assert taught.theta[:, 0] == pytest.approx(1.0)
     assert taught.theta[-1, 1] == pytest.approx(0.7, abs=0.02)
+
+
+def test_a_demonstration_that_was_recorded_in_bunches_is_the_same_motion(tmp_path):
+    times = [0.02 * k for k in range(1, 101)]
+    regular = motion(tmp_path / 'regular', times)
+    bunched = motion(tmp_path / 'bunched', times, bunch=SECOND // 2)
+    assert bunched.time == pytest.approx(regular.time)
+    assert bunched.theta == pytest.approx(regular.theta)
 
 
 @pytest.mark.parametrize(

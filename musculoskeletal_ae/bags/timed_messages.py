@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages of a recording with the best times that are known, for training and replay.
+
+A recorder on a busy computer is blocked for a moment, and then writes many messages late and in
+bunches, with almost the same log time. The publish times are then more accurate, but the
+publisher's clock may differ from that of the recorder. With the delay d = log time − publish time
+of each message, the best time is
+
+    publish time + min(d)
+
+The minimum is over all messages of the topic. Topics without bunches keep their log times, because
+publish times have errors of their own: the clock of another computer drifts, and the clock of a
+recorder with `use_sim_time` passes at another rate.
+"""
+
+from __future__ import annotations
+
+import heapq
+from array import array
+from collections.abc import Collection, Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.storage import LATEST, BagMessage
+
+# The log times of a topic count as bunched if all of these conditions hold.
+FEW = 20  # it has at least this number of messages
+BUNCHED = 50_000_000  # the delays of its messages differ by more than this [ns]
+MANY = 0.1  # more than this fraction of its messages was written together with the message before
+
+
+class _Bunched(NamedTuple):
+    """A topic with bunched log times."""
+
+    offset: int  # min(d) [ns], to be added to a publish time
+    longest: int  # longest time by which a log time is later than the best time [ns]
+
+
+class TimedMessages:
+    """The messages of some topics of a recording, with the best times that are known.
+
+    Attributes:
+        bag: The recording.
+        topics: Recorded names of the topics.
+        note: A text that names the topics with corrected times; '' if there are none.
+    """
+
+    def __init__(self, bag: Bag, topics: Iterable[str], stop: int = LATEST) -> None:
+        """Find the topics with bunched log times.
+
+        Args:
+            bag: The recording.
+            topics: Recorded names of the topics.
+            stop: Latest log time of the messages to check [ns].
+        """
+        self.bag, self.topics = bag, frozenset(topics)
+        self._bunched = _find_bunched(bag, self.topics, stop)
+        self.note = ''
+        if self._bunched:
+            problem = 'the recorder wrote messages late and in bunches'
+            self.note = f'{", ".join(self._bunched)}: {problem}; their publish times are used'
+
+    def messages(
+        self, topics: Collection[str], start: int = 0, stop: int = LATEST
+    ) -> Iterator[BagMessage]:
+        """Yield messages from start to stop [ns], both included, with their best times as log time.
+
+        The messages are sorted by these times.
+
+        Args:
+            topics: Recorded names of the topics to read.
+            start: Earliest time [ns]. The start of the bag includes messages that were published
+                before, but recorded late.
+            stop: Latest time [ns].
+        """
+        start = start if start > self.bag.start else 0
+        longest = max(
+            (self._bunched[name].longest for name in topics if name in self._bunched), default=0
+        )
+        waiting: list[tuple[int, int, BagMessage]] = []  # a heap
+        for n, message in enumerate(self.bag.messages(topics, start, stop + longest)):
+            # Later messages of the bag have best times after this time.
+            while waiting and waiting[0][0] < message.log_time - longest:
+                yield heapq.heappop(waiting)[2]
+            bunched = self._bunched.get(message.topic)
+            time = message.publish_time + bunched.offset if bunched else message.log_time
+            if start <= time <= stop:
+                heapq.heappush(waiting, (time, n, message._replace(log_time=time)))
+        while waiting:
+            yield heapq.heappop(waiting)[2]
+
+
+def _find_bunched(bag: Bag, topics: Collection[str], stop: int) -> dict[str, _Bunched]:
+    times = {topic: (array('q'), array('q')) for topic in topics}
+    for message in bag.messages(topics, stop=stop):
+        log, sent = times[message.topic]
+        log.append(message.log_time)
+        sent.append(message.publish_time)
+    bunched = {}
+    for topic in sorted(times):
+        log_time, publish_time = (np.array(part, dtype=np.int64) for part in times[topic])
+        if len(log_time) < FEW or not (publish_time > 0).all():
+            continue
+        if (np.diff(publish_time) < 0).any():
+            continue
+        delay = log_time - publish_time
+        together = np.diff(log_time) < 0.1 * np.median(np.diff(publish_time))
+        if np.ptp(delay) > BUNCHED and together.mean() > MANY:
+            bunched[topic] = _Bunched(int(delay.min()), int(np.ptp(delay)))
+    return bunched
