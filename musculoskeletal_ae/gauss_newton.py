@@ -43,7 +43,7 @@ Samples without shared unknowns. `minimise_each` solves, for every sample n alon
 Each sample has its own damping, and stops alone. r contains the roots of weights, and the prior as
 further rows. An unknown at its bound is held if the step would move it beyond.
 
-Two problems of this package have a solver of their own. The steps of `simulation/equilibrium.py` are
+Two problems of this package have their own solver. The steps of `simulation/equilibrium.py` are
 compiled, because a simulation takes thousands of them. Each step of `control/methods.py` is a
 quadratic programme, because tensions have to balance the torque and stay within their limits.
 """
