@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Robust Gauss–Newton fit with a prior, for unknowns of single samples and shared unknowns.
+"""Damped, robust Gauss–Newton: the one solver of this package.
+
+`minimise` fits unknowns of single samples and unknowns that all samples share. `minimise_each` fits
+samples that share no unknowns, for example the posture at every message of a recording.
 
     min over w, θ_1 … θ_N of   Σ_nr ω_nr ρ_nr(θ_n, w)² / σ_r²  +  Σ_k ((w_k − w̄_k) / s_k)²
 
@@ -32,15 +35,26 @@ previous round.
 
 Stopping. The fit ends after a number of rounds, or when a step lowers the cost, or is predicted to
 lower it, by less than `enough`.
+
+Samples without shared unknowns. `minimise_each` solves, for every sample n alone,
+
+    min over θ_n of  ‖r(θ_n)‖²   with  θ_low ≤ θ_n ≤ θ_high
+
+Each sample has its own damping, and stops alone. r contains the roots of weights, and the prior as
+further rows. An unknown at its bound is held if the step would move it beyond.
+
+Two problems of this package have their own solver. The steps of `simulation/equilibrium.py` are
+compiled, because a simulation takes thousands of them. Each step of `control/methods.py` is a
+quadratic programme, because tensions have to balance the torque and stay within their limits.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky
 
 from musculoskeletal_ae.arrays import Array
 
@@ -49,12 +63,27 @@ PRIOR_COUNT = 4.0  # number of residuals that count as much as the prior at σ�
 WEIGHTINGS = 3  # steps of the EM algorithm in each round
 DAMPING = (0.0, 0.1, 1.0, 10.0, 100.0)  # values of λ that a round tries
 SMALL = 1e-6  # added to the diagonal of C, so that the Schur complement is positive definite
+#: values of λ in `minimise_each`; more of them, because a start may be far from the solution
+LADDER = np.array([0.0, *np.logspace(-1.0, 9.0, 11)])
+#: predicted decrease of ‖r‖² by the last step of `minimise_each`, a third of a standard deviation
+SETTLED = 0.1
 
 
 def student(score: Array) -> Array:
     """Return the weights ω for scaled residuals ρ/σ, in the same shape."""
     weight: Array = (FREEDOM + 1.0) / (FREEDOM + score**2)
     return weight
+
+
+def student_cost(score: Array) -> float:
+    """Return −2 times the log-likelihood of scaled residuals ρ/σ, up to a constant."""
+    return float((FREEDOM + 1.0) * np.log1p(score**2 / FREEDOM).sum())
+
+
+def whitening(covariance: Array) -> Array:
+    """Return R with RᵀR = Σ⁻¹; R ρ are independent residuals of standard deviation 1, (R, R)."""
+    root: Array = np.linalg.inv(np.linalg.cholesky(covariance))
+    return root
 
 
 def noise_and_weight(
@@ -157,13 +186,16 @@ class Eliminated:
         self._reduced = self._inverse @ mixed  # L B
         tall = self._reduced.reshape(-1, len(common))
         diagonal = np.broadcast_to(common_damping, len(common))
-        self.root: Array = cholesky(common + np.diag(diagonal) - tall.T @ tall)
+        # numpy alone: nodes that estimate would wait 0.3 s for the import of scipy.linalg.
+        self._complement = common + np.diag(diagonal) - tall.T @ tall
+        self.root: Array = np.linalg.cholesky(self._complement).T
 
     def solve(self, right: RightSides) -> Step:
         """Return the step that solves the equations for these right sides."""
         inverse, reduced = self._inverse, self._reduced
         last = (inverse @ right.samples[:, :, None])[:, :, 0]
-        common = cho_solve((self.root, False), right.common - np.tensordot(last, reduced, 2))
+        right_common = right.common - np.tensordot(last, reduced, 2)
+        common = np.linalg.solve(self._complement, right_common)
         samples = (inverse.swapaxes(1, 2) @ (last - reduced @ common)[:, :, None])[:, :, 0]
         decrease = float(common @ right.common + (samples * right.samples).sum())
         return Step(samples, common, decrease)
@@ -220,6 +252,9 @@ class Result(Generic[Point]):
     decrease: float = 0.0
 
 
+Work = Generator[None, None, Result[Point]]  # yields before each short piece of work
+
+
 def minimise(problem: Problem[Point], start: Point, rounds: int, enough: float) -> Result[Point]:
     """Fit a problem, beginning at a point.
 
@@ -233,6 +268,19 @@ def minimise(problem: Problem[Point], start: Point, rounds: int, enough: float) 
     Returns:
         The state after the last round. The weights of the problem then belong to its point.
     """
+    work = minimise_in_pieces(problem, start, rounds, enough)
+    while True:
+        try:
+            next(work)
+        except StopIteration as end:
+            result: Result[Point] = end.value
+            return result
+
+
+def minimise_in_pieces(
+    problem: Problem[Point], start: Point, rounds: int, enough: float
+) -> Work[Point]:
+    """Fit a problem like `minimise`, and yield before every evaluation of a new point."""
     fit = Result(start)
     for _ in range(rounds):
         problem.weigh(fit.point)
@@ -242,18 +290,19 @@ def minimise(problem: Problem[Point], start: Point, rounds: int, enough: float) 
             right = problem.right_sides(fit.point)
             if fit.eliminated.solve(right).decrease < enough:
                 break
-        fit = _descend(problem, fit, enough)
+        fit = yield from _descend(problem, fit, enough)
         if fit.decrease < enough:
             break
     problem.weigh(fit.point)
     return fit
 
 
-def _descend(problem: Problem[Point], fit: Result[Point], enough: float) -> Result[Point]:
+def _descend(problem: Problem[Point], fit: Result[Point], enough: float) -> Work[Point]:
     """Take the step with the least damping that lowers the cost; return the new state.
 
     If no step lowers the cost enough, the state keeps its point.
     """
+    yield
     before = problem.cost(fit.point)
     equations = problem.equations(fit.point)
     right = problem.right_sides(fit.point)
@@ -268,4 +317,77 @@ def _descend(problem: Problem[Point], fit: Result[Point], enough: float) -> Resu
         after = problem.cost(point)
         if after <= before:
             return Result(point, eliminated, level, before - after)
+        yield
     return Result(fit.point, eliminated, level)
+
+
+#: maps θ (..., D) to residuals r (..., R) and their derivatives ∂r/∂θ (..., R, D)
+Residuals = Callable[[Array], tuple[Array, Array]]
+
+
+def minimise_each(
+    residuals: Residuals,
+    start: Array,
+    usual: Array | float,
+    rounds: int,
+    *,
+    bounds: tuple[Array, Array] | None = None,
+    least_damping: float = SMALL,
+    enough: float = SETTLED,
+) -> Array:
+    """Minimise ‖r(θ)‖² of every sample alone, beginning at `start`.
+
+    Args:
+        residuals: The residuals r(θ), in standard deviations, and their derivatives.
+        start: The first θ, (..., D).
+        usual: e_θ, 1 over the square of a typical step, (D,).
+        rounds: Largest number of steps.
+        bounds: θ_low and θ_high, (D,) each; None without bounds.
+        least_damping: Smallest λ. With a large one, residuals that hardly depend on an unknown do
+            not move it far.
+        enough: The first step that is predicted to lower ‖r‖² by less than this value is the last
+            one of a sample. It is not checked.
+
+    Returns:
+        θ, (..., D).
+    """
+    theta = start if bounds is None else np.clip(start, *bounds)
+    ladder, unit = np.maximum(least_damping, LADDER), usual * np.eye(theta.shape[-1])
+    level = np.zeros(theta.shape[:-1], dtype=np.int64)
+    value, slope = residuals(theta)
+    cost = _dot(value, value)
+    for _ in range(rounds):
+        gradient = (value[..., None, :] @ slope)[..., 0, :]
+        if bounds is not None:
+            lower, upper = bounds
+            held = (theta <= lower) & (gradient > 0.0) | (theta >= upper) & (gradient < 0.0)
+            if held.any():
+                slope = np.where(held[..., None, :], 0.0, slope)
+                gradient = np.where(held, 0.0, gradient)
+        matrix = slope.swapaxes(-1, -2) @ slope + ladder[level][..., None, None] * unit
+        step = -np.linalg.solve(matrix, gradient[..., None])[..., 0]
+        tried = theta + step if bounds is None else np.clip(theta + step, *bounds)
+        is_last = -_dot(step, gradient) < enough
+        if is_last.all():
+            return tried
+        tried_value, tried_slope = residuals(tried)
+        tried_cost = _dot(tried_value, tried_value)
+        is_better = ~is_last & (tried_cost <= cost)
+        if is_better.all():
+            theta, value, slope, cost = tried, tried_value, tried_slope, tried_cost
+            level = np.maximum(level - 1, 0)
+        else:
+            # A finished sample keeps its point, so that its last step stays the same.
+            theta = np.where(is_better[..., None], tried, theta)
+            value = np.where(is_better[..., None], tried_value, value)
+            slope = np.where(is_better[..., None, None], tried_slope, slope)
+            cost = np.where(is_better, tried_cost, cost)
+            change = np.where(is_better, -1, np.where(is_last, 0, 1))
+            level = np.clip(level + change, 0, len(ladder) - 1)
+    result: Array = np.where(is_last[..., None], tried, theta)
+    return result
+
+
+def _dot(one: Array, other: Array) -> Array:
+    result: Array = np.einsum('...i,...i->...', one, other)
+    return result

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The robust solver: its steps, its weights, and its termination."""
+"""The solver: its steps, weights, damping and bounds, and its termination."""
 
 from typing import NamedTuple
 
@@ -12,6 +12,8 @@ from musculoskeletal_ae.gauss_newton import (
     RightSides,
     determined,
     minimise,
+    minimise_each,
+    minimise_in_pieces,
     noise_and_weight,
 )
 
@@ -137,3 +139,55 @@ def test_a_step_that_would_raise_the_cost_is_damped():
 def test_residuals_determine_what_the_prior_leaves_open():
     curvature = np.diag([1e6, 1e6, 1e-6])
     assert determined(curvature, np.ones(3)) == pytest.approx(2.0, abs=1e-5)
+
+
+def test_every_piece_of_work_ends_with_the_same_result_as_the_whole_fit():
+    x, y = np.linspace(-1.0, 1.0, 20), np.linspace(0.0, 3.0, 20)
+    whole, in_pieces = LineFit(x, y), LineFit(x, y)
+    expected = minimise(whole, whole.point(np.zeros(2)), 50, 1e-9)
+    pieces, results = 0, []
+
+    def run():
+        results.append((yield from minimise_in_pieces(in_pieces, start, 50, 1e-9)))
+
+    start = in_pieces.point(np.zeros(2))
+    for _ in run():
+        pieces += 1
+    assert pieces > 1
+    np.testing.assert_array_equal(results[0].point.values, expected.point.values)
+
+
+def arc_tangents(theta):
+    """Return residuals whose undamped Gauss–Newton steps diverge far from the solution, 0."""
+    return np.arctan(theta), (1.0 / (1.0 + theta**2))[..., None] * np.eye(theta.shape[-1])
+
+
+def test_samples_without_shared_unknowns_do_not_affect_each_other():
+    start = np.array([[0.1, -0.2], [3.0, 2.0], [-3.0, 0.0]])
+    together = minimise_each(arc_tangents, start, 1.0, 30, enough=1e-12)
+    alone = [minimise_each(arc_tangents, one, 1.0, 30, enough=1e-12) for one in start]
+    np.testing.assert_allclose(together, alone, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(together, 0.0, atol=1e-6)
+
+
+def test_an_unknown_at_its_bound_is_held_while_the_others_go_on():
+    turn = np.array([[1.0, 0.8], [0.0, 0.6]])  # the residuals depend on both unknowns
+    wanted = np.array([2.0, 1.0])
+    end = minimise_each(
+        lambda theta: (turn @ (theta - wanted), turn),
+        np.zeros(2),
+        1.0,
+        30,
+        bounds=(np.full(2, -1.0), np.array([1.5, 5.0])),
+        enough=1e-12,
+    )
+    # With θ₁ = 1.5, the sum (θ₁ − 2 + 0.8 u)² + (0.6 u)² is least at u = 0.4, and θ₂ = 1 + u.
+    np.testing.assert_allclose(end, [1.5, 1.4], atol=1e-6)
+
+
+def test_least_damping_keeps_unknowns_that_the_residuals_do_not_determine():
+    def residuals(theta):
+        return theta[:1] - 1.0 + 1e-4 * theta[1:], np.array([[1.0, 1e-4]])
+
+    end = minimise_each(residuals, np.zeros(2), 1.0, 30, least_damping=1.0, enough=1e-12)
+    np.testing.assert_allclose(end, [1.0, 0.0], atol=1e-3)

@@ -268,7 +268,8 @@ def _approach(
 ) -> Array:
     """Return tensions whose joint stiffness is close to `desired`, by Gauss–Newton iterations.
 
-    Only joints with `desired` > 0 count.
+    Only joints with `desired` > 0 count. Each step is a quadratic programme, because the tensions
+    have to balance the torque within their limits. The module `gauss_newton` cannot do that.
     """
     chosen, start = desired > 0.0, tension
     for _ in range(ITERATIONS if chosen.any() else 0):

@@ -38,8 +38,9 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.gauss_newton import whitening
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.units import LENGTH_SCALE, scale_vector
+from musculoskeletal_ae.mae.units import LENGTH_SCALE
 from musculoskeletal_ae.robot.model_errors import ELASTIC, length_variances
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -48,9 +49,6 @@ SENSOR_NOISE = 0.0003  # standard deviation of the noise of a length [m]
 #: Width of the correlation ρ, as a share of the joint ranges. It is the width with which the
 #: learner's residual model varies (`learning/body.py`).
 SMOOTHNESS = 0.35
-STEPS = 15  # largest number of Newton steps
-SETTLED = 1e-4  # step below which the fit ends [rad]
-HALVINGS = 6  # number of times that a step is halved if it does not lower the cost
 
 
 class Prediction(NamedTuple):
@@ -83,10 +81,9 @@ class LengthErrors:
         """
         self._robot, self._mae = robot, mae
         self._range = robot.upper - robot.lower
-        joints, muscles = robot.joint_count, robot.muscle_count
-        scale = scale_vector(joints, muscles)
-        self._mean = (mae.mean / scale)[:joints]
-        self._precision: Array = np.diag(np.square((scale / mae.std)[:joints]))
+        muscles = robot.muscle_count
+        _, spread = mae.usual_posture
+        self._precision: Array = np.diag(spread**-2)
         theta = robot.random_postures(POSTURES, np.random.default_rng(0))
         if mae.covariance is None:
             self.covariance: Array = np.diag(length_variances(robot, theta).mean(axis=0))
@@ -118,10 +115,10 @@ class LengthErrors:
         noise = np.square(elastic) + np.square(compliance * spread) + SENSOR_NOISE**2
         total = self.covariance + np.diag(noise)
         rows: Ints = np.flatnonzero(used)
-        weight = np.zeros_like(self.covariance)
-        among = np.ix_(rows, rows)
-        weight[among] = np.linalg.inv(total[among])
-        theta = self._fit(length, tension, weight, start)
+        root = np.zeros((len(rows), len(total)))
+        root[:, rows] = whitening(total[np.ix_(rows, rows)])
+        weight = root.T @ root
+        theta = self._mae.fit_posture(tension, length, root, start)
         slope = self._mae.muscle_jacobian(theta, tension)
         excess: Array = self._mae.lengths(theta, tension) - length
         spread_of_theta = np.linalg.inv(slope.T @ weight @ slope + self._precision)
@@ -130,30 +127,6 @@ class LengthErrors:
         variance = np.einsum('ij,jk,ik->i', shares, total, shares)
         variance += np.einsum('ij,jk,ik->i', moves, self._precision, moves)
         return Prediction(theta, excess, variance, shares, elastic)
-
-    def _fit(self, length: Array, tension: Array, weight: Array, start: Array) -> Array:
-        def cost_at(theta: Array) -> tuple[float, Array]:
-            error = length - self._mae.lengths(theta, tension)
-            away = theta - self._mean
-            return float(error @ weight @ error + away @ self._precision @ away), error
-
-        theta, (cost, error) = start, cost_at(start)
-        for _ in range(STEPS):
-            slope = self._mae.muscle_jacobian(theta, tension)
-            pull = slope.T @ (weight @ error) + self._precision @ (self._mean - theta)
-            step = np.linalg.solve(slope.T @ weight @ slope + self._precision, pull)
-            for _ in range(HALVINGS):
-                tried = theta + step
-                new_cost, new_error = cost_at(tried)
-                if new_cost <= cost:
-                    break
-                step = 0.5 * step
-            else:
-                break
-            theta, cost, error = tried, new_cost, new_error
-            if np.abs(step).max() < SETTLED:
-                break
-        return theta
 
     def given(self, now: Prediction, taut: Prediction, muscle: int) -> Prediction:
         """Correct the prediction for one muscle by the error that it had while it was taut.

@@ -1,22 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fits the length offsets, and the postures of all moments, to readings of length and tension.
 
-    l_read = l(θ, T) + o                       M equations for each moment, with D unknown angles
-    0 = g(θ) + K θ − b + G(θ, T)ᵀ T            D more equations while the arm moves slowly
-
-A moment is the mean of the readings over a short window. l_read are the lengths as read, o the
-offsets, T the tensions, and θ the joint angles. g is the torque of the weight, and K and b describe
-the springs of the joints. The network computes the lengths l and G = ∂l/∂θ.
-
-If the joint angles were measured, o is the mean residual of the first line. Otherwise the offsets
-and the postures of all moments are estimated together, by maximum likelihood with noise of
-Student's distribution. Because muscles outnumber joints and G changes with the posture, only one
-set of offsets explains all moments of a moving arm. The second line already restricts the posture
-at the first moment, when the lengths alone do not.
-
-The fit is a damped Gauss–Newton method that eliminates the postures. It starts from the best of
-many random postures of the first moment. Besides the offsets it estimates the friction of every
-tendon, the offset of every tension sensor, and the Coulomb friction torque of every joint.
+A moment is the mean of the readings over a short window; `length_model` describes its equations. If
+the joint angles were measured, the offsets are the mean residuals of the lengths. Otherwise the
+offsets and the postures of all moments are estimated together, by the solver `gauss_newton`.
+Because muscles outnumber joints and G = ∂l/∂θ changes with the posture, only one set of offsets
+explains all moments of a moving arm. The balance of torques already restricts the posture at the
+first moment, when the lengths alone do not. The fit starts from the best of many random postures of
+the first moment.
 """
 
 from __future__ import annotations
@@ -27,36 +18,12 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.estimation.length_model import LengthModel, MomentFit
 from musculoskeletal_ae.estimation.length_moments import Moments
+from musculoskeletal_ae.gauss_newton import minimise_in_pieces
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.wiring import Judgement, Wiring, decide, single_faults
-
-# Constants in rad and N·m are for revolute joints. For a prismatic joint, angles are multiplied by
-# `kinematics.RACK` and become [m], and torques are divided by it and become [N].
-
-LENGTH_NOISE = 0.0004  # standard deviation of the network's error of a length [m]
-#: standard deviation of the network's error of a joint torque, apart from friction [N·m]
-TORQUE_NOISE = 0.4
-LIMIT_NOISE = 0.05  # standard deviation of the excess of a joint angle over its limits [rad]
-NOISE_FACTORS = 0.3, 5.0  # smallest and largest factor of LENGTH_NOISE for a single muscle
-ISOLATED_WEIGHT = 1e-6  # weight of an isolated muscle's length relative to a used muscle's
-FREEDOM = 4.0  # degrees of freedom of Student's distribution
-AT_STOP = 0.03  # distance from a joint limit below which the stop may carry torque [rad]
-
-# Prior of the constants; the mean is 0 except for FRICTION.
-OFFSET = 0.1  # prior standard deviation of a length offset [m]
-FRICTION = 0.05  # prior mean and standard deviation of the friction coefficient μ of a tendon
-#: prior standard deviation of a tension sensor's offset [N]; it covers the error of the gain
-TENSION_OFFSET = 1.5
-#: prior standard deviation of the Coulomb torque of a joint, relative to the largest torque of the
-#: weight
-JOINT_FRICTION = 0.03
-
-STICKING = 0.003  # motion after a reversal over which the friction of a joint changes sign [rad]
-#: lower limit of the largest torque of the weight, relative to the largest torque of the muscles at
-#: T_bias
-LEAST_WEIGHT = 0.1
 
 # Constants of the search for initial values.
 DRAWN_POSTURES = 3200  # number of random postures whose torques at the first moment are compared
@@ -73,11 +40,10 @@ COARSE_ANGLE = 0.1  # standard deviation of the excess over joint limits in coar
 LIKELY = 3  # number of the likeliest wirings that are fitted to all moments
 MOST_FAULTS = 3  # largest number of exchanges and reversed signs that are searched for
 
-FARTHEST = 0.3  # largest offset [m], and largest change of an angle in a Gauss–Newton step [rad]
+FARTHEST = 0.3  # largest offset [m]
 ROUNDS = 20  # largest number of Gauss–Newton steps
 FIRST_ROUNDS = 6  # largest number of Gauss–Newton steps in the search for initial values
-STEP = 1e-3  # step of numerical derivatives, of θ [rad] and of μ
-LARGEST_DAMPING = 1e4  # damping at which the fit ends, because no step lowers the cost
+LEAST_DECREASE = 3e-5  # decrease of the cost, per residual, that ends the Gauss–Newton steps
 
 
 class Fit(NamedTuple):
@@ -110,25 +76,8 @@ class LengthFit:
         robot = robot.with_elasticity(mae.elasticity)
         self._robot, self._mae = robot, mae
         self._rng = np.random.default_rng([0, 0x2E])
-        muscle_count, joint_count = robot.muscle_count, robot.joint_count
-        self._radian = radian = robot.kinematics.radian
-        postures = robot.random_postures(64, self._rng)
-        weight = np.abs(radian * robot.kinematics.weight_torque(postures)).max()
-        moment_arms = np.abs(radian * robot.routes.muscle_jacobian(postures))
-        # Joints with a vertical axis have friction although they carry no weight.
-        by_bias = (robot.description.tension.bias @ moment_arms).max()
-        weight = max(weight, LEAST_WEIGHT * by_bias)
-        counts = muscle_count, muscle_count, muscle_count, joint_count
-        self._prior_mean = np.repeat([0.0, FRICTION, 0.0, 0.0], counts)
-        spread = OFFSET, FRICTION, TENSION_OFFSET, JOINT_FRICTION * weight
-        self._prior_spread = np.repeat(spread, counts)
-        self._prior_spread[-joint_count:] /= radian
-        self._torque_noise = TORQUE_NOISE / radian
-        self.used = ~np.isin(np.arange(muscle_count), mae.isolated)
-        length_weight = np.where(self.used, 1.0, ISOLATED_WEIGHT)
-        length_noise = LENGTH_NOISE * _noise_factors(mae) / length_weight
-        #: standard deviations of the residuals, (M + 2D,)
-        self._noise = np.concatenate((length_noise, self._torque_noise, LIMIT_NOISE * radian))
+        self._model = LengthModel(robot, mae, self._rng)
+        self.used = self._model.used
 
     def known_angles(self, moments: Moments) -> Fit:
         """Fit the offsets to moments whose joint angles were measured.
@@ -137,7 +86,7 @@ class LengthFit:
         """
         residual = moments.length - self._mae.lengths(moments.theta, moments.tension)
         muscle_count = self._robot.muscle_count
-        constants = np.concatenate([residual.mean(axis=0), self._prior_mean[muscle_count:]])
+        constants = np.concatenate([residual.mean(axis=0), self._model.prior_mean[muscle_count:]])
         return Fit(0.0, constants, moments.theta)
 
     def unknown_angles(self, moments: Moments, before: Fit | None) -> Steps:
@@ -217,7 +166,11 @@ class LengthFit:
 
     def cost_per_residual(self, fit: Fit) -> float:
         """Return the cost of a fit, divided by the number of its length and torque residuals."""
-        return fit.cost / (len(fit.theta) * (len(self._noise) - self._robot.joint_count))
+        return fit.cost / self._count(fit.theta)
+
+    def _count(self, theta: Array) -> int:
+        """Return the number of length and torque residuals in the postures `theta`, (K, D)."""
+        return len(theta) * (self._robot.muscle_count + self._robot.joint_count)
 
     # -- search for a start ---------------------------------------------------------------------
 
@@ -250,7 +203,7 @@ class LengthFit:
         drawn, unbalanced = list[Array](), list[Array]()
         for _ in range(DRAWN_POSTURES // FITTED_POSTURES):
             drawn.append(self._robot.random_postures(FITTED_POSTURES, self._rng))
-            torque = self._radian * self._torque(drawn[-1], tension)[0]
+            torque = self._model.radian * self._model.torque(drawn[-1], tension)[0]
             unbalanced.append(np.linalg.norm(torque, axis=1))
             yield
         first = np.concatenate(drawn)[np.argsort(np.concatenate(unbalanced))[:FITTED_POSTURES]]
@@ -264,144 +217,32 @@ class LengthFit:
             tension = np.broadcast_to(few.tension, length.shape)
             theta = mae.estimate(tension, length).theta
             residual = self.used * (length - mae.lengths(theta, tension))
-            parts = residual / COARSE_LENGTH, self._outside(theta) / (COARSE_ANGLE * self._radian)
+            parts = (
+                residual / COARSE_LENGTH,
+                self._model.outside(theta) / (COARSE_ANGLE * self._model.radian),
+            )
             costs = [np.log1p(each**2).sum(axis=(1, 2)) for each in parts]
             cost[n : n + BATCH] = np.sum(costs, axis=0)
             postures.extend(theta)
             yield
         order = np.argsort(cost)[:COMPARED_FITS]
         for n in order:
-            torque = self._radian * self._torque(postures[n], few.tension)[0] / COARSE_TORQUE
+            torque = (
+                self._model.radian * self._model.torque(postures[n], few.tension)[0] / COARSE_TORQUE
+            )
             cost[n] += np.log1p(torque**2).sum()
             yield
         best = order[np.argsort(cost[order])][:REFINED_FITS]
-        others = self._prior_mean[self._robot.muscle_count :]
+        others = self._model.prior_mean[self._robot.muscle_count :]
         return [np.concatenate([offset[n], others]) for n in best]
-
-    # -- residuals ------------------------------------------------------------------------------
-
-    def _outside(self, theta: Array) -> Array:
-        return theta - np.clip(theta, self._robot.lower, self._robot.upper)
-
-    def _torque(self, theta: Array, tension: Array) -> tuple[Array, Array]:
-        """Return the unbalanced joint torque and the muscle Jacobian in K postures.
-
-        Args:
-            theta: Postures [rad], (K, D).
-            tension: Tensions [N], (K, M).
-
-        Returns:
-            The torque of weight, springs and muscles together [N·m], (K, D), and the muscle
-            Jacobian ∂l/∂θ [m/rad], (K, M, D).
-        """
-        jacobian = self._mae.muscle_jacobian(theta, tension)
-        by_muscles = np.einsum('kmd,km->kd', jacobian, tension)
-        return self._robot.kinematics.holding_torque(theta) + by_muscles, jacobian
-
-    def _residuals(
-        self, fit: Fit, moments: Moments, turning: Array, derivatives: bool = False
-    ) -> tuple[Array, ...]:
-        """Return the residuals of lengths, torques and joint limits, in standard deviations.
-
-        Args:
-            fit: Constants and postures.
-            moments: The readings.
-            turning: Direction in which each joint moved last, (K, D).
-            derivatives: Whether to return the derivatives as well.
-
-        Returns:
-            The residuals, (K, M + 2D), and, if requested, their derivatives with respect to θ,
-            (K, M + 2D, D), and to the constants, (K, M + 2D, 3M + D).
-        """
-        theta, muscles, joints = fit.theta, self._robot.muscle_count, self._robot.joint_count
-        ends = [muscles, 2 * muscles, 3 * muscles]
-        offset, friction, tension_offset, joint_friction = np.split(fit.constants, ends)
-        passed = np.exp(-friction * moments.sliding)  # T_end / T
-        end, pull = moments.tension * passed, (moments.tension - tension_offset) * passed
-        length, outside = self._mae.lengths(theta, end), self._outside(theta)
-        unbalanced, jacobian = self._torque(theta, pull)
-        torque = unbalanced + joint_friction * turning
-        # A stop can carry any torque, so the residual of a joint at its stop means nothing. It is
-        # replaced by a typical one, so that the fit neither seeks nor avoids stops.
-        at_stop = AT_STOP * self._radian
-        is_free = (self._robot.lower + at_stop < theta) & (theta < self._robot.upper - at_stop)
-        torque = np.where(is_free, torque, self._torque_noise)
-        residuals = [moments.length - offset - length, torque, outside]
-        value = np.concatenate(residuals, axis=1) / self._noise
-        if not derivatives:
-            return (value,)
-        shifted = [self._torque(theta + STEP * row, pull)[0] for row in np.eye(joints)]
-        torque_slope = (np.stack(shifted, axis=-1) - unbalanced[..., None]) / STEP
-        torque_slope = torque_slope * is_free[..., None]
-        outside_slope = (outside != 0.0)[..., None] * np.eye(joints)
-        by_theta = np.concatenate([-jacobian, torque_slope, outside_slope], axis=1)
-        by_constants = np.zeros((*value.shape, len(fit.constants)))
-        m, j = np.arange(muscles), np.arange(joints)
-        by_constants[:, m, m] = -1.0
-        with_more_friction = self._mae.lengths(theta, end * np.exp(-STEP * moments.sliding))
-        by_constants[:, m, muscles + m] = (length - with_more_friction) / STEP
-        moment_arm = -np.swapaxes(jacobian, 1, 2) * is_free[..., None]
-        by_friction = moment_arm * (pull * moments.sliding)[:, None]
-        by_constants[:, muscles:-joints, muscles + m] = by_friction
-        by_constants[:, muscles:-joints, 2 * muscles + m] = moment_arm * passed[:, None]
-        by_constants[:, muscles + j, 3 * muscles + j] = turning * is_free
-        return value, by_theta / self._noise[:, None], by_constants / self._noise[:, None]
-
-    def _cost(self, value: Array, constants: Array) -> float:
-        noisy, outside = np.split(value, [-self._robot.joint_count], axis=1)
-        student = (FREEDOM + 1.0) * np.log1p(noisy**2 / FREEDOM).sum()
-        prior = np.square((constants - self._prior_mean) / self._prior_spread).sum()
-        return float(student + np.square(outside).sum() + prior)
-
-    # -- Gauss–Newton ---------------------------------------------------------------------------
 
     def _refine(self, fit: Fit, moments: Moments, rounds: int) -> Steps:
         """Refine a fit by at most `rounds` Gauss–Newton steps."""
-        joint_eye, constant_eye = np.eye(self._robot.joint_count), np.eye(len(self._prior_mean))
-        damping = 1e-3
-        turning = _turning(fit.theta, STICKING * self._radian)
-        farthest = FARTHEST * self._radian
-        (value,) = self._residuals(fit, moments, turning)
-        fit = fit._replace(cost=self._cost(value, fit.constants))
-        for _ in range(rounds):
-            yield
-            value, by_theta, by_constants = self._residuals(fit, moments, turning, derivatives=True)
-            weight = (FREEDOM + 1.0) / (FREEDOM + value**2)
-            weight[:, -len(joint_eye) :] = 1.0
-            # Blocks of the normal equations: θ of each moment, the constants, and the cross terms.
-            weighted = weight[..., None] * by_theta
-            theta_normal = np.swapaxes(by_theta, 1, 2) @ weighted
-            theta_gradient = np.einsum('krd,kr->kd', weighted, value)
-            cross = np.swapaxes(by_constants, 1, 2) @ weighted
-            normal = np.einsum('krp,kr,krq->pq', by_constants, weight, by_constants, optimize=True)
-            normal += np.diag(self._prior_spread**-2)
-            gradient = np.einsum('krp,kr->p', by_constants, weight * value)
-            gradient += (fit.constants - self._prior_mean) / self._prior_spread**2
-            before = fit.cost
-            while damping < LARGEST_DAMPING:
-                # Eliminate θ, solve for the constants, and substitute back.
-                damped = theta_normal * (1.0 + damping * joint_eye) + 1e-6 * joint_eye
-                inverse = np.linalg.inv(damped)
-                through = cross @ inverse
-                reduced = normal * (1.0 + damping * constant_eye)
-                reduced = reduced - np.einsum('kpd,kqd->pq', through, cross)
-                eliminated = np.einsum('kpd,kd->p', through, theta_gradient)
-                shift = -np.linalg.solve(reduced, gradient - eliminated)
-                turn = theta_gradient + np.einsum('kpd,p->kd', cross, shift)
-                turn = np.clip(-np.einsum('kij,kj->ki', inverse, turn), -farthest, farthest)
-                candidate = Fit(np.inf, fit.constants + shift, fit.theta + turn)
-                (value,) = self._residuals(candidate, moments, turning)
-                cost = self._cost(value, candidate.constants)
-                if cost < before:
-                    break
-                damping *= 5.0
-                yield
-            else:
-                break
-            fit, damping = candidate._replace(cost=cost), max(0.2 * damping, 1e-6)
-            if before - cost < 1e-4 * before and np.abs(shift).max() < 1e-4:
-                break
-        return fit
+        problem = MomentFit(self._model, moments, fit.theta)
+        start, enough = problem.point(fit.constants, fit.theta), self._count(fit.theta)
+        work = minimise_in_pieces(problem, start, rounds, LEAST_DECREASE * enough)
+        point = (yield from work).point
+        return Fit(problem.log_cost(point), point.constants, point.theta)
 
 
 def _few(moments: Moments) -> Ints:
@@ -420,32 +261,3 @@ def _rewired(moments: Moments, wiring: Wiring) -> Moments:
         wiring.signed(moments.read),
         moments.theta,
     )
-
-
-def _turning(theta: Array, sticking: Array) -> Array:
-    """Return the direction in which each joint moved last, in [−1, 1], (K, D).
-
-    Args:
-        theta: K consecutive postures [rad], (K, D).
-        sticking: Motion after a reversal over which the direction changes its sign [rad], (D,).
-    """
-    result, reference = np.zeros_like(theta), theta[0].copy()
-    for k, posture in enumerate(theta):
-        reference = np.clip(reference, posture - sticking, posture + sticking)
-        result[k] = (posture - reference) / sticking
-    return result
-
-
-def _noise_factors(mae: Mae) -> Array:
-    """Return the assumed length error of each muscle, relative to that of a typical muscle, (M,).
-
-    The factor is the variance of the muscle's length residual, divided by the median variance. For
-    independent errors, the ratio of standard deviations would be correct. But the errors of a
-    network in neighbouring postures are correlated, so with standard deviations, a muscle with
-    large errors would bias the offsets of all other muscles. The ratio of variances gives such a
-    muscle less weight.
-    """
-    if mae.anomaly is None:
-        return np.ones(len(mae.muscles))
-    variance = np.diag(mae.anomaly.covariance)[len(mae.muscles) :]
-    return np.clip(variance / np.median(variance), *NOISE_FACTORS)

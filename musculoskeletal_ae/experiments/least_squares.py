@@ -24,19 +24,20 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.emulator.modules import LENGTH_NOISE, TENSION_NOISE, Arm
 from musculoskeletal_ae.experiments.recording import Recording, mean_error
+from musculoskeletal_ae.gauss_newton import minimise_each
 from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
-ITERATIONS = 30
-DAMPING = 1e-3  # damping, relative to the diagonal of the normal matrix
+ROUNDS = 30  # largest number of Gauss–Newton steps
+USUAL_STEP = 0.1  # typical step of a joint, as a share of its range
 EVERY = np.s_[::10]  # every tenth message of a recording, because least squares is slow
 DIFFERENCE = 1e-4  # step of finite differences [rad]
 
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """Estimates θ from many messages at once by Levenberg–Marquardt, within the joint limits."""
+    """Estimates θ from many messages at once by Gauss–Newton, within the joint limits."""
 
     robot: Robot
     lengths: Callable[[Array, Array], Array]  # maps θ (N, D) and T [N] (N, M) to l [m] (N, M)
@@ -57,27 +58,14 @@ class LeastSquares:
         absolute = self.length_at_zero + self.lengths(theta, np.zeros_like(tension))
         compliance = self.elastic.compliance(absolute, tension)
         variance = self.tension_noise**2 + (self.friction * tension) ** 2
-        weight = 1.0 / (LENGTH_NOISE**2 + compliance**2 * variance)
-        damping = np.full(len(tension), DAMPING)
-        residual = length - self.lengths(theta, tension)
-        cost = np.sum(weight * residual**2, axis=1)
-        for _ in range(ITERATIONS):
-            jacobian = self.muscle_jacobian(theta)
-            weighted = jacobian * weight[:, :, None]
-            normal = np.einsum('nmi,nmj->nij', weighted, jacobian)
-            diagonal = np.einsum('nii->ni', normal) * damping[:, None]
-            normal += diagonal[:, :, None] * np.eye(theta.shape[1])
-            gradient = np.einsum('nmi,nm->ni', weighted, residual)
-            step = np.linalg.solve(normal, gradient[..., None])[..., 0]
-            candidate = np.clip(theta + step, lower, upper)
-            candidate_residual = length - self.lengths(candidate, tension)
-            candidate_cost = np.sum(weight * candidate_residual**2, axis=1)
-            better = candidate_cost < cost
-            theta[better] = candidate[better]
-            residual[better] = candidate_residual[better]
-            cost[better] = candidate_cost[better]
-            damping = np.clip(np.where(better, damping * 0.3, damping * 10.0), 1e-6, 1e6)
-        return theta
+        root = 1.0 / np.sqrt(LENGTH_NOISE**2 + compliance**2 * variance)
+
+        def residuals(theta: Array) -> tuple[Array, Array]:
+            error = self.lengths(theta, tension) - length
+            return root * error, root[:, :, None] * self.muscle_jacobian(theta)
+
+        usual = (USUAL_STEP * (upper - lower)) ** -2
+        return minimise_each(residuals, theta, usual, ROUNDS, bounds=(lower, upper))
 
     def error(self, recording: Recording, rows: slice = EVERY) -> float:
         """Return the mean error [rad] over `rows` of a recording, by default every tenth row."""

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Export a learned body as an MJCF model, and compare the model with the network.
 
-Links, joints, limits and masses are those of the robot directory. Route points are learned; `fit`
-computes them. Each tendon has an actuator that represents a motor and its series elastic element.
-The control u is the length of the tendon at which the element is slack:
+Links, joints, limits and masses are those of the robot directory. Route points are learned: the
+calibrated body without a residual model is fitted to the network (`learning.fit.fit_to_network`).
+Each tendon has an actuator that represents a motor and its series elastic element. The control u is
+the length of the tendon at which the element is slack:
 
     T = k (L − u),   0 ≤ T ≤ T_max,   k = dT/dx at T_mid = (T_bias + T_limit) / 2
 
@@ -26,13 +27,13 @@ from musculoskeletal_ae.emulator import mjcf
 from musculoskeletal_ae.emulator.effects import NONE, Draw
 from musculoskeletal_ae.emulator.modules import joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.exporting.fit import fit
 from musculoskeletal_ae.files import new_directory
+from musculoskeletal_ae.learning.body import CalibratedBody
+from musculoskeletal_ae.learning.fit import fit_to_network
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.description import Route, RoutePoint
 from musculoskeletal_ae.robot.drawing import SHORTEST_BONE
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
 POSTURES = 1000  # number of postures in which the model and the network are compared
 #: damping of a joint, multiplied by its `joint_gear` [N·m·s/rad]; chosen for a stable simulation
@@ -119,10 +120,12 @@ def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> Report:
 
 def _write(robot: Robot, mae: Mae, out: Path, seed: int) -> Report:
     robot = robot.with_elasticity(mae.elasticity)
-    fitted = fit(robot, mae, seed)
-    moved = Robot(replace(robot.description, routes=_moved(robot, fitted.shift)))
+    body = CalibratedBody.of_straight_lines(robot)
+    fit_to_network(body, mae, seed)
+    shift = np.concatenate([body.shift(m) for m in range(robot.muscle_count)])
+    moved = Robot(replace(robot.description, routes=_moved(robot, shift)))
     moved = moved.with_elasticity(mae.elasticity)
-    springs = _springs(robot, fitted.elastic)
+    springs = _springs(robot, body)
     spec = _spec(moved, mae, springs)
     try:
         spec.compile()
@@ -153,12 +156,12 @@ class Springs(NamedTuple):
     error: Array  # largest error of the elongation between T_bias and T_limit [m]
 
 
-def _springs(robot: Robot, elastic: SeriesElastic) -> Springs:
+def _springs(robot: Robot, body: CalibratedBody) -> Springs:
     low, high, at_zero = robot.tension.bias, robot.tension.limit, robot.routes.length_at_zero
     mid = 0.5 * (low + high)
     rows = []
     for m in range(robot.muscle_count):
-        law = elastic.of(m)
+        law = body.elastic(m)
         tension = np.linspace(low[m], high[m], 50)
         elongation = law.elongation(np.full(50, at_zero[m]), tension)
         middle = float(law.elongation(at_zero[m], mid[m]))

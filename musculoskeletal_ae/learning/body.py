@@ -189,10 +189,21 @@ class CalibratedBody:
         body.parameters = parameters
         return body
 
+    @classmethod
+    def of_straight_lines(cls, robot: Robot) -> CalibratedBody:
+        """Return the body without a residual model, which a robot description can represent."""
+        shapes = (0, robot.joint_count), 0, (0, 0)
+        none = ResidualModel(*(np.zeros(shape, np.float32) for shape in shapes))
+        return cls(robot, smooth=[none] * robot.muscle_count)
+
     @property
     def elasticity(self) -> JointElasticity:
         """The springs and dampers of the joints, with learned corrections."""
         return springs.learned(self.robot.kinematics.elasticity, self.springs)
+
+    def shift(self, m: int) -> Array:
+        """Return δ, the displacements of one muscle's route points [m], (P, 3)."""
+        return self.parameters[m][self.layouts[m].attachment].reshape(-1, 3)
 
     def elastic(self, m: int) -> SeriesElastic:
         """Return the elastic constants of one muscle as arrays of shape ()."""
@@ -276,9 +287,8 @@ class CalibratedBody:
         """
         layout, routes = self.layouts[m], self.robot.routes
         joint = routes.joint[layout.points]
-        shift = self.parameters[m][layout.attachment].reshape(-1, 3)
         turn = poses.rotation[:, joint]  # (N, P, 3, 3)
-        local = routes.point[layout.points] + shift
+        local = routes.point[layout.points] + self.shift(m)
         return (turn @ local[:, :, None])[..., 0] + poses.translation[:, joint], turn
 
     def lengths(self, theta: Array, tension: Array, *direction: Array) -> tuple[Array, ...]:
@@ -341,14 +351,7 @@ class CalibratedBody:
         slope = 1.0 - elastic.length_slope(end)
         jacobian = np.empty((len(smooth), layout.size))
         jacobian[:, layout.attachment] = slope[:, None] * by_point[:-1] - by_point[-1]
-        jacobian[:, layout.elastic] = np.stack(
-            [
-                end / (elastic.force + end) / elastic.rate,
-                np.log1p(end / elastic.force) / elastic.rate,
-                -elastic.wire_stretch * absolute * end,
-            ],
-            axis=1,
-        )
+        jacobian[:, layout.elastic] = -elastic.by_logarithms(absolute, end)
         compliance = elastic.compliance(absolute, end)
         jacobian[:, layout.friction] = compliance * end * direction
         jacobian[:, layout.drive] = -compliance[:, None] * by_losses[:, 1:]

@@ -215,7 +215,8 @@ def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
 
     The samples from which the network was learned may be missing (after `train --from-bag`, on
     another machine, or if the state was lost). With this fit as prior, learning still continues
-    from the learned body and does not start again from the geometric model.
+    from the learned body and does not start again from the geometric model. An exported model of
+    the learned body is fitted in the same way.
     """
     robot, rng = body.robot, np.random.default_rng([seed, 0x1B])
     theta = robot.random_postures(NETWORK_STATES, rng)

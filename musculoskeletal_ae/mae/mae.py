@@ -35,6 +35,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints, Singles
+from musculoskeletal_ae.gauss_newton import minimise_each, whitening
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
 from musculoskeletal_ae.mae.units import (
     LENGTH_SCALE,
@@ -52,8 +53,7 @@ from musculoskeletal_ae.signals.friction import Transmission
 Layer = tuple[Array, Array]
 
 # Constants of the estimate with isolated muscles.
-NEWTON_STEPS = 10  # largest number of Newton steps
-SETTLED = 1e-4  # step below which the iteration ends [rad]
+ROUNDS = 15  # largest number of Gauss–Newton steps
 LENGTH_NOISE = 0.0003  # standard deviation of the sensor noise that is added to Σ [m]
 LENGTH_SPREAD = 0.003  # standard deviation of each length if there are no anomaly statistics [m]
 
@@ -402,36 +402,53 @@ class Mae:
             return self.decode(self.encode(Mask.TENSION_LENGTH, tension=tension, length=length))
         tension, length, lost = tension.copy(), length.copy(), list(self.isolated)
         joints, muscles = len(self.joints), len(self.muscles)
-        mean = self.mean / scale_vector(joints, muscles)
-        tension[..., lost], length[..., lost] = mean[joints:-muscles][lost], 0.0
-        theta = np.broadcast_to(mean[:joints], (*length.shape[:-1], joints))
-        prior = np.diag(1.0 / np.square(self.std[:joints]))
-        for _ in range(NEWTON_STEPS):
-            predicted, jacobian = self._lengths_and_jacobian(theta, tension)
-            weighted = jacobian.swapaxes(-1, -2) @ self._length_weight
-            from_lengths = weighted @ (length - predicted)[..., None]
-            from_prior = prior @ (mean[:joints] - theta)[..., None]
-            hessian = weighted @ jacobian + prior
-            step = np.linalg.solve(hessian, from_lengths + from_prior)[..., 0]
-            theta = theta + step
-            if np.abs(step).max() < SETTLED:
-                break
+        mean_tension = (self.mean / scale_vector(joints, muscles))[joints:-muscles]
+        tension[..., lost], length[..., lost] = mean_tension[lost], 0.0
+        start = np.broadcast_to(self.usual_posture[0], (*length.shape[:-1], joints))
+        theta = self.fit_posture(tension, length, self._length_root, start)
         length[..., lost] = self.lengths(theta, tension)[..., lost]
         state = self.decode(self.encode(Mask.TENSION_LENGTH, tension=tension, length=length))
         return state._replace(theta=theta)
 
+    def fit_posture(self, tension: Array, length: Array, root: Array, start: Array) -> Array:
+        """Return the most likely posture for measured lengths, θ [rad], (..., D).
+
+        Args:
+            tension: Bone-side tension T_end [N], (..., M).
+            length: Muscle length [m], (..., M).
+            root: R with RᵀR = Σ⁻¹ [1/m], (K, M). Muscles whose columns are 0 have no influence.
+            start: Posture with which the fit starts [rad], (..., D).
+        """
+        mean, std = self.usual_posture
+        by_prior = np.broadcast_to(np.diag(1.0 / std), (*start.shape, len(std)))
+
+        def residuals(theta: Array) -> tuple[Array, Array]:
+            predicted, jacobian = self._lengths_and_jacobian(theta, tension)
+            value = np.concatenate(((predicted - length) @ root.T, (theta - mean) / std), axis=-1)
+            return value, np.concatenate((root @ jacobian, by_prior), axis=-2)
+
+        return minimise_each(residuals, start, 1.0 / std**2, ROUNDS)
+
     @cached_property
-    def _length_weight(self) -> Array:
-        """Inverse covariance Σ⁻¹ of the length residuals [1/m²], (M, M); 0 for isolated muscles."""
+    def usual_posture(self) -> tuple[Array, Array]:
+        """Mean θ̄ and standard deviation s of θ in the training data [rad], (D,) each."""
+        joints = len(self.joints)
+        scale = scale_vector(joints, len(self.muscles))
+        return (self.mean / scale)[:joints], (self.std / scale)[:joints]
+
+    @cached_property
+    def _length_root(self) -> Array:
+        """R with RᵀR = Σ⁻¹, for the K muscles that are not isolated [1/m], (K, M)."""
         muscles = len(self.muscles)
         used = np.delete(np.arange(muscles), self.isolated)
-        rows, weight = np.ix_(used, used), np.zeros((muscles, muscles))
         if self.anomaly is None:
-            weight[used, used] = LENGTH_SPREAD**-2
+            covariance = LENGTH_SPREAD**2 * np.eye(len(used))
         else:
-            healthy = self.anomaly.covariance[muscles:, muscles:][rows] / LENGTH_SCALE**2
-            weight[rows] = np.linalg.inv(healthy + LENGTH_NOISE**2 * np.eye(len(used)))
-        return weight
+            healthy = self.anomaly.covariance[muscles:, muscles:][np.ix_(used, used)]
+            covariance = healthy / LENGTH_SCALE**2 + LENGTH_NOISE**2 * np.eye(len(used))
+        root = np.zeros((len(used), muscles))
+        root[:, used] = whitening(covariance)
+        return root
 
     @property
     def transmission(self) -> Transmission:
@@ -496,11 +513,7 @@ class Mae:
 
     def _lengths_and_jacobian(self, theta: Array, tension: Array) -> tuple[Array, Array]:
         x = np.concatenate((theta, tension), axis=-1)
-        # One direction moves one joint of every group, because groups do not affect each other.
-        directions = np.zeros((max(len(group.joints) for group in self.groups), x.shape[-1]))
-        for group in self.groups:
-            directions[np.arange(len(group.joints)), group.joints] = 1.0
-        z, tangent = self._enter[Mask.THETA_TENSION].tangent(x, directions)
+        z, tangent = self._enter[Mask.THETA_TENSION].tangent(x, self._directions)
         length, slopes = self._leave_length.tangent(z, tangent)
         slopes = slopes.swapaxes(-1, -2)
         if len(self.groups) == 1:
@@ -510,6 +523,18 @@ class Mae:
             rows, columns = np.ix_(muscles, joints)
             result[..., rows, columns] = slopes[..., muscles, : len(joints)]
         return length, result
+
+    @cached_property
+    def _directions(self) -> Array:
+        """Directions of (θ, T), each of which moves one joint of every group, (K, D+M).
+
+        Groups do not affect each other, so K is the number of joints of the largest group.
+        """
+        largest = max(len(group.joints) for group in self.groups)
+        directions = np.zeros((largest, len(self.joints) + len(self.muscles)))
+        for group in self.groups:
+            directions[np.arange(len(group.joints)), group.joints] = 1.0
+        return directions
 
 
 def _frozen(array: Array) -> Array:

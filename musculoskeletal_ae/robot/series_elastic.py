@@ -53,6 +53,26 @@ class SeriesElastic:
         element = 1.0 / (self.rate * (self.force + np.maximum(tension, 0.0)))
         return element + self.wire_stretch * absolute_length
 
+    def by_logarithms(self, absolute_length: Array, tension: Array) -> Array:
+        """Return the derivatives of one muscle's elongation by the logarithms of its constants.
+
+        Args:
+            absolute_length: Lengths of the tendon [m], (N,).
+            tension: Tensions [N], (N,).
+
+        Returns:
+            The derivatives with respect to ln force, ln rate and ln wire_stretch [m], (N, 3).
+        """
+        tension = np.maximum(tension, 0.0)
+        return np.stack(
+            [
+                -tension / (self.force + tension) / self.rate,
+                -np.log1p(tension / self.force) / self.rate,
+                self.wire_stretch * absolute_length * tension,
+            ],
+            axis=1,
+        )
+
     def length_slope(self, tension: Array) -> Array:
         """Return the derivative of the elongation with respect to the tendon's length, (..., M).
 

@@ -21,6 +21,8 @@ posture. K and b describe the springs of the joints (`JointElasticity`): the val
 has learned, or else those of the robot description. A joint limit is a hard stop that exerts any
 torque needed. Tendon friction (`friction`) does affect the rest posture: the arm rests in different
 postures after tendons have been wound in and after they have been paid out.
+
+These steps follow a motion and are compiled, so they do not use the solver `gauss_newton`.
 """
 
 import math

@@ -14,6 +14,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.figures import save_plot
 from musculoskeletal_ae.files import read_csv
+from musculoskeletal_ae.gauss_newton import minimise_each
 from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.series_elastic import DEFAULT, SeriesElastic
 
@@ -22,7 +23,8 @@ EXAMPLE_TENSIONS = (5.0, 15.0, 30.0, 60.0, 110.0, 200.0, 330.0, 500.0)  # [N]
 EXAMPLE_LENGTHS = (0.15, 0.30, 0.45, 0.60)  # [m]
 EXAMPLE_NOISE = 1e-4  # standard deviation of the noise [m]: the resolution of a caliper
 LEAST_FORCE, MOST_FORCE = 1e-3, 1e3  # range of `force`, relative to the highest tension
-SLIGHTLY = 1e-3  # smallest distance of the starting point from the bounds, in logarithms
+ROUNDS = 200  # largest number of Gauss–Newton steps
+ENOUGH = 1e-9  # decrease of the sum of squares, relative to the noise, by the last step
 LEAST_ELONGATION = -0.002  # smallest legal elongation [m]; noise can make it negative
 #: largest length of a muscle on a testbed [m]; larger numbers are probably in another unit
 LONGEST = 10.0
@@ -78,8 +80,6 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
         ValueError: If there are fewer than four rows, if a number is not finite, or if the rows do
             not describe a spring.
     """
-    from scipy.optimize import least_squares
-
     table = np.column_stack([tension, absolute_length, elongation])
     if (finite := int(np.isfinite(table).all(axis=1).sum())) < len(table) or finite < 4:
         raise ValueError(
@@ -94,15 +94,18 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
     def model(log_constants: Array) -> SeriesElastic:
         return SeriesElastic(*np.exp(log_constants)[:, None])
 
-    def residual(log_constants: Array) -> Array:
-        return 1e3 * (model(log_constants).elongation(absolute_length, tension) - elongation)
+    def residuals(log_constants: Array) -> tuple[Array, Array]:
+        elastic = model(log_constants)
+        error = elastic.elongation(absolute_length, tension) - elongation
+        slope = elastic.by_logarithms(absolute_length, tension)
+        return error / EXAMPLE_NOISE, slope / EXAMPLE_NOISE
 
     # A linear spring would need an infinite `force`, and a tendon without an element an infinite
     # `rate`. Both are bounded here.
     most = tension.max()
     low, high = np.log([[LEAST_FORCE * most, 1e-3, 1e-12], [MOST_FORCE * most, 1e6, 1.0]])
-    start = np.clip(np.log(list(DEFAULT.values())), low + SLIGHTLY, high - SLIGHTLY)
-    return model(least_squares(residual, start, x_scale='jac', bounds=(low, high)).x)
+    start = np.log(list(DEFAULT.values()))
+    return model(minimise_each(residuals, start, 1.0, ROUNDS, bounds=(low, high), enough=ENOUGH))
 
 
 def read_table(file: Path) -> Array:
