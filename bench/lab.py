@@ -256,7 +256,7 @@ class Lab:
     def _estimate(self, now: float) -> None:
         core = self.estimator
         for received, delay, (muscles, theta) in self._estimating.receive(now):
-            if theta is not None and not np.isnan(theta).any():
+            if theta is not None and np.isfinite(theta).any():
                 core.joints(theta, received)
             try:
                 output = core.take(muscles, received + self.clock_shift, received, delay)

@@ -43,7 +43,9 @@ REVOKED = frozenset({
 FROZEN = FAULTY | {'sensor_frozen'}
 MISSING = FAULTY | {'values_missing', 'implausible_muscle_states', 'readings_rejected'}
 TENSION_SENSOR = FAULTY | {'sensor_saturated', 'module_stands', 'tension_above_limit', 'overload'}
-JOINT = frozenset({'joint_sensors_doubted', 'joint_readings_impossible'})
+JOINT = frozenset({
+    'joint_sensors_doubted', 'joint_readings_impossible', 'joint_readings_missing',
+})  # fmt: skip
 #: messages are rejected, and say why: a true symptom of readings that jump
 REJECTED = frozenset({
     'implausible_muscle_states', 'readings_rejected', 'stale_muscle_states', 'stale_estimate',

@@ -338,10 +338,20 @@ class ConditionKind(Enum):
         'joint_readings_impossible',
         'estimator',
         'warn',
-        'for 1 s, all readings of a joint sensor were beyond the joint limits, or jumped further '
-        'than a joint can move',
-        'impossible readings of joint sensors are not used',
-        (Step.CHECK_JOINT_SENSOR,),
+        'for more than 2 s, readings of a joint sensor were beyond the joint limits, or jumped '
+        'further than a joint can move; until none has been so for 1 s, no reading of the sensor '
+        'is used',
+        'joint sensors are not used, because their readings are impossible',
+        (Step.CHECK_JOINT_DRIVER,),
+    )
+    JOINT_READINGS_MISSING = Declaration(
+        'joint_readings_missing',
+        'estimator',
+        'warn',
+        'a joint that had readings in `joint_states` has had none for 1 s, or only NaN, although '
+        '`muscle_states` are received',
+        'no readings of joint sensors',
+        (Step.CHECK_JOINT_DRIVER,),
     )
     READINGS_REJECTED = Declaration(
         'readings_rejected',
@@ -714,13 +724,6 @@ class ConditionKind(Enum):
         'warn',
         'a request was refused in the last 10 s',
         'a request was refused',
-    )
-    PART_IGNORED = Declaration(
-        'part_ignored',
-        _ALL,
-        'warn',
-        'a part of a message was not used in the last 10 s',
-        'a part of a message was not used',
     )
     REPLAY_STANDS = Declaration(
         'replay_stands',

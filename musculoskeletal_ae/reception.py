@@ -10,7 +10,7 @@ from typing import Any
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 
 LONGEST_TEXT = 500
-SHOWN = 10.0  # report refusals, ignored parts of messages and internal errors for this time [s]
+SHOWN = 10.0  # report refusals and internal errors for this time [s]
 #: longest time between two messages of a stream [s]; `ros2 topic pub` sends one message a second
 STREAM_GAP = 1.5
 # A source time that lies further back than this comes from another clock, not from reordering.
@@ -37,7 +37,6 @@ class Reception:
         #: topics that carry requests, whose senders must see a refusal
         self.commands: set[str] = set()
         self._refusal = '', -math.inf  # text of the last refusal, and its time [s]
-        self._ignored_at: dict[str, float] = {}  # time [s] at which a part was last ignored
         self._received: Counter[str] = Counter()
         self._rates_taken_at = time.monotonic()  # [s]
         self._started_at = clock()  # [s]
@@ -135,15 +134,8 @@ class Reception:
     def ignore(self, source: str, part: str) -> None:
         """Count an unused part of a message, such as one joint's position."""
         self.ignored[f'{source}: {part}'] += 1
-        self._ignored_at[f'{source}: {part}'] = time.monotonic()
         if self.ignored[f'{source}: {part}'] == 1:
             self._warn(f'ignored {source}: {part}')
-
-    @property
-    def recently_ignored(self) -> list[str]:
-        """The parts of messages that were ignored in the last SHOWN seconds, with their topics."""
-        now = time.monotonic()
-        return [part for part, at in self._ignored_at.items() if now - at < SHOWN]
 
     def reject_error(self, source: str, error: Exception) -> bool:
         """Count an exception that escaped a callback; return whether its type is new."""

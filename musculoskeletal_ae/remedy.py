@@ -51,6 +51,10 @@ class Step(Enum):
         'check_joint_sensor',
         'correct the named joint sensors or their order; if they are right, call estimator/reset',
     )
+    CHECK_JOINT_DRIVER = (
+        'check_joint_driver',
+        'check the named joint sensors, their cables, and the driver that publishes joint_states',
+    )
     CHECK_MODULE = (
         'check_module',
         'check drag, cooling and tension sensor of the module; then call estimator/reset',

@@ -267,11 +267,15 @@ class Estimator:
         self._commands.note(now, length, tension)
 
     def joints(self, theta: Array, now: float) -> None:
-        """Record θ [rad] (D,) as measured by joint sensors at `now` [s], NaN for other joints."""
-        usable = self.joint_stream.take(now, theta).theta
-        self._readings = np.where(
-            np.isnan(usable), self._readings, [usable, np.full_like(usable, now)]
-        )
+        """Record θ [rad] (D,) as measured by joint sensors at `now` [s], NaN for other joints.
+
+        A joint that had readings is reported if it has none for a second.
+        """
+        usable = self.joint_stream.take(now, theta)
+        impossible = self.joint_stream.impossible(now)
+        self.joint_check.use_impossible({j: each.since for j, each in impossible.items()})
+        is_usable = np.isfinite(usable)
+        np.copyto(self._readings, [usable, np.full_like(usable, now)], where=is_usable)
 
     @property
     def joint_trust(self) -> JointTrust:
@@ -397,6 +401,7 @@ class Estimator:
         if before is not None:
             elapsed = max(sample.time - before.time, 0.0)
             sent_apart = max(sample.sent_at - before.sent_at, 0.0)
+        self.joint_stream.pass_time(min(elapsed, LONGEST_PERIOD))
         temperature = np.where(self.body.used, sample.temperature, np.nan)
         self.heat.step(sample.model_tension, temperature, elapsed)
         if self.mae is None:
@@ -437,7 +442,7 @@ class Estimator:
         demand = self._commands.demand(self.robot, sample.length, now)
         known = self.body.offsets.known
         readings = self._fresh_readings(now)
-        self.measured = self._measured_theta(now)
+        self.measured = self._measured_theta(readings)
         command = self._commands.length(now)
         observation = Observation(sample, estimate, demand, dt, known, self.measured, command)
         finding = self.health.step(observation)
@@ -473,11 +478,10 @@ class Estimator:
         self.body = body
         self.stream.use_body(body)
 
-    def _measured_theta(self, now: float) -> Array | None:
-        """Return θ [rad] (D,) from joint sensors, or None if a value is missing or in doubt."""
-        theta = self._fresh_readings(now)
-        is_known = np.isfinite(theta).all() and not self.joint_trust.doubted
-        return theta if is_known else None
+    def _measured_theta(self, readings: Array) -> Array | None:
+        """Return fresh readings (D,), or None if a joint sensor has none or is not used."""
+        is_known = not self.joint_trust.unused and np.isfinite(readings).all()
+        return readings if is_known else None
 
     def _fresh_readings(self, now: float) -> Array:
         """Return the usable readings of joint sensors [rad], (D,), with NaN where they are old."""
@@ -588,7 +592,7 @@ class Estimator:
 
         The result is None before the first estimate.
         """
-        evidence = calibration.step(sample, dt, self._measured_theta(now))
+        evidence = calibration.step(sample, dt, self._measured_theta(self._fresh_readings(now)))
         if evidence is not None:
             self._note(evidence, found=calibration.offsets)
         if evidence is Evidence.CALIBRATED:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decides which joint sensors are trusted, by comparing them with the muscle lengths.
+"""Decides which joint sensors are trusted, mainly by comparing them with the muscle lengths.
 
     x_j = (θ_j − θ̂_j) − median of the same in earlier messages
 
@@ -25,10 +25,14 @@ the sensors of the joints with large x are false, or the length of a single musc
 Under the first hypothesis, the angles of the joints in question may have any value: θ̂ and a motion
 along the muscle Jacobian. Under the second, Δ of one muscle does not count. Sensors are doubted if
 the first hypothesis leaves a clearly smaller sum of squares of Δ, in healthy spreads.
+
+A sensor is not used either while it reports impossible readings again and again
+(`signals/joint_stream.py`). Its other readings may be wrong as well, for example if two programs
+publish.
 """
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import islice
 from typing import NamedTuple
 
@@ -38,7 +42,7 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.estimation.finding import Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.joint_trust import JointTrust, Trust
+from musculoskeletal_ae.signals.joint_trust import NOT_USED, JointTrust, Trust
 
 SPACING = 0.5  # shortest time between two messages that count [s]
 #: A message counts if the estimate of a joint has moved by this much since the last one that
@@ -152,6 +156,23 @@ class JointCheck:
             message.theta[doubted] = deviation[doubted] = np.nan
         return joints
 
+    def use_impossible(self, since: Mapping[int, float]) -> None:
+        """Use no sensors that report impossible readings again and again.
+
+        Args:
+            since: Time of the first of these readings [s], by index of the joint.
+        """
+        if not since and Trust.IMPOSSIBLE not in self.trust.trust:
+            return
+        trust, begin = list(self.trust.trust), self.trust.since.copy()
+        for j, each in enumerate(trust):
+            if j in since and each not in NOT_USED:
+                trust[j], begin[j] = Trust.IMPOSSIBLE, since[j]
+            elif j not in since and each is Trust.IMPOSSIBLE:
+                trust[j] = Trust.TRUSTED
+        if tuple(trust) != self.trust.trust:
+            self.trust = JointTrust(tuple(trust), begin, self.trust.deviation)
+
     # -- messages -------------------------------------------------------------------------------
 
     def step(self, observation: Observation, theta: Array, now: float) -> None:
@@ -180,10 +201,10 @@ class JointCheck:
         if len(self._messages) >= WINDOWS[0][0]:
             self._judge()
         if len(self._messages) > NEWEST:
-            # Readings of a doubted sensor are no anchor.
-            doubted = self.trust.is_doubted
-            self._messages[-1 - NEWEST].theta[doubted] = np.nan
-            self._compared[-1 - NEWEST][0][doubted] = np.nan
+            # Readings of a sensor that is not used are no anchor.
+            unused = ~self.trust.is_used
+            self._messages[-1 - NEWEST].theta[unused] = np.nan
+            self._compared[-1 - NEWEST][0][unused] = np.nan
 
     def _judge(self) -> None:
         usual = self._usual
@@ -335,8 +356,13 @@ def _unexplained(change: Array, jacobian: Array) -> float:
 
 
 def _median(values: Array) -> Array:
-    """Return the median of each column of (N, K), NaN where most values are unknown."""
+    """Return the median of each column of (N, K), NaN where most values are unknown.
+
+    With few rows this is much faster than `numpy.nanmedian(values, axis=0)`.
+    """
     if not len(values):
         return np.full(values.shape[1], np.nan)
-    is_known = 2 * np.isfinite(values).sum(axis=0) > len(values)
-    return np.where(is_known, np.nanmedian(np.where(is_known, values, 0.0), axis=0), np.nan)
+    known_count, column = np.isfinite(values).sum(axis=0), np.arange(values.shape[1])
+    ordered = np.sort(values, axis=0)  # NaN comes last
+    low, high = ordered[(known_count - 1) // 2, column], ordered[known_count // 2, column]
+    return np.where(2 * known_count > len(values), 0.5 * (low + high), np.nan)

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.estimator import Estimator
     from musculoskeletal_ae.mae.mae import Mae
 
+#: a sensor whose readings are impossible in at least this share is itself at fault
+ALL = 0.9
 UNKNOWN_TENSION = 'unknown: tension_source is none'
 
 
@@ -47,9 +49,7 @@ def report(core: Estimator, now: float) -> Report:
 def conditions(core: Estimator, now: float) -> tuple[Condition, ...]:
     """Return all conditions of the readings, the body and the network; `now` is as in `report`."""
     present = [*_finding(core), *_changed_modules(core), *_isolated(core), *_unknown_offsets(core)]
-    present += _doubted_joints(core)
-    if names := core.joint_stream.unreadable(now):
-        present.append(ConditionKind.JOINT_READINGS_IMPOSSIBLE.condition(', '.join(names), names))
+    present += [*_doubted_joints(core), *_unreadable_joints(core, now)]
     if reason := core.rejected_because(now):
         present.append(ConditionKind.READINGS_REJECTED.condition(reason))
     if core.mounting.tilt is not None:
@@ -119,6 +119,22 @@ def _doubted_joints(core: Estimator) -> Iterator[Condition]:
         )
         names = [robot.joints[j] for j in trust.doubted]
         yield ConditionKind.JOINT_SENSORS_DOUBTED.condition(detail, names)
+
+
+def _unreadable_joints(core: Estimator, now: float) -> Iterator[Condition]:
+    """Yield the joints with lasting impossible readings, and those without readings."""
+    if series := core.joint_stream.impossible(now):
+        names = [core.robot.joints[j] for j in series]
+        impossible = sum(each.impossible for each in series.values())
+        share = impossible / sum(each.total for each in series.values())
+        detail, steps = f'{", ".join(names)}: {share:.0%} of the readings', list[Step]()
+        if share < ALL:
+            detail += '; a second program may publish joint angles, or a contact is loose'
+            steps = [Step.STOP_SECOND_PUBLISHER]
+        kind = ConditionKind.JOINT_READINGS_IMPOSSIBLE
+        yield kind.condition(detail, names, steps=[*kind.steps, *steps])
+    if missing := core.joint_stream.missing:
+        yield ConditionKind.JOINT_READINGS_MISSING.condition(', '.join(missing), missing)
 
 
 def _joint_sensors(core: Estimator) -> dict[str, str]:

@@ -24,7 +24,7 @@ from musculoskeletal_ae.learning.rest import REST_TIME, RestDetector
 from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
-from musculoskeletal_ae.signals.joint_stream import IMPOSSIBLE, JointStream
+from musculoskeletal_ae.signals.joint_stream import JointStream
 from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
@@ -114,13 +114,13 @@ class SampleCollector:
         """Record θ [rad] (D,) received at `time` [s], with NaN for unmeasured joints.
 
         It is paired with the message of muscle_states that is nearest in time. Impossible readings
-        are counted and not used; those of joint sensors that the estimator doubts are not used.
+        are not used, and no readings of joint sensors that the estimator does not use. The
+        estimator counts and reports both.
         """
-        sample = self._joint_stream.take(time, theta)
-        for name, status in zip(self._robot.joints, sample.status, strict=True):
-            if status in IMPOSSIBLE:
-                self.rejected[f'{status.value}: {name}'] += 1
-        self._measure(time, 0, np.where(self.joint_trust.is_doubted, np.nan, sample.theta))
+        usable = self._joint_stream.take(time, theta)
+        if unused := self.joint_trust.unused:
+            usable[list(unused)] = np.nan
+        self._measure(time, 0, usable)
 
     def imu(self, time: float, link: str, acceleration: Array) -> None:
         """Record an accelerometer reading [m/s²] (3,) in the axes of a link.

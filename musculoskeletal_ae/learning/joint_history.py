@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gives up the readings of joint sensors that are in doubt.
+"""Gives up the readings of joint sensors that the estimator does not use.
 
 The estimator doubts a sensor some time after its fault, and publishes when the doubt begins
 (`signals/joint_trust.py`). Samples of the doubtful time then lose the angle of this joint. They
@@ -30,7 +30,7 @@ class JointHistory:
         self._trust = JointTrust.full(joint_count)
         #: times [s] and numbers of recent samples
         self._recent: deque[tuple[float, int]] = deque(maxlen=MOST_RECENT)
-        #: angles that were removed [rad], by number of the sample, for each doubted joint
+        #: angles that were removed [rad], by number of the sample, for each unused joint
         self._removed: dict[int, dict[int, float]] = {}
         self.given_up = 0
 
@@ -39,15 +39,15 @@ class JointHistory:
         self._recent.append((now, self._samples.accepted))
 
     def use(self, trust: JointTrust) -> tuple[int, ...]:
-        """Remove or put back angles, as another trust requires; return the newly doubted joints."""
+        """Remove or put back angles, as another trust requires; return the newly unused joints."""
         before, self._trust = self._trust, trust
-        new = tuple(j for j in trust.doubted if before.trust[j] is not Trust.DOUBTED)
+        new = tuple(j for j in trust.unused if before.is_used[j])
         for j in new:
             numbers = {number for at, number in self._recent if at >= trust.since[j]}
             self._removed[j] = self._samples.remove_angles(j, numbers)
             self.given_up += len(self._removed[j])
-        for j in [j for j in self._removed if trust.trust[j] is not Trust.DOUBTED]:
+        for j in [j for j in self._removed if trust.is_used[j]]:
             removed = self._removed.pop(j)
-            if trust.trust[j] is Trust.CONFIRMED:
+            if trust.trust[j] is Trust.CONFIRMED and before.trust[j] is Trust.DOUBTED:
                 self.given_up -= self._samples.put_back_angles(j, removed)
         return new

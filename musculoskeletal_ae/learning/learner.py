@@ -270,14 +270,14 @@ class Learner:
     def use_joint_trust(self, trust: JointTrust) -> None:
         """Use another trust in the joint sensors, whose times are those of the messages.
 
-        Doubted sensors are not learned. Their readings since the begin of the doubt are given up,
+        Sensors in doubt are not learned. Their readings since the begin of the doubt are given up,
         unless the user confirms them (`joint_history`).
         """
         self.collector.use_joint_trust(trust)
-        doubted = self.joint_history.use(trust)
-        for joint in doubted:
+        unused = self.joint_history.use(trust)
+        for joint in unused:
             self.collector.healthy.remove_angles(joint, self._time - trust.since[joint])
-        if doubted:
+        if unused:
             self.reset()
             self.keeper.forget_messages()
         self._note_new_samples()

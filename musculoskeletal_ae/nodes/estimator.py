@@ -323,8 +323,8 @@ class Estimator(Shell):
         self.trust.publish(array_message(trust.rows(time.monotonic()), 'quantity', 'joint'))
         if before is not None:
             self.candidates.validator.forget()  # the readings so far may be wrong
-            names = ', '.join(self.robot.joints[joint] for joint in trust.doubted)
-            self.get_logger().warning(f'doubted joint sensors: {names or "none"}')
+            names = ', '.join(self.robot.joints[joint] for joint in trust.unused)
+            self.get_logger().warning(f'joint sensors that are not used: {names or "none"}')
             self._report()
 
     def _lines(self) -> list[Line]:

@@ -178,8 +178,6 @@ class Shell(Node):
             yield kind.SECOND_PUBLISHER.condition(f'{intruders}; {remedy}', steps=steps)
         if refusal := self._reception.refusal:
             yield kind.REQUEST_REFUSED.condition(refusal)
-        if ignored := self._reception.recently_ignored:
-            yield kind.PART_IGNORED.condition(', '.join(ignored))
         fault, at = self._fault
         if now - at < SHOWN:
             yield kind.INTERNAL_ERROR.condition(fault)

@@ -7,24 +7,29 @@ A reading is usable if it is a number within the joint limits (plus `LIMITS.join
 satisfies this equation. θ_j,accepted is the last usable reading of joint j, and dt is the time
 since its previous reading, limited to `LIMITS.longest_step`. Single impossible readings, such as 0
 or −π, and bursts of them are therefore not usable. Each joint is judged by itself, so that a bad
-sensor does not affect the readings of the others.
+sensor does not affect the readings of the others. Only if at least half of the joints in a message
+are impossible, no reading in it is usable, because the message then describes another posture, for
+example that of another program.
 
 The level of a sensor changes if the sensor slips on its axis. The new level is accepted after all
 readings have followed each other plausibly for `LIMITS.settled`. This file cannot say which level
-is right: the estimator compares both with the muscle lengths (`estimation/joint_trust.py`).
+is right: the estimator compares both with the muscle lengths (`estimation/joint_check.py`).
 
-Live arms and recordings use the same `JointStream`.
+As with `MuscleStream`, each node that reads the messages drops single readings by its own stream.
+What a lasting fault of a sensor means for others is decided by the estimator alone, which publishes
+it as the trust in this sensor (`joint_trust.py`).
 """
 
+import math
 from collections import Counter
 from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import LIMITS, share_outside
+from musculoskeletal_ae.signals.limits import LIMITS
 
 #: Constant part of the largest change between two readings of a joint sensor [rad]; for prismatic
 #: joints times `kinematics.radian`. It is far beyond the noise, resolution and backlash of sensors.
@@ -32,7 +37,15 @@ STEP = 0.1
 #: Largest speed of a joint [rad/s]; for prismatic joints times `kinematics.radian`. Emulated arms
 #: reach 5.4 rad/s when a tendon slips.
 SPEED = 10.0
-LASTING = 1.0  # report a joint sensor without a possible reading for this time [s]
+#: report a series of impossible readings that has lasted for this time [s]; a burst is shorter,
+#: even with the time in which the readings of a moving arm settle again
+LASTING = 2.0
+MISSING = 1.0  # report a joint that has had no reading for this time [s]
+#: a series of impossible readings has ended if there was none for this time [s]
+ENDED = 1.0
+#: Reject a whole message if at least this share of its readings is impossible. A single sensor
+#: never rejects the readings of others.
+FOREIGN_SHARE = 0.5
 
 
 class JointReading(Enum):
@@ -42,24 +55,97 @@ class JointReading(Enum):
     MISSING = 'missing'
     OUTSIDE = 'θ far outside the joint limits'
     JUMPED = 'θ jumped further than a joint can move'
+    FOREIGN = 'most other joint angles of the message are impossible'
 
 
-#: readings that are not usable although the sensor has reported a number
-IMPOSSIBLE = frozenset({JointReading.OUTSIDE, JointReading.JUMPED})
-
-
-class JointSample(NamedTuple):
-    """The readings of all joint sensors in one message.
+class Series(NamedTuple):
+    """A series of impossible readings of one joint sensor.
 
     Attributes:
-        theta: θ [rad], (D,); NaN where the reading is not usable.
-        read: θ as the sensors reported it [rad], (D,); NaN where a joint was not measured.
-        status: Whether the reading of each joint is usable, D values.
+        since: Time of its first impossible reading [s].
+        until: Time of its newest impossible reading [s].
+        impossible: Number of impossible readings in the series.
+        total: Number of all readings in the series, possible ones included.
     """
 
-    theta: Array
-    read: Array
-    status: tuple[JointReading, ...]
+    since: float
+    until: float
+    impossible: int
+    total: int
+
+    def is_present(self, now: float) -> bool:
+        """Return whether the series has not ended yet."""
+        return now - self.until <= ENDED
+
+    def is_lasting(self, now: float) -> bool:
+        """Return whether the series is present, and more than a burst or a slip of the sensor."""
+        return self.is_present(now) and self.until - self.since > LASTING
+
+
+_NONE = Series(-math.inf, -math.inf, 0, 0)
+
+
+class JointChannel:
+    """The readings of one joint sensor.
+
+    Attributes:
+        series: The newest series of impossible readings.
+        read_at: Time of the newest reading, on the clock of `JointStream.pass_time` [s]; None
+            before the first.
+    """
+
+    def __init__(self, low: float, high: float, radian: float) -> None:
+        """Start without readings.
+
+        Args:
+            low: Lowest possible reading [rad].
+            high: Highest possible reading [rad].
+            radian: 1 for a revolute joint, and for a prismatic joint the displacement [m] that
+                counts as 1 rad.
+        """
+        self._low, self._high = low, high
+        self._step, self._speed = STEP * radian, SPEED * radian
+        self.read_at: float | None = None
+        self.reset()
+
+    def reset(self) -> None:
+        """Discard all readings, but not whether the joint has a sensor."""
+        # Time of the last reading within the limits [s], this reading, the last usable reading
+        # [rad], and the time since which all readings have followed each other plausibly [s]; NaN
+        # before the first.
+        self._time = self._last = self._accepted = self._settling_since = math.nan
+        self.series = _NONE
+
+    def judge(self, time: float, value: float) -> JointReading:
+        """Judge a reading [rad] received at `time` [s]."""
+        if not math.isfinite(value):
+            return JointReading.MISSING
+        if not self._low <= value <= self._high:
+            return JointReading.OUTSIDE
+        elapsed = time - self._time
+        largest = self._step + self._speed * min(elapsed, LIMITS.longest_step)
+        # After a pause, any reading may be right, as at the beginning.
+        is_first = not elapsed <= LIMITS.pause
+        if not abs(value - self._last) <= largest:
+            self._settling_since = time
+        is_settled = time - self._settling_since >= LIMITS.settled - 1e-9
+        is_near = abs(value - self._accepted) <= largest
+        self._last, self._time = value, time
+        if is_first or is_near or is_settled:
+            return JointReading.USABLE
+        return JointReading.JUMPED
+
+    def note(self, time: float, value: float, kind: JointReading) -> None:
+        """Record a reading [rad] received at `time` [s], and how it was judged in the end."""
+        series = self.series
+        if kind is JointReading.USABLE:
+            self._accepted = value
+            if series is not _NONE and series.is_present(time):
+                self.series = series._replace(total=series.total + 1)
+        elif not series.is_present(time):
+            self.series = Series(time, time, 1, 1)
+        else:
+            self.series = Series(series.since, time, series.impossible + 1, series.total + 1)
 
 
 class JointStream:
@@ -71,68 +157,83 @@ class JointStream:
 
     def __init__(self, robot: Robot) -> None:
         """Start without readings."""
-        self._robot = robot
-        self._step = STEP * robot.kinematics.radian
-        self._speed = SPEED * robot.kinematics.radian
+        margin = LIMITS.joint_outside * (robot.upper - robot.lower)
+        radian = np.broadcast_to(robot.kinematics.radian, margin.shape)
+        limits = robot.lower - margin, robot.upper + margin, radian
+        self._joints = robot.joints
+        self._channels = [JointChannel(*each) for each in zip(*(part.tolist() for part in limits))]
         self.rejected: Counter[tuple[str, JointReading]] = Counter()
-        self.reset()
+        self._newest = -math.inf  # time of the newest message [s]
+        self._impossible_at = -math.inf  # time of the newest impossible reading of any joint [s]
+        self._passed = 0.0  # sum of the times of `pass_time` [s]
 
     def reset(self) -> None:
         """Discard all readings, for example after a backward jump of the clock."""
-        count = self._robot.joint_count
-        # The last usable reading, the last reading of all [rad], its time, and the time since which
-        # all readings have followed each other plausibly [s], (D,) each; NaN before the first.
-        self._accepted, self._last, self._time, self._settling_since = np.full((4, count), np.nan)
-        self._impossible_since = np.full(count, np.inf)  # [s]; ∞ for joints that can be read
+        self._impossible_at = -math.inf
+        for channel in self._channels:
+            channel.reset()
 
-    def take(self, time: float, theta: Array) -> JointSample:
-        """Judge the readings θ [rad] (D,) received at `time` [s]; NaN for joints not measured."""
-        read = np.array(theta, dtype=float)
-        is_measured = np.isfinite(read)
-        with np.errstate(invalid='ignore'):
-            is_outside = is_measured & (share_outside(self._robot, read) > LIMITS.joint_outside)
-        is_candidate = is_measured & ~is_outside
-        has_jumped = self._jumped(time, read, is_candidate)
-        is_usable = is_candidate & ~has_jumped
-        self._accepted[is_usable] = read[is_usable]
-        status = tuple(
-            JointReading.MISSING
-            if not measured
-            else JointReading.OUTSIDE
-            if outside
-            else JointReading.JUMPED
-            if jumped
-            else JointReading.USABLE
-            for measured, outside, jumped in zip(is_measured, is_outside, has_jumped, strict=True)
-        )
-        for name, kind in zip(self._robot.joints, status, strict=True):
-            if kind in IMPOSSIBLE:
-                self.rejected[name, kind] += 1
-        since = np.minimum(self._impossible_since, time)
-        self._impossible_since = np.where(is_measured & ~is_usable, since, np.inf)
-        return JointSample(np.where(is_usable, read, np.nan), read, status)
+    def take(self, time: float, theta: Array) -> Array:
+        """Judge the readings θ [rad] (D,) received at `time` [s]; NaN for joints not measured.
 
-    def unreadable(self, now: float) -> list[str]:
-        """Return the joints whose readings have all been impossible for longer than LASTING."""
-        is_lasting = now - self._impossible_since > LASTING
-        return [name for name, lasts in zip(self._robot.joints, is_lasting, strict=True) if lasts]
-
-    def _jumped(self, time: float, read: Array, is_candidate: Bools) -> Bools:
-        """Return which readings are too far from the last usable one, (D,)."""
-        elapsed = time - self._time
-        if (elapsed < 0.0).any():  # the clock has gone back
+        Returns:
+            θ [rad], (D,); NaN where the reading is not usable.
+        """
+        if time < self._newest:  # the clock has gone back
             self.reset()
-            elapsed = time - self._time
-        # After a pause, any reading may be right, as at the beginning.
-        is_first = is_candidate & ~(elapsed <= LIMITS.pause)
-        largest = self._step + self._speed * np.minimum(elapsed, LIMITS.longest_step)
-        follows = is_candidate & (np.abs(read - self._last) <= largest)
-        self._settling_since[is_candidate & ~follows] = time
-        is_settled = follows & (time - self._settling_since >= LIMITS.settled - 1e-9)
-        is_near = is_candidate & (np.abs(read - self._accepted) <= largest)
-        self._last[is_candidate], self._time[is_candidate] = read[is_candidate], time
-        has_jumped: Bools = is_candidate & ~(is_first | is_near | is_settled)
-        return has_jumped
+        self._newest = time
+        values, channels = theta.tolist(), self._channels
+        kinds = [each.judge(time, value) for each, value in zip(channels, values, strict=True)]
+        usable, foreign = JointReading.USABLE, JointReading.FOREIGN
+        if self._is_foreign(kinds):
+            kinds = [foreign if kind is usable else kind for kind in kinds]
+        for j, kind in enumerate(kinds):
+            if kind is JointReading.MISSING:
+                values[j] = math.nan
+                continue
+            channels[j].read_at = self._passed
+            channels[j].note(time, values[j], kind)
+            if kind is not usable:
+                self.rejected[self._joints[j], kind] += 1
+                self._impossible_at = time
+                values[j] = math.nan
+        return np.array(values)
+
+    @staticmethod
+    def _is_foreign(kinds: list[JointReading]) -> bool:
+        """Return whether a message with these readings describes another posture."""
+        usable = kinds.count(JointReading.USABLE)
+        impossible = len(kinds) - usable - kinds.count(JointReading.MISSING)
+        return impossible > 1 and impossible >= FOREIGN_SHARE * (impossible + usable)
+
+    def pass_time(self, seconds: float) -> None:
+        """Let time pass [s] in which readings should have arrived.
+
+        Pauses of the driver or of this process do not count. Callers therefore pass the time
+        between two messages that are not far apart.
+        """
+        self._passed += seconds
+
+    @property
+    def missing(self) -> list[str]:
+        """The joints that had readings, and have had none for longer than MISSING."""
+        return [
+            name
+            for name, channel in zip(self._joints, self._channels, strict=True)
+            if channel.read_at is not None and self._passed - channel.read_at > MISSING
+        ]
+
+    def impossible(self, now: float) -> dict[int, Series]:
+        """Return the lasting series of impossible readings, by index of the joint.
+
+        Args:
+            now: Time on the clock of the readings [s].
+        """
+        if now - self._impossible_at > ENDED:
+            return {}
+        return {
+            j: each.series for j, each in enumerate(self._channels) if each.series.is_lasting(now)
+        }
 
     @property
     def text(self) -> str:

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which joint sensors are trusted, as the estimator has decided.
 
-The estimator compares the joint sensors with the muscle lengths (`estimation/joint_check.py`), and
-publishes its decision on the latched topic `joint_sensor_trust`. Nothing else judges whether a
-plausible reading is right. Every change creates a new `JointTrust`.
+The estimator compares the joint sensors with the muscle lengths, and watches for lasting series of
+impossible readings (`estimation/joint_check.py`). It publishes its decision on the latched topic
+`joint_sensor_trust`. Nothing else judges whether a plausible reading is right. Every change creates
+a new `JointTrust`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -26,6 +28,13 @@ class Trust(IntEnum):
     DOUBTED = 1
     #: Its readings are used, including those of the doubtful time, because the user confirmed them.
     CONFIRMED = 2
+    #: Its readings are not used, from the begin of a series of impossible readings on, until the
+    #: series ends.
+    IMPOSSIBLE = 3
+
+
+#: sensors whose readings are not used
+NOT_USED = frozenset({Trust.DOUBTED, Trust.IMPOSSIBLE})
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +43,8 @@ class JointTrust:
 
     Attributes:
         trust: Trust in each joint sensor, D values.
-        since: Begin of the newest doubt in each sensor [s], (D,); NaN if there was none.
+        since: Begin of the newest time in which each sensor was not used [s], (D,); NaN if there
+            was none.
         deviation: By how much each sensor read too much at the newest doubt [rad], (D,), as the
             muscle lengths show; 0 if there was no doubt.
     """
@@ -51,14 +61,24 @@ class JointTrust:
         unknown = np.full(joint_count, np.nan)
         return cls((Trust.TRUSTED,) * joint_count, unknown, np.zeros(joint_count))
 
-    @property
+    @cached_property
+    def is_used(self) -> Bools:
+        """Which joint sensors are used, (D,)."""
+        return np.array([each not in NOT_USED for each in self.trust], dtype=bool)
+
+    @cached_property
+    def unused(self) -> tuple[int, ...]:
+        """Indices of the joint sensors that are not used."""
+        return tuple(np.flatnonzero(~self.is_used).tolist())
+
+    @cached_property
     def is_doubted(self) -> Bools:
-        """Which joint sensors are in doubt, (D,)."""
+        """Which joint sensors are in doubt because of the muscle lengths, (D,)."""
         return np.array([each is Trust.DOUBTED for each in self.trust], dtype=bool)
 
-    @property
+    @cached_property
     def doubted(self) -> tuple[int, ...]:
-        """Indices of the joint sensors that are in doubt."""
+        """Indices of the joint sensors that are in doubt because of the muscle lengths."""
         return tuple(np.flatnonzero(self.is_doubted).tolist())
 
     def rows(self, now: float) -> Array:
@@ -68,8 +88,8 @@ class JointTrust:
             now: Time on the clock of `since` [s].
 
         Returns:
-            The numbers of `Trust`, the time since the begin of the newest doubt [s] (0 if there was
-            none) and the deviations [rad], (3, D).
+            The numbers of `Trust`, the times since `since` [s] (0 if there is none) and the
+            deviations [rad], (3, D).
         """
         age = np.nan_to_num(np.maximum(now - self.since, 0.0))
         return np.array([np.array(self.trust, dtype=float), age, self.deviation])

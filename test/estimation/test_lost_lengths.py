@@ -250,7 +250,7 @@ def test_after_a_repair_with_another_zero_the_reset_is_refused_until_a_calibrati
     with pytest.raises(MusculoskeletalError, match=r'(shorter|longer) than.*estimator/zero'):
         ruptured.core.reset()
     assert ruptured.kind is ConditionKind.SLACK_TENDON
-    assert ruptured.core.report(ruptured.time).steps == (Step.CALIBRATE_LENGTHS,)
+    assert ruptured.core.remedy == (Step.CALIBRATE_LENGTHS,)
     ruptured.core.calibrate_lengths()
     assert ruptured.kind is None
 
@@ -283,6 +283,49 @@ def test_a_joint_sensor_that_all_lengths_outvote_is_doubted_and_the_arm_goes_on(
 def test_a_healthy_arm_with_joint_sensors_is_healthy(moved):
     moved.go(12.0)
     assert moved.kind is None
+
+
+def conditions_of_joints(arm):
+    return {
+        each.identifier: each.subjects
+        for each in arm.core.conditions(arm.time)
+        if each.identifier.startswith('joint_')
+    }
+
+
+def test_a_joint_sensor_that_is_unplugged_is_named_until_it_is_plugged_in_again(moved):
+    elbow = moved.robot.joints[1]
+    moved.joint_off = np.array([0.0, np.nan])
+    moved.go(5.0)
+    assert conditions_of_joints(moved) == {'joint_readings_missing': (elbow,)}
+    moved.joint_off[:] = 0.0
+    moved.go(1.0)
+    assert conditions_of_joints(moved) == {}
+
+
+def test_all_joints_are_named_if_their_driver_ends(moved):
+    moved.go(5.0, sensors=False)
+    assert conditions_of_joints(moved) == {'joint_readings_missing': moved.robot.joints}
+
+
+def test_a_pause_of_all_messages_is_no_fault_of_the_joint_sensors(moved):
+    moved.time += 5.0
+    moved.go(0.1, sensors=False)
+    assert conditions_of_joints(moved) == {}
+
+
+def test_joint_sensors_are_not_used_while_a_second_program_publishes_zeros(moved):
+    for _ in range(round(3.0 / DT)):
+        moved.core.joints(np.zeros(2), moved.time + 0.5 * DT)
+        moved.go(DT)
+    names = moved.robot.joints
+    assert conditions_of_joints(moved) == {'joint_readings_impossible': names}
+    assert moved.core.joint_trust.unused == (0, 1)
+    assert moved.core.measured is None
+    moved.go(2.0)
+    assert conditions_of_joints(moved) == {}
+    assert moved.core.joint_trust.unused == ()
+    assert moved.core.measured is not None
 
 
 def test_joint_sensors_that_are_dead_decide_nothing(robot, mae):

@@ -49,6 +49,15 @@ def test_readings_of_the_doubtful_time_come_back_if_the_user_confirms_them(taugh
     assert history.given_up == 0
 
 
+def test_readings_during_impossible_ones_are_given_up_even_if_the_sensor_was_confirmed(taught):
+    samples, history = taught
+    history.use(trust(Trust.CONFIRMED, 2.0))
+    assert history.use(trust(Trust.IMPOSSIBLE, 6.0)) == (1,)
+    history.use(trust(Trust.CONFIRMED, 6.0))
+    assert np.isnan(elbows(samples)[5:]).all()
+    assert np.isfinite(elbows(samples)[:5]).all()
+
+
 def test_a_trust_survives_its_message():
     sent = trust(Trust.DOUBTED, 90.0)
     received = JointTrust.from_rows(sent.rows(100.0), 1e9)

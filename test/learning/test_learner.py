@@ -433,6 +433,18 @@ def test_a_learner_that_gets_nothing_to_learn_from_warns_and_names_why(
     assert ('no usable data for' in report.message) == bool(obstacle)
 
 
+@pytest.mark.parametrize(('value', 'count'), [(-np.pi, 1), (0.0, 1), (0.0, 40)])
+def test_impossible_joint_readings_are_never_learned(learner, stage, value, count):
+    arm, sample = Arm(learner, stage), stage.sample()
+    arm.rest(1.5, sample)
+    wrong = np.array([sample.theta[0], value])
+    for _ in range(count):
+        arm.send(sample._replace(theta=wrong))
+    arm.rest(MARGIN + 3.0, sample)
+    assert len(learner.samples) == 1
+    np.testing.assert_allclose(learner.samples.samples[0].theta, sample.theta, atol=1e-6)
+
+
 def test_messages_after_the_last_poll_are_no_silence(learner, stage):
     sample = stage.sample()
     learner.poll(0.0)

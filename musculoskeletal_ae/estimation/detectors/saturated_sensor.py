@@ -63,6 +63,7 @@ class SaturatedSensor(Detector):
         self._beyond: Array = np.zeros(count)  # time for which the reading has been higher [s]
         self._value: Array = np.full(count, np.nan)  # value of the last visit [N]
         self._visits: Ints = np.zeros(count, dtype=np.int64)
+        self._has_visits = False  # whether any muscle has visited a value
         self._has_left = np.ones(count, dtype=bool)  # whether it was lower since the last visit
 
     def step(self, observation: Observation) -> Finding | None:
@@ -70,14 +71,18 @@ class SaturatedSensor(Detector):
         sample, dt, value = observation.sample, observation.dt, self._value
         reading = sample.newest[1]
         is_same = reading == self._before
-        if 2 * np.count_nonzero(is_same) > len(is_same):  # a repeated message
+        same_count = np.count_nonzero(is_same)
+        if 2 * same_count > len(is_same):  # a repeated message
             return None
         self._highest = np.fmax(self._highest, np.minimum(reading, self._before))
         self._before = reading
-        self._unchanged = (self._unchanged + dt) * is_same
-        self._length = np.where(is_same, self._length, sample.length)
         is_below = ~(reading >= (1.0 - SAME) * self._highest)
         self._varying += dt / MEMORY * is_below * (~is_same - self._varying)
+        if not same_count and not self._has_visits:  # the usual case: no reading is clipped
+            self._unchanged, self._length = np.zeros(len(is_same)), sample.length
+            return None
+        self._unchanged = (self._unchanged + dt) * is_same
+        self._length = np.where(is_same, self._length, sample.length)
         self._has_left |= reading < (1.0 - BELOW) * value
         self._beyond = (self._beyond + dt) * (reading > (1.0 + SAME) * value)
         is_clipped = (self._unchanged >= LASTING) & (self._varying > VARYING) & sample.usable
@@ -87,6 +92,7 @@ class SaturatedSensor(Detector):
         is_wrong = self._beyond > BEYOND
         self._visits = np.where(new, 1, self._visits + again) * ~is_wrong
         self._value = np.where(is_wrong, np.nan, np.where(new, reading, value))
+        self._has_visits = bool(np.isfinite(self._value).any())
         self._has_left = (self._has_left & ~(again | new)) | is_wrong
         wound = is_clipped & (self._unchanged >= WINDING_TIME)
         wound &= self._length - sample.length > WOUND
