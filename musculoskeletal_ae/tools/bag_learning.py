@@ -10,11 +10,11 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrival import LONGEST_STEP
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.bags.topics import NO_MOTORS
-from musculoskeletal_ae.estimation.estimator import LONGEST_PERIOD
 from musculoskeletal_ae.estimation.finding import Finding, observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.exceptions import BagError, CheckpointError, MusculoskeletalError
@@ -236,7 +236,7 @@ def anomaly_in(
             health.use(reduced)
         states = np.array([recording.length[row], recording.tension[row], recording.tension[row]])
         states[2] = np.nan
-        finding = _finding(health, reduced, stream, states, at, min(dt, LONGEST_PERIOD))
+        finding = _finding(health, reduced, stream, states, at, min(dt, LONGEST_STEP))
         progress()
         if finding is None:
             continue
@@ -313,7 +313,7 @@ def learn(
             health.use(mae)
         states = np.array([length, tension, np.full(len(length), np.nan)])
         learner.joints(at, theta)
-        finding = _finding(health, mae, stream, states, at, min(dt, LONGEST_PERIOD))
+        finding = _finding(health, mae, stream, states, at, min(dt, LONGEST_STEP))
         if finding is not None:
             learner.anomaly(True)
             stop = stop or (
