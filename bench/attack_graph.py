@@ -291,7 +291,7 @@ class Attack:
             STOP.raise_if_received()
             if time.monotonic() > self._judged + JUDGE_PERIOD:
                 self._judged = time.monotonic()
-                self.situation.tick()
+                self.situation.forget_ended()
                 now, level = time.time(), self.situation.level()
                 self.status.append((now, level, self.situation.trouble()))
             if time.monotonic() > self._looked + 1.0:

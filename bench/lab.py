@@ -30,6 +30,7 @@ import numpy as np
 
 from bench.learned_arm import STEPS, Seldom
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.emulator.modules import Arm
@@ -42,7 +43,6 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.state import StateStore
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.signals.body_state import BodyState
-from musculoskeletal_ae.signals.message_delay import MessageDelay
 from musculoskeletal_ae.signals.readings import MuscleReading
 
 CORES = 2  # number of cores of the simulated computer
@@ -75,7 +75,7 @@ class Process:
         self._per_core, self._rng = load / CORES, np.random.default_rng(seed)
         self._runs_at = 0.0  # time at which the process runs next [s]
         self._waiting: list[Message] = []
-        self._delays = MessageDelay()
+        self._arrival = Arrival()
         self.lost = 0  # number of lost messages
         self.longest_delay = 0.0  # longest delay of a message [s]
 
@@ -89,7 +89,7 @@ class Process:
 
     def restart(self, at: float) -> None:
         """End the process; its successor runs from the time `at` [s] on, with an empty queue."""
-        self._runs_at, self._delays = at, MessageDelay()
+        self._runs_at, self._arrival = at, Arrival()
         self._waiting.clear()
 
     def runs(self, now: float) -> float | None:
@@ -113,9 +113,10 @@ class Process:
         self.lost += len(waiting) - len(kept)
         received = []
         for message in kept:
-            delay = self._delays.step(now, round(1e9 * (message.sent_at + AHEAD)))
-            self.longest_delay = max(self.longest_delay, delay)
-            received.append((now, delay, message.content))
+            sent = round(1e9 * (message.sent_at + AHEAD))
+            self._arrival.receive(now, sent, self._arrival.number + 1)
+            self.longest_delay = max(self.longest_delay, self._arrival.delay)
+            received.append((now, self._arrival.delay, message.content))
             now += HANDLING
         return received
 
@@ -330,7 +331,7 @@ class Lab:
             tell()
         self._to_controller.clear()
         # Without an estimate for 1.5 periods, the timer of the node steps the controller.
-        if now - core.watchdog.age.stepped_at > 1.5 * SAMPLE_TIME:
+        if now - core.watchdog.steps.stepped_at > 1.5 * SAMPLE_TIME:
             self._command_by(core, now)
         estimates, self._estimates = self._estimates[-QUEUE:], []
         for message, theta in zip_longest(self.controlling.receive(now), estimates):

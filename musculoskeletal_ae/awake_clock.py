@@ -2,21 +2,21 @@
 """A clock that excludes the pauses of this process.
 
 A process pauses while it is suspended, or while a busy computer gives it no time. Messages that
-arrive during a pause wait unread, so their absence proves nothing about their sender. Code that
-decides by the age of messages therefore measures the age on an `AwakeClock`. Of the time between
-two ticks of such a clock, at most `longest` counts:
+arrive during a pause wait unread, so their absence proves nothing about their sender. Whether a
+sender is silent is therefore decided by the age of its messages on an `AwakeClock` (`arrival`).
 
-    user                           calls `tick`                 longest
-    controller (`DataAge`)         in every step of control     0.3 s
-    any node (`Shell`)             ten times a second           0.3 s
-    status line (`Situation`)      about once a second          1.0 s
-    check_driver (`Pace`)          every 0.02 s                 0.07 s
+Each node has one such clock. It ticks ten times a second (`nodes/shell.py`), and in each step of
+the controller; that of `view` ticks in its loop, and that of `check_driver` every 0.02 s. Of the
+time between two ticks, at most `longest` counts. In a process that is always late, the clock
+advances by only `longest` for each tick. The process still notices a silent sender, but later.
 
-In a process that is always late, this clock advances by only `longest` for each tick. The process
-still notices a silent sender, but later.
+The arm moves on during a pause of this process. How far it can have moved since the last message is
+therefore a question for the steady clock, not for this one.
 """
 
 import math
+
+PAUSE = 0.3  # count the time between two ticks that exceeds this as a pause of this process [s]
 
 
 class AwakeClock:
@@ -25,7 +25,7 @@ class AwakeClock:
     The clock follows the steady clock until its first tick.
     """
 
-    def __init__(self, longest: float) -> None:
+    def __init__(self, longest: float = PAUSE) -> None:
         """Count at most `longest` [s] of the time between two ticks.
 
         Args:

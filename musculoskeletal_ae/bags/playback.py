@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrival import SILENCE
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import BagMessage
 from musculoskeletal_ae.bags.timed_messages import TimedMessages
@@ -36,7 +37,6 @@ SMOOTHING = 0.15
 SPACING = 0.1  # time between two points of the trajectory [s]
 LEAD_TIME = 3.0  # duration of the motion to the first posture [s]
 SHORTEST_MOTION = 0.5  # shorter motions are refused [s]
-LONGEST_GAP = 1.0  # the motion between two messages that are further apart is unknown [s]
 
 
 def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
@@ -168,8 +168,8 @@ def taught_motion(bag: Bag, topic: str, start: int, stop: int) -> TaughtMotion:
     recorded, theta = map(np.array, zip(*postures[joints]))
     _check_motion(bag, topic, recorded, len(joints))
     time = np.linspace(recorded[0], recorded[-1], max(2, round(np.ptp(recorded) / SPACING)) + 1)
-    # Messages further away than LONGEST_GAP get no weight.
-    ends = np.searchsorted(recorded, [time - LONGEST_GAP, time + LONGEST_GAP]).T
+    # Messages further away than SILENCE get no weight.
+    ends = np.searchsorted(recorded, [time - SILENCE, time + SILENCE]).T
     smooth: Array = np.empty((len(time), len(joints)))
     for n, (first, last) in enumerate(ends):
         weight = np.exp(-0.5 * ((time[n] - recorded[first:last]) / SMOOTHING) ** 2)
@@ -184,7 +184,7 @@ def _check_motion(bag: Bag, topic: str, time: Array, joint_count: int) -> None:
     if span < SHORTEST_MOTION:
         raise _no_motion(bag, topic)
     gaps = np.diff(time)
-    if (gap := float(gaps.max())) > LONGEST_GAP:
+    if (gap := float(gaps.max())) > SILENCE:
         begin = f'which begins {time[gaps.argmax()]:.1f} s after the start of this part of the bag'
         problem = f'{topic} has a gap of {gap:.1f} s, {begin}'
         remedy = 'use --start and --duration to choose a part without gaps'

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LATEST
 from musculoskeletal_ae.bags.timed_messages import TimedMessages
@@ -21,7 +22,6 @@ from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
-from musculoskeletal_ae.signals.message_delay import MessageDelay
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream
 from musculoskeletal_ae.signals.pairing import Pairing
@@ -95,27 +95,19 @@ class Streams(NamedTuple):
         return Pairs(time, postures, values[:, 0], values[:, 1], isolated)
 
 
-class _Arrival(NamedTuple):
-    """When a message was received."""
-
-    time: float  # time of reception since the bag's start [s]
-    delay: float  # how late the message is (`MessageDelay`) [s]
-
-
 @dataclass
 class _Stream:
     """Collects the times and values of a topic's messages while the bag is being read."""
 
     shape: tuple[int, ...]  # shape of the values of one message
-    read: Callable[[Any, _Arrival], Array]  # converts a message to values
+    read: Callable[[Any, Arrival], Array]  # converts a message to values
     times: list[float] = field(default_factory=list)
     values: list[Array] = field(default_factory=list)
 
-    def take(self, message: tuple[_Arrival, Any]) -> None:
-        """Convert a message to values and append them; `message` is (arrival, decoded content)."""
-        came, content = message
-        self.values.append(self.read(content, came))
-        self.times.append(came.time)
+    def take(self, message: Any, arrival: Arrival) -> None:
+        """Convert a decoded message to values and append them; `arrival` is that of its sender."""
+        self.values.append(self.read(message, arrival))
+        self.times.append(arrival.received_at)
 
     def series(self) -> Series:
         """Return the times and values of all messages."""
@@ -155,32 +147,33 @@ class _ArmStreams:
             'muscle_length_zeros': self._offsets,
         }
 
-    def _posture(self, message: Any, _: _Arrival) -> Array:
+    def _posture(self, message: Any, _: Arrival) -> Array:
         joints = self._robot.joints
         theta = read_posture(message, joints, some=True)
         for name in joints_not_finite(message, joints):
             self._ignore(f'position of {name} is not finite')
         return theta
 
-    def _muscle_states(self, message: Any, came: _Arrival) -> Array:
+    def _muscle_states(self, message: Any, arrival: Arrival) -> Array:
         stream = self._muscle_stream
-        stream.use_body(_body_at(came.time, stream.body, self._isolated, self._offsets))
+        now = arrival.received_at
+        stream.use_body(_body_at(now, stream.body, self._isolated, self._offsets))
         reading = self._interface.reading(message)
-        sample = stream.take(reading, came.time, delay=came.delay)
+        sample = stream.take(reading, now, delay=arrival.delay)
         self.had_offsets.append(stream.body.offsets.known)
         return np.array([sample.length, sample.tension_read, sample.temperature])
 
-    def _command(self, message: Any, _: _Arrival) -> Array:
+    def _command(self, message: Any, _: Arrival) -> Array:
         return read_array(message, 1, self._robot.muscle_count)
 
-    def _offset_rows(self, message: Any, _: _Arrival) -> Array:
+    def _offset_rows(self, message: Any, _: Arrival) -> Array:
         muscles = self._robot.muscle_count
         if len(message.data) == 2 * muscles:  # recorded with version 0.1.0: without trust
             offsets = LengthOffsets(*read_array(message, 2, muscles))
             return replace(offsets, generation=len(self._offsets.values) + 1).rows
         return LengthOffsets.of_rows(read_array(message, ROWS, muscles)).rows
 
-    def _isolated_mask(self, message: Any, _: _Arrival) -> Array:
+    def _isolated_mask(self, message: Any, _: Arrival) -> Array:
         indices = self._robot.muscle_indices(read_names(message))
         return np.isin(np.arange(self._robot.muscle_count), indices).astype(float)
 
@@ -224,7 +217,7 @@ def read_streams(
     reception = Reception(warnings.append)
     arm = _ArmStreams(robot, lambda part: reception.ignore(labels['joint_states'], part))
     used = {labels[name]: stream for name, stream in arm.by_topic.items() if name in recorded}
-    takers = defaultdict[str, dict[str, Callable[[Any], None]]](dict)
+    takers = defaultdict[str, dict[str, Callable[[Any, Arrival], None]]](dict)
     for name, stream in arm.by_topic.items():
         if name in recorded:
             takers[recorded[name]][labels[name]] = stream.take
@@ -267,7 +260,7 @@ def _labels(recorded: Mapping[str, str]) -> dict[str, str]:
 
 def _deliver(
     messages: TimedMessages,
-    takers: Mapping[str, Mapping[str, Callable[[Any], None]]],
+    takers: Mapping[str, Mapping[str, Callable[[Any, Arrival], None]]],
     early: Sequence[str],
     reception: Reception,
     progress: Callable[[float], None],
@@ -275,7 +268,8 @@ def _deliver(
 ) -> None:
     """Read messages, and pass each one to the functions for its topic.
 
-    The functions receive pairs (arrival, decoded content).
+    The functions receive the decoded message, and when messages of its sender arrived, in the time
+    since the bag's start.
 
     Args:
         messages: The messages to read.
@@ -288,24 +282,19 @@ def _deliver(
     """
     bag = messages.bag
     count = sum(bag.topics[topic].message_count for topic in takers)
-    receive = dict[tuple[str, ...], list[Callable[[Any, dict[str, Any]], Any]]]()
-    delays = defaultdict[tuple[str, ...], MessageDelay](MessageDelay)
+    arrivals = defaultdict[tuple[str, ...], Arrival](Arrival)
     for message in chain(
         messages.messages(early, stop=stop), messages.messages(takers.keys() - early, stop=stop)
     ):
         decoded = bag.decode(message)
         # Publishers of different joints on one topic may have different clocks.
-        sender = message.topic, *getattr(decoded, 'name', ())
-        if sender not in receive:
-            receive[sender] = [
-                reception.of(label, take, lambda: 1)
-                for label, take in takers[message.topic].items()
-            ]
-        sent = {'source_timestamp': message.publish_time, 'publication_sequence_number': 0}
-        time = (message.log_time - bag.start) / 1e9
-        arrival = _Arrival(time, delays[sender].step(time, message.publish_time))
-        for take in receive[sender]:
-            take((arrival, decoded), sent)
+        arrival = arrivals[(message.topic, *getattr(decoded, 'name', ()))]
+        is_new = arrival.receive((message.log_time - bag.start) / 1e9, message.publish_time)
+        for label, take in takers[message.topic].items():
+            if is_new:
+                reception.deliver(label, take, decoded, arrival)
+            else:
+                reception.note_repeated(label)
         progress(1.0 / count)
 
 

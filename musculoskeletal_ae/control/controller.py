@@ -28,6 +28,7 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.awake_clock import PAUSE, AwakeClock
 from musculoskeletal_ae.conditions import ORDER, Action, Condition, ConditionKind
 from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.activities import ActivityControl, Inputs
@@ -45,7 +46,7 @@ from musculoskeletal_ae.control.stopping import SafeStop
 from musculoskeletal_ae.control.supervisor import Activity, Supervisor
 from musculoskeletal_ae.control.torque import GravityCompensation, TorqueControl
 from musculoskeletal_ae.control.trajectory import Setpoint
-from musculoskeletal_ae.control.watchdog import OWN_PAUSE, Watchdog
+from musculoskeletal_ae.control.watchdog import Watchdog
 from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.report import Report
@@ -202,8 +203,22 @@ class Controller:
     each message and each control step to them. It does not depend on ROS.
     """
 
-    def __init__(self, robot: Robot, settings: Settings | None = None, seed: int = 0) -> None:
-        """Control `robot`; `seed` is the random seed of the exploration."""
+    def __init__(
+        self,
+        robot: Robot,
+        settings: Settings | None = None,
+        seed: int = 0,
+        clock: AwakeClock | None = None,
+    ) -> None:
+        """Start without messages.
+
+        Args:
+            robot: The robot.
+            settings: The settings; None for the defaults.
+            seed: Random seed of the exploration.
+            clock: Measures the ages of messages without the pauses of the process; each control
+                step ticks it. None for a clock of this object alone.
+        """
         self.robot, self.settings = robot, settings or Settings()
         check_settings(robot, self.settings)
         self.mae: Mae | None = None
@@ -217,7 +232,7 @@ class Controller:
         self.estimate: Array | None = None
         self.target_state = Target(np.zeros(robot.joint_count))
         self.supervisor = Supervisor()
-        self.watchdog = Watchdog(robot, self.settings)
+        self.watchdog = Watchdog(robot, self.settings, clock)
         self.planner = Planner(robot, self.settings)
         self.activities = Activities(robot, self.settings, seed)
         self.limiter = CommandLimiter(robot, self.settings)
@@ -274,7 +289,7 @@ class Controller:
         Args:
             message: The message, or a `MuscleReading`.
             now: Time of reception by the steady clock [s].
-            delay: How late the message is (`MessageDelay`) [s].
+            delay: How late the message is (`Arrival.delay`) [s].
 
         Raises:
             RejectionError: If the message cannot be used.
@@ -295,7 +310,7 @@ class Controller:
             self._jumped_at = now
         self.watchdog.take_sample(sample, now)
         # Messages that had waited during a pause show how the arm was before it.
-        if self._awaited_samples and sample.delay <= OWN_PAUSE:
+        if self._awaited_samples and sample.delay <= PAUSE:
             self._awaited_samples -= 1
             if not self._awaited_samples:
                 self.limiter.restart(sample, self.supervisor.is_running)
@@ -318,7 +333,7 @@ class Controller:
             raise
         self._estimate_problem.note('', now)
         if is_new:
-            self.watchdog.take_estimate(now)
+            self.watchdog.estimate.use(now)
         self.estimate = theta
 
     def use_body(self, body: BodyState) -> None:
@@ -335,7 +350,7 @@ class Controller:
         if self.mae is not None:
             self.activities.follower.plan_anew()
         if added := set(body.isolated) - set(before.isolated):
-            self._suspicion.note_isolated(max(added), self.watchdog.age.stepped_at)
+            self._suspicion.note_isolated(max(added), self.watchdog.steps.stepped_at)
         self._note_suspect()
 
     def _use_offsets(self, body: BodyState) -> None:
@@ -349,8 +364,7 @@ class Controller:
         if not is_known and not body.offsets.revoked:
             # A length calibration begins or continues. The estimate is discarded, because it was
             # computed with other offsets.
-            age = self.watchdog.age
-            age.expect_later(ConditionKind.STALE_ESTIMATE, age.stepped_at, FIRST_ESTIMATE)
+            self.watchdog.estimate.expect_later(self.watchdog.steps.stepped_at, FIRST_ESTIMATE)
             self.estimate = None
         self.limiter.offsets_known = is_known
         self.supervisor.on_offsets(is_known)
@@ -367,7 +381,7 @@ class Controller:
         another stop cause needs a reset.
         """
         if detected and not self.watchdog.has_anomaly:
-            self._suspicion.note_anomaly(self.watchdog.age.stepped_at)
+            self._suspicion.note_anomaly(self.watchdog.steps.stepped_at)
         self.watchdog.has_anomaly = detected
         if detected:
             self.stop(ConditionKind.ANOMALY)
@@ -380,7 +394,7 @@ class Controller:
         suspect = self._suspicion.suspect(self.watchdog.has_anomaly, isolated)
         self.stopping.suspect = suspect
         is_lost = self.watchdog.has_anomaly and suspect is None
-        self._suspicion.note_lost(is_lost, self.watchdog.age.stepped_at)
+        self._suspicion.note_lost(is_lost, self.watchdog.steps.stepped_at)
         if suspect is not None:
             self.supervisor.on_suspect(True)
 
@@ -390,7 +404,7 @@ class Controller:
         The comparison of this clock with the steady clock starts again, and the muscle states of
         earlier messages are discarded from the filters.
         """
-        self.watchdog.age.clock_jumped_back()
+        self.watchdog.steps.clock_jumped_back()
         self.stream.reset()
 
     # -- commands from users --------------------------------------------------------------------
@@ -578,9 +592,9 @@ class Controller:
         """
         # The rate limit applies to the time since the last publication. The time since the last
         # step is longer, because it also contains the computation of the last command.
-        computing = max(self.sent_at - self.watchdog.age.stepped_at, 0.0)
+        computing = max(self.sent_at - self.watchdog.steps.stepped_at, 0.0)
         time = now if time is None else time
-        step = self.watchdog.age.step(now, time, not self.supervisor.is_running)
+        step = self.watchdog.steps.step(now, time, not self.supervisor.is_running)
         if step.has_paused:  # the arm may have moved: restart the activity from the new posture
             self.activities.entered, self._awaited_samples = None, WINDOW
         present = self.stop_conditions(now)
@@ -790,7 +804,7 @@ class Controller:
         self._refuse_gravity_compensation()
         if self.estimate is None or self.mae is None:
             raise MessageError('no posture yet', 'wait for an estimate and a checkpoint')
-        present = self.stop_conditions(self.watchdog.age.stepped_at)
+        present = self.stop_conditions(self.watchdog.steps.stepped_at)
         condition = self.supervisor.condition or next(iter(present), None)
         if condition is not None:
             raise MessageError('stopped', condition.text)

@@ -4,6 +4,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+from musculoskeletal_ae.arrival import INTERRUPTION
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.parameters import PRESET, CheckedSettings, settable
 
@@ -54,7 +55,7 @@ class Settings(CheckedSettings):
         legal=UNREACHABLE,
     )
     max_age: float = settable(
-        0.2,
+        INTERRUPTION,
         'age of muscle_states or estimated_joint_states above which the arm stops',
         's',
         0.01,

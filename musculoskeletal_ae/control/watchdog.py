@@ -6,7 +6,7 @@ messages' clock [s], by whose steps commands advance.
 
 In a slow simulator, the messages' clock runs at a fraction of real time. The allowed age is then
 divided by this fraction, but by no less than `SLOWEST`. A fast clock does not shorten the allowed
-age. Pauses of the controller itself do not count as age (`AwakeClock`).
+age (`arrival`). Pauses of the controller itself do not count as age.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.awake_clock import AwakeClock
+from musculoskeletal_ae.arrival import LONGEST_STEP, Arrival
+from musculoskeletal_ae.awake_clock import PAUSE, AwakeClock
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.report import distinct
@@ -25,8 +26,6 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.heat import Heat
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-LONGEST_STEP = 0.1  # largest time step [s]; after a pause, control does not catch up
-OWN_PAUSE = 0.3  # longest time between two steps that counts as age [s]
 #: smallest pace of the messages' clock by which age limits are extended; below it, the steps of a
 #: stopped arm follow the steady clock
 SLOWEST = 0.05
@@ -36,8 +35,6 @@ OVERHEATED = 20.0  # excess over temperature_limit at which the arm stops [°C]
 #: time, the limiter pays out the muscle
 OVERLOAD = 1.1
 OVERLOAD_TIME = 0.2  # time after which an overload stops the arm [s]
-
-MUSCLE_STATES, ESTIMATE = ConditionKind.STALE_MUSCLE_STATES, ConditionKind.STALE_ESTIMATE
 
 
 class Step(NamedTuple):
@@ -50,48 +47,24 @@ class Step(NamedTuple):
     has_paused: bool  # whether control paused before the step, so that the arm may have moved
 
 
-class DataAge:
-    """Measures the age of data and the pace of the messages' clock."""
+class ControlSteps:
+    """Measures the time between steps of control, and the pace of the messages' clock.
 
-    def __init__(self) -> None:
-        self.stepped_at = -math.inf
-        self._came_at = {MUSCLE_STATES: -math.inf, ESTIMATE: -math.inf}
+    Attributes:
+        stepped_at: Time of the last step on the steady clock [s].
+        pace: Pace of the messages' clock relative to the steady clock.
+    """
+
+    def __init__(self, clock: AwakeClock) -> None:
+        """Tick `clock` in each step."""
+        self._clock = clock
         self._time = math.nan  # time of the messages' clock at the last step [s]
-        self._awake = AwakeClock(OWN_PAUSE)
-        self.pace = 1.0  # pace of the messages' clock relative to the steady clock
+        self.stepped_at = -math.inf
+        self.pace = 1.0
 
-    def awake(self, now: float) -> float:
-        """Return the time `now` of the steady clock minus the controller's own pauses [s]."""
-        return self._awake.at(now)
-
-    def received(self, kind: ConditionKind, now: float) -> float:
-        """Record that data was received; return the time since the previous data [s].
-
-        The result is 0 for the first data. `kind` is the stop cause that occurs when this data is
-        too old.
-        """
-        awake, before = self.awake(now), self._came_at[kind]
-        self._came_at[kind] = awake
-        return max(awake - before, 0.0) if before > -math.inf else 0.0
-
-    def expect_later(self, kind: ConditionKind, now: float, within: float) -> None:
-        """Allow a pause of some data: its age counts only from `within` [s] after `now`.
-
-        `kind` is the stop cause that occurs when this data is too old.
-        """
-        self._came_at[kind] = self.awake(now) + within
-
-    def stale(self, now: float, max_age: float) -> list[Condition]:
-        """Return a stop condition for each kind of data that is older than `max_age` [s].
-
-        If the messages' clock runs slowly, `max_age` is extended accordingly.
-        """
-        allowed = max_age / min(max(self.pace, SLOWEST), 1.0)
-        return [
-            kind.condition(f'for {allowed:.3g} s')
-            for kind, came_at in self._came_at.items()
-            if self.awake(now) - came_at > allowed
-        ]
+    def allowed_age(self, max_age: float) -> float:
+        """Return `max_age` [s], extended accordingly if the messages' clock runs slowly."""
+        return max_age / min(max(self.pace, SLOWEST), 1.0)
 
     def clock_jumped_back(self) -> None:
         """Restart the comparison of the clocks, because the messages' clock has jumped back."""
@@ -109,8 +82,8 @@ class DataAge:
         if self.stepped_at == -math.inf or math.isnan(passed):
             elapsed = passed = 0.0
         self.stepped_at, self._time = now, time
-        self._awake.tick(now)
-        counted = min(elapsed, OWN_PAUSE)
+        self._clock.tick(now)
+        counted = min(elapsed, PAUSE)
         has_jumped = not 0.0 <= passed < LONGEST_STEP + 10.0 * counted
         if counted > 0.0 and not has_jumped:
             share = 1.0 - math.exp(-counted / PACE_SPAN)
@@ -119,7 +92,7 @@ class DataAge:
         if self.pace < SLOWEST and is_stopped:
             passed = elapsed
         dt = min(max(passed, 0.0), LONGEST_STEP)
-        return Step(dt, min(elapsed, LONGEST_STEP), elapsed > OWN_PAUSE)
+        return Step(dt, min(elapsed, LONGEST_STEP), elapsed > PAUSE)
 
 
 class Overload:
@@ -145,7 +118,7 @@ class Overload:
         Args:
             tension: T [N], (M,). Where it is not finite, nothing changes.
             now: Time of reception by the steady clock [s].
-            delay: How late the message is (`MessageDelay`) [s].
+            delay: How late the message is (`Arrival.delay`) [s].
         """
         self._received_at, self._sent_at = now, now - delay
         earliest = np.minimum(self._since, self._sent_at)
@@ -228,12 +201,27 @@ class HeatLimit:
 
 
 class Watchdog:
-    """Collects the stop causes that are present."""
+    """Collects the stop causes that are present.
 
-    def __init__(self, robot: Robot, settings: Settings) -> None:
-        self.age, self.overload, self.heat = DataAge(), Overload(robot), HeatLimit(robot)
+    Attributes:
+        steps: The time between steps of control.
+        muscle_states: Arrival of the plausible muscle states.
+        estimate: Arrival of the new and plausible estimates.
+        overload: Detects tensions that are too high.
+        heat: Limits tensions by temperature.
+        has_checkpoint: Whether there is a network.
+        has_anomaly: Whether an anomaly is present.
+        second_publisher: Description of an additional publisher of a topic, or ''.
+    """
+
+    def __init__(self, robot: Robot, settings: Settings, clock: AwakeClock | None = None) -> None:
+        """Start without data; `clock` is as in `Controller`."""
+        clock = clock or AwakeClock()
+        self.steps = ControlSteps(clock)
+        self.muscle_states, self.estimate = Arrival(clock), Arrival(clock)
+        self.overload, self.heat = Overload(robot), HeatLimit(robot)
         self.has_checkpoint = self.has_anomaly = False
-        self.second_publisher = ''  # description of an additional publisher of a topic, or ''
+        self.second_publisher = ''
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
@@ -242,7 +230,10 @@ class Watchdog:
 
     def take_sample(self, sample: MuscleSample, now: float) -> None:
         """Record that plausible muscle states were received; check them for overload and heat."""
-        self.heat.take(self._robot, sample, self.age.received(MUSCLE_STATES, now))
+        states = self.muscle_states
+        elapsed = states.age(now) if states.was_used else 0.0
+        states.use(now)
+        self.heat.take(self._robot, sample, elapsed)
         self.overload.take(sample.motor_tension * sample.usable, now, sample.delay)
 
     def take_rejected(self, tension: Array, used: Bools, now: float, delay: float) -> None:
@@ -252,13 +243,9 @@ class Watchdog:
             tension: T; −∞ where it is implausible.
             used: Which muscles are not isolated, (M,).
             now: Time of reception by the steady clock [s].
-            delay: How late the message is (`MessageDelay`) [s].
+            delay: How late the message is (`Arrival.delay`) [s].
         """
         self.overload.take(np.where(used, tension, 0.0), now, delay)
-
-    def take_estimate(self, now: float) -> None:
-        """Record that a plausible estimate was received."""
-        self.age.received(ESTIMATE, now)
 
     def conditions(self, now: float) -> list[Condition]:
         """Return the stop causes that are present, in the order of `ConditionKind`."""
@@ -272,5 +259,11 @@ class Watchdog:
         settings = self._settings
         present += self.overload.conditions(now)
         present += self.heat.conditions(self._robot, settings.temperature_limit)
-        present += self.age.stale(now, settings.max_age)
+        allowed = self.steps.allowed_age(settings.max_age)
+        for kind, arrival in (
+            (ConditionKind.STALE_MUSCLE_STATES, self.muscle_states),
+            (ConditionKind.STALE_ESTIMATE, self.estimate),
+        ):
+            if arrival.age(now) > allowed:
+                present.append(kind.condition(f'for {allowed:.3g} s'))
         return present

@@ -58,7 +58,7 @@ class Winches:
             tension: T [N], (M,).
             command: Length command at the time of l and T [m], (M,).
             dt: Time since the previous call [s].
-            delay: How late the message with l and T is (`MessageDelay`) [s].
+            delay: How late the message with l and T is (`Arrival.delay`) [s].
         """
         # Messages that have waited arrive together, so a speed needs the times of sending.
         dt, self._delay = max(dt + self._delay - delay, 0.0), delay

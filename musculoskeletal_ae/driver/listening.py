@@ -16,6 +16,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.driver.pace import Pace
 from musculoskeletal_ae.driver.verdict import FAULTS, ZERO_TOLERANCE, Verdict
 from musculoskeletal_ae.exceptions import MessageError
@@ -85,6 +86,7 @@ class Listening:
         posture: Sequence[float] | None = None,
         zeroed: bool = True,
         motors: MotorInterface | None = None,
+        clock: AwakeClock | None = None,
     ) -> None:
         """Prepare to check the messages of a driver.
 
@@ -94,8 +96,10 @@ class Listening:
             posture: θ [rad] (D,) in which the arm is held, or None to use joint_states.
             zeroed: Whether the lengths are calibrated; if not, each may have any constant offset.
             motors: How the motors of a ros2_control robot are connected, or None for muscle_states.
+            clock: Shows the pauses of this process; None for a process without pauses.
         """
-        self._robot, self._zeroed, self._pace = robot, zeroed, Pace(rate)
+        self._robot, self._zeroed = robot, zeroed
+        self._pace = Pace(rate, clock or AwakeClock())
         self._motors = motors or MotorInterface(None)
         self._stated = posture is not None
         self._theta = np.full(robot.joint_count, math.nan) if posture is None else np.array(posture)
@@ -146,10 +150,6 @@ class Listening:
             theta = read_posture(message, self._robot.joints, some=True)
             if not self._stated:  # joints may come in several messages
                 self._theta = np.where(np.isnan(theta), self._theta, theta)
-
-    def tick(self, now: float) -> None:
-        """Record that this process runs; call this at intervals below `pace.LONGEST_TICK`."""
-        self._pace.tick(now)
 
     @contextmanager
     def _rejecting(self, topic: str) -> Iterator[None]:

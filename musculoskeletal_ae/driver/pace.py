@@ -3,11 +3,11 @@
 
 Source time and sequence number of the messages give the rate of publication. Without them, the rate
 of reception is used instead. It may be lower, because a busy computer may delay or lose messages,
-or block this process. An `AwakeClock` shows whether this process was blocked.
+or block this process. The `AwakeClock` of this process shows whether it was blocked.
 
 A driver must keep at least the expected rate. If it does not, but this computer is overloaded, the
 rate is not judged, because the driver may run here. The motion test then remains possible, within
-LEAST_RATE and LONGEST_GAP.
+LEAST_RATE and INTERRUPTION.
 """
 
 from typing import NamedTuple
@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrival import INTERRUPTION
 from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.report import is_overloaded
@@ -23,9 +24,6 @@ RATE_TOLERANCE = 0.2  # tolerated relative error of the rate
 #: lowest rate at which the motion test may begin [Hz], if the expected rate is not lower. A muscle
 #: that runs away is then noticed within 33 ms, and `motion.MEAN` averages 9 readings.
 LEAST_RATE = 30.0
-LONGEST_GAP = 0.2  # longest gap between two messages [s]; the default of the controller's `max_age`
-#: time between two ticks above which this process was blocked [s]; check_driver ticks every 0.02 s
-LONGEST_TICK = 0.07
 LONGEST_STALL = 1.0  # longest gap that an overload of this computer may explain [s]
 LEAST_LOST = 0.05  # fraction of lost messages above which the loss is reported
 
@@ -40,11 +38,11 @@ class _Message(NamedTuple):
 class Pace:
     """Collects the times of one driver's messages and checks its rate."""
 
-    def __init__(self, rate: float) -> None:
-        """Prepare to check that messages arrive at a rate [Hz]."""
+    def __init__(self, rate: float, clock: AwakeClock) -> None:
+        """Prepare to check that messages arrive at a rate [Hz]; `clock` shows pauses."""
         self._rate = rate
         self._messages: list[_Message] = []
-        self._awake = AwakeClock(LONGEST_TICK)
+        self._awake = clock
 
     @property
     def count(self) -> int:
@@ -54,10 +52,6 @@ class Pace:
     def message(self, came: float, sent: float, number: int) -> None:
         """Record when a message was received and when it was sent [s], and its sequence number."""
         self._messages.append(_Message(came, self._awake.at(came), sent, number))
-
-    def tick(self, now: float) -> None:
-        """Record that this process runs; call this at intervals below LONGEST_TICK."""
-        self._awake.tick(now)
 
     def judge(self, verdict: Verdict, now: float) -> None:
         """Check the rate and the gaps until `now` [s], and add the results to `verdict`."""
@@ -78,16 +72,16 @@ class Pace:
         gaps = np.append(gaps[steps == 1], now - came[-1])
         gap = float(gaps.max())
         came, came_awake = np.append(came, now), np.append(came_awake, self._awake.at(now))
-        if gap > LONGEST_GAP and _explained(came, came_awake):
+        if gap > INTERRUPTION and _explained(came, came_awake):
             verdict.notes.append(
                 f'this computer is busy: no message was received for {gap:.2f} s, and check_driver '
                 'was blocked as well. The rate was not checked; end other programs and try again'
             )
-        elif gap > LONGEST_GAP:
+        elif gap > INTERRUPTION:
             if is_overloaded() and gap <= LONGEST_STALL:
                 verdict.excuse('rate', f'no message was received for {gap:.2f} s')
                 verdict.forbid_motion(
-                    f'no message was received for {gap:.2f} s (longest legal gap: {LONGEST_GAP} s)'
+                    f'no message was received for {gap:.2f} s (longest legal gap: {INTERRUPTION} s)'
                 )
             else:
                 verdict.failed('gap', gap=gap)

@@ -23,6 +23,7 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrival import INTERRUPTION, LONGEST_STEP, SILENCE
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation import status
 from musculoskeletal_ae.estimation.checked_calibration import CheckedCalibration
@@ -54,14 +55,9 @@ from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.limits import Persistence
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
-#: largest time between two messages that detectors count [s]; a longer pause counts as this time
-LONGEST_PERIOD = 0.1
-#: Pause between two messages after which the detectors discard their evidence [s]. What happened in
-#: the pause is unknown: the driver may have received no commands, or the whole computer may have
-#: stood still. By default, the controller stops the arm after the same time (`max_age`).
-INTERRUPTION = 0.2
-SILENCE = 1.0  # restart the filter of the contact estimator after a pause of this length [s]
-JOINTS_AGE = 0.05  # age up to which measured joint angles are used with a message [s]
+#: Age up to which measured joint angles are used with a message [s]. It is much shorter than
+#: SILENCE, because an older reading belongs to another posture of a moving arm.
+JOINTS_AGE = 0.05
 
 
 class Output(NamedTuple):
@@ -401,7 +397,7 @@ class Estimator:
         if before is not None:
             elapsed = max(sample.time - before.time, 0.0)
             sent_apart = max(sample.sent_at - before.sent_at, 0.0)
-        self.joint_stream.pass_time(min(elapsed, LONGEST_PERIOD))
+        self.joint_stream.pass_time(min(elapsed, LONGEST_STEP))
         temperature = np.where(self.body.used, sample.temperature, np.nan)
         self.heat.step(sample.model_tension, temperature, elapsed)
         if self.mae is None:
@@ -409,6 +405,8 @@ class Estimator:
         self.stepped_at = now
         pause = max(elapsed, sent_apart)
         if pause > INTERRUPTION:
+            # What happened in the pause is unknown: the driver may have received no commands, or
+            # the whole computer may have stood still.
             self.health.reset()
         if pause > SILENCE:
             self.contact.reset()
@@ -428,7 +426,7 @@ class Estimator:
         Returns:
             The results; None before a running length calibration has its first estimate.
         """
-        dt, guess = min(elapsed, LONGEST_PERIOD), self.body.offsets
+        dt, guess = min(elapsed, LONGEST_STEP), self.body.offsets
         if self.calibration is not None:
             before = self.body.offsets
             newest = self._calibrate(self.calibration, sample, dt, now)

@@ -6,7 +6,10 @@ import math
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
 
-COMMAND_AGE = 0.5  # age above which a command is out of date [s]
+#: Age above which a command is out of date [s]. Modules without commands for this time enter their
+#: safe state (doc/howto/your_driver.md). This does not depend on the pauses of this process, so it
+#: is measured on the steady clock.
+COMMAND_AGE = 0.5
 
 
 class ModuleCommands:

@@ -10,7 +10,6 @@ Values of isolated muscles are replaced by 0 before messages are paired. A sampl
 version of the body state at that time, and the muscles that were isolated then.
 """
 
-import math
 from collections import Counter
 from dataclasses import replace
 from typing import Any
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.margin import AnomalyMargin
 from musculoskeletal_ae.learning.rest import REST_TIME, RestDetector
@@ -46,8 +46,9 @@ class SampleCollector:
         samples: The samples so far.
         healthy: Messages of the healthy arm, from motion and rest.
         rejected: Number of messages and rests that were not used, by reason.
-        used_at: Time of the last message that was suitable for learning [s]; −∞ before the first.
-        obstacle: Why all messages since `used_at` were unsuitable.
+        usable: Arrival of the messages that were suitable for learning, on the clock of the
+            messages.
+        obstacle: Why all messages since the last suitable one were unsuitable.
         joint_trust: Which joint sensors the estimator trusts.
     """
 
@@ -71,7 +72,7 @@ class SampleCollector:
         radian = robot.kinematics.radian
         self.samples, self.healthy = samples, healthy
         self.rejected: Counter[str] = Counter()
-        self.used_at, self.obstacle = -math.inf, NO_MESSAGES
+        self.usable, self.obstacle = Arrival(), NO_MESSAGES
         self._needs_joints = joint_source == SENSOR
         self._robot = robot
         self._stream = MuscleStream(robot)
@@ -143,7 +144,7 @@ class SampleCollector:
         Args:
             time: Time of reception [s].
             message: The message, or a `MuscleReading`.
-            delay: How late the message is (`MessageDelay`) [s].
+            delay: How late the message is (`Arrival.delay`) [s].
 
         Returns:
             The previous message with its θ, or None if there is none.
@@ -182,7 +183,8 @@ class SampleCollector:
         if self._needs_joints and np.isnan(theta).all():
             self.obstacle = NO_JOINTS
         else:
-            self.used_at, self.obstacle = paired.time, NO_MESSAGES
+            self.usable.use(paired.time)
+            self.obstacle = NO_MESSAGES
         message = paired.message
         reading = Sample(
             theta,

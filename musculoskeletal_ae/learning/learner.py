@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.conditions import Condition
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
@@ -102,8 +103,6 @@ class Learner:
         self.robot = robot
         self.enabled = True
         self._polled_at = math.inf  # time of the last poll [s]
-        self._progress_at = math.inf  # time of the last poll that found new usable data [s]
-        self._used_at = -math.inf  # time of the newest usable message at the last poll [s]
         self.trainer = trainer(robot, preset, seed)
         own_preset = self.trainer.preset
         radian = robot.kinematics.radian
@@ -167,7 +166,7 @@ class Learner:
         Args:
             message: The message, or a `MuscleReading`.
             time: Time of reception [s].
-            delay: How late the message is (`MessageDelay`) [s].
+            delay: How late the message is (`Arrival.delay`) [s].
 
         Raises:
             RejectionError: If the message cannot be used.
@@ -338,10 +337,9 @@ class Learner:
         Returns:
             A checkpoint if one is due for publication, else None.
         """
+        if now < self._polled_at:  # this is the first poll, or the clock was set back
+            self.collector.usable = Arrival(since=now)
         self._polled_at = now
-        if self.collector.used_at != self._used_at:
-            self._used_at, self._progress_at = self.collector.used_at, now
-        self._progress_at = min(self._progress_at, now)  # the clock may have been set back
         is_learning = self.enabled and not self.collector.is_anomaly
         if is_learning and self.trainer.ready and self.scheduler.is_due(now, len(self.samples)):
             healthy = self.collector.healthy
@@ -486,9 +484,7 @@ class Learner:
 
         It is 0 before the first call of `poll`.
         """
-        if self.collector.used_at != self._used_at or math.isinf(self._polled_at):
-            return 0.0
-        return self._polled_at - self._progress_at
+        return 0.0 if math.isinf(self._polled_at) else self.collector.usable.age(self._polled_at)
 
     def report(self, _: float = 0.0) -> Report:
         """Return the learner's status for /diagnostics."""

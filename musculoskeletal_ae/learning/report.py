@@ -16,7 +16,9 @@ from musculoskeletal_ae.robot.robot import Robot
 if TYPE_CHECKING:
     from musculoskeletal_ae.learning.learner import Learner
 
-LONGEST_IDLE = 5.0  # report a learner that has received no usable message for this time [s]
+#: Report a learner that has received no usable message for this time [s]. It exceeds `SILENCE`,
+#: because the estimator reports what makes messages unusable for a short time.
+LONGEST_IDLE = 5.0
 
 
 def learner_report(learner: Learner) -> Report:

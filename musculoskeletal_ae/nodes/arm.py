@@ -15,6 +15,7 @@ from std_msgs.msg import ColorRGBA, Float64MultiArray, String
 from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrival import LONGEST_STEP
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import (
     LATCHED,
@@ -40,7 +41,6 @@ BONE_COLOURS = {'estimated': (0.0, 0.62, 0.45, 0.5), 'sim': (0.58, 0.40, 0.74, 0
 HARDWARE_COLOUR = (*BONE_COLOUR, 1.0)  # colour of the bones of all arms not in BONE_COLOURS
 # After a pause (a debugger, a jump of /clock) the arm continues without simulating the missed time.
 # Therefore one step covers at most LONGEST_STEP or MOST_PERIODS periods, whichever is longer.
-LONGEST_STEP = 0.1  # [s]
 MOST_PERIODS = 2.0
 
 

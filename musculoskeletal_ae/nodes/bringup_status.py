@@ -17,11 +17,12 @@ from rclpy.executors import ExternalShutdownException
 from std_msgs.msg import Float64
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrival import SILENCE
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
-from musculoskeletal_ae.nodes.situation import LARGEST_AGE, Situation, figures, nodes_in_graph
+from musculoskeletal_ae.nodes.situation import Situation, figures, nodes_in_graph
 from musculoskeletal_ae.report import (
     END_OF_RECORDING,
     NOT_WAITED_FOR,
@@ -50,11 +51,15 @@ class BringupStatus(Shell):
         self.duration: float = self.parameter('duration')
         self.patience: float = self.parameter('patience')
         self.begun = time.monotonic()
-        #: time of arrival [s] and θ of the newest joint_states; θ is None before the first message
-        self.measured: tuple[float, Array | None] = -math.inf, None
+        #: θ of the newest joint_states [rad], (D,); None before the first message
+        self.measured: Array | None = None
         self.errors: list[float] = []
         self.anomalies: list[float] = []
-        self.situation = Situation(self.get_namespace(), lambda: nodes_in_graph(self))
+        self.situation = Situation(
+            self.get_namespace(),
+            lambda: nodes_in_graph(self),
+            lambda: self.awake.at(time.monotonic()),
+        )
         self.last_known = [math.nan, math.nan]  # last estimation error and A in a status line
         self.started: float | None = None
         self.ended: float | None = None  # when the end of the recording was first reported [s]
@@ -70,13 +75,13 @@ class BringupStatus(Shell):
         self.create_timer(1.0, self._print, clock=STEADY)
 
     def _on_measured_posture(self, theta: Array) -> None:
-        self.measured = time.monotonic(), theta
+        self.measured = theta
 
     @property
     def theta(self) -> Array | None:
         """Measured θ [rad], (D,); None if no message has arrived recently."""
-        at, theta = self.measured
-        return theta if time.monotonic() - at <= LARGEST_AGE else None
+        is_recent = self._reception.arrivals['joint_states'].age(time.monotonic()) <= SILENCE
+        return self.measured if is_recent else None
 
     def _on_estimate(self, theta: Array) -> None:
         if (measured := self.theta) is not None:
@@ -89,12 +94,12 @@ class BringupStatus(Shell):
 
     def status(self) -> Report:
         """Return whether all nodes are OK."""
-        self.situation.tick()
+        self.situation.forget_ended()
         return Report('' if self.situation.trouble() else 'all nodes are OK', {})
 
     def _print(self) -> None:
         now = time.monotonic()
-        self.situation.tick()
+        self.situation.forget_ended()
         if self.started is None and not self.anomalies:
             if 0.0 < self.patience < now - self.begun:
                 what = with_load(f'no estimate within {self.patience:g} s')

@@ -20,6 +20,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
+from musculoskeletal_ae.arrival import SILENCE, Arrival
+from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR, array_message, motor_command
 from musculoskeletal_ae.nodes.ros_tool import (
@@ -39,9 +41,11 @@ if TYPE_CHECKING:  # slow imports, which --help does not need
 
 JOINTS = 'joint_states'
 DISCOVERY_TIME = 1.0  # time in which other nodes are discovered [s]
-SILENCE = 1.0  # time without messages after which the motion test ends [s]
 COUNTDOWN = 10.0  # time between two statements of the remaining time [s]
 TICK = 0.02  # period of a timer [s]; a late tick shows that this process was paused
+#: longest time between two ticks that is no pause [s]; it is shorter than that of the nodes,
+#: because gaps of 0.2 s between messages are judged
+LONGEST_TICK = 0.07
 
 
 def _say(text: object) -> None:
@@ -79,9 +83,9 @@ class CheckDriver:
         kind = message_class(self.motors.state_type)
         subscribe(kind, self.topic, lambda m, info: self.muscles(m, info), SENSOR)
         subscribe(JointState, JOINTS, lambda message: self.joints(message), SENSOR)
-        self.tick: Callable[[float], object] = lambda _: None
+        self.awake = AwakeClock(LONGEST_TICK)
         clock = Clock(clock_type=ClockType.STEADY_TIME)
-        self.node.create_timer(TICK, lambda: self.tick(time.monotonic()), clock=clock)
+        self.node.create_timer(TICK, lambda: self.awake.tick(time.monotonic()), clock=clock)
         self.spin_until = Spinner(self.node).spin_until
         self.spin_until(lambda: False, DISCOVERY_TIME)
 
@@ -106,14 +110,16 @@ class CheckDriver:
             _say(f'check_driver expects messages of {self.topic}')
         kind: Any = import_heavy('musculoskeletal_ae.driver.listening').Listening
         self.motors.reset()
-        listening = kind(self.robot, chosen.rate, chosen.posture, not chosen.unzeroed, self.motors)
+        listening = kind(
+            self.robot, chosen.rate, chosen.posture, not chosen.unzeroed, self.motors, self.awake
+        )
 
         def take(message: Any, info: dict[str, int]) -> None:
             sent = 1e-9 * info['source_timestamp'] or math.nan
             number = info['publication_sequence_number']
             listening.muscles(message, time.monotonic(), sent, number)
 
-        self.muscles, self.joints, self.tick = take, listening.joints, listening.tick
+        self.muscles, self.joints = take, listening.joints
         self.measured = lambda: listening.measured
         self.spin_until(lambda: listening.count, 2.0)
         if not listening.count:
@@ -171,16 +177,17 @@ class CheckDriver:
             verdict.failed('deaf', topic=self.command)
             return
         _say('the arm moves now: all muscles hold it, then each muscle is wound in slightly')
-        last, trying = time.monotonic(), ''
+        arrival, trying = Arrival(self.awake, time.monotonic()), ''
 
         def follow(message: Any, _: dict[str, int]) -> None:
-            nonlocal last, trying
+            nonlocal trying
             now = time.monotonic()
             try:
                 states = read(self.motors.reading(message))
             except MusculoskeletalError:
                 return
-            last, target = now, winding.step(states, now, self.measured())
+            arrival.use(now)
+            target = winding.step(states, now, self.measured())
             if target is not None:
                 if self.motors.command_topic:
                     publisher.publish(motor_command(self.motors, target))
@@ -195,7 +202,7 @@ class CheckDriver:
         def ended() -> bool:
             # Check in every round that no other node commands the arm, because a node may be
             # discovered late.
-            return self.alone(1) and (winding.done or time.monotonic() - last > SILENCE)
+            return self.alone(1) and (winding.done or arrival.age(time.monotonic()) > SILENCE)
 
         try:
             self.spin_until(ended, math.inf)

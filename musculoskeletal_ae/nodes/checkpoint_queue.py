@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Processes the checkpoints of a topic in small steps, so that they do not block the node."""
 
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -88,7 +89,7 @@ class CheckpointQueue:
             next(steps)
             return
         except StopIteration:
-            self._reception.note_used(self._topic)
+            self._reception.arrivals[self._topic].use(time.monotonic())
         except MusculoskeletalError as error:
             if isinstance(error, CheckpointError) and not isinstance(error, GateError):
                 self._unfit(str(error))

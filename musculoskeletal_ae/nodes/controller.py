@@ -21,6 +21,7 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from musculoskeletal_ae.arrival import STREAM_GAP, is_later, nanoseconds
 from musculoskeletal_ae.bags.topics import topics_with
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.control import status
@@ -43,7 +44,6 @@ from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.sources import AUTHORS
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import naming_parameter, parameters_of
-from musculoskeletal_ae.reception import Stamps, Streams
 from musculoskeletal_ae.remedy import Step, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.signals.limits import LIMITS
@@ -70,7 +70,7 @@ class Controller(Shell):
             kind: self.create_publisher(Float64MultiArray, f'muscle_{kind}_command', RELIABLE)
             for kind in (LENGTH, TENSION)
         }
-        self.core = Core(self.robot, self._settings(), self.parameter('seed'))
+        self.core = Core(self.robot, self._settings(), self.parameter('seed'), self.awake)
         self.memory = StopMemory(self.state_directory())
         if self.memory.found is not None:
             self.core.stop(self.memory.found.kind, BEFORE)
@@ -82,8 +82,7 @@ class Controller(Shell):
         self.logged: list[str] = []
         self.mode = self.create_publisher(String, 'controller_mode', LATCHED)
         self.published_mode = ''
-        self.estimate_stamps = Stamps()
-        self.requests = Streams()  # accepted requests for motion
+        self.estimate_sent = -1  # stamp of the newest estimate [ns]; -1 before the first
         self.motor_commands = None
         if topic := self.motors.command_topic:
             self.motor_commands = self.create_publisher(Float64MultiArray, topic, RELIABLE)
@@ -178,7 +177,9 @@ class Controller(Shell):
 
     def _on_estimate(self, message: JointState) -> None:
         theta = read_posture(message, self.robot.joints)
-        is_new = self.estimate_stamps.is_new(message.header.stamp)
+        sent = nanoseconds(message.header.stamp)
+        if is_new := is_later(sent, self.estimate_sent):
+            self.estimate_sent = sent
         self.core.estimated(theta, time.monotonic(), is_new)
         # Compute a command now. An estimate comes from the newest muscle states, so all inputs are
         # fresh.
@@ -228,7 +229,8 @@ class Controller(Shell):
 
     def _log_accepted(self, topic: str, content: str) -> None:
         """Log an accepted request for motion; of a stream of requests, log only the first."""
-        if self.requests.begins(topic, time.monotonic()):
+        arrival = self._reception.arrivals[topic]
+        if not arrival.was_used or arrival.age(time.monotonic()) > STREAM_GAP:
             self.get_logger().info(f'accepted {topic}: {content}')
 
     def _warn_if_slowed(self) -> None:
@@ -284,7 +286,7 @@ class Controller(Shell):
         return 'moving to the last target, if there is one; call controller/explore to explore'
 
     def _watch(self) -> None:
-        if time.monotonic() - self.core.watchdog.age.stepped_at > 1.5 / self.rate:
+        if time.monotonic() - self.core.watchdog.steps.stepped_at > 1.5 / self.rate:
             self._step()
 
     def _step(self) -> None:

@@ -2,7 +2,6 @@
 """Publishes a node's state on /diagnostics, with message rates and rejected messages."""
 
 import secrets
-from collections.abc import Mapping
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
@@ -16,6 +15,7 @@ from musculoskeletal_ae.report import Report
 
 MANY_REPORTS = QoSProfile(depth=50)  # QoS of /diagnostics, on which all nodes of the graph report
 PERIOD = 1.0  # time between reports [s]
+NODE_SILENCE = 2.0  # count a node as ended or hanging without a report for this time [s]
 
 
 class Diagnostics:
@@ -26,7 +26,7 @@ class Diagnostics:
 
         Args:
             node: The node.
-            reception: Counts of the messages that the node has used and rejected.
+            reception: Rates of the messages that the node has used, and counts of rejected ones.
             hardware: Value of `hardware_id` in each status.
         """
         self._node, self._reception, self._hardware = node, reception, hardware
@@ -35,14 +35,9 @@ class Diagnostics:
         #: random text that distinguishes this node from another node of the same name
         self.identity = secrets.token_hex(8)
 
-    def tell(self, report: Report, rates: Mapping[str, float]) -> None:
-        """Publish a report.
-
-        Args:
-            report: The report.
-            rates: Rate at which the node uses messages [Hz], by topic.
-        """
-        rejected = self._reception.rejected
+    def tell(self, report: Report) -> None:
+        """Publish a report, with the rate at which the node uses the messages of each topic."""
+        rejected, rates = self._reception.rejected, self._reception.rates
         values = {'doing': report.doing} if report.doing else {}
         values |= {**report.values, 'identity': self.identity}
         values |= {f'{topic} rate': f'{rate:.1f} Hz' for topic, rate in rates.items()}

@@ -129,7 +129,7 @@ class Learner(Shell):
     def _isolate(self) -> None:
         # An estimator that has just started does not have our network yet, and so does not know
         # which muscles are isolated. Ignore its first message if the message names no muscle.
-        number = self._reception.numbers['isolated_muscles']
+        number = self._reception.arrivals['isolated_muscles'].number
         knows = number > 1 or (number == 0 and self.has_heard_isolated)
         muscles = self.body.isolated
         if muscles or knows or not self.core.isolated:

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 
 from rclpy.node import Node
 
+from musculoskeletal_ae.arrival import SILENCE
 from musculoskeletal_ae.conditions import Condition, ConditionKind, Level
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.remedy import Step
@@ -17,7 +19,6 @@ from musculoskeletal_ae.report import with_load
 #: flow, and the remedy for silence
 STREAMS = {'muscle_states': Step.CHECK_DRIVER, 'estimated_joint_states': Step.CHECK_ESTIMATOR}
 REPLAY = 'replay'  # name of the node that plays a recording
-SILENCE = 1.0  # report a stream as silent without a usable message for this time [s]
 SLOW = 0.4  # count messages as too slow below this fraction of the expected rate
 SLOW_REPORTS = 3  # warn after this number of successive reports with too low a rate
 
@@ -36,7 +37,6 @@ class NeededTopics:
         self._node, self._full_name, self._reception = node, full_name, reception
         self._topics: list[str] = []
         self._expected_rates = dict[str, float]()  # [Hz], by topic
-        self._rates: Mapping[str, float] = {}  # newest rates [Hz], by topic
         self._slow_reports = Counter[str]()  # successive reports with a low rate, by topic
         self._waiting = ''  # the missing topics, as last logged
 
@@ -55,14 +55,13 @@ class NeededTopics:
         """Stop reporting a topic."""
         self._topics = [other for other in self._topics if other != topic]
 
-    def take_rates(self, rates: Mapping[str, float]) -> None:
-        """Use the newest rates of used messages [Hz], by topic; log which topics are missing.
+    def check_rates(self) -> None:
+        """Compare the newest rates with the expected ones; log which topics are missing.
 
         Call this once for each periodic report. A topic without any message is silent, not slow.
         """
-        self._rates = rates
         for topic, expected in self._expected_rates.items():
-            is_slow = 0.0 < rates.get(topic, 0.0) < SLOW * expected
+            is_slow = 0.0 < self._reception.arrivals[topic].rate < SLOW * expected
             self._slow_reports[topic] = self._slow_reports[topic] + 1 if is_slow else 0
         self._log_missing()
 
@@ -74,14 +73,14 @@ class NeededTopics:
         """
         has_remedy = False
         for topic in sorted(self._topics, key=[*STREAMS, *self._topics].index):
-            is_missing = not self._reception.was_used(topic)
+            is_missing = not self._reception.arrivals[topic].was_used
             is_silent = self._is_silent(topic)
             if not (is_silent or is_missing):
                 continue
             steps = () if has_remedy else self._remedy(topic)
             has_remedy = has_remedy or topic in STREAMS
             if is_silent:
-                silence = self._reception.silence(topic)
+                silence = self._reception.arrivals[topic].age(time.monotonic())
                 detail = with_load(f'no usable {topic} for {silence:.0f} s')
                 if self._reception.last_rejected.startswith(f'{topic}: '):
                     detail += f'; last rejected: {self._reception.last_rejected}'
@@ -93,7 +92,7 @@ class NeededTopics:
                 yield kind.condition(detail, [topic], level=level, steps=steps)
         for topic, expected in self._expected_rates.items():
             if self._slow_reports[topic] >= SLOW_REPORTS:
-                rate = self._rates.get(topic, 0.0)
+                rate = self._reception.arrivals[topic].rate
                 detail = f'{topic} come at {rate:.0f} Hz instead of {expected:g} Hz'
                 yield ConditionKind.SLOW_TOPIC.condition(with_load(detail), [topic])
 
@@ -122,7 +121,8 @@ class NeededTopics:
 
     def _log_missing(self) -> None:
         """Log which topics lack a usable message, and why, whenever this changes."""
-        missing = [topic for topic in self._topics if not self._reception.was_used(topic)]
+        arrivals = self._reception.arrivals
+        missing = [topic for topic in self._topics if not arrivals[topic].was_used]
         reasons = [self._missing_text(topic) for topic in missing]
         # Remove duplicates, because one topic may carry both joint angles and motors.
         before, self._waiting = self._waiting, '; '.join(dict.fromkeys(reasons))
@@ -135,7 +135,8 @@ class NeededTopics:
 
         A stream without a publisher that has never had a usable message is missing, not silent.
         """
-        if topic not in STREAMS or self._reception.silence(topic) <= SILENCE:
+        arrival = self._reception.arrivals[topic]
+        if topic not in STREAMS or arrival.age(time.monotonic()) <= SILENCE:
             return False
         is_published = self._node.count_publishers(self._full_name(topic)) > 0
-        return self._reception.was_used(topic) or is_published
+        return arrival.was_used or is_published

@@ -194,7 +194,7 @@ class Replay(Node):
             self._next_report = time.monotonic() + PERIOD
             waiting = f'waiting until {" and ".join(self._lockstep.missing())} can receive'
             stands = (ConditionKind.REPLAY_STANDS.condition(waiting),)
-            self._diagnostics.tell(Report('', {'state': WAITING}, stands), {})
+            self._diagnostics.tell(Report('', {'state': WAITING}, stands))
             if waiting != self._printed:
                 self._printed = waiting
                 print(waiting, file=sys.stderr, flush=True)
@@ -206,7 +206,7 @@ class Replay(Node):
             self._lockstep.step(self._stop, self._spinner)
             values[NOT_WAITED_FOR] = ', '.join(self._lockstep.lost)
         stands = (ConditionKind.REPLAY_STANDS.condition('end of the recording'),)
-        self._diagnostics.tell(Report('', values, stands), {})
+        self._diagnostics.tell(Report('', values, stands))
         end = time.monotonic() + ACKNOWLEDGE_TIME
         for publisher in self._publisher.values():
             left = max(0.0, end - time.monotonic())
@@ -236,7 +236,7 @@ class Replay(Node):
                 STOP.raise_if_received()
                 if now > self._next_report:
                     self._next_report = now + PERIOD
-                    self._diagnostics.tell(self._report(now), {})
+                    self._diagnostics.tell(self._report(now))
                     seconds = self._before + np.array([self._done(), self.length])
                     self._position_publisher.publish(array_message(seconds, ''))
                 progress.update(max(0.0, self._done() - progress.n))

@@ -63,7 +63,6 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
 from musculoskeletal_ae.signals.joint_trust import JointTrust
-from musculoskeletal_ae.signals.message_delay import MessageDelay
 from musculoskeletal_ae.signals.motor_interface import STATES, MotorInterface
 from musculoskeletal_ae.validity import (
     joints_not_finite,
@@ -78,7 +77,6 @@ if TYPE_CHECKING:  # a slow import, because it loads the bag writer
 #: clock for message ages and watchdogs; independent of /clock
 STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 TIMER = 'Timer'  # source of an exception that escaped a timer's callback
-LONGEST_LOOK = 0.3  # if more time passes between two checks of the graph, the node was paused [s]
 #: remedies for incompatible QoS, by the side that states the policy and by policy
 QOS_REMEDIES = {
     ('publisher offers', QoSPolicyKind.RELIABILITY): 'publish it reliable',
@@ -120,21 +118,24 @@ class Shell(Node):
         #: name of the root link's frame in published messages
         self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
         warn = self.get_logger().warning
-        self._awake = AwakeClock(LONGEST_LOOK)
-        self._rates: dict[str, float] = {}  # rates of the last periodic report [Hz], by topic
+        self.awake = AwakeClock()  # excludes the pauses of this process
         self._reception = Reception(
-            lambda text: warn(f'{text} (counted in /diagnostics)'),
-            lambda: self._awake.at(time.monotonic()),
+            lambda text: warn(f'{text} (counted in /diagnostics)'), self.awake
         )
         #: subscription of each latched topic, and a function that subscribes again
         self._latched: dict[str, tuple[Any, Callable[[], Any]]] = {}
-        self.sources = Sources(self, self.full_name, self._reception.turns, self._subscribe_anew)
+        self.sources = Sources(
+            self,
+            self.full_name,
+            lambda topic: self._reception.arrivals[topic].turns,
+            self._subscribe_anew,
+        )
         self.rejected = self._reception.rejected  # number of messages, by topic and reason
         #: offsets and isolated muscles that the estimator has published
         self.body = BodyState.healthy(self.robot.muscle_count)
         hardware = self.robot.description.directory.name
         self._diagnostics = Diagnostics(self, self._reception, hardware)
-        self.twins = Twins(self._diagnostics.status_name, self._diagnostics.identity)
+        self.twins = Twins(self._diagnostics.status_name, self._diagnostics.identity, self.awake)
         self.create_subscription(
             DiagnosticArray,
             '/diagnostics',
@@ -450,7 +451,7 @@ class Shell(Node):
         self._latched[topic] = subscribe(), subscribe
 
     def _look_around(self) -> None:
-        self._awake.tick(time.monotonic())
+        self.awake.tick(time.monotonic())
         self.sources.watch(CLOCK)  # `use_sim_time` may be set at any time
         self.sources.look()
         self.on_intruders(self.intruders)
@@ -489,15 +490,13 @@ class Shell(Node):
 
         Args:
             follow: Called with the message, the time of its reception by the steady clock [s], and
-                its delay [s] (`MessageDelay`).
+                its delay [s] (`Arrival.delay`).
         """
         kind = JointState if self.motors.is_ros2_control else Float64MultiArray
-        delays = MessageDelay()
+        arrival = self._reception.arrivals[STATES]
 
         def take(message: Any) -> None:
-            now = time.monotonic()
-            delay = delays.step(now, self._reception.source_times[STATES])
-            follow(self.motors.reading(message), now, delay)
+            follow(self.motors.reading(message), arrival.received_at, arrival.delay)
 
         self.listen(kind, STATES, take, SENSOR)
 
@@ -568,8 +567,8 @@ class Shell(Node):
     # -- diagnostics ----------------------------------------------------------------------------
 
     def _report_periodically(self) -> None:
-        self._rates = self._reception.take_rates()
-        self.needed.take_rates(self._rates)
+        self._reception.measure_rates()
+        self.needed.check_rates()
         self._report()
 
     def _report_changes(self) -> None:
@@ -591,7 +590,7 @@ class Shell(Node):
         if self.checkpoint_version is not None:
             report.values.setdefault('checkpoint version', str(self.checkpoint_version))
         self._reported = _signs(report.conditions)
-        self._diagnostics.tell(report, self._rates)
+        self._diagnostics.tell(report)
 
 
 def _signs(conditions: Iterable[Condition]) -> frozenset[tuple[str, str, tuple[str, ...]]]:

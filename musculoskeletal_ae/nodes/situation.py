@@ -16,16 +16,15 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node as RosNode
 
 from musculoskeletal_ae import conditions
-from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.conditions import CONDITIONS, KINDS, LEVELS, Condition, ConditionKind, Level
 from musculoskeletal_ae.control.supervisor import Activity, StopState
+from musculoskeletal_ae.nodes.diagnostics import NODE_SILENCE
 from musculoskeletal_ae.remedy import Step, sentence
 from musculoskeletal_ae.report import with_load
 
-LARGEST_AGE = 1.0  # show no measured or estimated value above this age [s]
-SILENCE = 2.0  # report a node without a report for this time; nodes report once a second [s]
-TICK = 1.0  # count a longer time between two ticks as a pause of this process [s]
-FORGET_TIME = 5.0  # forget other nodes than NEEDED without a report for this time [s]
+#: forget other nodes than NEEDED without a report for this time [s]; it exceeds NODE_SILENCE,
+#: because nodes of other packages may report less often
+FORGET_TIME = 5.0
 #: nodes that should not end, once they have reported
 NEEDED = 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim'
 OTHER = 'other_report'  # identifier of a report that lists no conditions
@@ -97,26 +96,18 @@ class Situation:
             namespace: The namespace of the arm.
             graph: Returns the full names of the nodes in the ROS graph. It is called only while a
                 node is silent.
-            clock: Returns the time of a steady clock [s].
+            clock: Returns the time, excluding pauses of this process [s] (`AwakeClock`).
         """
-        self._clock, self._awake, self._graph = clock, AwakeClock(TICK), graph
+        self._clock, self._graph = clock, graph
         self._here = namespace.rstrip('/')
         self._reports: dict[str, NodeReport] = {}  # by the name of the node, without namespace
 
-    def tick(self) -> None:
-        """Forget the reports of nodes that may end at any time, and have ended.
-
-        Call this about once a second, because longer intervals count as pauses of this process.
-        """
-        self._awake.tick(self._clock())
+    def forget_ended(self) -> None:
+        """Forget the reports of nodes that may end at any time, and have ended."""
+        now = self._clock()
         for name, report in list(self._reports.items()):
-            if name not in NEEDED and self._now - report.heard_at > FORGET_TIME:
+            if name not in NEEDED and now - report.heard_at > FORGET_TIME:
                 del self._reports[name]
-
-    @property
-    def _now(self) -> float:
-        """The present time, excluding pauses of this process [s]."""
-        return self._awake.at(self._clock())
 
     def diagnosed(self, message: DiagnosticArray) -> None:
         """Store the reports that a message of /diagnostics contains."""
@@ -129,7 +120,7 @@ class Situation:
                 level = LEVELS[min(ord(status.level), len(LEVELS) - 1)]
                 if level != 'ok' and not present:  # a node of another package, such as a driver
                     present = (Condition(OTHER, level, status.message, (), (name,)),)
-                self._reports[name] = NodeReport(values, present, status.message, self._now)
+                self._reports[name] = NodeReport(values, present, status.message, self._clock())
 
     def values(self, name: str) -> dict[str, str]:
         """Return the values that a node has reported; {} if it has not reported."""
@@ -180,8 +171,10 @@ class Situation:
 
     def silent_nodes(self) -> dict[str, float]:
         """Return the time [s] since the last report of each needed node that is silent, by name."""
-        silence = {name: self._now - each.heard_at for name, each in self._reports.items()}
-        return {name: time for name, time in silence.items() if name in NEEDED and time > SILENCE}
+        now = self._clock()
+        needed = {name: each for name, each in self._reports.items() if name in NEEDED}
+        silence = {name: now - each.heard_at for name, each in needed.items()}
+        return {name: age for name, age in silence.items() if age > NODE_SILENCE}
 
     def level(self) -> Level:
         """Return the level of the whole arm."""

@@ -27,7 +27,10 @@ from typing import NamedTuple
 
 from rclpy.node import Node
 
+from musculoskeletal_ae.arrival import Arrival
+from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.nodes.diagnostics import NODE_SILENCE
 
 _ESTIMATOR, _CONTROLLER, _DRIVER = 'the estimator', 'the controller', 'the driver'
 MOTOR_COMMAND = 'motor_command'  # stands for the topic of commands in motors.yaml
@@ -58,9 +61,9 @@ LOOKS = 20  # number of recent checks over which decreases of the sequence numbe
 TURNS = 3  # number of decreases within LOOKS checks that proves two publishers of one name
 LEASE = 30.0  # time for which the graph keeps a killed node, plus a margin [s]
 NAMING = 1.0  # longest time for which the graph knows a publisher but not its node [s]
-TWIN_SILENCE = 3.0  # time without a report after which a second node counts as stopped [s]
-LINK_SILENCE = 3.0  # time without a message after which a link counts as having no sensor [s]
-LINK_PATIENCE = 3.0  # time for which there may be more publishers than links [s]
+#: time for which there may be more publishers than links, and without a message after which a link
+#: counts as having no sensor [s]
+LINK_PATIENCE = 3.0
 #: name that the graph returns for a node of which it knows only a publisher
 UNNAMED = '_NODE_NAME_UNKNOWN_'
 #: how messages to users call such a node
@@ -134,13 +137,19 @@ class Twins:
     core.
     """
 
-    def __init__(self, name: str, identity: str) -> None:
-        """Watch reports with this status name; the reports of our own node contain `identity`."""
+    def __init__(self, name: str, identity: str, clock: AwakeClock | None = None) -> None:
+        """Watch the reports under one status name.
+
+        Args:
+            name: The status name.
+            identity: Text that the reports of our own node contain.
+            clock: Measures the ages of reports; None for the steady clock.
+        """
         # Include CDR's length prefix, so that `/controller` does not match in `/left/controller`.
         text = name.encode() + b'\0'
         self._name, self._identity = struct.pack('<I', len(text)) + text, identity.encode()
         self._has_reported = False
-        self._heard_at = -math.inf  # time of the last report of another node [s]
+        self._others = Arrival(clock)  # reports of other nodes
 
     def take(self, report: bytes, now: float) -> None:
         """Process a serialized report (CDR) that arrived at `now` [s].
@@ -152,11 +161,11 @@ class Twins:
         if self._identity in report:
             self._has_reported = True
         elif self._has_reported:
-            self._heard_at = now
+            self._others.use(now)
 
     def is_alone(self, now: float) -> bool:
-        """Whether no other node has reported under this name in the last TWIN_SILENCE seconds."""
-        return now - self._heard_at > TWIN_SILENCE
+        """Whether no other node has reported under this name in the last NODE_SILENCE seconds."""
+        return self._others.age(now) > NODE_SILENCE
 
 
 class LinkSensors:
@@ -182,7 +191,7 @@ class LinkSensors:
     def look(self, publishers: Iterable[Publisher], now: float) -> None:
         """Update `problem` from the publishers that the ROS graph shows at `now` [s]."""
         nodes = sorted(each.node for each in publishers)
-        links = sorted(link for link, at in self._heard_at.items() if now - at <= LINK_SILENCE)
+        links = sorted(link for link, at in self._heard_at.items() if now - at <= LINK_PATIENCE)
         self.problem = ''
         if not links or len(nodes) <= len(links):
             self._too_many_since = math.inf
@@ -220,7 +229,7 @@ class Sources:
         self,
         node: Node,
         resolve: Callable[[str], str],
-        turns: Counter[str],
+        turns: Callable[[str], int],
         renew: Callable[[str], object],
     ) -> None:
         """Start without topics to watch.
@@ -228,8 +237,7 @@ class Sources:
         Args:
             node: Node whose view of the graph is used.
             resolve: Returns the full name of a topic of `AUTHORS`; '' if there is none.
-            turns: Number of times that the sequence number decreased, by topic. The caller updates
-                it.
+            turns: Returns how often the sequence number of a topic has decreased.
             renew: Resubscribes to a topic; called when the topic has one publisher again.
         """
         self._node, self._resolve = node, resolve
@@ -293,4 +301,4 @@ class Sources:
 
     def _look(self, topic: str) -> None:
         publishers = publishers_of(self._node, self._resolve(topic))
-        self._authorships[topic].look(publishers, self._turns[topic], time.monotonic())
+        self._authorships[topic].look(publishers, self._turns(topic), time.monotonic())

@@ -30,18 +30,20 @@ from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrival import SILENCE, Arrival
+from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.nodes import diagnostics
 from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, joint_message
 from musculoskeletal_ae.nodes.ros_tool import ROS_HELP, message_class, run_tool, start_ros
-from musculoskeletal_ae.nodes.situation import LARGEST_AGE, Situation, figures, nodes_in_graph
+from musculoskeletal_ae.nodes.situation import Situation, figures, nodes_in_graph
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.inverse_kinematics import POSITION_ONLY, inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.motor_interface import MotorInterface
+from musculoskeletal_ae.signals.motor_interface import STATES, MotorInterface
 from musculoskeletal_ae.stop_signals import STOP, Reaction, import_heavy
 from musculoskeletal_ae.validity import read_array, read_muscle_states, read_names, read_posture
 
@@ -96,11 +98,17 @@ class View(Node):
         self.page = page.Page(robot, *address, options.read_only, request)
         for note in self.page.scene.notes:
             self.get_logger().warning(f'mesh omitted: {printable(note)}')
-        self.situation = Situation(self.get_namespace(), lambda: nodes_in_graph(self))
-        self.reception = Reception(lambda text: self.get_logger().warning(text))
+        self.awake = AwakeClock()
+        self.situation = Situation(
+            self.get_namespace(),
+            lambda: nodes_in_graph(self),
+            lambda: self.awake.at(time.monotonic()),
+        )
+        self.reception = Reception(lambda text: self.get_logger().warning(text), self.awake)
         hardware = robot.description.directory.name
         self.diagnostics = diagnostics.Diagnostics(self, self.reception, hardware)
-        self.newest: dict[str, tuple[float, Any]] = {}  # arrival time [s] and value, by name
+        #: the newest value, and the arrival of its topic, by name
+        self.newest: dict[str, tuple[Any, Arrival]] = {}
         self.subscribed: list[Any] = []  # subscriptions, while somebody views the page
         #: monotonic time [s] of the last update of texts, check of the graph, and report
         self.texts_at = self.graph_at = self.reported_at = -math.inf
@@ -137,8 +145,7 @@ class View(Node):
             for is_measured in [arm == 'measured']
         ]
         table += [
-            ('muscles', message_class(self.motors.state_type), self.motors.state_topic, NEWEST,
-             muscles),
+            ('muscles', message_class(self.motors.state_type), STATES, NEWEST, muscles),
             ('played', Float64MultiArray, 'replay/position', NEWEST,
              lambda m: read_array(m, 1, 2).tolist()),
             ('anomaly', Float64, 'anomaly', NEWEST, lambda m: m.data),
@@ -147,18 +154,20 @@ class View(Node):
             ('', DiagnosticArray, '/diagnostics', MANY, self.situation.diagnosed),
         ]  # fmt: skip
 
-        def note(what: str, read: Callable[[Any], Any], message: Any) -> None:
-            self.newest[what] = time.monotonic(), read(message)
+        def note(what: str, topic: str, read: Callable[[Any], Any], message: Any) -> None:
+            self.newest[what] = read(message), self.reception.arrivals[topic]
 
         for what, kind, topic, qos, read in table:
-            publishers = partial(self.count_publishers, self.resolve_topic_name(topic))
-            receive: Any = self.reception.of(topic, partial(note, what, read), publishers)
-            self.subscribed.append(self.create_subscription(kind, topic, receive, qos))
+            wire = self.motors.state_topic if topic == STATES else topic
+            publishers = partial(self.count_publishers, self.resolve_topic_name(wire))
+            receive: Any = self.reception.of(topic, partial(note, what, topic, read), publishers)
+            self.subscribed.append(self.create_subscription(kind, wire, receive, qos))
 
-    def _newest(self, what: str, largest_age: float = LARGEST_AGE) -> Any:
+    def _newest(self, what: str, largest_age: float = SILENCE) -> Any:
         """Return the newest value named `what`; None if it is older than `largest_age` [s]."""
-        when, value = self.newest.get(what, (-math.inf, None))
-        return value if time.monotonic() - when < largest_age else None
+        value, arrival = self.newest.get(what, (None, None))
+        is_recent = arrival is not None and arrival.age(time.monotonic()) < largest_age
+        return value if is_recent else None
 
     def _take(self) -> None:
         for each in self.subscribed:
@@ -181,10 +190,13 @@ class View(Node):
         """Show messages until the process receives a stop signal."""
         while rclpy.ok() and not STOP.received:
             is_viewed = self.page.looked_at.wait(timeout=STOP_CHECK_PERIOD)
-            if (now := time.monotonic()) >= self.reported_at + diagnostics.PERIOD:
+            now = time.monotonic()
+            self.awake.tick(now)
+            if now >= self.reported_at + diagnostics.PERIOD:
                 self.reported_at = now
                 state = 'viewed' if is_viewed else 'the page has no visitors'
-                self.diagnostics.tell(Report(state, {}), self.reception.take_rates())
+                self.reception.measure_rates()
+                self.diagnostics.tell(Report(state, {}))
             self.page.send_entries()
             while not self.requests.empty():  # also after the last visitor has left
                 what, *value = self.requests.get()
@@ -210,7 +222,7 @@ class View(Node):
     def _show(self, now: float) -> None:
         """Read the newest messages and show them; `now` is monotonic time [s]."""
         self._take()
-        self.situation.tick()
+        self.situation.forget_ended()
         posture = {arm: at for arm in ARM_TOPICS if (at := self._newest(arm)) is not None}
         if (measured := posture.get('measured')) is not None and np.isnan(measured).any():
             # Draw joints without a working sensor at the estimated angle.

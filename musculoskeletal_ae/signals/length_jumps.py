@@ -4,7 +4,7 @@
 A length jumps if it changes faster than a muscle can, for example because a module has lost its
 length offset. The change between two messages is compared with the pause between their receptions
 or between their sendings, whichever is longer: messages in between may have been lost, and the
-later message may have arrived right after a late one (`message_delay`). `LengthJumps.step`
+later message may have arrived right after a late one (`arrival`). `LengthJumps.step`
 receives every message and decides:
 
     no jump ── a length jumps ──────────────────────────────► waiting: messages are rejected
@@ -24,10 +24,10 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.arrival import longer_pause
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.limits import LENGTH_JUMPED, LIMITS
-from musculoskeletal_ae.signals.message_delay import longer_pause
 
 
 class Verdict(NamedTuple):
@@ -174,7 +174,7 @@ class LengthJumps:
             tension: Tensions as measured [N], (M,); NaN where they are unknown.
             used: Which muscles to check, (M,).
             now: Time of reception by a steady clock [s].
-            delay: How late the message is (`MessageDelay`) [s].
+            delay: How late the message is (`Arrival.delay`) [s].
         """
         last, pause = self._last, self._pause(now, delay)
         self._last, self._last_at, self._last_delay = length, now, delay

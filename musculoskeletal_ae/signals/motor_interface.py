@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrival import is_later, nanoseconds
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.reception import Stamps
 from musculoskeletal_ae.robot.motors import ARRAY, JOINT_STATE, NO_MOTORS, Motors
 from musculoskeletal_ae.signals.readings import QUANTITIES, MuscleReading, Row
 from musculoskeletal_ae.validity import joint_names, read_array
@@ -67,7 +67,7 @@ class MotorInterface:
 
     def reset(self) -> None:
         """Discard the last stamp, for example after a jump of the clock."""
-        self._stamps = Stamps()
+        self._stamp = 0  # the last stamp [ns]; 0 before the first
 
     def reading(self, message: Any) -> Any:
         """Return a message of `state_topic` in the format of muscle_states.
@@ -83,12 +83,13 @@ class MotorInterface:
         names = joint_names(message)
         if names != self._names:
             self._places, self._names = self._find(names), names
-        stamp = message.header.stamp
-        if stamp.sec == 0 and stamp.nanosec == 0:
+        stamp = nanoseconds(message.header.stamp)
+        if stamp == 0:
             raise MessageError('no stamp', 'header.stamp is 0; expected the time of measurement')
-        if not self._stamps.is_new(stamp):
-            detail = f'{stamp.sec}.{stamp.nanosec:09d} s is not later than the previous stamp'
+        if not is_later(stamp, self._stamp):
+            detail = f'{1e-9 * stamp:.9f} s is not later than the previous stamp'
             raise MessageError('repeated stamp', detail)
+        self._stamp = stamp
         position = np.array(message.position, dtype=float)[self._places]
         rows = np.full((len(QUANTITIES), len(position)), np.nan)
         with np.errstate(over='ignore'):  # a result that overflows is later rejected as not finite

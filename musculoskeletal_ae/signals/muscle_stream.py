@@ -25,13 +25,13 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, median_of_rows
+from musculoskeletal_ae.arrival import longer_pause
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.friction import FrictionDirection, Transmission
 from musculoskeletal_ae.signals.length_jumps import DisplacedMuscles, LengthJumps, Verdict
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence
-from musculoskeletal_ae.signals.message_delay import longer_pause
 from musculoskeletal_ae.signals.plausibility import LevelCheck, TemperatureCheck
 from musculoskeletal_ae.signals.readings import Row
 from musculoskeletal_ae.validity import muscle_rows, read_muscle_states
@@ -77,7 +77,7 @@ class MuscleSample:
             length offset removed and motor-side tensions.
         jumped: Muscles whose new level after a jump is accepted with this message; usually none.
         tension_spread: Standard deviation σ_T of T [N]; 0 for tension sensors.
-        delay: How late the message is, compared with the fastest one (`MessageDelay`) [s].
+        delay: How late the message is, compared with the fastest one (`Arrival.delay`) [s].
     """
 
     time: float
@@ -251,7 +251,7 @@ class MuscleStream:
             message: The message.
             time: Time of reception by the caller's clock [s].
             now: Time of reception by a steady clock [s]; None if `time` is by a steady clock.
-            delay: How late the message is, compared with the fastest one (`MessageDelay`) [s].
+            delay: How late the message is, compared with the fastest one (`Arrival.delay`) [s].
 
         Raises:
             RejectionError: If the message is invalid or implausible.

@@ -11,10 +11,10 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrival import LONGEST_STEP
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
-from musculoskeletal_ae.estimation.estimator import LONGEST_PERIOD
 from musculoskeletal_ae.estimation.finding import Finding, observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.exceptions import BagError, CheckpointError, MusculoskeletalError
@@ -234,7 +234,7 @@ def anomaly_in(
         reading = muscle_reading(
             robot, length=recording.length[row], tension=recording.tension[row]
         )
-        finding = _finding(health, reduced, stream, reading, at, min(dt, LONGEST_PERIOD))
+        finding = _finding(health, reduced, stream, reading, at, min(dt, LONGEST_STEP))
         progress()
         if finding is None:
             continue
@@ -308,7 +308,7 @@ def learn(
             health.use(mae)
         reading = muscle_reading(learner.robot, length=length, tension=tension)
         learner.joints(at, theta)
-        finding = _finding(health, mae, stream, reading, at, min(dt, LONGEST_PERIOD))
+        finding = _finding(health, mae, stream, reading, at, min(dt, LONGEST_STEP))
         if finding is not None:
             learner.anomaly(True)
             stop = stop or (

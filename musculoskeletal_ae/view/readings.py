@@ -11,6 +11,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrival import SILENCE
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.view import body
 
@@ -19,7 +20,6 @@ ARMS = {'measured': (176, 180, 186), 'estimated': (0, 158, 115), 'simulated': (1
 ENVIRONMENT = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
 HTML: Any = ENVIRONMENT.get_template('page.html.jinja').module  # macros
 DURATION = 60.0  # time that the curves show [s]
-GAP = 1.0  # time without a value after which a curve restarts [s]
 GREEN, BLUE = {'stroke': '#009e73', 'width': 2}, {'stroke': '#0072b2', 'width': 2}
 DASHED = {'stroke': '#c80082', 'width': 2, 'dash': [6, 4]}
 HEIGHT = 84  # height of a plot [pixels]
@@ -78,7 +78,7 @@ class History:
         time, columns = table[:, 0], table[:, 1:].T[list(values)]
         known = ~np.isnan(columns[0])
         now, time, columns = time[-1], time[known], columns[:, known]
-        gaps = np.flatnonzero(np.diff(time) > GAP)
+        gaps = np.flatnonzero(np.diff(time) > SILENCE)
         start = gaps[-1] + 1 if len(gaps) else 0
         time, columns = time[start:], columns[:, start:]
         columns = np.where(np.isnan(columns), columns[0], columns)

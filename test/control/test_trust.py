@@ -14,9 +14,10 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from readings import reading
 
+from musculoskeletal_ae.awake_clock import PAUSE
 from musculoskeletal_ae.control.controller import REACTION_TIME, WINDOW
 from musculoskeletal_ae.control.supervisor import RESUME
-from musculoskeletal_ae.control.watchdog import OVERHEATED, OVERLOAD_TIME, OWN_PAUSE, Overload
+from musculoskeletal_ae.control.watchdog import OVERHEATED, OVERLOAD_TIME, Overload
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.readings import QUANTITIES
@@ -261,7 +262,7 @@ def test_after_a_pause_of_its_own_the_controller_goes_on_from_the_present_tensio
     bench = settled(max_age=0.2, hold_time=0.5)
     bench.target(OTHER)
     bench.step(100)
-    assert pause > OWN_PAUSE
+    assert pause > PAUSE
     bench.now += pause
     bench.tension = COLD
     length, tension = rest_readings(ROBOT, bench.theta, bench.tension)

@@ -17,6 +17,7 @@ import yaml
 
 from driver.scripted import Driver, RecordedArm, array, joint_state, record
 from musculoskeletal_ae import validity
+from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.driver.motion import ABOVE_BIAS, RUN_AWAY_TENSION
 from musculoskeletal_ae.driver.verdict import CHECKS, FAULTS, Verdict
@@ -522,13 +523,17 @@ def test_slow_repeated_and_frozen_messages_are_found():
     assert [fault.muscles for fault in verdict.faults] == [(3,)], str(verdict)
 
 
+LONGEST_TICK = 0.07  # as in check_driver [s]
+
+
 class Messages:
     """Passes messages of a driver at rest to `Listening`, at times that the test chooses."""
 
     def __init__(self):
-        self.listening, self.driver = Listening(ROBOT, 100.0), silent()
+        self.awake = AwakeClock(LONGEST_TICK)
+        self.listening, self.driver = Listening(ROBOT, 100.0, clock=self.awake), silent()
         self.number = 0
-        self.ticks = []  # times at which `Listening` learns that this process is running [s]
+        self.ticks = []  # times at which the clock learns that this process is running [s]
 
     def bring(self, count, sent, came, lost=()):
         """Let `count` messages arrive, except those whose numbers are in `lost`.
@@ -539,7 +544,7 @@ class Messages:
         for n in range(count):
             self.number += 1
             while self.ticks and self.ticks[0] <= came(n):
-                self.listening.tick(self.ticks.pop(0))
+                self.awake.tick(self.ticks.pop(0))
             if n not in lost:
                 (_, rows), *_ = self.driver.step()
                 self.listening.muscles(array(rows), came(n), sent(n), self.number)

@@ -3,6 +3,7 @@
 
 import math
 import os
+import time
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from rclpy.executors import ExternalShutdownException
 from sensor_msgs.msg import JointState
 
+from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.conditions import (
     CONDITIONS,
     Condition,
@@ -98,14 +100,20 @@ def test_unknown_values_are_shown_with_the_missing_topic():
     assert none == 'error waits for estimated_joint_states  A waits for anomaly'
 
 
+def measure(node, ago=0.0):
+    """Let a node have received joint angles of 0, for the last time `ago` seconds ago."""
+    node._on_measured_posture(np.zeros(2))
+    node._reception.arrivals['joint_states'].use(time.monotonic() - ago)
+
+
 def test_silent_joint_sensors_are_shown_as_missing(graph, capsys):
     node = graph.host(bringup_status.BringupStatus, robot='arm26')
     node.anomalies.append(0.5)
-    node._on_measured_posture(np.zeros(2))
+    measure(node)
     node._on_estimate(np.ones(2))
     node._print()
     assert 'error 1.414 rad  A 0.500' in capsys.readouterr().out
-    node.measured = node.measured[0] - 2.0, node.measured[1]
+    measure(node, ago=2.0)
     node._on_estimate(np.ones(2))
     node._print()
     assert 'error waits for joint_states' in capsys.readouterr().out
@@ -154,12 +162,12 @@ def test_at_the_end_of_a_recording_the_last_values_are_shown(graph, capsys):
     node = graph.host(bringup_status.BringupStatus, robot='arm26', end_with_replay=True)
     node.situation.diagnosed(diagnostics(f'{graph.namespace}/learner', samples='9'))
     node.anomalies.append(0.5)
-    node._on_measured_posture(np.zeros(2))
+    measure(node)
     node._on_estimate(np.ones(2))
     node._print()
     end = diagnostics(f'{graph.namespace}/replay', state='end_of_recording')
     node.situation.diagnosed(end)
-    node.measured = node.measured[0] - 2.0, node.measured[1]
+    measure(node, ago=2.0)
     for _ in range(2):  # the learner has not reported since the end
         node.started -= bringup_status.SETTLING
         node._print()
@@ -285,15 +293,18 @@ class Clocked(Situation):
     """The situation of an arm whose nodes are or are not in the ROS graph, at a settable time."""
 
     def __init__(self):
-        self.now, self.nodes = 100.0, set()
-        super().__init__('/left', lambda: self.nodes, lambda: self.now)
+        self.now, self.nodes, self.awake = 100.0, set(), AwakeClock()
+        super().__init__('/left', lambda: self.nodes, lambda: self.awake.at(self.now))
 
-    def second(self, *nodes, lasting=1.0):
-        """Let nodes report and time pass."""
+    def second(self, *nodes, pause=0.0):
+        """Let nodes report, and let a second pass, which begins with a pause of this process."""
         for node in nodes:
             self.diagnosed(diagnostics(f'/left/{node}'))
-        self.now += lasting
-        self.tick()
+        self.now += pause
+        for _ in range(10):
+            self.awake.tick(self.now)
+            self.now += 0.1
+        self.forget_ended()
 
 
 @pytest.mark.parametrize('busy', [0.0, 1e3])
@@ -322,7 +333,7 @@ def test_our_own_pause_is_no_silence_of_others_and_a_viewer_may_end():
     for _ in range(3):
         situation.second('sim', 'learner', 'view')
     # A jump of the clock by 60 s means that this machine was suspended, not that nodes are silent.
-    situation.second('sim', 'learner', lasting=60.0)
+    situation.second('sim', 'learner', pause=60.0)
     assert situation.level() == 'ok'
     for _ in range(6):
         situation.second('sim', 'learner')

@@ -3,7 +3,6 @@
 
 import numpy as np
 import pytest
-from builtin_interfaces.msg import Time
 from controlled_arm import ControlledArm
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
@@ -14,13 +13,13 @@ from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.diagnostics import NODE_SILENCE
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.messages import LATCHED, array_message, joint_message
 from musculoskeletal_ae.nodes.sources import (
     LEASE,
     LINK_PATIENCE,
     NAMING,
-    TWIN_SILENCE,
     UNNAMED,
     Authorship,
     LinkSensors,
@@ -28,7 +27,6 @@ from musculoskeletal_ae.nodes.sources import (
     Twins,
     full_name,
 )
-from musculoskeletal_ae.reception import Stamps
 from musculoskeletal_ae.signals.body_state import Trust
 
 FIRST, SECOND = Publisher('/estimator', b'1'), Publisher('/estimator', b'2')
@@ -79,14 +77,7 @@ def test_a_second_node_of_the_same_name_is_noticed_by_its_reports():
     assert twins.is_alone(0.2)
     twins.take(report('/controller', 'theirs'), 0.3)
     assert not twins.is_alone(0.3)
-    assert twins.is_alone(0.4 + TWIN_SILENCE)
-
-
-def test_a_stamp_is_new_if_it_is_later_or_the_clock_was_set_back():
-    stamps = Stamps()
-    times = (5, 0), (5, 1), (5, 1), (5, 0), (2, 0), (2, 0), (2, 5)
-    new = [stamps.is_new(Time(sec=sec, nanosec=nanosec)) for sec, nanosec in times]
-    assert new == [True, True, False, False, True, False, True]
+    assert twins.is_alone(0.4 + NODE_SILENCE)
 
 
 def test_a_repeated_estimate_grows_old(graph, arm26, trained_file):
@@ -96,7 +87,7 @@ def test_a_repeated_estimate_grows_old(graph, arm26, trained_file):
 
     def is_stale():
         joints.publish(repeated)
-        present = controller.core.watchdog.conditions(controller.core.watchdog.age.stepped_at)
+        present = controller.core.watchdog.conditions(controller.core.watchdog.steps.stepped_at)
         return controller.core.estimate is not None and any(
             condition.identifier == 'stale_estimate' for condition in present
         )

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from readings import reading
 
 from musculoskeletal_ae import validity
+from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals import plausibility, readings
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets, Trust
 from musculoskeletal_ae.signals.friction import Transmission
 from musculoskeletal_ae.signals.limits import LIMITS, longest_lengths
-from musculoskeletal_ae.signals.message_delay import MessageDelay
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 from musculoskeletal_ae.signals.readings import QUANTITIES, Presence, Quantity
 
@@ -200,12 +200,12 @@ def taken(stream, deliveries):
         deliveries: Time of reception [s], time of sending [s] and length of muscle 1 [m] of each
             message. The clock of the publisher is 50 s ahead.
     """
-    delays, accepted = MessageDelay(), []
+    arrival, accepted = Arrival(), []
     for received, sent, length in deliveries:
-        delay = delays.step(received, round(1e9 * (sent + 50.0)))
+        arrival.receive(received, round(1e9 * (sent + 50.0)), arrival.number + 1)
         accepted.append(False)
         with suppress(RejectionError):
-            stream.take(reading(resting(length=(1, length))), received, delay=delay)
+            stream.take(reading(resting(length=(1, length))), received, delay=arrival.delay)
             accepted[-1] = True
     return accepted
 
@@ -236,11 +236,11 @@ def test_no_pause_of_the_sender_explains_a_change_beyond_that_of_the_longest_ste
 
 
 def test_hot_readings_that_arrive_apart_but_were_sent_together_are_not_believed():
-    stream, delays = MuscleStream(ROBOT), MessageDelay()
+    stream, arrival = MuscleStream(ROBOT), Arrival()
     for received, sent, degrees in ((0.0, 0.0, 199.0), (0.5, 0.01, 199.0), (0.51, 0.51, 30.0)):
-        delay = delays.step(received, round(1e9 * (sent + 1.0)))
+        arrival.receive(received, round(1e9 * (sent + 1.0)), arrival.number + 1)
         states = resting(temperature=(0, degrees))
-        sample = stream.take(reading(states), received, delay=delay)
+        sample = stream.take(reading(states), received, delay=arrival.delay)
         assert not sample.temperature[0] > 100.0
 
 

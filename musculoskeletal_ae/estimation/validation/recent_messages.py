@@ -10,11 +10,11 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.signals.friction import FrictionDirection
+from musculoskeletal_ae.signals.limits import LIMITS
 
 SPAN = 10.0  # time that the kept messages cover [s]
 SPACING = 0.1  # shortest time between two kept messages [s]
 LEAST = 20  # smallest number of messages on which a network can be validated
-LONGEST_PERIOD = 0.5  # time without messages after which the direction of sliding is unknown [s]
 
 
 class _Message(NamedTuple):
@@ -59,7 +59,7 @@ class RecentMessages:
             is_healthy: Whether the arm is healthy, that is, no anomaly is detected.
         """
         period, self._time = now - self._time, now
-        if not 0.0 <= period < LONGEST_PERIOD:
+        if not 0.0 <= period <= LIMITS.pause:
             self._direction.reset()
         direction = self._direction.step(length)
         is_too_early = bool(self._messages) and 0.0 <= now - self._messages[-1].time < SPACING
