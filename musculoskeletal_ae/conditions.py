@@ -254,13 +254,14 @@ class ConditionKind(Enum):
         REPAIR,
         reaction=Reaction.ISOLATE,
     )
-    MODULE_STANDS = Declaration(
-        'module_stands',
+    MODULE_NOT_FOLLOWING = Declaration(
+        'module_not_following',
         'estimator',
         'error',
-        'a winch stands still although its tension reading is far from the commanded tension: it '
-        'is jammed, or the reading is wrong',
-        'a module stands still against its commands',
+        'the tension of a module stays away from the one that its command demands (its length, if '
+        'it follows positions), and its winch does not correct that: its motor is jammed or weak, '
+        'a reading is wrong, or commands do not arrive',
+        'a module does not follow its commands',
         REPAIR,
         reaction=Reaction.ISOLATE,
     )
