@@ -307,8 +307,9 @@ class ConditionKind(Enum):
         'muscles_exchanged',
         'estimator',
         'error',
-        'the driver has exchanged two muscles, in readings and commands',
-        'exchanged muscles',
+        'the driver has exchanged two muscles or reversed the sign of a length, in readings and '
+        'commands',
+        'the driver uses another order or sign of muscles',
         (Step.CORRECT_WIRING, Step.CALIBRATE_LENGTHS),
         reaction=Reaction.STOP,
         revokes=Revokes.ALL,
