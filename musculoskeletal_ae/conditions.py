@@ -551,7 +551,7 @@ class ConditionKind(Enum):
         'error',
         'a winding is 20 °C above temperature_limit, or heat limits all muscles to T_bias',
         'overheated',
-        (Step.WAIT_UNTIL_COOL, Step.RESET_CONTROLLER),
+        (Step.CHECK_COOLING, Step.WAIT_UNTIL_COOL, Step.RESET_CONTROLLER),
         Stop(Action.RELEASE, _RESET),
     )
     STALE_MUSCLE_STATES = Declaration(
@@ -648,6 +648,7 @@ class ConditionKind(Enum):
         'warn',
         'the temperature of a winding limits the tension of its muscle',
         'heat limits the tension',
+        (Step.CHECK_COOLING, Step.WAIT_UNTIL_COOL),
     )
     STOP_NOT_KEPT = Declaration(
         'stop_not_kept',

@@ -22,7 +22,7 @@ from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.heat import Heat
+from musculoskeletal_ae.signals.heat import Heat, soon
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 LONGEST_STEP = 0.1  # largest time step [s]; after a pause, control does not catch up
@@ -223,7 +223,11 @@ class HeatLimit:
         if not self._is_overheated:
             return []
         warm, most = distinct(winding[m], highest)
-        detail = f'{robot.muscles[m]} {warm} °C, limit {most} °C'
+        rest = self.heat.rest_needed(highest, robot.tension.bias)[robot.used & self.heat.is_known]
+        detail = (
+            f'{robot.muscles[m]} {warm} °C, limit {most} °C; at rest, it has cooled '
+            f'{soon(float(rest.max(initial=0.0)))}'
+        )
         return [ConditionKind.OVERHEATED.condition(detail, [robot.muscles[m]])]
 
 
