@@ -39,6 +39,7 @@ REPAIRS = {
     Step.CHECK_SENSOR,
     Step.CHECK_TENDON,
     Step.CHECK_MODULE,
+    Step.CHECK_COOLING,
     Step.CHECK_JOINT_SENSOR,
     Step.REPAIR_SENSOR,
 }

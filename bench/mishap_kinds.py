@@ -34,7 +34,9 @@ SELF = frozenset({
 #: statements that a muscle is faulty, without saying what of it
 FAULTY = frozenset({'residual_distance', 'muscle_isolated'})
 RUPTURE = FAULTY | {'slack_tendon'}
-JAM = FAULTY | {'module_stands', 'slack_tendon'}
+#: names a jammed or weak motor, a wrong tension or length reading, and lost commands as causes
+NOT_FOLLOWING = frozenset({'module_not_following'})
+JAM = FAULTY | NOT_FOLLOWING | {'slack_tendon'}
 ONE_LENGTH = FAULTY | {'length_jump', 'length_disagrees'}
 SEVERAL_LENGTHS = frozenset({'lengths_jumped', 'lengths_disagree'})
 REVOKED = frozenset({
@@ -42,7 +44,7 @@ REVOKED = frozenset({
 })  # fmt: skip
 FROZEN = FAULTY | {'sensor_frozen'}
 MISSING = FAULTY | {'values_missing', 'implausible_muscle_states', 'readings_rejected'}
-TENSION_SENSOR = FAULTY | {'sensor_saturated', 'module_stands', 'tension_above_limit', 'overload'}
+TENSION_SENSOR = FAULTY | NOT_FOLLOWING | {'sensor_saturated', 'tension_above_limit', 'overload'}
 JOINT = frozenset({
     'joint_sensors_doubted', 'joint_readings_impossible', 'joint_readings_missing',
 })  # fmt: skip
@@ -933,9 +935,11 @@ MISHAPS: tuple[Mishap, ...] = (
     Mishap('motor is hot', hot_motor, HEAT, says='heat|hot', patience=300.0),
     Mishap('cables of two tension sensors exchanged', exchanged_tensions, TENSION_SENSOR,
            says=ORDER),
-    Mishap('driver repeats another length', copied_length, ONE_LENGTH | FROZEN, says='jumped',
-           allowed=REVOKED),
-    Mishap('encoder loses counts', lost_counts, ONE_LENGTH, allowed=REVOKED),
+    Mishap('driver repeats another length', copied_length,
+           ONE_LENGTH | FROZEN | NOT_FOLLOWING, says='jumped',
+           allowed=REVOKED | REJECTED),
+    Mishap('encoder loses counts', lost_counts, ONE_LENGTH | NOT_FOLLOWING,
+           allowed=REVOKED | REJECTED | {'tension_above_limit', 'overload'}),
     Mishap('noise on tension readings', noisy_tensions, is_harmless=True, says='nois'),
     Mishap('joint sensor sticks', joint_fault(float, 'sticks'), JOINT, says=OF_JOINT),
     Mishap('joint sensor reversed', joint_fault(lambda x: -x, 'reversed'), JOINT,

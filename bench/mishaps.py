@@ -78,6 +78,7 @@ BETWEEN = 0.5  # time between two steps of a remedy [s]
 SETTLING = 4.0  # time after the steps of a remedy until the operator reads the statements again [s]
 QUIET = 3.0  # the arm is well when it has explored without a condition for this time [s]
 CALIBRATION = 60.0  # longest time for which an operator waits for a length calibration [s]
+COOLING = 1500.0  # longest time for which an operator waits for motors to cool [s]
 AFTER = 20.0  # time in which the true error is measured [s]
 WELL, WELL_RAD = 1.5, 0.02  # a larger error than this multiple or this much more is not well
 HOLDABLE = 4  # number of postures from which the one to hold is chosen
@@ -140,6 +141,7 @@ class Course:
         self.peak = 0.0  # highest tension, in multiples of tension.limit
         self.quiet_since = lab.now
         self._next_look = lab.now
+        self._cooled_for = 0.0  # time for which the operator has waited for motors to cool [s]
         self._errors: list[float] | None = None  # true errors of the estimate [rad]
         self.present: list[Statement] = []
 
@@ -263,6 +265,8 @@ class Course:
             for step in dict.fromkeys(step for step, _ in advised):
                 self._take(step, [each for other, each in advised if other is step])
                 self.run(BETWEEN)
+            end += self._cooled_for
+            self._cooled_for = 0.0
             if not self.present and not self._explores and self.mended_at is not None:
                 lab.controller.explore(True)  # the operator goes on with the work
             elif not advised and not self.present and self.mended_at is None:
@@ -294,6 +298,8 @@ class Course:
                 lab.estimator.restore(isolated)
                 lab.validator.declare_repaired(isolated, lab.now)
                 lab.publish()
+            elif step is Step.WAIT_UNTIL_COOL:
+                self._wait_until_cool()
             elif step not in SOFTWARE:
                 refused = self._mend_named(by)
         except MusculoskeletalError as error:
@@ -302,6 +308,15 @@ class Course:
             self.mended_at, self.is_found_by_advice = lab.now, True
         if len(self.taken) < 60:
             self.taken.append(step.identifier + (f' ({refused[:90]})' if refused else ''))
+
+    def _wait_until_cool(self) -> None:
+        """Wait while a statement advises it; the patience does not count this."""
+        start = self.lab.now
+        while self.lab.now - start < COOLING:
+            if not any(Step.WAIT_UNTIL_COOL in each.steps for each in self.present):
+                break
+            self.run(1.0)
+        self._cooled_for += self.lab.now - start
 
     def _reset_estimator(self) -> None:
         lab = self.lab

@@ -246,13 +246,14 @@ class ConditionKind(Enum):
         REPAIR,
         reaction=Reaction.ISOLATE,
     )
-    MODULE_STANDS = Declaration(
-        'module_stands',
+    MODULE_NOT_FOLLOWING = Declaration(
+        'module_not_following',
         'estimator',
         'error',
-        'a winch stands still although its tension reading is far from the commanded tension: it '
-        'is jammed, or the reading is wrong',
-        'a module stands still against its commands',
+        'the tension of a module stays away from the one that its command demands (its length, if '
+        'it follows positions), and its winch does not correct that: its motor is jammed or weak, '
+        'a reading is wrong, or commands do not arrive',
+        'a module does not follow its commands',
         REPAIR,
         reaction=Reaction.ISOLATE,
     )
@@ -298,8 +299,9 @@ class ConditionKind(Enum):
         'muscles_exchanged',
         'estimator',
         'error',
-        'the driver has exchanged two muscles, in readings and commands',
-        'exchanged muscles',
+        'the driver has exchanged two muscles or reversed the sign of a length, in readings and '
+        'commands',
+        'the driver uses another order or sign of muscles',
         (Step.CORRECT_WIRING, Step.CALIBRATE_LENGTHS),
         reaction=Reaction.STOP,
         revokes=Revokes.ALL,
@@ -551,7 +553,7 @@ class ConditionKind(Enum):
         'error',
         'a winding is 20 °C above temperature_limit, or heat limits all muscles to T_bias',
         'overheated',
-        (Step.WAIT_UNTIL_COOL, Step.RESET_CONTROLLER),
+        (Step.CHECK_COOLING, Step.WAIT_UNTIL_COOL, Step.RESET_CONTROLLER),
         Stop(Action.RELEASE, _RESET),
     )
     STALE_MUSCLE_STATES = Declaration(
@@ -648,6 +650,7 @@ class ConditionKind(Enum):
         'warn',
         'the temperature of a winding limits the tension of its muscle',
         'heat limits the tension',
+        (Step.CHECK_COOLING, Step.WAIT_UNTIL_COOL),
     )
     STOP_NOT_KEPT = Declaration(
         'stop_not_kept',

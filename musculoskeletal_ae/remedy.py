@@ -59,6 +59,7 @@ class Step(Enum):
         'check_module',
         'check drag, cooling and tension sensor of the module; then call estimator/reset',
     )
+    CHECK_COOLING = 'check_cooling', 'check what heats the named motors, and their cooling'
     CHECK_TENDON = 'check_tendon', 'check tendon and length sensor of the named muscle'
     CHECK_IMU = 'check_imu', 'check the publishers of imu and the link that each one names'
     CHECK_CHECKPOINT = 'check_checkpoint', 'check that the checkpoint belongs to this arm'
@@ -82,7 +83,7 @@ class Step(Enum):
     )
     WAIT_UNTIL_COOL = (
         'wait_until_cool',
-        'wait until all windings are below the parameter temperature_limit',
+        'let the arm rest or pull less until the motors have cooled, when this condition ends',
     )
     REPORT_LOG = 'report_log', 'keep the log of the node, and report the error'
     FREE_DISK = 'free_disk', 'make the state directory writable, with free space'

@@ -17,6 +17,7 @@ from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.description import NO_TENSION
+from musculoskeletal_ae.signals.heat import soon
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.control.controller import Controller
@@ -80,17 +81,22 @@ def conditions(core: Controller, now: float) -> tuple[Condition, ...]:
 def _stop(core: Controller, now: float) -> Iterator[Condition]:
     """Yield every cause of a stop, of a pause, or of waiting before the first command."""
     supervisor, present = core.supervisor, core.stop_conditions(now)
-    followed = {kind for each in present for kind in CONSEQUENCES.get(each.kind, ())}
+    followed = {kind: each.kind for each in present for kind in CONSEQUENCES.get(each.kind, ())}
+
+    def text(each: Condition) -> str:
+        cause = followed.get(each.kind)
+        return each.text if cause is None else f'{each.text}, because {cause.text}'
+
     if supervisor.is_running:
         for each in present:
             steps = () if each.kind in followed else each.steps
             needed = tuple(step for step in steps if step is not Step.RESET_CONTROLLER)
-            yield each._replace(level='warn', text=f'waiting: {each.text}', steps=needed)
+            yield each._replace(level='warn', text=f'waiting: {text(each)}', steps=needed)
         return
     causes = supervisor.causes(present)
     if not supervisor.is_latched:  # the arm continues by itself
         for each in causes:
-            yield each._replace(level='warn', text=f'paused: {each.text}', steps=())
+            yield each._replace(level='warn', text=f'paused: {text(each)}', steps=())
         return
     for each in causes:
         steps = each.steps
@@ -98,7 +104,7 @@ def _stop(core: Controller, now: float) -> Iterator[Condition]:
             steps = ()
         elif each.kind in followed:
             steps = ONLY_RESET
-        yield each._replace(level='error', text=f'stopped: {each.text}', steps=steps)
+        yield each._replace(level='error', text=f'stopped: {text(each)}', steps=steps)
 
 
 def _exploration(core: Controller) -> Iterator[Condition]:
@@ -140,7 +146,13 @@ def _limits(core: Controller) -> Iterator[Condition]:
     if tense := core.watchdog.overload.tense:
         yield ConditionKind.TENSION_ABOVE_LIMIT.condition(', '.join(tense))
     if hot := _limited_by_heat(core):
-        yield ConditionKind.TENSION_LIMITED_BY_HEAT.condition(', '.join(hot), hot)
+        limits = ', '.join(f'{name} at most {tension:.0f} N' for name, tension in hot.items())
+        muscles = [core.robot.muscles.index(name) for name in hot]
+        rest = core.watchdog.heat.heat.rest_needed(
+            core.settings.temperature_limit, core.robot.tension.limit
+        )
+        detail = f'{limits}; at rest, all have cooled {soon(float(rest[muscles].max()))}'
+        yield ConditionKind.TENSION_LIMITED_BY_HEAT.condition(detail, hot)
 
 
 def _missing_torque(core: Controller) -> Array | None:

@@ -23,7 +23,7 @@ from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.heat import Heat
+from musculoskeletal_ae.signals.heat import Heat, soon
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 #: smallest pace of the messages' clock by which age limits are extended; below it, the steps of a
@@ -196,7 +196,11 @@ class HeatLimit:
         if not self._is_overheated:
             return []
         warm, most = distinct(winding[m], highest)
-        detail = f'{robot.muscles[m]} {warm} °C, limit {most} °C'
+        rest = self.heat.rest_needed(highest, robot.tension.bias)[robot.used & self.heat.is_known]
+        detail = (
+            f'{robot.muscles[m]} {warm} °C, limit {most} °C; at rest, it has cooled '
+            f'{soon(float(rest.max(initial=0.0)))}'
+        )
         return [ConditionKind.OVERHEATED.condition(detail, [robot.muscles[m]])]
 
 

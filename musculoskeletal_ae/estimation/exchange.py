@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decides whether a finding is explained by two muscles that a driver has exchanged.
+"""Decides whether a finding is explained by a driver that exchanges muscles or reverses a length.
 
 If a driver restarts with two muscles exchanged, in readings and commands, their lengths jump or no
-longer fit the rest of the arm. Detectors then report lost length offsets or a damaged muscle, and
-the advice that follows would be wrong. If the muscles are exchanged, putting the two columns back
-restores the usual anomaly score A in all recent messages (`signals/wiring.py`). A network that has
-learned the arm is exact enough for this. With any other network, the length calibration judges the
-order, because the arm moves meanwhile.
+longer fit the rest of the arm. The same applies if it reverses the sign of a length. Detectors then
+report lost length offsets or a damaged muscle, and the advice that follows would be wrong. Two
+observations reveal what the driver has done:
+
+Silence. A driver that restarts is silent for a moment. The arm moves little meanwhile, so that
+putting the columns back makes their lengths continue those before the silence.
+
+Anomaly score. If muscles are exchanged, putting the two columns back restores the usual A in all
+recent messages (`signals/wiring.py`). A network that has learned the arm is exact enough for this.
+With any other network, the length calibration judges the order, because the arm moves meanwhile.
 """
 
 import math
@@ -14,7 +19,7 @@ from collections import deque
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.mae.mae import Mae
@@ -34,6 +39,14 @@ USUAL = 1.5
 #: factors, in moments of two learned arms, an exchange explained 3 of 475 shifts of one or two
 #: lengths, and it was recognised in 194 of 229 exchanges.
 BETTER = 3.0
+SILENT = 0.3  # pause of all messages after which the driver may have restarted [s]
+#: judge a finding by the lengths around a silence for this time after it [s]
+RESTARTED = 5.0
+#: a length that has changed by more than this during a silence may belong to another muscle [m]
+DISCONTINUOUS = 0.02
+#: assume another wiring only if it divides the change of the concerned lengths during the silence
+#: by at least this factor, and if this change was larger than that of the other lengths by it
+CONTINUOUS = 3.0
 #: kinds of findings to which an exchange can lead
 EXPLAINED = frozenset(
     {
@@ -43,10 +56,12 @@ EXPLAINED = frozenset(
         ConditionKind.RESIDUAL_DISTANCE,
     }
 )
+#: kinds that the lengths around a silence may explain
+EXPLAINED_BY_SILENCE = EXPLAINED | {ConditionKind.LENGTH_JUMP}
 
 
 class ExchangeCheck:
-    """Keeps recent messages, and replaces a finding that exchanged muscles explain."""
+    """Keeps recent messages, and replaces a finding that the driver's order or signs explain."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
@@ -55,10 +70,29 @@ class ExchangeCheck:
         self._messages: deque[tuple[Array, Array]] = deque(maxlen=USUAL_COUNT)
         self._offset: Array = np.zeros(robot.muscle_count)  # length offsets of these messages [m]
         self._since = 0.0  # time since a message was last kept [s]
+        #: time [s] and lengths as read [m], (M,), of the newest message, accepted or not
+        self._newest: tuple[float, Array] | None = None
+        #: time of the first message after the last silence [s], and the lengths as read before and
+        #: in it [m], (M,) each
+        self._silence: tuple[float, Array, Array] | None = None
 
     def use(self, mae: Mae) -> None:
         """Use another network; its isolated muscles are ignored."""
         self._mae = mae
+
+    def read(self, states: Array, now: float) -> None:
+        """Note the raw l of a message, accepted or not, and whether a silence has ended with it.
+
+        Args:
+            states: Raw l [m], T [N] and temperature [°C], (3, M).
+            now: Time of the message on a steady clock [s].
+        """
+        length = states[0]
+        if not np.isfinite(length).all():
+            return
+        if self._newest is not None and now - self._newest[0] > SILENT:
+            self._silence = now, self._newest[1], length
+        self._newest = now, length
 
     def note(self, observation: Observation) -> None:
         """Keep a message in regular intervals, while the length offsets are known."""
@@ -74,15 +108,51 @@ class ExchangeCheck:
             self._messages.append((sample.bone_tension, sample.length_read))
 
     def explain(self, finding: Finding | None, observation: Observation) -> Finding | None:
-        """Return a finding of exchanged muscles if they explain `finding`, else `finding`."""
-        if finding is None or finding.kind not in EXPLAINED or not observation.lengths_known:
+        """Return a finding of exchanged muscles or a reversed length if it explains `finding`.
+
+        The result is `finding` otherwise.
+        """
+        if finding is None or finding.kind not in EXPLAINED_BY_SILENCE:
             return finding
-        judgement = self._judge(observation)
+        if not observation.lengths_known:
+            return finding
+        judgement, reason = self._judge_silence(), 'the lengths then continue those before a pause'
+        is_explained = judgement is not None and judgement.is_faulty
+        if not is_explained and finding.kind in EXPLAINED:
+            judgement, reason = self._judge(observation), 'the lengths then fit the arm again'
         if judgement is None or not judgement.is_faulty:
             return finding
-        text = f'{judgement.text(self._robot.muscles)}: the lengths then fit the arm again'
+        text = f'{judgement.text(self._robot.muscles)}: {reason}'
         first, *others = judgement.faulty
         return Finding(first, ConditionKind.MUSCLES_EXCHANGED, text, tuple(others))
+
+    def _judge_silence(self) -> Judgement | None:
+        """Return which wiring makes lengths continue over a recent silence; None without one."""
+        if self._silence is None or self._newest is None or self._mae is None:
+            return None
+        resumed_at, before, after = self._silence
+        if self._newest[0] - resumed_at > RESTARTED:
+            return None
+        used = ~np.isin(np.arange(self._robot.muscle_count), self._mae.isolated)
+        straight = Wiring.straight(self._robot.muscle_count)
+
+        def change(wiring: Wiring, columns: Bools) -> float:
+            """Return the root mean square of the changes of some lengths [m]."""
+            gap = wiring.signed(after) - before
+            return float(np.sqrt(np.square(gap[columns]).mean())) if columns.any() else 0.0
+
+        explaining = list[tuple[float, Wiring]]()
+        for wiring in single_faults(straight, np.flatnonzero(used).tolist()):
+            concerned = np.isin(np.arange(self._robot.muscle_count), wiring.faulty)
+            now, then = change(straight, concerned), change(wiring, concerned)
+            elsewhere = change(straight, used & ~concerned)
+            if now > max(DISCONTINUOUS, CONTINUOUS * then, CONTINUOUS * elsewhere):
+                explaining.append((then, wiring))
+        if not explaining:
+            return Judgement(straight, (straight,), (), 0.0)
+        explaining.sort()
+        least, best = explaining[0]
+        return Judgement(best, tuple(wiring for _, wiring in explaining), (), least)
 
     def _judge(self, observation: Observation) -> Judgement | None:
         """Return which exchange restores the usual A; None if that cannot be judged.

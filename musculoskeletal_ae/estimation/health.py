@@ -80,13 +80,14 @@ class HealthMonitor:
 
         `Detector.read` describes the arguments. Without a finding, the result is None.
         """
+        self._exchange.read(states, now)
         findings = [detector.read(states, usable, now) for detector in self._detectors]
         return next(filter(None, findings), None)
 
     def step(self, observation: Observation) -> Finding | None:
         """Check a message for which there is an estimate; return the first finding or None.
 
-        If two exchanged muscles explain this finding, they are reported instead.
+        If exchanged muscles or a reversed length explain this finding, they are reported instead.
         """
         findings = [detector.step(observation) for detector in self._detectors]
         self._exchange.note(observation)

@@ -38,7 +38,7 @@ class Evidence(Enum):
     CALIBRATING = 'being calibrated'
     CALIBRATED = 'calibrated'
     JUMPED = 'revoked because the length jumped'
-    EXCHANGED = 'revoked because the driver exchanges muscles'
+    EXCHANGED = 'revoked because the driver uses another order or sign'
     DISAGREES = 'revoked because lengths disagree with the joint sensors'
     AGREES = 'confirmed by the joint sensors'
     MOVED = 'changed while the muscle was repaired; not checked yet'

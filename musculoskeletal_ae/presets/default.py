@@ -61,10 +61,10 @@ class DefaultPreset:
         return BodyUpdater(robot, mae, seed)
 
     def residual_detectors(self, robot: Robot) -> tuple[ResidualDistance, list[Detector]]:
-        """Return the detectors of large residuals, and of slack tendons and jammed modules."""
-        from musculoskeletal_ae.estimation.detectors.jammed_module import (
-            JammedModule,
-            JammedPosition,
+        """Return the detectors of large residuals, of slack tendons, and of idle modules."""
+        from musculoskeletal_ae.estimation.detectors.module_following import (
+            ModuleFollowing,
+            PositionFollowing,
         )
         from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
         from musculoskeletal_ae.estimation.detectors.slack_tendon import (
@@ -73,8 +73,8 @@ class DefaultPreset:
         )
 
         slack = robot.actuation.choose(SlackTendon, StretchedTendon)(robot)
-        jammed = robot.actuation.choose(JammedModule, JammedPosition)(robot)
-        return ResidualDistance(robot, slack), [slack, jammed]
+        following = robot.actuation.choose(ModuleFollowing, PositionFollowing)(robot)
+        return ResidualDistance(robot, slack), [slack, following]
 
     def length_methods(self) -> Mapping[str, LengthMethod]:
         """Return the paper's methods except `proposed`.

@@ -18,6 +18,8 @@ the temperature limit. If κ or τ₂ departs from its first known value by the 
 module has changed: its motor drags, its housing is covered, or its tension sensor is faulty.
 """
 
+import math
+
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
@@ -45,6 +47,8 @@ FAR = 2.5  # largest change of the logarithm of a constant from its initial esti
 SLOPE = 1e-4  # step of numerical derivatives
 LEARNED = 1200.0  # time of learning before a constant can count as known [s]
 KNOWN = 0.2  # standard deviation of a constant's logarithm below which the constant is known
+REST_STEP = 30.0  # step by which the end of a rest is searched for [s]
+LONGEST_REST = 3600.0  # longest rest that is predicted [s]
 CHANGED = 1.5  # factor by which a known constant must change to be reported
 
 
@@ -72,6 +76,13 @@ def flow(state: Array, square: Array, dt: float) -> Array:
     return np.stack([inner + (settled - inner) * gone, after, *logs, air])
 
 
+def soon(seconds: float) -> str:
+    """Return when a rest of a predicted duration [s] ends, as a text for users."""
+    if not math.isfinite(seconds):
+        return f'in more than {LONGEST_REST / 60.0:.0f} min'
+    return 'now' if seconds == 0.0 else f'in about {math.ceil(seconds / 60.0)} min'
+
+
 class Heat:
     """Estimates temperatures and thermal constants of all modules, and their tension limits."""
 
@@ -89,8 +100,9 @@ class Heat:
         self._reference: Array = np.full((2, count), np.nan)  # log κ, log τ₂ when first known
         self._sums: Array = np.zeros((2, count))
         self._passed, self._messages = 0.0, 0
-        #: cache of `limits` by highest temperature, cleared by each update
+        #: caches of `limits` and `rest_needed` by their arguments, cleared by each update
         self._limits: dict[float, tuple[Array, Array]] = {}
+        self._rests: dict[tuple[float, bytes], Array] = {}
         #: muscles whose constants have changed since they were first known, with a description
         self.changed: dict[int, str] = {}
 
@@ -133,6 +145,36 @@ class Heat:
         self._limits = {highest: (limits[0], limits[1])}
         return self._limits[highest]
 
+    @property
+    def is_known(self) -> Bools:
+        """Whether the housing temperature of each module is known, (M,)."""
+        return self._known
+
+    def rest_needed(self, highest: float, tension: Array) -> Array:
+        """Return for how long each muscle has to rest until it may hold a tension for HELD seconds.
+
+        Args:
+            highest: The temperature limit of the windings [°C].
+            tension: The tension [N], (M,).
+
+        Returns:
+            The durations [s], (M,), rounded up to REST_STEP; infinite if they exceed LONGEST_REST
+            or if the temperature is not known.
+        """
+        key = highest, tension.tobytes()
+        if key not in self._rests:
+            rest, state, passed = np.full(len(tension), np.inf), self._state, 0.0
+            while passed <= LONGEST_REST and (self._known & np.isinf(rest)).any():
+                ahead = state
+                for _ in range(round(HELD / REST_STEP)):
+                    ahead = flow(ahead, tension**2, REST_STEP)
+                is_cool = np.maximum(state[0] + state[1], ahead[0] + ahead[1]) <= highest
+                rest = np.where(is_cool & self._known, np.minimum(rest, passed), rest)
+                state = flow(state, self._tension.bias**2, REST_STEP)
+                passed += REST_STEP
+            self._rests[key] = rest
+        return self._rests[key]
+
     def step(self, tension: Array, housing: Array, dt: float) -> None:
         """Process one measurement of all modules.
 
@@ -149,7 +191,7 @@ class Heat:
         if np.count_nonzero(changed):
             self._state[1] = np.where(known & changed, housing, measured)
             self._interrupted |= changed
-            self._limits, self._known = {}, known
+            self._limits, self._rests, self._known = {}, {}, known
         self._sums[0] += tension * tension
         self._sums[1] += housing  # an unknown temperature makes the sum NaN
         self._messages, self._passed = self._messages + 1, self._passed + dt
@@ -159,7 +201,7 @@ class Heat:
         # Without a valid temperature, the winding's temperature is predicted but not corrected.
         is_valid = known & ~self._interrupted
         self._update(square, mean, is_valid, min(self._passed, LONGEST))
-        self._limits, self._interrupted[:] = {}, False
+        self._limits, self._rests, self._interrupted[:] = {}, {}, False
         self._sums[:], self._passed, self._messages = 0.0, 0.0, 0
 
     def _miss(self, housing: Array, known: Bools, dt: float) -> None:

@@ -247,6 +247,23 @@ def test_a_sensor_that_stands_still_while_the_arm_moves_is_detected(robot, calib
     assert core.cause == f'{robot.muscles[frozen]}: a sensor is frozen while the arm moves'
 
 
+def test_a_tension_reading_that_freezes_at_the_bias_is_detected_if_it_had_noise_before(
+    robot, calibrated, healthy
+):
+    rng, frozen = np.random.default_rng(0), 3
+    core = Estimator(robot)
+    core.use(replace(calibrated, anomaly=replace(calibrated.anomaly, thresholds={})))
+    for n in range(1600):
+        theta = 0.5 * (robot.lower + robot.upper) + 0.5 * np.sin(0.01 * n)
+        length = robot.muscle_lengths(theta, healthy.tension) + 1e-4 * rng.standard_normal(6)
+        tension = robot.tension.bias + rng.standard_normal(6)
+        if n >= 1200:
+            tension[frozen] = robot.tension.bias[frozen] + 0.5
+        core.step(np.array([length, tension, np.full(6, 25.0)]), n * DT, n * DT)
+        assert n >= 1200 or not core.cause
+    assert core.cause == f'{robot.muscles[frozen]}: a sensor is frozen while the arm moves'
+
+
 def test_a_tension_that_stays_exactly_at_the_bias_is_no_sensor_fault(robot, calibrated, healthy):
     # A simulated module without sensor noise reads exactly T_bias as long as l_target > l.
     rng, paid_out = np.random.default_rng(0), 3

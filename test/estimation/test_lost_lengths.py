@@ -35,6 +35,7 @@ class MovingArm:
         self.tension = robot.tension.bias + 20.0
         self.tense = np.ones(robot.muscle_count)  # 0 for a tendon without tension
         self.order = np.arange(robot.muscle_count)  # muscle that each column of the readings shows
+        self.sign = np.ones(robot.muscle_count)  # of each column of lengths
         self.posture = None  # θ of an arm that stands still [rad], or None
 
     def go(self, seconds, sensors=True):
@@ -50,6 +51,7 @@ class MovingArm:
             length += 1e-4 * self.rng.standard_normal(len(length))
             if sensors:
                 self.core.joints(theta + self.joint_off, self.time)
+            length = length * self.sign
             states = np.array([length, tension, np.full_like(length, 25.0)])
             with suppress(RejectionError):
                 self.core.take(reading(states[:, self.order]), self.time, self.time)
@@ -138,6 +140,26 @@ def test_exchanged_muscles_are_named_instead_of_lost_offsets(robot, calibrated, 
     assert f'the readings of {first} and {second} are exchanged' in arm.core.cause
     assert arm.core.remedy == (Step.CORRECT_WIRING, Step.CALIBRATE_LENGTHS)
     assert arm.offsets.revoked
+
+
+@pytest.mark.parametrize('is_exchange', [True, False])
+def test_a_driver_that_returns_with_another_order_or_sign_is_named(robot, mae, is_exchange):
+    arm = MovingArm(robot, mae)
+    arm.posture = robot.lower + 0.2 * (robot.upper - robot.lower)
+    arm.go(2.0, sensors=False)
+    length = arm.core.sample.length_read
+    longest = int(np.abs(length).argmax())
+    other = int(np.abs(length - length[longest]).argmax())
+    arm.time += 1.0  # the driver restarts
+    if is_exchange:
+        arm.order[[longest, other]] = other, longest
+    else:
+        arm.sign[longest] = -1.0
+    arm.go(2.0, sensors=False)
+    assert arm.kind is ConditionKind.MUSCLES_EXCHANGED, arm.core.cause
+    assert robot.muscles[longest] in arm.core.cause
+    assert ('exchanged' if is_exchange else 'wrong sign') in arm.core.cause
+    assert Step.CORRECT_WIRING in arm.core.remedy
 
 
 def test_a_jump_of_two_lengths_that_no_exchange_explains_is_one_of_lost_offsets(robot, calibrated):

@@ -8,7 +8,7 @@ import pytest
 from exact_mae import rest_readings
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.estimation.detectors.jammed_module import JAM_TIME, JammedPosition
+from musculoskeletal_ae.estimation.detectors.module_following import FAULTY, PositionFollowing
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME, StretchedTendon
 from musculoskeletal_ae.estimation.finding import observe
 from musculoskeletal_ae.estimation.verification import Outcome, PositionLaw, Verification
@@ -117,14 +117,16 @@ def test_tendons_that_do_not_determine_the_posture_are_no_evidence_of_a_rupture(
     ('behind', 'tension', 'is_found'), [(0.02, 60.0, True), (0.001, 60.0, False),
                                         (0.02, 490.0, False)]
 )  # fmt: skip
-def test_a_module_that_does_not_go_where_it_is_commanded_is_jammed(mae, behind, tension, is_found):
-    detector = JammedPosition(ROBOT)
+def test_a_module_that_does_not_go_where_it_is_commanded_does_not_follow(
+    mae, behind, tension, is_found
+):
+    detector = PositionFollowing(ROBOT)
     detector.use(mae)
     length, pull = mae.lengths(THETA, BIAS), BIAS.copy()
     pull[MUSCLE] = tension
     command = length - behind * (np.arange(ROBOT.muscle_count) == MUSCLE)
     message = observe(mae, length, pull, pull, DT, command=command)
-    findings = [detector.step(message) for _ in range(round(1.5 * JAM_TIME / DT))]
+    findings = [detector.step(message) for _ in range(round(1.5 * FAULTY / DT))]
     assert (findings[-1] is not None) == is_found
 
 

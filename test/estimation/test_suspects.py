@@ -41,7 +41,9 @@ def test_the_consequences_of_each_finding(suspects, kind, on_anomaly, latched, i
 
 def test_the_first_finding_stays_latched(suspects, robot):
     isolated = suspects.take(DISTANCE, (), 0.0)
-    assert suspects.take(Finding(3, ConditionKind.MODULE_STANDS, ''), isolated, 1.0) == isolated
+    assert (
+        suspects.take(Finding(3, ConditionKind.MODULE_NOT_FOLLOWING, ''), isolated, 1.0) == isolated
+    )
     assert suspects.finding is DISTANCE
     assert suspects.cause == f'{robot.muscles[1]}: d = 9'
 

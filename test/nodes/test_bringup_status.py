@@ -254,6 +254,7 @@ def test_steps_of_several_conditions_are_given_once_and_the_reset_comes_after_th
     situation.diagnosed(diagnostics('/estimator', SLACK))
     assert situation.steps() == [
         Step.REPAIR_MUSCLE,
+        Step.CHECK_COOLING,
         Step.WAIT_UNTIL_COOL,
         Step.RESET_ESTIMATOR,
         Step.RESET_CONTROLLER,

@@ -151,6 +151,19 @@ def test_a_muscle_held_at_its_limit_reaches_the_highest_temperature_and_no_more(
     assert (motors.heat.limits(HIGHEST)[0] > limit)[hot].all()
 
 
+def test_the_predicted_rest_is_as_long_as_the_motors_need():
+    motors = Motors()
+    motors.run(1500.0)
+    motors.run(300.0, TENSION.limit)
+    highest = float(motors.heat.core.max()) - 8.0
+    predicted = motors.heat.rest_needed(highest, TENSION.bias)
+    hottest = int(motors.heat.core.argmax())
+    assert 0.0 < predicted[hottest] < 600.0
+    motors.run(predicted[hottest] + 60.0, TENSION.bias)
+    assert motors.arm.winding[hottest] < highest + 3.0
+    assert motors.heat.rest_needed(highest + 60.0, TENSION.bias)[hottest] == 0.0
+
+
 def test_cool_muscles_are_not_limited_and_short_pulls_may_be_stronger_than_long_ones():
     motors = Motors()
     motors.run(10, TENSION.bias)

@@ -15,6 +15,9 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
 
 FROZEN_TIME = 1.0  # duration of identical readings after which a sensor may be frozen [s]
+#: share of the messages near T_bias in which a reading changes if its sensor has noise there, and
+#: the smallest number of messages from which this share is known
+NOISY, ENOUGH = 0.9, 1000
 MOVED = 0.006  # predicted motion of the muscle above which its constant reading is a fault [m]
 
 
@@ -27,6 +30,9 @@ class FrozenSensor(Detector):
         self._last: Array | None = None  # last readings of l and T, (2, M)
         #: time without a change of l and of T [s]
         self._unchanged_time: Array = np.zeros((2, robot.muscle_count))
+        #: numbers of messages near T_bias in which the reading stayed the same and in which it
+        #: changed, and those in which it has stayed the same since its last change, (3, M)
+        self._near_bias: Array = np.zeros((3, robot.muscle_count))
         self._reduced_mae: Mae | None = None  # network without the observed muscle
         #: shortest and longest predicted length of the observed muscle [m]
         self._shortest, self._longest = np.inf, -np.inf
@@ -53,6 +59,13 @@ class FrozenSensor(Detector):
         is_same = readings == self._last if self._last is not None else np.zeros_like(readings)
         if not robot.tension_source.is_known:  # an unknown tension does not count as frozen
             is_same[1] = 0.0
+        slack = LIMITS.slack_share * robot.tension.bias
+        is_near_bias = np.abs(tension - robot.tension.bias) <= slack
+        # What the reading does now counts only once it has changed again.
+        same, changed, now = self._near_bias
+        has_changed = is_same[1] == 0.0
+        same, changed = same + now * has_changed, changed + (has_changed & is_near_bias)
+        self._near_bias = np.array([same, changed, (now + is_near_bias) * ~has_changed])
         self._last = readings
         self._unchanged_time = (self._unchanged_time + observation.dt) * is_same
         is_calibrated = mae is not None and mae.anomaly is not None and mae.anomaly.calibrated
@@ -60,12 +73,11 @@ class FrozenSensor(Detector):
             self._stop_observing()
             return None
         assert mae is not None
-        # Slack tendons are left to `slack_tendon.py`. A constant tension of T_bias is no fault,
-        # because a simple module may always report exactly T_bias.
-        slack = LIMITS.slack_share * robot.tension.bias
+        # Slack tendons are left to `slack_tendon.py`. A constant tension of T_bias is no fault of a
+        # simple module that always reports exactly T_bias.
         by_length, by_tension = self._unchanged_time
-        differs_from_bias = np.abs(tension - robot.tension.bias) > slack
-        time = np.maximum(by_length, by_tension * differs_from_bias)
+        has_noise = (same + changed >= ENOUGH) & (changed > NOISY * (same + changed))
+        time = np.maximum(by_length, by_tension * (~is_near_bias | has_noise))
         time = time * (robot.used & (tension > slack))
         muscle = int(time.argmax())
         if time[muscle] < FROZEN_TIME or not observation.lengths_known:

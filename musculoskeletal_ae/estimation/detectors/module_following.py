@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Detects a muscle module that does not follow its commands, whatever the arm does.
+
+A module under muscle stiffness control turns its winch until the tension T is the demanded one:
+
+    dl/dt = G (T − T_ref)
+
+T_ref is the tension that the command demands at the measured length l. This law holds for every
+module alone: in any posture, in contact, and with any network. A healthy module corrects a
+difference T_limit at the speed CORRECTING or faster. The rest of the difference is not explained:
+
+    e = |T − T_ref| − T_limit · max(0, v) / CORRECTING
+
+v is the speed at which the winch turns in the direction that reduces the difference. A jammed or
+weak motor, a wrong reading of tension or length, and commands that do not arrive or are reversed
+all lead to a large e. A ruptured tendon does not, because its winch winds in at full speed.
+
+The evidence is a time. It grows while e is above a tolerance and shrinks while e is below it,
+the faster the farther e is away from it, but at most by one second per second. A module is reported
+after FAULTY seconds of evidence. In 80 s of exploration of individuals 0 to 4 of musashi_left_arm,
+emulator models kin and foreign, the evidence against a healthy module was 0.03 s at most, and with
+half the tolerance 0.12 s. In the same recordings, every reading that was multiplied by 0.7, or
+shifted by 30 N, would have been reported within 5 s after its error had first exceeded 20 N.
+
+A position-controlled module has no T_ref. Its e is a length:
+
+    e = |l − l_target| − LAG · max(0, v)
+
+It may stay behind while T > FULL · T_max, because it cannot pull harder.
+
+The readings of such a module may be consistent with a posture. The residuals of the network then do
+not reveal the fault.
+"""
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+FAULTY = 1.0  # report a module after this time of evidence [s]
+SMOOTHING = 0.1  # time constant by which differences and speeds are smoothed [s]
+#: a winch that turns at this share of its largest speed, if that is known, cannot do more
+FULL_SPEED = 0.5
+#: speed at which the slowest healthy module corrects a difference of T_limit [m/s]
+CORRECTING = 0.4
+#: tolerance of T − T_ref: a share of T_limit, and a share of T_ref for errors of the sensor's gain
+#: and of the module's stiffness
+ALLOWED, ALLOWED_SHARE = 0.04, 0.05
+#: excess of e above the tolerance, relative to T_limit, at which the evidence grows fastest
+CLEAR = 0.05
+SURE = 2.0  # number of standard deviations of an uncertain tension that are tolerated
+BEHIND = 0.005  # tolerance of |l − l_target| of a position-controlled module [m]
+CLEARLY_BEHIND = 0.005  # excess of e above it at which the evidence grows fastest [m]
+LAG = 0.3  # lag of the slowest healthy position-controlled module [s]
+FULL = 0.9  # share of T_max above which a position-controlled module cannot pull harder
+
+
+class ModuleFollowing(Detector):
+    """Reports a module that has not followed its commands for some time."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = self._complete_robot = robot
+        self.reset()
+
+    def use(self, mae: Mae) -> None:
+        """Monitor the muscles that are not isolated in this network."""
+        self._robot = self._complete_robot.without(mae.isolated)
+
+    def reset(self) -> None:
+        """Discard all evidence."""
+        count = self._complete_robot.muscle_count
+        self._evidence: Array = np.zeros(count)  # time of evidence [s]
+        self._length: Array | None = None  # l in the previous message [m]
+        self._difference: Array | None = None  # smoothed difference from the command
+        self._speed: Array = np.zeros(count)  # smoothed dl/dt [m/s]
+
+    def step(self, observation: Observation) -> Finding | None:
+        """Report the module with the most evidence; None if there is less than 1 s of it."""
+        difference = self._differences(observation)
+        if difference is None or not observation.lengths_known:
+            self.reset()
+            return None
+        length, dt = observation.sample.length, observation.dt
+        if self._length is None or self._difference is None:
+            self._length, self._difference = length, difference
+            return None
+        if dt <= 0.0:
+            return None
+        share = 1.0 - np.exp(-dt / SMOOTHING)
+        self._difference = self._difference + share * (difference - self._difference)
+        self._speed = self._speed + share * ((length - self._length) / dt - self._speed)
+        self._length = length
+        correcting = np.maximum(np.sign(self._difference) * self._speed, 0.0)
+        growth = self._growth(observation, np.abs(self._difference), correcting)
+        is_full = correcting > FULL_SPEED * self._robot.actuation.speed
+        growth = np.where(is_full | ~self._robot.used, -1.0, np.clip(growth, -1.0, 1.0))
+        # An unknown tension is no evidence.
+        growth = np.nan_to_num(growth, nan=-1.0)
+        self._evidence = np.maximum(self._evidence + growth * dt, 0.0)
+        if self._evidence.max() < FAULTY:
+            return None
+        muscle = int(self._evidence.argmax())
+        text = self._text(observation, muscle)
+        likely = np.flatnonzero(self._evidence > 0.5 * FAULTY).tolist()
+        others = tuple(other for other in likely if other != muscle)
+        return Finding(muscle, ConditionKind.MODULE_NOT_FOLLOWING, text, others)
+
+    def _differences(self, observation: Observation) -> Array | None:
+        """Return T − T_ref [N], (M,); None without a command."""
+        if observation.demand is None:
+            return None
+        demand = np.minimum(observation.demand, self._complete_robot.tension.max)
+        difference: Array = observation.sample.motor_tension - demand
+        return difference
+
+    def _growth(self, observation: Observation, away: Array, correcting: Array) -> Array:
+        """Return how fast the evidence grows, not limited to ±1, (M,).
+
+        Args:
+            observation: The message.
+            away: Smoothed size of the difference [N], (M,).
+            correcting: Speed of each winch in the direction that reduces the difference [m/s].
+        """
+        assert observation.demand is not None
+        limit = self._complete_robot.tension.limit
+        demand = np.minimum(observation.demand, self._complete_robot.tension.max)
+        excess = away - limit * correcting / CORRECTING
+        allowed = ALLOWED * limit + ALLOWED_SHARE * demand
+        spread = np.fmax(observation.sample.tension_spread, 0.0)
+        growth: Array = (excess - allowed - SURE * spread) / (CLEAR * limit)
+        return growth
+
+    def _text(self, observation: Observation, muscle: int) -> str:
+        assert observation.demand is not None
+        tension, demand = observation.sample.motor_tension[muscle], observation.demand[muscle]
+        return (
+            f'its command demands {demand:.0f} N, but its reading is {tension:.0f} N: its motor is '
+            'jammed or weak, its tension or length reading is wrong, or it gets no commands'
+        )
+
+
+class PositionFollowing(ModuleFollowing):
+    """Reports a position-controlled module that has not followed its target length."""
+
+    def _differences(self, observation: Observation) -> Array | None:
+        """Return l − l_target [m], (M,); None without a command."""
+        if observation.command is None:
+            return None
+        return observation.sample.length - observation.command
+
+    def _growth(self, observation: Observation, away: Array, correcting: Array) -> Array:
+        excess = away - LAG * correcting - BEHIND
+        tension, most = observation.sample.motor_tension, self._complete_robot.tension.max
+        growth: Array = np.where(tension > FULL * most, -1.0, excess / CLEARLY_BEHIND)
+        return growth
+
+    def _text(self, observation: Observation, muscle: int) -> str:
+        assert observation.command is not None
+        away = 1e3 * (observation.sample.length[muscle] - observation.command[muscle])
+        return (
+            f'its length differs by {away:.0f} mm from its command, and does not approach it: its '
+            'motor is jammed or weak, its length reading is wrong, or it gets no commands'
+        )
