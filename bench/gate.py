@@ -129,10 +129,6 @@ def learned(arm: Arm, mae: Mae, driver: Mae, seed: int, minutes: float, spread: 
         if learner.step(now, *row) is not None:
             spread.take(gate, learner.mae, f'individual {seed}, {mae.preset}, {now:.0f} s')
             gate.take(learner.mae, now)
-    if learner.keeper.rejected:
-        spread.refused.append(
-            f'individual {seed}, rejected by the learner: {learner.keeper.last_rejected}'
-        )
     return learner.mae
 
 

@@ -71,6 +71,18 @@ class CheckpointValidator:
         """The network in use; None before the first."""
         return self._used[-1][1] if self._used else None
 
+    def is_in_use(self, mae: Mae) -> bool:
+        """Return whether a network is the one in use, which needs no further decision.
+
+        Isolated muscles, detector and residual torque do not distinguish networks.
+        """
+        in_use = self.mae
+        return (
+            in_use is not None
+            and mae.version == in_use.version
+            and np.array_equal(mae.encoder[0][0], in_use.encoder[0][0])
+        )
+
     def message(
         self, tension: Array, length: Array, now: float, theta: Array | None = None
     ) -> None:

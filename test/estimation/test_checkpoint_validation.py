@@ -25,9 +25,6 @@ from musculoskeletal_ae.estimation.validation.message_errors import FLOOR
 from musculoskeletal_ae.estimation.validation.postures import LIMITS
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.learning.calibration import Healthy, calibrate
-from musculoskeletal_ae.learning.job import Update
-from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
@@ -191,33 +188,6 @@ def test_messages_just_before_and_during_an_anomaly_do_not_count_as_healthy(trai
         assert after[name].max() < 2.0 * before[name].max() + 1e-3
 
 
-class ScriptedTrainer(Trainer):
-    """A trainer whose updates the test chooses."""
-
-    answer = None
-
-    def poll(self):
-        mae, self.answer = self.answer, None
-        return None if mae is None else Update(mae, 0.0)
-
-
-def test_the_learner_publishes_no_refused_network_and_rolls_back_on_an_anomaly(trained):
-    learner = Learner(ROBOT, trained['default'], preset='default', trainer=ScriptedTrainer)
-    good = learner.poll(0.0)
-    with pytest.raises(GateError):
-        learner.replace(ATTACKS['weights × 1.5'](trained['default']))
-    learner.trainer.answer = ATTACKS['weights × 1.5'](trained['default'])
-    assert learner.poll(10.0) is None
-    assert learner.keeper.rejected == 1
-    assert 'limit' in learner.report().values['last rejected network']
-    assert learner.checkpoint == good
-    learner.trainer.answer = trained['paper']
-    assert learner.poll(20.0) is not None
-    learner.anomaly(True)
-    assert learner.poll(30.0) is not None
-    np.testing.assert_array_equal(learner.mae.mean, trained['default'].mean)
-
-
 def test_the_first_network_is_accepted_although_the_body_differs_from_the_model(trained):
     gate = CheckpointValidator(ROBOT)
     for k, (tension, length) in enumerate(zip(*body(), strict=True)):
@@ -227,12 +197,13 @@ def test_the_first_network_is_accepted_although_the_body_differs_from_the_model(
     gate.check(trained['default'])
 
 
-def test_a_restarted_learner_does_not_roll_back_to_an_earlier_network(trained):
-    learner = Learner(ROBOT, trained['paper'], preset='default')
-    learner.replace(None)
-    learner.begin(trained['default'])
-    learner.anomaly(True)
-    np.testing.assert_array_equal(learner.mae.mean, trained['default'].mean)
+def test_only_the_network_in_use_needs_no_decision(trained):
+    gate, mae = CheckpointValidator(ROBOT), trained['default']
+    assert not gate.is_in_use(mae)
+    gate.take(mae, 0.0)
+    assert gate.is_in_use(calibrated(mae).without((2,)))
+    assert not gate.is_in_use(replace(mae, version=mae.version + 1))
+    assert not gate.is_in_use(replace(trained['paper'], version=mae.version))
 
 
 def test_many_unproven_networks_leave_the_first_one_to_roll_back_to(trained):
