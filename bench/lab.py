@@ -268,7 +268,11 @@ class Lab:
                 if core.body.offsets.known:
                     sample = output.sample
                     self.validator.message(
-                        sample.tension_read, sample.length, received, core.measured
+                        sample.tension_read,
+                        sample.length,
+                        sample.sliding,
+                        received,
+                        core.measured,
                     )
             self.publish()
 

@@ -260,7 +260,7 @@ class Estimator(Shell):
             self.frames.publish(state.theta)
         if self.core.body.offsets.known:
             self.candidates.validator.message(
-                sample.tension_read, sample.length, now, self.core.measured
+                sample.tension_read, sample.length, sample.sliding, now, self.core.measured
             )
         self.joints.publish(joint_message(self.robot.joints, state.theta, stamp))
         if output.covariance is not None and is_heard(self.covariance):

@@ -326,7 +326,7 @@ def learn(
         learner.joints(at, theta)
         sample = _sample(stream, states, at)
         if sample is not None:
-            validator.message(sample.tension_read, sample.length, at, theta)
+            validator.message(sample.tension_read, sample.length, sample.sliding, at, theta)
         finding = _finding(health, mae, sample, min(dt, LONGEST_PERIOD))
         if finding is not None:
             learner.anomaly(True)

@@ -30,6 +30,7 @@ from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot.load('arm26')
+STILL = np.zeros(ROBOT.muscle_count)  # direction of sliding of tendons that have not slid
 
 
 def body(count=60, seed=0):
@@ -46,7 +47,7 @@ def body(count=60, seed=0):
 def send_healthy_messages(gate, start=0.0):
     """Send a validator six seconds of messages of a healthy arm; return the time at the end [s]."""
     for k, (tension, length) in enumerate(zip(*body(), strict=True)):
-        gate.message(tension, length, start + 0.1 * k)
+        gate.message(tension, length, STILL, start + 0.1 * k)
     return start + 6.0
 
 
@@ -179,10 +180,10 @@ def test_messages_just_before_and_during_an_anomaly_do_not_count_as_healthy(trai
     before = gate.message_errors(trained['default'])
     tension, length = body()
     for k in range(15):
-        gate.message(tension[k], length[k] + 0.2, end + 0.1 * k)
+        gate.message(tension[k], length[k] + 0.2, STILL, end + 0.1 * k)
     gate.anomaly(True, end + 0.75 * DETECTION_DELAY)
     for k in range(30):
-        gate.message(tension[k], length[k] + 0.2, end + 2.0 + 0.1 * k)
+        gate.message(tension[k], length[k] + 0.2, STILL, end + 2.0 + 0.1 * k)
     after = gate.message_errors(trained['default'])
     for name in before:
         assert after[name].max() < 2.0 * before[name].max() + 1e-3
@@ -191,7 +192,7 @@ def test_messages_just_before_and_during_an_anomaly_do_not_count_as_healthy(trai
 def test_the_first_network_is_accepted_although_the_body_differs_from_the_model(trained):
     gate = CheckpointValidator(ROBOT)
     for k, (tension, length) in enumerate(zip(*body(), strict=True)):
-        gate.message(tension, length + 0.2 * np.array([1, -1, 1, -1, 1, -1]), 0.1 * k)
+        gate.message(tension, length + 0.2 * np.array([1, -1, 1, -1, 1, -1]), STILL, 0.1 * k)
     errors = gate.message_errors(trained['default'])
     assert any(errors[name].max() > FLOOR[name] for name in FLOOR)
     gate.check(trained['default'])
@@ -225,7 +226,7 @@ def send_messages_of_the_model(gate, measures):
     tension = rng.uniform(30.0, 150.0, (60, ROBOT.muscle_count))
     length = ROBOT.muscle_lengths(theta, tension)
     for k in range(60):
-        gate.message(tension[k], length[k], 0.1 * k, theta[k] if measures else None)
+        gate.message(tension[k], length[k], STILL, 0.1 * k, theta[k] if measures else None)
     return theta, tension, length
 
 
