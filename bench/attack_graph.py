@@ -541,6 +541,7 @@ LATCHING = (
     'isolated_muscles',
     'joint_sensor_trust',
     'muscle_length_zeros',
+    'rejected_checkpoint',
 )
 KINDS_OF = {'muscle_states': 'Float64MultiArray', 'anomaly': 'Float64'}
 

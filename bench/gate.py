@@ -40,6 +40,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.friction import directions
 from musculoskeletal_ae.signals.limits import LIMITS as SIGNAL_LIMITS
 from musculoskeletal_ae.signals.limits import share_outside
 
@@ -123,16 +124,13 @@ def learned(arm: Arm, mae: Mae, driver: Mae, seed: int, minutes: float, spread: 
         spread.most[name] = max(spread.most[name], value)
     learner = Learner(robot, mae, preset=mae.preset, seed=seed)
     gate.take(mae, 0.0)
-    for n, row in enumerate(zip(stream.theta_sensor, stream.tension, stream.length, strict=True)):
+    rows = zip(stream.theta_sensor, stream.tension, stream.length, strict=True)
+    for n, (row, sliding) in enumerate(zip(rows, directions(stream.length), strict=True)):
         now = n * SAMPLE_TIME
-        gate.message(*row[1:], now, row[0])
+        gate.message(*row[1:], sliding, now, row[0])
         if learner.step(now, *row) is not None:
             spread.take(gate, learner.mae, f'individual {seed}, {mae.preset}, {now:.0f} s')
             gate.take(learner.mae, now)
-    if learner.keeper.rejected:
-        spread.refused.append(
-            f'individual {seed}, rejected by the learner: {learner.keeper.last_rejected}'
-        )
     return learner.mae
 
 

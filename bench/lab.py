@@ -2,7 +2,7 @@
 """A laboratory in one process: an emulated arm, its driver and all nodes, in lock-step.
 
     arm ─► sensors ─► Wire ─► Process ─► estimator ─► controller ─► Wire ─► arm
-                                     └─► learner ─► networks, validated by the estimator
+                                     └─► learner ─► networks, which the estimator accepts or rejects
 
 Time is simulated, and the cores exchange messages as their nodes do: muscle states best-effort with
 a queue of QUEUE messages, everything else reliably. The wire between the driver and the nodes
@@ -269,7 +269,11 @@ class Lab:
                 if core.body.offsets.known:
                     sample = output.sample
                     self.validator.message(
-                        sample.tension_read, sample.length, received, core.measured
+                        sample.tension_read,
+                        sample.length,
+                        sample.sliding,
+                        received,
+                        core.measured,
                     )
             self.publish()
 
@@ -281,8 +285,11 @@ class Lab:
             self._published_anomaly = detected
             self._to_controller.append(partial(self._tell_controller, detected))
             self._to_learner.append(lambda: self.learner.anomaly(detected))
-            if (older := self.validator.anomaly(detected, self.now)) is not None:
+            doubtful = self.validator.mae
+            older = self.validator.anomaly(detected, self.now)
+            if older is not None and doubtful is not None:
                 self._use(older)
+                self._reject(doubtful, 'an anomaly was detected soon after it was accepted')
         if (trust := core.joint_trust) is not self._published_trust:
             self._published_trust = trust
             self.validator.forget()
@@ -300,10 +307,13 @@ class Lab:
 
     def _validate(self, candidate: Mae) -> None:
         """Let the estimator validate a network of the learner and, if it is accepted, use it."""
+        if self.validator.is_in_use(candidate):
+            return
         try:
             self.validator.check(candidate)
         except MusculoskeletalError as error:
             self.rejected_networks.append(str(error))
+            self._reject(candidate, str(error))
             return
         self._use(self.validator.with_detector(candidate, self.now))
         self.estimator.keep_isolated()
@@ -318,10 +328,14 @@ class Lab:
         self._use(mae)
         return True
 
+    def _reject(self, mae: Mae, reason: str) -> None:
+        self._to_learner.append(lambda: self.learner.note_rejected(mae.version, reason))
+
     def _use(self, mae: Mae) -> None:
         self.estimator.use(mae)
         self.validator.take(mae, self.now)
         self.controller.use(mae)
+        self._to_learner.append(lambda: self.learner.note_accepted(mae))
         if Evidence.NOT_CALIBRATED in self.estimator.trust.evidence:  # it waits for a network
             self.estimator.calibrate_lengths()
 

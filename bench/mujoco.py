@@ -188,11 +188,7 @@ def holding_error(study: Study, seed: int) -> float:
 
 
 def learned_error(preset: str, held_out: Recording, study: Study, seed: int) -> float:
-    """Let an individual learn with a preset, save its network, and return its error [rad].
-
-    Raises:
-        GateError: If the initial network of the preset is refused.
-    """
+    """Let an individual learn with a preset, save its network, and return its error [rad]."""
     learner, loop = online_learning.new_learner_and_loop(study, study.arm(seed), seed, preset)
     online_learning.teach(learner, online_learning.explore(loop, learner, 60.0 * study.minutes))
     checkpoint.save(learner.mae, study.network_file(preset, seed))

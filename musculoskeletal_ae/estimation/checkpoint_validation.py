@@ -71,18 +71,36 @@ class CheckpointValidator:
         """The network in use; None before the first."""
         return self._used[-1][1] if self._used else None
 
+    def is_in_use(self, mae: Mae) -> bool:
+        """Return whether a network is the one in use, which needs no further decision.
+
+        Isolated muscles, detector and residual torque do not distinguish networks.
+        """
+        in_use = self.mae
+        return (
+            in_use is not None
+            and mae.version == in_use.version
+            and np.array_equal(mae.encoder[0][0], in_use.encoder[0][0])
+        )
+
     def message(
-        self, tension: Array, length: Array, now: float, theta: Array | None = None
+        self,
+        tension: Array,
+        length: Array,
+        sliding: Array,
+        now: float,
+        theta: Array | None = None,
     ) -> None:
         """Record a measurement on which candidates are tested.
 
         Args:
             tension: Tensions as read [N], (M,).
             length: Muscle lengths [m], (M,).
+            sliding: Direction in which each tendon slid last (`MuscleSample.sliding`), (M,).
             now: Time of the measurement [s].
             theta: Joint angles from joint sensors [rad], (D,), or None if there are none.
         """
-        self._messages.note(tension, length, now, theta, is_healthy=not self._is_anomaly)
+        self._messages.note(tension, length, sliding, now, theta, is_healthy=not self._is_anomaly)
 
     def start(self) -> None:
         """Discard all networks and messages, so that the next network counts as the first one."""
@@ -91,7 +109,7 @@ class CheckpointValidator:
 
     def forget(self) -> None:
         """Discard the messages, for example when the length offsets change."""
-        self._messages.forget()
+        self._messages.clear()
 
     def check(self, mae: Mae, is_chosen: bool = False) -> None:
         """Check a network in a single call; `trial` does the same in steps.

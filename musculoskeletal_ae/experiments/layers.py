@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.online_learning import TEST_STATES, teach
@@ -109,9 +110,10 @@ def _learn(study: Study, seed: int, hidden: tuple[int, ...], training: int) -> d
     held_out = study.stream(seed, 'held_out')
     numbers['before_rad'] = estimation_error(initial, held_out)
     try:
-        learner = Learner(robot, initial, PAPER_PRESET, training)
-    except GateError:  # checkpoint validation rejects the initial network as too inaccurate
+        CheckpointValidator(robot).check(initial)
+    except GateError:  # the estimator would reject the initial network as too inaccurate
         return numbers | {'after_rad': None}
+    learner = Learner(robot, initial, PAPER_PRESET, training)
     teach(learner, zip(*study.stream(seed, 'exploring'), strict=True))
     numbers['after_rad'] = estimation_error(learner.mae, held_out)
     return numbers

@@ -1,23 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Validates, numbers, stores, publishes and rolls back networks.
+"""Numbers, stores and publishes the networks of one learner, and follows the estimator's decisions.
 
-    candidate ─► validated on the arm's messages ─► numbered ─► on disk ─► published
-                                                       ▲
-    anomaly ─► the last network that was in use long enough without an anomaly
+    network of an update ─► numbered ─► published as a candidate ─► estimator
+                                                                        │
+    saved and published again ◄─ the accepted network ◄─ accepted or rejected
 
-If there is a state directory, every network is saved before it is published. A failed save is
-retried, and does not prevent the publication.
+The learner does not judge its networks. It saves a candidate when the estimator has accepted it. If
+the estimator rejects the newest one, the learner returns to the network that the estimator uses.
+Without an estimator nobody rejects a network, and each one is saved at once.
+
+A save precedes everything that follows from it. A failed save is retried, and does not prevent the
+publication.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
-from musculoskeletal_ae.exceptions import GateError, StateError
+from musculoskeletal_ae.exceptions import StateError
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.learning.scheduler import is_recent
 from musculoskeletal_ae.learning.state import StateStore
@@ -59,147 +61,150 @@ class Publication:
 
 
 class CheckpointKeeper:
-    """Validates, stores and publishes the networks of one learner.
+    """Stores and publishes the networks of one learner.
 
     Attributes:
-        mae: The network in use; None before the first.
-        validation: Validates candidates on the messages of the arm.
+        mae: The newest network, whether the estimator has decided on it or not; None before the
+            first.
+        checkpoint: The network to save, as the content of a checkpoint; None before the first. This
+            is the last accepted one.
         publication: Releases checkpoints for publication.
-        rejected: Number of rejected candidates.
+        rejected: Number of networks that the estimator has rejected.
         last_rejected: Reason of the last rejection.
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        samples: SampleStore,
-        directory: Path | None = None,
-        is_validating: bool = True,
-    ) -> None:
+    def __init__(self, robot: Robot, samples: SampleStore, directory: Path | None = None) -> None:
         """Start without a network.
 
         Args:
             robot: The nominal body.
             samples: The samples, which are saved together with the network.
             directory: State directory; None to save nothing.
-            is_validating: Whether learned networks have to pass the validation.
 
         Raises:
             StateError: If the directory cannot be used.
         """
         self.mae: Mae | None = None
-        self.validation = CheckpointValidator(robot)
+        self.checkpoint: bytes | None = None
         self.publication = Publication()
         self.rejected, self.last_rejected = 0, ''
+        self._saved: Mae | None = None  # the network of `checkpoint`
+        self._in_use: Mae | None = None  # network of the estimator; None without an estimator
+        self._rejected_version = -1  # version of the network that was rejected last
+        self._highest_version = 0  # highest version so far, also of networks of the estimator
+        self._isolated: tuple[int, ...] = ()  # muscles that published networks leave out
         self._torque, self._has_torque = HealthyTorque(robot), robot.tension_source.is_known
         self._samples = samples
-        self._is_validating = is_validating
-        self._time = 0.0  # time of the last message, as the sum of all `dt` [s]
         self._state = None if directory is None else StateStore(directory, robot)
 
     # -- messages and events --------------------------------------------------------------------
 
-    def observe(
-        self, message: MuscleSample, dt: float, is_anomaly: bool, theta: Array | None = None
-    ) -> None:
-        """Record a plausible message for the validation of networks and for contact detection.
-
-        Contact detection needs the usual residual torque of the healthy arm. Messages during an
-        anomaly do not contribute to this torque.
+    def observe(self, message: MuscleSample, dt: float) -> None:
+        """Learn the usual residual torque, which contact detection needs, from a healthy message.
 
         Args:
             message: The message.
             dt: Time since the previous message [s].
-            is_anomaly: Whether an anomaly is present.
-            theta: Measured θ [rad], (D,), or None.
         """
-        self._time += dt
-        self.validation.message(message.learned_tension, message.length, self._time, theta)
-        # The healthy torque, which contact detection uses, cannot be computed without tensions.
-        if self.mae is not None and not is_anomaly and self._has_torque:
+        # The residual torque cannot be computed without tensions.
+        if self.mae is not None and self._has_torque:
             self._torque.step(message.tension_read, message.length, dt)
-
-    def forget_messages(self) -> None:
-        """Discard the messages used for validation, for example after the body state changed."""
-        self.validation.forget()
 
     def reset(self) -> None:
         """Restart the filter of the torque, for example after a backward jump of the clock."""
         self._torque.reset()
 
-    def set_anomaly(self, is_anomaly: bool, adapt: Callable[[Mae], Mae]) -> None:
-        """Set whether an anomaly is present.
-
-        When an anomaly begins, the last network that was in use long enough without an anomaly is
-        published again, unless it is still in use. Before that, `adapt` converts this network.
-        """
-        earlier = self.validation.anomaly(is_anomaly, self._time)
-        if earlier is not None:
-            self.use(adapt(earlier))
-
     def isolate(self, muscles: Iterable[int]) -> None:
         """Set the isolated muscles of the networks that are published from now on."""
-        self.validation.isolated = tuple(muscles)
+        self._isolated = tuple(muscles)
 
     # -- networks -------------------------------------------------------------------------------
 
-    def check(self, mae: Mae) -> None:
-        """Validate a network, which a user has chosen, on recent messages of the arm.
-
-        Raises:
-            GateError: If the validation rejects the network.
-        """
-        self.validation.check(mae, is_chosen=True)
-
-    def is_accepted(self, mae: Mae) -> bool:
-        """Return whether a learned network passes the validation, and count rejections."""
-        if not self._is_validating:
-            return True
-        try:
-            self.validation.check(mae)
-        except GateError as error:
-            self.rejected, self.last_rejected = self.rejected + 1, str(error)
-            return False
-        return True
-
     def numbered(self, mae: Mae) -> Mae:
-        """Return the network with a version higher than its own and that of the network in use."""
-        before = 0 if self.mae is None else self.mae.version
-        return replace(mae, version=1 + max(mae.version, before))
+        """Return the network with a version above its own and all versions so far."""
+        return replace(mae, version=1 + max(mae.version, self._highest_version))
 
     def use(self, mae: Mae) -> None:
-        """Number, save and publish a network that replaces the one in use."""
-        self.restore(self.numbered(mae))
+        """Number a network and publish it as a candidate; save it if there is no estimator."""
+        self._publish(self.numbered(mae))
+        if self._in_use is None:
+            self._save_newest()
 
     def restore(self, mae: Mae) -> None:
-        """Save and publish a network like `use`, but keep its version."""
-        self.mae = mae = self._torque.use(mae.without(self.validation.isolated))
+        """Save and publish a network that needs no decision, and keep its version.
+
+        It comes from a user, from the disk or from the estimator.
+        """
+        self._publish(mae)
+        self._save_newest()
+
+    def _publish(self, mae: Mae) -> None:
+        self.mae = mae = self._torque.use(mae.without(self._isolated))
+        self._highest_version = max(self._highest_version, mae.version)
         self.publication.offer(checkpoint.to_bytes(mae))
-        self.validation.take(mae, self._time)
+
+    def _save_newest(self) -> None:
+        self._saved, self.checkpoint = self.mae, self.publication.checkpoint
         self.store()
 
     def clear(self) -> None:
-        """Forget the network and all messages."""
-        self.validation.start()
+        """Forget all networks."""
         self._torque.start()
-        self.mae = None
+        self.mae = self._saved = self._in_use = self.checkpoint = None
         self.publication.offer(None)
+
+    # -- decisions of the estimator -------------------------------------------------------------
+
+    def note_accepted(self, mae: Mae) -> None:
+        """Record that the estimator uses this network, and save the newest one if it is the same.
+
+        The newest network differs from it while a decision is pending, after a rejection, and if a
+        user has chosen a network for the estimator.
+        """
+        self._in_use = mae
+        self._highest_version = max(self._highest_version, mae.version)
+        if self.mae is None:
+            return
+        if mae.version == self.mae.version:
+            if self._saved is not self.mae:
+                self._save_newest()
+        else:
+            self._return_if_rejected()
+
+    def note_rejected(self, version: int, reason: str) -> None:
+        """Record that the estimator has rejected the network of this version, and why.
+
+        A network may be rejected after it was accepted, if an anomaly follows soon.
+        """
+        self.rejected, self.last_rejected = self.rejected + 1, reason
+        self._rejected_version = version
+        self._return_if_rejected()
+
+    def _return_if_rejected(self) -> None:
+        """Return to the network of the estimator if the newest one is rejected.
+
+        The estimator's messages on rejected and accepted networks may arrive in either order.
+        """
+        mae, in_use, saved = self.mae, self._in_use, self._saved
+        if mae is None or saved is None or in_use is None:
+            return
+        if mae.version != self._rejected_version or mae.version == in_use.version:
+            return
+        if saved.version == in_use.version:
+            in_use = saved
+        elif self._state is not None:
+            # The saved network is rejected, or a user has chosen another one for the estimator.
+            try:
+                self._state.back_up(self._samples, self.checkpoint, self.last_rejected)
+            except StateError:  # no space on the disk; the next decision repeats this
+                return
+        self.restore(in_use)
 
     # -- the disk -------------------------------------------------------------------------------
 
     def load(self) -> Mae | None:
-        """Load the saved samples into the store; return the saved network, or None.
-
-        A network that the validation rejects is kept as a backup and not returned.
-        """
-        if self._state is None:
-            return None
-        saved = self._state.load(self._samples)
-        if saved is None or self.is_accepted(saved):
-            return saved
-        self._state.back_up(self._samples, checkpoint.to_bytes(saved), self.last_rejected)
-        self.store()  # save without the network; otherwise each start would make another backup
-        return None
+        """Load the saved samples into the store; return the saved network, or None."""
+        return None if self._state is None else self._state.load(self._samples)
 
     def store(self, changed: bool = True) -> None:
         """Save samples and network if they have `changed`.
@@ -207,7 +212,7 @@ class CheckpointKeeper:
         If they have not, check that the files still exist. In both cases, a failed save is retried.
         """
         if self._state is not None:
-            self._state.keep(self._samples, self.publication.checkpoint, changed)
+            self._state.keep(self._samples, self.checkpoint, changed)
 
     def save(self) -> Path:
         """Save samples and network now, and the network also as a checkpoint file.
@@ -223,7 +228,7 @@ class CheckpointKeeper:
                 "nothing can be saved because state_directory is ''; restart the learner with the "
                 'path of a directory'
             )
-        self._state.save(self._samples, self.publication.checkpoint)
+        self._state.save(self._samples, self.checkpoint)
         return self._state.directory
 
     def back_up(self) -> None:
@@ -232,7 +237,7 @@ class CheckpointKeeper:
         Raises:
             StateError: If the backup cannot be made.
         """
-        data = self.publication.checkpoint
+        data = self.checkpoint
         if self._state is not None and (self._samples or data):
             self._state.back_up(self._samples, data)
 

@@ -2,10 +2,13 @@
 """Online learning from messages to checkpoints, shared by the node and the experiments.
 
     θ, (T, l) ─► SampleCollector ─ samples ─► UpdateScheduler ─ job ─► Trainer
-                       │                                                  │ update
-                       └─ messages of the healthy arm ─► CheckpointKeeper ◄
-                                                          │
-                                         disk, subscribers ◄
+                                                                          │ update
+                            candidates for the estimator ◄─ CheckpointKeeper ◄
+                            decisions of the estimator ─────►    │
+                                                                 └─► disk
+
+The estimator validates the candidates (`estimation/checkpoint_validation.py`). Whatever it decides,
+training continues from the newest samples and weights.
 
 Isolated muscles are not learned: samples do not describe them, and the published network lists
 them.
@@ -58,7 +61,7 @@ class Learner:
         collector: Turns messages into samples.
         scheduler: Decides when an update begins.
         trainer: Computes updates.
-        keeper: Validates, stores and publishes networks.
+        keeper: Stores and publishes networks.
         enabled: Whether the learner learns, see `enable`.
     """
 
@@ -93,7 +96,6 @@ class Learner:
             MusculoskeletalError: If the preset does not exist, or if there are neither joint
                 angles nor tensions.
             StateError: If the directory cannot be used.
-            GateError: If the validation rejects `mae`.
         """
         if joint_source == NONE and not robot.tension_source.is_known:
             raise MusculoskeletalError(
@@ -104,16 +106,15 @@ class Learner:
         self.enabled = True
         self._polled_at = math.inf  # time of the last poll [s]
         self.trainer = trainer(robot, preset, seed)
-        own_preset = self.trainer.preset
         radian = robot.kinematics.radian
         samples = SampleStore(radian=radian)
         healthy = Reservoir(robot.muscle_count, seed, radian=radian)
         self.collector = SampleCollector(robot, samples, healthy, period, joint_source)
-        least = own_preset.least_samples
+        least = self.trainer.preset.least_samples
         self.scheduler = UpdateScheduler(
             least if joint_source == SENSOR else max(least, LEAST_BLIND), steps
         )
-        self.keeper = CheckpointKeeper(robot, samples, directory, own_preset.validates_updates)
+        self.keeper = CheckpointKeeper(robot, samples, directory)
         saved = self.keeper.load()
         self.offset_history = OffsetHistory(samples, self.body.offsets.offset)
         self.joint_history = JointHistory(samples, robot.joint_count)
@@ -182,8 +183,8 @@ class Learner:
             return
         if self.collector.has_jumped:  # since the last calibration of the lengths
             return
-        measured = None if paired.theta is None else paired.theta[: self.robot.joint_count]
-        self.keeper.observe(paired.message, paired.dt, self.collector.is_anomaly, measured)
+        if not self.collector.is_anomaly:
+            self.keeper.observe(paired.message, paired.dt)
         for _ in self.collector.collect(paired):
             self.offset_history.accepted(time)
             self.joint_history.accepted(time)
@@ -258,7 +259,6 @@ class Learner:
             elif offsets.known:
                 self._use_known_offsets()
         self.keeper.isolate(body.isolated)
-        self.keeper.forget_messages()
 
     def isolate(self, muscles: Iterable[int]) -> None:
         """Use the present body state with exactly these muscles isolated."""
@@ -278,19 +278,11 @@ class Learner:
             self.collector.healthy.remove_angles(joint, self._time - trust.since[joint])
         if unused:
             self.reset()
-            self.keeper.forget_messages()
         self._note_new_samples()
 
     def anomaly(self, detected: bool) -> None:
-        """Stop learning if an anomaly is `detected`; resume learning otherwise.
-
-        On detection, the keeper returns to the last network that was in use long enough without an
-        anomaly.
-        """
+        """Stop learning if an anomaly is `detected`; resume learning otherwise."""
         self.collector.set_anomaly(detected)
-        # The detector of the earlier network may have been calibrated before a muscle was changed.
-        holds = self.scheduler.statistics_hold
-        self.keeper.set_anomaly(detected, lambda mae: mae if holds else uncalibrated(mae))
         self._publish_isolation()
 
     def _publish_isolation(self) -> None:
@@ -359,8 +351,16 @@ class Learner:
             return
         for muscle, newest in update.changed:
             self._forget(muscle, newest)
-        if self.keeper.is_accepted(mae):
-            self.keeper.use(mae)
+        self.keeper.use(mae)
+
+    def note_accepted(self, mae: Mae) -> None:
+        """Record that the estimator uses this network; see `CheckpointKeeper`."""
+        # Its detector may have been calibrated before a muscle was changed.
+        self.keeper.note_accepted(mae if self.scheduler.statistics_hold else uncalibrated(mae))
+
+    def note_rejected(self, version: int, reason: str) -> None:
+        """Record that the estimator has rejected the network of this version, and why."""
+        self.keeper.note_rejected(version, reason)
 
     def _forget(self, muscle: int, newest: int = 0) -> None:
         """Record that only the last `newest` samples describe a muscle, and schedule an update.
@@ -374,12 +374,7 @@ class Learner:
     # -- beginning and end ----------------------------------------------------------------------
 
     def begin(self, mae: Mae) -> None:
-        """Start from a network, because no saved network could be loaded; samples are kept.
-
-        Raises:
-            GateError: If the validation rejects the network.
-        """
-        self.keeper.check(mae)
+        """Start from a network, because no saved network could be loaded; samples are kept."""
         self._start(self.keeper.numbered(mae))
 
     def replace(self, mae: Mae | None) -> None:
@@ -389,11 +384,9 @@ class Learner:
 
         Raises:
             StateError: If the backup cannot be made; nothing is changed then.
-            GateError: If the validation rejects the network; nothing is changed then.
         """
         successor = None
         if mae is not None:
-            self.keeper.check(mae)
             # Muscles that the estimator has isolated stay isolated in the new network.
             isolated = {*mae.isolated, *self.isolated}
             successor = self.keeper.numbered(mae.without(isolated))
@@ -435,14 +428,14 @@ class Learner:
 
     @property
     def mae(self) -> Mae:
-        """The network in use; only valid if `checkpoint` is not None."""
+        """The newest network; only valid if `checkpoint` is not None."""
         assert self.keeper.mae is not None
         return self.keeper.mae
 
     @property
     def checkpoint(self) -> bytes | None:
-        """The network in use as the content of a checkpoint; None before the first network."""
-        return self.keeper.publication.checkpoint
+        """The last accepted network, as the content of a checkpoint; None before the first one."""
+        return self.keeper.checkpoint
 
     @property
     def updates(self) -> int:

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 
 from musculoskeletal_ae.arrays import Bools
+from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.exceptions import CheckpointError, StateError
 from musculoskeletal_ae.learning.samples import Sample, SampleStore, StoredSample
 from musculoskeletal_ae.mae import checkpoint
@@ -187,7 +188,8 @@ def restore_network(state: SavedState, robot: Robot) -> Mae | None:
     """Return the saved network, or None if none was saved.
 
     Raises:
-        StateError: If the saved network lacks muscles of the robot or is not a valid checkpoint.
+        StateError: If the saved network lacks muscles of the robot, is not a valid checkpoint, or
+            does not explain the robot, which may have been changed since.
     """
     if added := [name for name in robot.muscles if name not in state.muscles]:
         raise StateError(
@@ -197,8 +199,10 @@ def restore_network(state: SavedState, robot: Robot) -> Mae | None:
     if state.network is None:
         return None
     try:
-        return checkpoint.restored(state.network, robot)
+        mae = checkpoint.restored(state.network, robot)
+        CheckpointValidator(robot).check(mae)
     except CheckpointError as error:
         raise StateError(
             f'the saved network cannot be used, so only the saved samples are used; reason: {error}'
         ) from error
+    return mae

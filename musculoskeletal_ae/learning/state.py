@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Saves the learner's state to disk, so that nothing is lost if the learner is killed.
 
-    learner.state          the samples and the newest network
+    learner.state          the samples and the newest accepted network
     previous.state         the state before that, used if the newest one is missing or unusable
-    backup-N.state         states that the user replaced or that were unusable
+    backup-N.state         states that the user replaced, that were unusable, or whose network the
+                           estimator has rejected later
     network.safetensors    the network of the last explicit save, as a checkpoint for other tools
     lock                   locked by the learner that uses the directory
 

@@ -1,28 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
 """The part of the estimator that selects the network that all nodes use.
 
-    mae_checkpoint (learner) ─► validation ─► accepted_checkpoint (estimator) ─► controller, sim
+    mae_checkpoint (learner) ─► validation ─► accepted_checkpoint ─► controller, sim, learner
+                                          └─► rejected_checkpoint ─► learner
+
+Each candidate of the learner is validated here and nowhere else. The decision is published: the
+network if it is accepted, its version and the reason if it is rejected.
 
 Candidates arrive on the topic `mae_checkpoint`, or from the file that the parameter `checkpoint`
 names. The estimator uses an accepted network and publishes it on a latched topic. As soon as there
 is an accepted network, controller and simulator use only accepted networks.
 
 An anomaly that is detected soon after a network was accepted may be due to this network. The
-estimator then returns to the newest network that was in use long enough without an anomaly, and
-publishes it again.
+estimator then returns to the newest network that was in use long enough without an anomaly. It
+publishes this network again, and the version of the doubtful one as rejected.
 """
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 
 import numpy as np
+from diagnostic_msgs.msg import KeyValue
 from std_msgs.msg import UInt8MultiArray
 
 from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
-from musculoskeletal_ae.exceptions import CheckpointError
+from musculoskeletal_ae.exceptions import CheckpointError, printable
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES
+from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, REJECTED
 from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message
 from musculoskeletal_ae.nodes.shell import Shell
 
@@ -47,14 +53,15 @@ class Candidates:
         """
         self._node, self._use, self._on_candidate = node, use, on_candidate
         self.validator = CheckpointValidator(node.robot)
-        self._publisher = node.create_publisher(UInt8MultiArray, ACCEPTED, LATCHED)
+        self._accepted = node.create_publisher(UInt8MultiArray, ACCEPTED, LATCHED)
+        self._rejected = node.create_publisher(KeyValue, REJECTED, LATCHED)
         self.queue = node.checkpoint_queue(CANDIDATES, self._validate)
 
     def follow(self) -> None:
         """Subscribe to candidates, and follow the parameter `checkpoint`."""
         node = self._node
         node.needed.add(CANDIDATES)
-        node.follow_parameter('checkpoint', self._use_file, node.load_checkpoint)
+        node.follow_parameter('checkpoint', self._use_file, self._read)
         node.listen(UInt8MultiArray, CANDIDATES, self.queue.propose, LATCHED)
 
     def on_anomaly(self, detected: bool) -> None:
@@ -66,29 +73,47 @@ class Candidates:
         Args:
             detected: Whether an anomaly has begun; False if one has ended.
         """
-        if detected and self.validator.mae is not None:
-            self.queue.give_up()
+        in_use, waiting = self.validator.mae, None
+        if detected and in_use is not None:
+            waiting = self.queue.give_up()
         before = self.validator.anomaly(detected, time.monotonic())
-        if before is not None:
+        if before is not None and in_use is not None:
+            reason = 'an anomaly was detected soon after it was accepted'
             self._node.get_logger().warning(
-                'an anomaly was detected soon after a new network was accepted; returned to '
-                f'checkpoint version {before.version}'
+                f'checkpoint version {in_use.version}: {reason}; returned to checkpoint version '
+                f'{before.version}'
             )
             self._use(before)
             self._publish(before)
+            self._reject(in_use, reason)
+        if waiting is not None:
+            with suppress(CheckpointError):  # an unfit checkpoint has no version
+                mae = checkpoint.from_bytes(bytes(waiting.data), self._node.robot)
+                self._reject(mae, 'an anomaly was detected before it was validated')
 
     def _validate(self, message: UInt8MultiArray) -> Iterator[None]:
         mae = checkpoint.from_bytes(bytes(message.data), self._node.robot)
         yield
-        yield from self.validator.trial(mae)
-        complete = self.validator.with_detector(mae, time.monotonic())
-        self._accept(complete, message if complete is mae else None)
+        if self.validator.is_in_use(mae):
+            return
+        try:
+            yield from self.validator.trial(mae)
+            complete = self.validator.with_detector(mae, time.monotonic())
+            self._accept(complete, message if complete is mae else None)
+        except CheckpointError as error:
+            self._reject(mae, str(error))
+            raise
         self._on_candidate()
+
+    def _reject(self, mae: Mae, reason: str) -> None:
+        self._rejected.publish(KeyValue(key=str(mae.version), value=printable(reason)))
+
+    def _read(self, path: str) -> Mae | None:
+        return checkpoint.load(path, self._node.robot) if path else None
 
     def _use_file(self, mae: Mae) -> None:
         self.validator.check(mae, is_chosen=True)
         self._accept(mae)
-        self.queue.give_up()
         self._node.needed.remove(CANDIDATES)
 
     def _accept(self, mae: Mae, message: UInt8MultiArray | None = None) -> None:
@@ -103,4 +128,4 @@ class Candidates:
         self._node.checkpoint_version = mae.version
         if message is None:
             message = bytes_message(checkpoint.to_bytes(mae))
-        self._publisher.publish(message)
+        self._accepted.publish(message)

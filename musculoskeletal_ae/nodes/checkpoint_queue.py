@@ -14,6 +14,7 @@ from musculoskeletal_ae.reception import Reception
 
 CANDIDATES = 'mae_checkpoint'  # topic of the networks that the learner proposes
 ACCEPTED = 'accepted_checkpoint'  # topic of the networks that the estimator has accepted
+REJECTED = 'rejected_checkpoint'  # topic of the versions that it has rejected, with the reasons
 #: Time between steps [s]. A step takes a few milliseconds, at most a quarter of this time.
 STEP_PERIOD = 0.02
 LARGEST = 64 << 20  # largest size of a checkpoint [bytes]; a typical checkpoint has half a MB
@@ -47,7 +48,8 @@ class CheckpointQueue:
         """
         self._reception, self._topic = reception, topic
         self._handle, self._unfit = handle, unfit
-        self._next: UInt8MultiArray | None = None
+        self._next: UInt8MultiArray | None = None  # the one that waits
+        self._present: UInt8MultiArray | None = None  # the one that is being processed
         self._steps: Iterator[None] | None = None
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer: Any = node.create_timer(STEP_PERIOD, self._step, clock=clock)
@@ -73,17 +75,24 @@ class CheckpointQueue:
         if self._timer.is_canceled():
             self._timer.reset()
 
-    def give_up(self) -> None:
-        """Discard the checkpoint that is being processed, and the one that waits."""
-        self._steps = self._next = None
+    def give_up(self) -> UInt8MultiArray | None:
+        """Discard the checkpoint that is being processed, and the one that waits.
+
+        Returns:
+            The newest discarded checkpoint; None if there was none.
+        """
+        newest = self._present if self._next is None else self._next
+        self._steps = self._next = self._present = None
         self._timer.cancel()
+        return newest
 
     def _step(self) -> None:
         if self._steps is None:
             if self._next is None:
                 self._timer.cancel()
                 return
-            self._steps, self._next = self._handle(self._next), None
+            self._present, self._next = self._next, None
+            self._steps = self._handle(self._present)
         steps = self._steps
         try:
             next(steps)
@@ -97,4 +106,4 @@ class CheckpointQueue:
         except Exception as error:  # noqa: BLE001 - a received checkpoint may cause any exception
             self._reception.reject_error(self._topic, error)
         if self._steps is steps:  # false if the step has called `give_up`
-            self._steps = None
+            self._steps = self._present = None

@@ -4,7 +4,8 @@
 muscle_states → estimated_joint_states with estimated_joint_covariance, estimated_muscle_states,
 anomaly, anomaly_detected, estimated_external_wrench, isolated_muscles, muscle_length_zeros,
 joint_sensor_trust, estimated/markers; on request muscle_joint_states and /tf.
-mae_checkpoint → accepted_checkpoint, the networks that have passed the validation.
+mae_checkpoint → accepted_checkpoint, the networks that have passed the validation, and
+rejected_checkpoint, the versions of those that have not.
 marker_pose → vision_joint_states, the joint angles measured by a camera.
 joint_states are optional. They are used by the length calibration, by the validation of
 checkpoints, and by the detectors that compare them with the lengths.
@@ -255,7 +256,7 @@ class Estimator(Shell):
             self.frames.publish(state.theta)
         if self.core.body.offsets.known:
             self.candidates.validator.message(
-                sample.tension_read, sample.length, now, self.core.measured
+                sample.tension_read, sample.length, sample.sliding, now, self.core.measured
             )
         self.joints.publish(joint_message(self.robot.joints, state.theta, stamp))
         if output.covariance is not None and is_heard(self.covariance):

@@ -3,13 +3,15 @@
 
 muscle_states, joint_states or vision_joint_states (or neither), imu, anomaly_detected,
 isolated_muscles, muscle_length_zeros, joint_sensor_trust → mae_checkpoint.
+accepted_checkpoint and rejected_checkpoint are the estimator's answers.
 """
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import partial
 from typing import Any
 
+from diagnostic_msgs.msg import KeyValue
 from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
@@ -18,7 +20,9 @@ from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.learning import learner
 from musculoskeletal_ae.learning.trainer import TrainerProcess
+from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, REJECTED
 from musculoskeletal_ae.nodes.messages import LATCHED, SENSOR, bytes_message, serve
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.sources import SEVERAL, LinkSensors, publishers_of
@@ -74,6 +78,9 @@ class Learner(Shell):
         serve(self, SetBool, 'learner/enable', self._enable)
         serve(self, Trigger, 'learner/save', lambda _: f'saved in {self.core.save()}')
         serve(self, Trigger, 'learner/relearn', self._relearn)
+        self._decisions = self.checkpoint_queue(ACCEPTED, self._use_accepted)
+        self.listen(UInt8MultiArray, ACCEPTED, self._decisions.propose, LATCHED)
+        self.listen(KeyValue, REJECTED, self._use_rejected, LATCHED)
         self.create_timer(POLL_PERIOD, self._poll, clock=STEADY)
 
     # -- parameters -----------------------------------------------------------------------------
@@ -135,6 +142,18 @@ class Learner(Shell):
         if muscles or knows or not self.core.isolated:
             self.core.isolate(muscles)
         self.has_heard_isolated = True
+
+    def _use_accepted(self, message: UInt8MultiArray) -> Iterator[None]:
+        mae = checkpoint.from_bytes(bytes(message.data), self.robot)
+        yield
+        self.core.note_accepted(mae)
+
+    def _use_rejected(self, message: KeyValue) -> None:
+        if not message.key.isdecimal():
+            raise MessageError(
+                'no version', f'rejected_checkpoint: {message.key!r} is no version; legal: a number'
+            )
+        self.core.note_rejected(int(message.key), message.value)
 
     def _enable(self, request: SetBool.Request) -> str:
         self.core.enable(request.data)

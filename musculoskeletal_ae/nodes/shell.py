@@ -357,7 +357,6 @@ class Shell(Node):
                     'all nodes use the network of the estimator; set the parameter `checkpoint` of '
                     'the estimator instead'
                 )
-            CheckpointValidator(self.robot).check(mae)
             put_to_use(mae)
 
         self.accepted = self.checkpoint_queue(ACCEPTED, handle, unfit)
@@ -366,8 +365,16 @@ class Shell(Node):
         self.listen(UInt8MultiArray, ACCEPTED, self.accepted.propose, LATCHED)
 
     def load_checkpoint(self, path: str) -> Mae | None:
-        """Return the network in a file, checked for this robot; None if the path is empty."""
-        return checkpoint.load(path, self.robot) if path else None
+        """Return the network in a file; None if the path is empty.
+
+        Raises:
+            CheckpointError: If it does not belong to this robot, or does not explain it.
+        """
+        if not path:
+            return None
+        mae = checkpoint.load(path, self.robot)
+        CheckpointValidator(self.robot).check(mae)
+        return mae
 
     def checkpoint_queue(
         self,

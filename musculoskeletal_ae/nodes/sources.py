@@ -50,6 +50,7 @@ AUTHORS = {
     'isolated_muscles': _ESTIMATOR,
     'joint_sensor_trust': _ESTIMATOR,
     'accepted_checkpoint': _ESTIMATOR,
+    'rejected_checkpoint': _ESTIMATOR,
     'mae_checkpoint': 'the learner',
     CLOCK: 'the source of time',
 }

@@ -30,7 +30,6 @@ class DefaultPreset:
 
     name = DEFAULT
     least_samples = 2
-    validates_updates = True
     simulates_on_devices = True
     methods_without_tension: tuple[str, ...] = 'geometric', 'first', 'proposed'
 

@@ -34,7 +34,6 @@ class PaperPreset:
 
     name = PAPER_PRESET
     least_samples = THRESHOLD + 1
-    validates_updates = False
     simulates_on_devices = False
     methods_without_tension: tuple[str, ...] = 'geometric', 'first'
 

@@ -32,15 +32,12 @@ class Preset(Protocol):
     Attributes:
         name: Name by which users select the preset.
         least_samples: Smallest number of samples with which a network is updated online.
-        validates_updates: Whether the learner validates an update before it publishes it
-            (`estimation/checkpoint_validation.py`).
         simulates_on_devices: Whether the simulator can run on a torch device.
         methods_without_tension: Names of the control methods that need no measured tension.
     """
 
     name: str
     least_samples: int
-    validates_updates: bool
     simulates_on_devices: bool
     methods_without_tension: tuple[str, ...]
 

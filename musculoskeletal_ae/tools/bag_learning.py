@@ -15,9 +15,15 @@ from musculoskeletal_ae.arrival import LONGEST_STEP
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
+from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.estimation.finding import Finding, observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
-from musculoskeletal_ae.exceptions import BagError, CheckpointError, MusculoskeletalError
+from musculoskeletal_ae.exceptions import (
+    BagError,
+    CheckpointError,
+    GateError,
+    MusculoskeletalError,
+)
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.rest import REST_TIME
 from musculoskeletal_ae.mae import checkpoint
@@ -26,7 +32,7 @@ from musculoskeletal_ae.options import DEFAULT_SEED
 from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
-from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 from musculoskeletal_ae.signals.readings import MuscleReading, muscle_reading
 from musculoskeletal_ae.stop_signals import STOP, Reaction
 from musculoskeletal_ae.tools.model_training import prepare, train_on_model
@@ -53,6 +59,7 @@ def train(args: Namespace) -> None:
     ]
     _warn(warnings)  # also before the training, because the user may want to stop here
     mae = _initial_network(robot, args)
+    CheckpointValidator(robot).check(mae)
     learner = Learner(robot, mae, args.preset, args.seed)
     before = {path: error(mae, pairs) for path, pairs in recordings.items()}
     try:
@@ -234,7 +241,7 @@ def anomaly_in(
         reading = muscle_reading(
             robot, length=recording.length[row], tension=recording.tension[row]
         )
-        finding = _finding(health, reduced, stream, reading, at, min(dt, LONGEST_STEP))
+        finding = _finding(health, reduced, _sample(stream, reading, at), min(dt, LONGEST_STEP))
         progress()
         if finding is None:
             continue
@@ -282,14 +289,16 @@ def learn(
 ) -> str:
     """Pass a recording to a learner, message by message, as on a running arm.
 
-    As in the estimator, the health monitor decides when learning has to stop. `progress` is called
-    with the recorded seconds since its last call.
+    This function plays the part of the estimator: it validates the networks, and the health monitor
+    decides when learning has to stop. `progress` is called with the recorded seconds since its last
+    call.
 
     Returns:
         A warning if learning stopped before the end of the recording, or ''.
     """
     stream = MuscleStream(learner.robot, learner.body)
     health = HealthMonitor(learner.robot, learner.trainer.preset.name)
+    validator = CheckpointValidator(learner.robot)
     newest, stop = None, ''
     learner.reset()
     learner.anomaly(False)
@@ -298,19 +307,27 @@ def learn(
         isolated = _isolated(recorded, learner.isolated)
         if isolated != learner.isolated:
             learner.isolate(isolated)
+            validator.isolated = isolated
+            validator.forget()
             stream.use_body(learner.body)
             health.reset()
             newest = None
         if learner.mae is not newest:
             newest = learner.mae
-            mae = newest.without(isolated)
+            mae = _network_in_use(validator, learner, at).without(isolated)
             stream.use_transmission(mae.transmission)
             health.use(mae)
         reading = muscle_reading(learner.robot, length=length, tension=tension)
         learner.joints(at, theta)
-        finding = _finding(health, mae, stream, reading, at, min(dt, LONGEST_STEP))
+        sample = _sample(stream, reading, at)
+        if sample is not None:
+            validator.message(sample.tension_read, sample.length, sample.sliding, at, theta)
+        finding = _finding(health, mae, sample, min(dt, LONGEST_STEP))
         if finding is not None:
             learner.anomaly(True)
+            if (before := validator.anomaly(True, at)) is not None:
+                learner.note_accepted(before)
+                learner.note_rejected(newest.version, 'an anomaly was detected soon after')
             stop = stop or (
                 f'learning stopped {at:.1f} s after the start: an anomaly begins there '
                 f'({learner.robot.muscles[finding.muscle]}: {finding.kind.identifier})'
@@ -320,24 +337,39 @@ def learn(
         learner.poll(at)
         if progress is not None:
             progress(dt)
+    if learner.mae is not newest:
+        _network_in_use(validator, learner, at)
     return stop
 
 
-def _finding(
-    health: HealthMonitor,
-    mae: Mae,
-    stream: MuscleStream,
-    reading: MuscleReading,
-    time: float,
-    dt: float,
-) -> Finding | None:
-    """Return the fault that the health monitor finds in a message; None if it finds none.
-
-    An implausible message is skipped, with None as the result.
-    """
+def _network_in_use(validator: CheckpointValidator, learner: Learner, now: float) -> Mae:
+    """Decide on the learner's newest network, tell the learner, and return the network to use."""
+    mae = learner.mae
+    if validator.is_in_use(mae):
+        return mae
     try:
-        sample = stream.take(reading, time)
+        validator.check(mae)
+    except GateError as error:
+        learner.note_rejected(mae.version, str(error))
+    else:
+        validator.take(mae, now)
+        learner.note_accepted(mae)
+    return mae if validator.mae is None else validator.mae
+
+
+def _sample(stream: MuscleStream, reading: MuscleReading, time: float) -> MuscleSample | None:
+    """Return the sample of a message; None if it is implausible."""
+    try:
+        return stream.take(reading, time)
     except RejectionError:
+        return None
+
+
+def _finding(
+    health: HealthMonitor, mae: Mae, sample: MuscleSample | None, dt: float
+) -> Finding | None:
+    """Return the fault that the health monitor finds in a sample; None if it finds none."""
+    if sample is None:
         return None
     observation = observe(mae, sample.length, sample.motor_tension, sample.bone_tension, dt)
     return health.step(observation)

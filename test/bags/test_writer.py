@@ -19,6 +19,7 @@ from musculoskeletal_ae.exceptions import BagError
 LATCHED = (
     'robot_description', 'accepted_checkpoint', 'anomaly_detected', 'controller_mode',
     'isolated_muscles', 'joint_sensor_trust', 'mae_checkpoint', 'muscle_length_zeros',
+    'rejected_checkpoint',
 )  # fmt: skip
 
 

@@ -25,14 +25,12 @@ from musculoskeletal_ae.estimation.validation.message_errors import FLOOR
 from musculoskeletal_ae.estimation.validation.postures import LIMITS
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.learning.calibration import Healthy, calibrate
-from musculoskeletal_ae.learning.job import Update
-from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot.load('arm26')
+STILL = np.zeros(ROBOT.muscle_count)  # direction of sliding of tendons that have not slid
 
 
 def body(count=60, seed=0):
@@ -49,7 +47,7 @@ def body(count=60, seed=0):
 def send_healthy_messages(gate, start=0.0):
     """Send a validator six seconds of messages of a healthy arm; return the time at the end [s]."""
     for k, (tension, length) in enumerate(zip(*body(), strict=True)):
-        gate.message(tension, length, start + 0.1 * k)
+        gate.message(tension, length, STILL, start + 0.1 * k)
     return start + 6.0
 
 
@@ -182,57 +180,31 @@ def test_messages_just_before_and_during_an_anomaly_do_not_count_as_healthy(trai
     before = gate.message_errors(trained['default'])
     tension, length = body()
     for k in range(15):
-        gate.message(tension[k], length[k] + 0.2, end + 0.1 * k)
+        gate.message(tension[k], length[k] + 0.2, STILL, end + 0.1 * k)
     gate.anomaly(True, end + 0.75 * DETECTION_DELAY)
     for k in range(30):
-        gate.message(tension[k], length[k] + 0.2, end + 2.0 + 0.1 * k)
+        gate.message(tension[k], length[k] + 0.2, STILL, end + 2.0 + 0.1 * k)
     after = gate.message_errors(trained['default'])
     for name in before:
         assert after[name].max() < 2.0 * before[name].max() + 1e-3
 
 
-class ScriptedTrainer(Trainer):
-    """A trainer whose updates the test chooses."""
-
-    answer = None
-
-    def poll(self):
-        mae, self.answer = self.answer, None
-        return None if mae is None else Update(mae, 0.0)
-
-
-def test_the_learner_publishes_no_refused_network_and_rolls_back_on_an_anomaly(trained):
-    learner = Learner(ROBOT, trained['default'], preset='default', trainer=ScriptedTrainer)
-    good = learner.poll(0.0)
-    with pytest.raises(GateError):
-        learner.replace(ATTACKS['weights × 1.5'](trained['default']))
-    learner.trainer.answer = ATTACKS['weights × 1.5'](trained['default'])
-    assert learner.poll(10.0) is None
-    assert learner.keeper.rejected == 1
-    assert 'limit' in learner.report().values['last rejected network']
-    assert learner.checkpoint == good
-    learner.trainer.answer = trained['paper']
-    assert learner.poll(20.0) is not None
-    learner.anomaly(True)
-    assert learner.poll(30.0) is not None
-    np.testing.assert_array_equal(learner.mae.mean, trained['default'].mean)
-
-
 def test_the_first_network_is_accepted_although_the_body_differs_from_the_model(trained):
     gate = CheckpointValidator(ROBOT)
     for k, (tension, length) in enumerate(zip(*body(), strict=True)):
-        gate.message(tension, length + 0.2 * np.array([1, -1, 1, -1, 1, -1]), 0.1 * k)
+        gate.message(tension, length + 0.2 * np.array([1, -1, 1, -1, 1, -1]), STILL, 0.1 * k)
     errors = gate.message_errors(trained['default'])
     assert any(errors[name].max() > FLOOR[name] for name in FLOOR)
     gate.check(trained['default'])
 
 
-def test_a_restarted_learner_does_not_roll_back_to_an_earlier_network(trained):
-    learner = Learner(ROBOT, trained['paper'], preset='default')
-    learner.replace(None)
-    learner.begin(trained['default'])
-    learner.anomaly(True)
-    np.testing.assert_array_equal(learner.mae.mean, trained['default'].mean)
+def test_only_the_network_in_use_needs_no_decision(trained):
+    gate, mae = CheckpointValidator(ROBOT), trained['default']
+    assert not gate.is_in_use(mae)
+    gate.take(mae, 0.0)
+    assert gate.is_in_use(calibrated(mae).without((2,)))
+    assert not gate.is_in_use(replace(mae, version=mae.version + 1))
+    assert not gate.is_in_use(replace(trained['paper'], version=mae.version))
 
 
 def test_many_unproven_networks_leave_the_first_one_to_roll_back_to(trained):
@@ -254,7 +226,7 @@ def send_messages_of_the_model(gate, measures):
     tension = rng.uniform(30.0, 150.0, (60, ROBOT.muscle_count))
     length = ROBOT.muscle_lengths(theta, tension)
     for k in range(60):
-        gate.message(tension[k], length[k], 0.1 * k, theta[k] if measures else None)
+        gate.message(tension[k], length[k], STILL, 0.1 * k, theta[k] if measures else None)
     return theta, tension, length
 
 

@@ -262,8 +262,9 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
         for now in range(10):
             learner.poll(2.0 * now)
         assert learner.updates == 4
-    assert_same(read_backup(tmp_path, small, tmp_path / 'scratch')[0], store)
     assert_same(read(tmp_path, arm26)[0], loaded)
+    (tmp_path / BACKUP).rename(tmp_path / NEWEST)
+    assert_same(read(tmp_path, small)[0], store)
 
 
 # -- one learner per directory --------------------------------------------------------------------

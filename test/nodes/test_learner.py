@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from graph import DEADLINE, LOOK
 from processes import is_running
 from rclpy.parameter import Parameter
@@ -186,6 +186,33 @@ def test_the_learner_publishes_and_saves_checkpoints_and_replaces_a_dead_trainin
     assert (Path(state) / NEWEST).exists()
     assert graph.call(Trigger, 'learner/save').success
     assert checkpoint.load(Path(state) / NETWORK, arm26).version in versions(graph, arm26)
+
+
+def test_the_learner_saves_what_the_estimator_accepts_and_returns_from_what_it_rejects(
+    host, graph, arm26, state
+):
+    learner = host(state_directory=state)
+    published = graph.received['mae_checkpoint']
+    accepted = graph.publisher(UInt8MultiArray, 'accepted_checkpoint', LATCHED)
+    rejected = graph.publisher(KeyValue, 'rejected_checkpoint', LATCHED)
+
+    def saved():
+        return checkpoint.from_bytes(learner.node.core.checkpoint, arm26).version
+
+    learner.learn(lambda: len(published) >= 2, 'a candidate')
+    assert graph.call(SetBool, 'learner/enable', SetBool.Request(data=False)).success
+    accepted.publish(published[-1])
+    candidate = versions(graph, arm26)[-1]
+    learner.learn(lambda: saved() == candidate, 'the accepted network')
+    assert graph.call(SetBool, 'learner/enable', SetBool.Request(data=True)).success
+    learner.learn(lambda: versions(graph, arm26)[-1] > candidate, 'another candidate')
+    rejected.publish(KeyValue(key='no number', value=''))
+    learner.learn(lambda: 'no version' in str(learner.node.rejected), 'the refusal')
+    learner.node.core.enable(False)
+    rejected.publish(KeyValue(key=str(learner.node.core.mae.version), value='it is too wrong'))
+    learner.learn(lambda: versions(graph, arm26)[-1] == candidate, 'the network in use')
+    assert saved() == candidate
+    assert learner.report().values['last rejected network'] == 'it is too wrong'
 
 
 def confirm(_, response):

@@ -70,6 +70,7 @@ def test_commands_checkpoints_and_targets_have_one_source():
         ('muscle_tension_command', 'controller'),
         ('mae_checkpoint', 'learner'),
         ('accepted_checkpoint', 'estimator'),
+        ('rejected_checkpoint', 'estimator'),
         ('target_joint_states', 'operator'),
         ('joint_trajectory', 'operator'),
         ('target_pose', 'operator'),

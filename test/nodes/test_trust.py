@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import rclpy
 from controlled_arm import ControlledArm
+from diagnostic_msgs.msg import KeyValue
 from graph import DEADLINE, LOOK
 from network_attacks import ATTACKS
 from rosgraph_msgs.msg import Clock
@@ -39,8 +40,11 @@ def arm(graph, arm26, trained_file):
 def test_a_bad_network_is_rejected_for_all_nodes_and_the_arm_goes_on(arm, trained, trained_file):
     bad = replace(ATTACKS['weights × 1.5'](trained['default']), version=66)
     sim = arm.graph.host(Sim, robot='arm26', checkpoint=trained_file)
+    decisions = arm.graph.listen(KeyValue, 'rejected_checkpoint', LATCHED)
     arm.graph.send_network(checkpoint.to_bytes(bad))
-    arm.graph.wait(lambda: arm.estimator.rejected[REFUSED], 'the rejection')
+    arm.graph.wait(lambda: arm.estimator.rejected[REFUSED] and decisions, 'the rejection')
+    assert decisions[-1].key == '66'
+    assert 'from the geometric model, limit' in decisions[-1].value
     why = arm.estimator._reception.last_rejected
     assert 'from the geometric model, limit' in why
     assert 66 not in (arm.estimator.core.mae.version, arm.controller.core.mae.version)
@@ -82,13 +86,17 @@ def test_of_networks_received_during_a_validation_all_nodes_use_the_last_without
     assert 'stopped' not in arm.state().message
 
 
-def test_an_anomaly_cancels_the_validation_of_a_network(arm, trained):
+def test_an_anomaly_rejects_a_network_that_is_being_validated(arm, trained):
     estimator = arm.estimator
+    decisions = arm.graph.listen(KeyValue, 'rejected_checkpoint', LATCHED)
     first, candidates = estimator.core.state.complete_mae, estimator.candidates
-    arm.graph.send_network(checkpoint.to_bytes(trained['paper']))
+    arm.graph.send_network(checkpoint.to_bytes(replace(trained['paper'], version=67)))
     arm.graph.wait(lambda: candidates.queue.is_busy, 'the validation')
     candidates.on_anomaly(True)
-    arm.graph.wait(lambda: not candidates.queue.is_busy, 'the end of the validation')
+    arm.graph.wait(lambda: decisions, 'the decision')
+    assert decisions[-1].key == '67'
+    assert 'anomaly' in decisions[-1].value
+    assert not candidates.queue.is_busy
     assert estimator.core.state.complete_mae is first
 
 
@@ -112,7 +120,12 @@ def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_n
         return all(node.core.mae.version == first + 1 for node in nodes)
 
     arm.graph.wait(is_used, 'the new network')
+    decisions = arm.graph.listen(KeyValue, 'rejected_checkpoint', LATCHED)
     arm.estimator.candidates.on_anomaly(True)
+    arm.graph.wait(
+        lambda: decisions and 'soon after' in decisions[-1].value, 'the rejection of the new one'
+    )
+    assert decisions[-1].key == str(first + 1)
     arm.graph.wait(lambda: all(n.core.mae.version == first for n in nodes), 'the proven network')
 
 

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stores the healthy messages of the last seconds, on which candidate networks are validated."""
 
-import math
 from collections import deque
 from typing import NamedTuple
 
@@ -9,8 +8,6 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.signals.friction import FrictionDirection
-from musculoskeletal_ae.signals.limits import LIMITS
 
 SPAN = 10.0  # time that the kept messages cover [s]
 SPACING = 0.1  # shortest time between two kept messages [s]
@@ -21,7 +18,7 @@ class _Message(NamedTuple):
     time: float  # time on the steady clock [s]
     tension: Array  # T [N], (M,)
     length: Array  # l [m], (M,)
-    direction: Array  # s: direction in which each tendon slid last, (M,)
+    sliding: Array  # s: direction in which each tendon slid last, (M,)
     theta: Array  # measured θ [rad], NaN if it was not measured, (D,)
 
 
@@ -31,7 +28,6 @@ class RecentMessages:
     def __init__(self, joint_count: int) -> None:
         self._unmeasured = np.full(joint_count, np.nan)
         self._messages: deque[_Message] = deque()
-        self._direction, self._time = FrictionDirection(), math.inf
 
     def __len__(self) -> int:
         return len(self._messages)
@@ -47,26 +43,29 @@ class RecentMessages:
         return np.array([message.theta for message in self._messages])
 
     def note(
-        self, tension: Array, length: Array, now: float, theta: Array | None, is_healthy: bool
+        self,
+        tension: Array,
+        length: Array,
+        sliding: Array,
+        now: float,
+        theta: Array | None,
+        is_healthy: bool,
     ) -> None:
         """Store a message if the arm is healthy and the last stored message is at least 0.1 s old.
 
         Args:
             tension: Tensions as read [N], (M,).
             length: Muscle lengths [m], (M,).
+            sliding: Direction in which each tendon slid last, (M,).
             now: Time of the message [s].
             theta: Measured joint angles [rad], (D,), or None.
             is_healthy: Whether the arm is healthy, that is, no anomaly is detected.
         """
-        period, self._time = now - self._time, now
-        if not 0.0 <= period <= LIMITS.pause:
-            self._direction.reset()
-        direction = self._direction.step(length)
         is_too_early = bool(self._messages) and 0.0 <= now - self._messages[-1].time < SPACING
         if not is_healthy or is_too_early:
             return
         measured = self._unmeasured if theta is None else theta
-        self._messages.append(_Message(now, tension, length, direction, measured))
+        self._messages.append(_Message(now, tension, length, sliding, measured))
         while now - self._messages[0].time > SPAN:
             self._messages.popleft()
 
@@ -77,8 +76,8 @@ class RecentMessages:
         """
         tension = np.array([message.tension for message in self._messages])
         length = np.array([message.length for message in self._messages])
-        direction = np.array([message.direction for message in self._messages])
-        return mae.transmission.end(tension, direction), length
+        sliding = np.array([message.sliding for message in self._messages])
+        return mae.transmission.end(tension, sliding), length
 
     def drop_after(self, time: float) -> None:
         """Discard the messages that are newer than a time [s]."""
@@ -88,8 +87,3 @@ class RecentMessages:
     def clear(self) -> None:
         """Discard all messages."""
         self._messages.clear()
-
-    def forget(self) -> None:
-        """Discard all messages and the direction of sliding, for example after a calibration."""
-        self._messages.clear()
-        self._direction.reset()
