@@ -32,8 +32,9 @@ def write(file: Path, value: Any) -> None:
     """
     arrays = dict[str, Array]()
     document = json.dumps(_encoded(value, arrays))
+    members: dict[str, Any] = {DOCUMENT: np.array(document), **arrays}
     stream = BytesIO()
-    np.savez(stream, **{DOCUMENT: np.array(document)}, **arrays)
+    np.savez(stream, **members)
     write_whole(file, stream.getvalue())
 
 
