@@ -196,7 +196,7 @@ def main(argv: list[str]) -> None:
     text = 'time of learning before a muscle ruptures [s]'
     parser.add_argument('--learning', type=positive, default=LEARNING, metavar='S', help=text)
     parser.add_argument('--frames', type=Path, metavar='DIR', help='folder that keeps every frame')
-    parser.add_out('DIR', default=ROOT / 'doc' / 'images')
+    parser.add_out('DIR', default=Path('doc/images'))
     options = parser.parse_args(argv)
     if unknown := set(options.only) - set(KINDS):
         parser.error(f'--only: unknown pictures {", ".join(unknown)}; legal: {", ".join(KINDS)}')

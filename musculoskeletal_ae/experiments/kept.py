@@ -31,9 +31,10 @@ def write(file: Path, value: Any) -> None:
         TypeError: If a part of the value has another type than those that the module names.
     """
     arrays = dict[str, Array]()
-    parts: dict[str, Any] = {DOCUMENT: np.array(json.dumps(_encoded(value, arrays))), **arrays}
+    document = json.dumps(_encoded(value, arrays))
+    members: dict[str, Any] = {DOCUMENT: np.array(document), **arrays}
     stream = BytesIO()
-    np.savez(stream, **parts)
+    np.savez(stream, **members)
     write_whole(file, stream.getvalue())
 
 
