@@ -188,14 +188,15 @@ class Eliminated:
         diagonal = np.broadcast_to(common_damping, len(common))
         # numpy alone: nodes that estimate would wait 0.3 s for the import of scipy.linalg.
         self._complement = common + np.diag(diagonal) - tall.T @ tall
-        self.root: Array = np.asarray(np.linalg.cholesky(self._complement).T, dtype=float)
+        self.root: Array = np.linalg.cholesky(self._complement).T.astype(float, copy=False)
 
     def solve(self, right: RightSides) -> Step:
         """Return the step that solves the equations for these right sides."""
         inverse, reduced = self._inverse, self._reduced
         last = (inverse @ right.samples[:, :, None])[:, :, 0]
         right_common = right.common - np.tensordot(last, reduced, 2)
-        common = np.asarray(np.linalg.solve(self._complement, right_common), dtype=float)
+        solution = np.linalg.solve(self._complement, right_common)
+        common: Array = solution.astype(float, copy=False)
         samples = (inverse.swapaxes(1, 2) @ (last - reduced @ common)[:, :, None])[:, :, 0]
         decrease = float(common @ right.common + (samples * right.samples).sum())
         return Step(samples, common, decrease)
