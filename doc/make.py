@@ -54,6 +54,8 @@ MODULES = {
     'mae/initial_training.py': ['initial_mae'],
     'conditions.py': ['Condition', 'ConditionKind', 'Stop', 'Reaction', 'Revokes', 'from_json'],
     'report.py': ['Report'],
+    'arrival.py': ['Arrival'],
+    'awake_clock.py': ['AwakeClock'],
     'estimation/estimator.py': ['Estimator', 'Output'],
     'estimation/finding.py': ['Finding', 'Observation', 'Detector'],
     'estimation/health.py': ['HealthMonitor'],
