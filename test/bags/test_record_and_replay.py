@@ -353,7 +353,6 @@ def test_an_impossible_request_is_reported_in_one_line(tool, bag):
         (replay_tool.parse, ['bag', '--start', '-1'], 'expected a number of at least 0'),
         (replay_tool.parse, ['bag', '--duration', 'inf'], 'expected a number above 0'),
         (replay_tool.parse, ['bag', '--topics', ','], "',': expected a name"),
-        (replay_tool.parse, ['bag', '--robot', 'arm26'], '--robot requires --check'),
         (
             replay_tool.parse,
             ['bag', '--as-trajectory', '--topics', 'joint_states,imu'],
@@ -366,6 +365,7 @@ def test_an_impossible_request_is_reported_in_one_line(tool, bag):
             "unknown topic 'nothing'; legal: joint_",
         ),
         (record_tool.parse, ['--duration', '0'], 'expected a number above 0'),
+        (record_tool.parse, ['--robot', 'nobody'], "--robot: robot 'nobody' is neither"),
         (record_tool.parse, ['a', '-o', 'b'], 'DIR is given twice'),
         (record_tool.parse, ['--compression', 'rar'], 'invalid choice'),
     ],

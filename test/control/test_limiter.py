@@ -63,8 +63,9 @@ def test_the_lead_of_a_winding_muscle_demands_more_only_while_its_tension_is_bel
     limit = ROBOT.tension.limit
 
     def demanded(tension, lead):
-        limiter, now = CommandLimiter(ROBOT, Settings(rate_limit=1e3)), sample(0.0, tension)
-        sent = limiter.limit(desired, now, LIMIT, DT, lead).value
+        limiter, now = CommandLimiter(ROBOT, Settings(rate_limit=1.0)), sample(0.0, tension)
+        for _ in range(10):  # long enough for the rate limit
+            sent = limiter.limit(desired, now, LIMIT, DT, lead).value
         return BIAS + ROBOT.stiffness * -sent
 
     np.testing.assert_allclose(demanded(BIAS, 0.0), limit)

@@ -93,7 +93,7 @@ def test_the_second_program_breaks_and_repairs_a_muscle_and_the_arm_explores_on(
         arm.graph, tmp_path, repair.replace(*HASTY) if is_hasty else repair, MUSCLE=muscle
     )
     assert 'isolate: set' in printed
-    assert f"['{muscle}']: set" in printed and "['']: set" in printed
+    assert f"['rupture:{muscle}']: set" in printed and "['']: set" in printed
     assert 'restored: isolated: ' in printed
     explores_healthily(arm)
     arm.graph.spin(2.0)  # nothing else is found in the repaired arm
