@@ -84,7 +84,9 @@ class Loop:
     """An estimator with `on_anomaly: isolate`, stepped with messages and commands of the test."""
 
     def __init__(self, robot, mae, healthy):
-        self.core, self.now, self.command = Estimator(robot), 100.0, healthy.length.copy()
+        self.core, self.now = Estimator(robot), 100.0
+        # The healthy modules follow this command.
+        self.command = robot.actuation.unchanging_length(healthy.length, healthy.tension)
         self.core.use(mae)
         self.core.configure(Settings(on_anomaly='isolate'))
         self.rng, self.length = np.random.default_rng(0), healthy.length

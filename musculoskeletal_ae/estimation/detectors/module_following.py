@@ -13,7 +13,7 @@ difference T_limit at the speed CORRECTING or faster. The rest of the difference
 
 v is the speed at which the winch turns in the direction that reduces the difference. A jammed or
 weak motor, a wrong reading of tension or length, and commands that do not arrive or are reversed
-all lead to a large e. A ruptured tendon does not, because its winch winds in at full speed.
+all lead to a large e. Tendons without tension are left to `slack_tendon.py`.
 
 The evidence is a time. It grows while e is above a tolerance and shrinks while e is below it,
 the faster the farther e is away from it, but at most by one second per second. A module is reported
@@ -39,6 +39,7 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.limits import LIMITS
 
 FAULTY = 1.0  # report a module after this time of evidence [s]
 SMOOTHING = 0.1  # time constant by which differences and speeds are smoothed [s]
@@ -104,8 +105,8 @@ class ModuleFollowing(Detector):
             return None
         muscle = int(self._evidence.argmax())
         text = self._text(observation, muscle)
-        likely = np.flatnonzero(self._evidence > 0.5 * FAULTY).tolist()
-        others = tuple(other for other in likely if other != muscle)
+        suspects = np.flatnonzero(self._evidence > 0.5 * FAULTY).tolist()
+        others = tuple(other for other in suspects if other != muscle)
         return Finding(muscle, ConditionKind.MODULE_NOT_FOLLOWING, text, others)
 
     def _differences(self, observation: Observation) -> Array | None:
@@ -130,8 +131,10 @@ class ModuleFollowing(Detector):
         excess = away - limit * correcting / CORRECTING
         allowed = ALLOWED * limit + ALLOWED_SHARE * demand
         spread = np.fmax(observation.sample.tension_spread, 0.0)
+        # Slack tendons, which even a slow winch may take up, are left to `slack_tendon.py`.
+        is_slack = observation.sample.motor_tension < LIMITS.slack_share * demand
         growth: Array = (excess - allowed - SURE * spread) / (CLEAR * limit)
-        return growth
+        return np.where(is_slack, -1.0, growth)
 
     def _text(self, observation: Observation, muscle: int) -> str:
         assert observation.demand is not None
