@@ -107,8 +107,12 @@ def test_messages_are_handled_while_a_callback_awaits(graph):
 
 def test_a_busy_executor_keeps_its_wait_set_and_notices_new_entities_at_once(graph, monkeypatch):
     built, ticks, heard = [], [], []
-    wait_set = executor.WaitSet
-    monkeypatch.setattr(executor, 'WaitSet', lambda *counts: built.append(1) or wait_set(*counts))
+    wait_set = executor.rclpy_implementation.WaitSet
+    monkeypatch.setattr(
+        executor.rclpy_implementation,
+        'WaitSet',
+        lambda *counts: built.append(1) or wait_set(*counts),
+    )
     graph.node.create_timer(1e-3, lambda: ticks.append(1))  # something is always ready
     begun = time.monotonic()
     graph.wait(lambda: len(ticks) > 500, 'the timer')
