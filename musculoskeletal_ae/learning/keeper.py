@@ -91,7 +91,7 @@ class CheckpointKeeper:
         self._saved: Mae | None = None  # the network of `checkpoint`
         self._in_use: Mae | None = None  # network of the estimator; None without an estimator
         self._rejected_version = -1  # version of the network that was rejected last
-        self._highest_version = 0  # highest version so far, also of networks of the estimator
+        self._highest_version = 0  # highest version so far, also of the estimator's decisions
         self._isolated: tuple[int, ...] = ()  # muscles that published networks leave out
         self._torque, self._has_torque = HealthyTorque(robot), robot.tension_source.is_known
         self._samples = samples
@@ -148,9 +148,9 @@ class CheckpointKeeper:
         self.store()
 
     def clear(self) -> None:
-        """Forget all networks."""
+        """Forget all networks of the learner."""
         self._torque.start()
-        self.mae = self._saved = self._in_use = self.checkpoint = None
+        self.mae = self._saved = self.checkpoint = None
         self.publication.offer(None)
 
     # -- decisions of the estimator -------------------------------------------------------------
@@ -178,6 +178,8 @@ class CheckpointKeeper:
         """
         self.rejected, self.last_rejected = self.rejected + 1, reason
         self._rejected_version = version
+        # The version may be that of an earlier learner; no network may be mistaken for that one.
+        self._highest_version = max(self._highest_version, version)
         self._return_if_rejected()
 
     def _return_if_rejected(self) -> None:

@@ -31,6 +31,7 @@ from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.validity import read_imu
 
 IMU = 'imu'  # topic of the accelerometers
+MOST_DIGITS = 15  # reject a version of a network with more digits
 POLL_PERIOD = 0.05  # time between checks of the training process [s]
 JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
 
@@ -149,9 +150,11 @@ class Learner(Shell):
         self.core.note_accepted(mae)
 
     def _use_rejected(self, message: KeyValue) -> None:
-        if not message.key.isdecimal():
+        if not (message.key.isdecimal() and len(message.key) <= MOST_DIGITS):
             raise MessageError(
-                'no version', f'rejected_checkpoint: {message.key!r} is no version; legal: a number'
+                'no version',
+                f'{message.key[:MOST_DIGITS]!r} is no version of a network; legal: at most '
+                f'{MOST_DIGITS} digits',
             )
         self.core.note_rejected(int(message.key), message.value)
 

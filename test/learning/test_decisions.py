@@ -111,6 +111,24 @@ def test_an_answer_to_an_earlier_candidate_does_not_touch_a_newer_one(scene, ini
     assert scene.saved() == newer.version
 
 
+def test_a_decision_on_a_network_of_an_earlier_learner_concerns_no_network_of_this_one(
+    scene, initial
+):
+    first = scene.published[-1]
+    scene.learner.note_rejected(first.version + 1, REASON)
+    candidate = scene.propose(initial)
+    scene.learner.note_accepted(first)
+    scene.wait()
+    assert scene.published[-1].version == candidate.version > first.version + 1
+
+
+def test_a_network_that_a_user_starts_from_anew_is_saved_at_once(scene, initial):
+    scene.learner.note_accepted(scene.published[-1])
+    scene.learner.replace(initial)
+    scene.wait()
+    assert scene.saved() == scene.published[-1].version
+
+
 @pytest.mark.parametrize('is_rejected_first', [False, True])
 def test_the_learner_returns_with_the_estimator_and_keeps_the_doubtful_network_as_a_backup(
     scene, initial, is_rejected_first
