@@ -127,12 +127,7 @@ class Estimator(Shell):
     # -- parameters and services ----------------------------------------------------------------
 
     def _use(self, mae: Mae) -> None:
-        before = self.core.body.isolated
         self.core.use(mae)
-        if mae.isolated != before:
-            # Publish the isolated muscles again, because the learner may have restarted without
-            # them.
-            self.published_isolated = None
         self._publish_isolated()
         if Evidence.NOT_CALIBRATED in self.core.trust.evidence:  # it waits for the first network
             self.core.calibrate_lengths(self.posture)

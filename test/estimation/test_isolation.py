@@ -261,7 +261,7 @@ def test_a_tension_reading_that_freezes_at_the_bias_is_detected_if_it_had_noise_
         tension = robot.tension.bias + rng.standard_normal(6)
         if n >= 1200:
             tension[frozen] = robot.tension.bias[frozen] + 0.5
-        core.step(np.array([length, tension, np.full(6, 25.0)]), n * DT, n * DT)
+        core.take(reading([length, tension, np.full(6, 25.0)]), n * DT, n * DT)
         assert n >= 1200 or not core.cause
     assert core.cause == f'{robot.muscles[frozen]}: a sensor is frozen while the arm moves'
 

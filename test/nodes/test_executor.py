@@ -107,12 +107,18 @@ def test_messages_are_handled_while_a_callback_awaits(graph):
 
 def test_a_busy_executor_keeps_its_wait_set_and_notices_new_entities_at_once(graph, monkeypatch):
     built, ticks, heard = [], [], []
-    wait_set = executor.rclpy_implementation.WaitSet
-    monkeypatch.setattr(
-        executor.rclpy_implementation,
-        'WaitSet',
-        lambda *counts: built.append(1) or wait_set(*counts),
-    )
+    names = executor.rclpy_implementation
+
+    class Counting:
+        def __getattr__(self, name):
+            return getattr(names, name)
+
+        @staticmethod
+        def WaitSet(*counts):
+            built.append(1)
+            return names.WaitSet(*counts)
+
+    monkeypatch.setattr(executor, 'rclpy_implementation', Counting())
     graph.node.create_timer(1e-3, lambda: ticks.append(1))  # something is always ready
     begun = time.monotonic()
     graph.wait(lambda: len(ticks) > 500, 'the timer')
