@@ -12,7 +12,7 @@ from pathlib import Path
 
 from musculoskeletal_ae.exceptions import replace_unprintable
 from musculoskeletal_ae.options import exit_status
-from musculoskeletal_ae.stop_signals import STOP, Reaction
+from musculoskeletal_ae.process_signals import STOP, Reaction
 
 
 def benches() -> dict[str, str]:

@@ -25,7 +25,6 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.learned_arm import initial_network
-from musculoskeletal_ae.control.exploration_steps import TRIES, holdable_postures
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -33,6 +32,7 @@ from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_
 from musculoskeletal_ae.experiments.resilience import IsolatingLoop
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.exploration_steps import TRIES, holdable_postures
 from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot

@@ -184,7 +184,7 @@ class Reader:
         return self._bag(kind, trial, rng)
 
     def _robot(self, kind: str, trial: Path, rng: random.Random) -> Callable[[], object]:
-        from musculoskeletal_ae.robot.checks import check_robot
+        from musculoskeletal_ae.design.checks import check_robot
         from musculoskeletal_ae.robot.robot import Robot
 
         shutil.copytree(self.sound, trial)

@@ -46,15 +46,15 @@ from bench.processes import end_processes, memory
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.faults import KINDS, read_fault
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
-from musculoskeletal_ae.nodes.ros_tool import Spinner, message_class
 from musculoskeletal_ae.nodes.situation import Situation
+from musculoskeletal_ae.process_signals import STOP
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.stop_signals import STOP
+from musculoskeletal_ae.ros.messages import LATCHED, bytes_message
+from musculoskeletal_ae.ros_tools.ros_tool import Spinner, message_class
 
 NODES = ('hardware_emulator', 'estimator', 'controller', 'learner', 'sim', 'bringup_status')
-RUN = 'import sys; from musculoskeletal_ae.nodes import running; running.run(sys.argv.pop(1))'
+RUN = 'import sys; from musculoskeletal_ae.ros import running; running.run(sys.argv.pop(1))'
 SERVICES = {
     'std_srvs/srv/Trigger': Trigger,
     'std_srvs/srv/SetBool': SetBool,

@@ -30,7 +30,7 @@ import torch
 
 from bench.learned_arm import initial_network
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.exploration import Exploration
+from musculoskeletal_ae.body_model.covariance import ellipsoids
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
 from musculoskeletal_ae.experiments.online_learning import JointView, teach
 from musculoskeletal_ae.experiments.recording import (
@@ -41,12 +41,12 @@ from musculoskeletal_ae.experiments.recording import (
     record,
 )
 from musculoskeletal_ae.learning.collector import NONE, SENSOR
-from musculoskeletal_ae.learning.covariance import ellipsoids
 from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.exploration import Exploration
 from musculoskeletal_ae.options import Parser, names, number
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot

@@ -22,10 +22,10 @@ from network_attacks import ATTACKS
 
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
-from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
-from musculoskeletal_ae.estimation.validation.detector import LEAST_RUPTURED
-from musculoskeletal_ae.estimation.validation.message_errors import FLOOR, WORSE
-from musculoskeletal_ae.estimation.validation.postures import LIMITS
+from musculoskeletal_ae.estimation.network_validation.detector import LEAST_RUPTURED
+from musculoskeletal_ae.estimation.network_validation.message_errors import FLOOR, WORSE
+from musculoskeletal_ae.estimation.network_validation.postures import LIMITS
+from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,

@@ -24,13 +24,13 @@ import mujoco
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.design.checks import check_robot
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.importing.cardsflow import ROUND
 from musculoskeletal_ae.importing.convert import check_verdict, import_robot, read_source
 from musculoskeletal_ae.importing.source import Comparison, Source, compare, refuse
 from musculoskeletal_ae.options import Parser
-from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 

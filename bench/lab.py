@@ -34,16 +34,16 @@ from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.emulator.modules import Arm
-from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.length_trust import Evidence
+from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
+from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_TIME
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.state import StateStore
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.signals.body_state import BodyState
-from musculoskeletal_ae.signals.readings import MuscleReading
+from musculoskeletal_ae.signals.muscle_readings import MuscleReading
 
 CORES = 2  # number of cores of the simulated computer
 WAIT = 0.0008  # mean time until a process gets the processor, for each process per core [s]

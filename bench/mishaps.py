@@ -57,12 +57,12 @@ from bench.lab import SAMPLE_TIME, Lab
 from bench.learned_arm import initial
 from bench.mishap_kinds import MISHAPS, NAMES, SELF, SOFTWARE, Case, Mishap
 from bench.statements import Statement, statements, troubles
-from musculoskeletal_ae.control.exploration_steps import holdable_postures
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.exploration_steps import holdable_postures
 from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.robot.robot import Robot

@@ -50,10 +50,7 @@ import numpy as np
 
 from bench.wire import KINDS, systems
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control import reach, slowness
-from musculoskeletal_ae.control.exploration_steps import holdable_postures
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
@@ -70,6 +67,9 @@ from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.exporting.mjcf import export
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.motion import reach, slowness
+from musculoskeletal_ae.motion.exploration_steps import holdable_postures
+from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.options import Parser, number, seeds
 from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot

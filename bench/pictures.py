@@ -37,10 +37,10 @@ import numpy as np
 from PIL import Image
 
 from bench.processes import end_processes
-from musculoskeletal_ae.control.methods import first_command
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.methods import first_command
 from musculoskeletal_ae.options import DEFAULT_ROBOT, Parser, names, positive, whole
 from musculoskeletal_ae.robot.drawing import draw_arm, save_picture
 from musculoskeletal_ae.robot.robot import Robot

@@ -19,8 +19,8 @@ from std_msgs.msg import Float64MultiArray
 
 from bench.processes import end_processes
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.nodes.messages import array_message
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.ros.messages import array_message
 
 ROBOT = 'arm26'
 PATIENCE = 120.0  # longest wait on a busy machine [s]

@@ -32,7 +32,6 @@ from bench.learned_arm import initial, learned_arm
 from bench.limbs import BODIES, write_body
 from bench.timings import microseconds
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.methods import proposed
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.least_squares import oracle_errors
@@ -49,6 +48,7 @@ from musculoskeletal_ae.learning.scheduler import STEPS
 from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import one_thread, random_states
+from musculoskeletal_ae.motion.methods import proposed
 from musculoskeletal_ae.options import Parser, names
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.robot import Robot

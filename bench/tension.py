@@ -25,7 +25,6 @@ import numpy as np
 
 from bench.learned_arm import initial_network
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.exploration_steps import TRIES, holdable_postures
 from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import KIN, make_arm
@@ -41,6 +40,7 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.exploration_steps import TRIES, holdable_postures
 from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.robot.robot import Robot
 

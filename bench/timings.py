@@ -19,9 +19,7 @@ import torch
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control import methods as control
 from musculoskeletal_ae.control.command import msc_compensation
-from musculoskeletal_ae.control.methods import first_command, stiffness_command
 from musculoskeletal_ae.emulator.modules import STEP
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
 from musculoskeletal_ae.mae.initial_training import initial_mae
@@ -29,6 +27,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, TorchLengths, from_mae
 from musculoskeletal_ae.mae.training import random_states
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, visible
+from musculoskeletal_ae.motion import methods as control
+from musculoskeletal_ae.motion.methods import first_command, stiffness_command
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.paper import control as paper
 from musculoskeletal_ae.paper.constants import CONTROL_WEIGHTS, TORQUE_UNITS

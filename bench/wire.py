@@ -37,8 +37,8 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.options import Parser, names, number, numbers, whole
+from musculoskeletal_ae.process_signals import STOP, Reaction
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.stop_signals import STOP, Reaction
 
 NODES = ('hardware_emulator', 'estimator', 'sim', 'controller')
 #: names of the nodes that run in each row of the table
@@ -99,7 +99,7 @@ from rclpy.qos import qos_profile_sensor_data
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
-from musculoskeletal_ae.nodes.executor import make_executor
+from musculoskeletal_ae.ros.executor import make_executor
 from musculoskeletal_ae.robot.robot import Robot
 name, robot, rate, at, out, hears = sys.argv[1:]
 robot = Robot.load(robot)
@@ -167,7 +167,7 @@ class System:
         from rclpy.signals import SignalHandlerOptions
         from std_msgs.msg import Float64MultiArray
 
-        from musculoskeletal_ae.nodes.executor import make_executor
+        from musculoskeletal_ae.ros.executor import make_executor
 
         folder = Path(os.environ['AMENT_PREFIX_PATH'].split(':')[0]) / 'lib/musculoskeletal_ae'
         assignments = {name: [f'robot:={robot}', f'rate:={rate}'] for name in names}

@@ -27,7 +27,7 @@ html_title = project
 myst_heading_anchors = 3
 autodoc_member_order = 'bysource'
 autodoc_typehints = 'description'
-# Only nodes/ and the page need these, and neither is part of the reference.
+# Only nodes/, ros/, ros_tools/ and the page need these, and neither is part of the reference.
 autodoc_mock_imports = ['rclpy', 'viser']
 #: fields of records are explained where they are defined; napoleon would list them twice
 napoleon_use_ivar = True
@@ -42,7 +42,9 @@ suppress_warnings = [
 
 def write_reference(_: Sphinx) -> None:
     """Write one page for each folder of the package, except those without a public API."""
-    left_out = [str(PACKAGE / room) for room in ('nodes', 'tools', 'view', 'importing')]
+    left_out = [
+        str(PACKAGE / room) for room in ('nodes', 'ros', 'ros_tools', 'tools', 'view', 'importing')
+    ]
     out = str(FOLDER / 'modules')
     apidoc.main(['-f', '-q', '-T', '-M', '-d', '1', '-o', out, str(PACKAGE), *left_out])
 

@@ -28,8 +28,8 @@ from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.emulator.arm import EmulatedArm  # for the fake bus only
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.messages import array_message, joint_message
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.ros.messages import array_message, joint_message
 
 RATE = 100.0  # rate at which sensors are read and tensions regulated [Hz]
 TURN = 10.0  # time in which a hand moves the first joint to and fro, if `moved` [s]

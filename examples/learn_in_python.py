@@ -29,9 +29,9 @@ from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
+from musculoskeletal_ae.process_signals import STOP, Reaction
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import FrictionDirection
-from musculoskeletal_ae.stop_signals import STOP, Reaction
 
 PERIOD = 0.01  # time between two readings [s]
 

@@ -50,7 +50,7 @@ STREAM_GAP = 1.5
 REORDERING = 1_000_000_000
 #: rate at which the minimum rises; clocks drift by up to 1e-4, and NTP slews them by up to 5e-4
 DRIFT = 1e-3
-#: longest delay [s]; a node that makes no progress for this time ends (`nodes/progress.py`)
+#: longest delay [s]; a node that makes no progress for this time ends (`ros/hang_detection.py`)
 LONGEST_DELAY = 10.0
 
 

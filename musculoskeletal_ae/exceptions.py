@@ -53,7 +53,7 @@ class CheckpointError(MusculoskeletalError):
 class GateError(CheckpointError):
     """A checkpoint has failed checkpoint validation; the present network stays in use.
 
-    `estimation/checkpoint_validation.py` defines the validation.
+    `estimation/network_validation/validator.py` defines the validation.
     """
 
     reason = 'does not explain the arm'

@@ -17,7 +17,7 @@ from importlib import import_module
 from pathlib import Path
 
 from musculoskeletal_ae.exceptions import replace_unprintable
-from musculoskeletal_ae.stop_signals import INTERRUPTED, STOP, Reaction
+from musculoskeletal_ae.process_signals import INTERRUPTED, STOP, Reaction
 
 
 def _prepare_process() -> None:
@@ -40,7 +40,7 @@ def _run_node(name: str) -> int:
         print(_node_help(name))
         return 0
     try:
-        status = int(import_module('musculoskeletal_ae.nodes.running').run(name))
+        status = int(import_module('musculoskeletal_ae.ros.running').run(name))
     finally:
         STOP.ignore()
     _end_process(status)
@@ -97,11 +97,11 @@ learner = partial(_run_node, 'learner')
 sim = partial(_run_node, 'sim')
 
 # Tools on the ROS graph
-check_driver = partial(_run_tool, 'nodes.check_driver')
-record = partial(_run_tool, 'nodes.record')
-render = partial(_run_tool, 'nodes.render')
-replay = partial(_run_tool, 'nodes.replay')
-view = partial(_run_tool, 'nodes.view')
+check_driver = partial(_run_tool, 'ros_tools.check_driver')
+record = partial(_run_tool, 'ros_tools.record')
+render = partial(_run_tool, 'ros_tools.render')
+replay = partial(_run_tool, 'ros_tools.replay')
+view = partial(_run_tool, 'ros_tools.view')
 
 # Tools without ROS
 check_robot = partial(_run_tool, 'tools.check_robot')

@@ -44,7 +44,7 @@ Each sample has its own damping, and stops alone. r contains the roots of weight
 further rows. An unknown at its bound is held if the step would move it beyond.
 
 Two problems of this package have their own solver. The steps of `simulation/equilibrium.py` are
-compiled, because a simulation takes thousands of them. Each step of `control/methods.py` is a
+compiled, because a simulation takes thousands of them. Each step of `motion/methods.py` is a
 quadratic programme, because tensions have to balance the torque and stay within their limits.
 """
 
@@ -152,7 +152,7 @@ class RightSides(NamedTuple):
         return cls(np.zeros((0, 0)), common)
 
 
-class Step(NamedTuple):
+class SolvedStep(NamedTuple):
     """A solution of the normal equations."""
 
     samples: Array  # Δθ, (N, D)
@@ -190,7 +190,7 @@ class Eliminated:
         self._complement = common + np.diag(diagonal) - tall.T @ tall
         self.root: Array = np.linalg.cholesky(self._complement).T.astype(float, copy=False)
 
-    def solve(self, right: RightSides) -> Step:
+    def solve(self, right: RightSides) -> SolvedStep:
         """Return the step that solves the equations for these right sides."""
         inverse, reduced = self._inverse, self._reduced
         last = (inverse @ right.samples[:, :, None])[:, :, 0]
@@ -199,7 +199,7 @@ class Eliminated:
         common: Array = solution.astype(float, copy=False)
         samples = (inverse.swapaxes(1, 2) @ (last - reduced @ common)[:, :, None])[:, :, 0]
         decrease = float(common @ right.common + (samples * right.samples).sum())
-        return Step(samples, common, decrease)
+        return SolvedStep(samples, common, decrease)
 
 
 Point = TypeVar('Point')
@@ -231,7 +231,7 @@ class Problem(Protocol[Point]):
         """
         ...
 
-    def moved(self, point: Point, step: Step) -> Point:
+    def moved(self, point: Point, step: SolvedStep) -> Point:
         """Return the point after a step."""
         ...
 

@@ -18,8 +18,8 @@ from typing import Any, NoReturn, TypeVar
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.presets.names import DEFAULT, PRESET_NAMES
+from musculoskeletal_ae.process_signals import INTERRUPTED
 from musculoskeletal_ae.robot.directories import shipped_robots
-from musculoskeletal_ae.stop_signals import INTERRUPTED
 
 DEFAULT_ROBOT = 'musashi_left_arm'
 DEFAULT_SEED = 0  # default of --seed

@@ -9,11 +9,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.arrival import LONGEST_STEP
+from musculoskeletal_ae.message_reading import read_array, read_muscle_states
 from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.learner import Learner
-from musculoskeletal_ae.validity import read_array, read_muscle_states
 
 RATE = 50.0  # rate of the arm's messages [Hz]; 100 Hz would take twice the processor time
 RATE_LIMIT = 0.2  # rate limit of length commands [m/s]

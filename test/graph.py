@@ -27,9 +27,9 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Float64MultiArray, String, UInt8MultiArray
 
 from musculoskeletal_ae.conditions import CONDITIONS, Condition, from_json
-from musculoskeletal_ae.nodes.executor import LeanExecutor
-from musculoskeletal_ae.nodes.messages import LATCHED, array_message, bytes_message
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.ros.executor import LeanExecutor
+from musculoskeletal_ae.ros.messages import LATCHED, array_message, bytes_message
 
 DEADLINE = 180.0  # longest wait on a loaded machine; then the test fails [s]
 PATIENCE = 600.0  # longest time until a process writes its next line or ends [s]

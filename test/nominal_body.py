@@ -13,12 +13,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control import methods
-from musculoskeletal_ae.control.exploration_steps import TRIES, holdable_postures
-from musculoskeletal_ae.control.methods import stiffness_command
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion import methods
+from musculoskeletal_ae.motion.exploration_steps import TRIES, holdable_postures
+from musculoskeletal_ae.motion.methods import stiffness_command
 from musculoskeletal_ae.paper.control import proposed as proposed_as_printed
 from musculoskeletal_ae.robot.robot import Robot
 

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from musculoskeletal_ae.signals.readings import MuscleReading
+from musculoskeletal_ae.signals.muscle_readings import MuscleReading
 
 
 def reading(states, robot=None):

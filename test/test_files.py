@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from musculoskeletal_ae import files
+from musculoskeletal_ae.design.checks import read_declared_actions
 from musculoskeletal_ae.exceptions import RobotDescriptionError
-from musculoskeletal_ae.robot.checks import read_declared_actions
 from musculoskeletal_ae.robot.description import load_description
 from musculoskeletal_ae.tools import fit_series_elastic
 

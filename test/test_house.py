@@ -52,8 +52,11 @@ def imports(file: Path) -> Imports:
     return Imports(names, at_run_time)
 
 
-def test_only_nodes_imports_ros() -> None:
-    outside = [file for file in sources(PACKAGE) if PACKAGE / 'nodes' not in file.parents]
+SPEAKING_ROS = ('nodes', 'ros', 'ros_tools')
+
+
+def test_only_nodes_and_tools_of_the_graph_import_ros() -> None:
+    outside = [file for file in sources(PACKAGE) if file.parent.name not in SPEAKING_ROS]
     assert len(outside) > 40
     speaking = {str(file): sorted(filter(ROS.match, imports(file).names)) for file in outside}
     assert not {file: names for file, names in speaking.items() if names}
@@ -93,7 +96,8 @@ def test_outside_its_folder_the_paper_is_only_cited() -> None:
 def test_one_file_uses_what_rclpy_does_not_publish() -> None:
     taking = [
         file.name
-        for file in sources(PACKAGE / 'nodes')
+        for room in SPEAKING_ROS
+        for file in sources(PACKAGE / room)
         if any('rclpy.impl' in n for n in imports(file).names)
         or re.search(r"(get|has)attr\(\w+, '_[a-z]", file.read_text(encoding='utf-8'))
     ]
@@ -102,9 +106,11 @@ def test_one_file_uses_what_rclpy_does_not_publish() -> None:
 
 def test_the_core_never_imports_the_nodes_or_the_tools() -> None:
     for file in sources(PACKAGE):
-        if file.parent.name not in ('nodes', 'tools') and file.name != 'executables.py':
+        if file.parent.name not in (*SPEAKING_ROS, 'tools') and file.name != 'executables.py':
             upward = [
-                n for n in imports(file).names if re.match(r'musculoskeletal_ae\.(nodes|tools)', n)
+                n
+                for n in imports(file).names
+                if re.match(r'musculoskeletal_ae\.(nodes|ros|ros_tools|tools)\b', n)
             ]
             assert not upward, file
 
@@ -112,7 +118,7 @@ def test_the_core_never_imports_the_nodes_or_the_tools() -> None:
 def test_the_foreign_emulator_shares_no_code_with_the_first_one_or_the_learner() -> None:
     first = r'emulator\.(arm|individual|wrapping)'
     model = r'(learning|estimation|mae)\b|robot\.(routes|series_elastic|wrapping)'
-    for name in ('effects', 'foreign', 'mjcf', 'tendons'):
+    for name in ('effects', 'foreign', 'mujoco_model', 'tendons'):
         file = PACKAGE / 'emulator' / f'{name}.py'
         pattern = rf'musculoskeletal_ae\.({first}|{model})'
         assert not [n for n in imports(file).names if re.match(pattern, n)], file

@@ -13,7 +13,7 @@ import pytest
 from musculoskeletal_ae import options
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.options import CLOSED, Parser, exit_status
-from musculoskeletal_ae.stop_signals import INTERRUPTED
+from musculoskeletal_ae.process_signals import INTERRUPTED
 
 
 def parser():
@@ -107,7 +107,8 @@ def test_an_unexpected_exception_is_not_hidden():
 
 
 TOOLS = [
-    'nodes.check_driver', 'nodes.record', 'nodes.render', 'nodes.replay', 'nodes.view',
+    'ros_tools.check_driver', 'ros_tools.record', 'ros_tools.render', 'ros_tools.replay',
+    'ros_tools.view',
     'tools.check_robot', 'tools.experiment', 'tools.fit_series_elastic', 'tools.import_robot',
     'tools.train',
 ]  # fmt: skip

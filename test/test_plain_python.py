@@ -22,6 +22,8 @@ PACKAGE = ROOT / 'musculoskeletal_ae'
 #: folders of the package, and the extra of setup.cfg that installs what they import
 EXTRAS = {'view': 'view', 'experiments': 'experiments', 'importing': 'experiments'}
 
+ROS_FOLDERS = ('nodes', 'ros', 'ros_tools')  # the only folders that import ROS
+
 
 @cache
 def imported(file):
@@ -76,7 +78,7 @@ def described():
 
 
 def test_what_the_package_imports_is_required(described):
-    files = [file for file in PACKAGE.rglob('*.py') if file.parent.name != 'nodes']
+    files = [file for file in PACKAGE.rglob('*.py') if file.parent.name not in ROS_FOLDERS]
     always = described.install_requires
     for extra, added in {'': [], **described.extras_require}.items():
         needed = imported_by(file for file in files if extra_of(file) == extra)

@@ -24,8 +24,8 @@ from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.motors import NO_MOTORS, motor_topics
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.muscle_readings import muscle_reading
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
-from musculoskeletal_ae.signals.readings import muscle_reading
 from musculoskeletal_ae.signals.wiring import Wiring, judge
 
 _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'

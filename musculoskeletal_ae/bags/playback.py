@@ -25,7 +25,7 @@ from musculoskeletal_ae.bags.storage import BagMessage
 from musculoskeletal_ae.bags.timed_messages import TimedMessages
 from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
-from musculoskeletal_ae.validity import MOST_ENTRIES, read_target
+from musculoskeletal_ae.message_reading import MOST_ENTRIES, read_target
 
 # After a longer interruption, playback resumes instead of catching up.
 LONGEST_LAG = 1.0  # [s]

@@ -19,18 +19,18 @@ from musculoskeletal_ae.bags.storage import LATEST
 from musculoskeletal_ae.bags.timed_messages import TimedMessages
 from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError
+from musculoskeletal_ae.message_reading import (
+    joints_not_finite,
+    read_array,
+    read_names,
+    read_posture,
+)
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream
 from musculoskeletal_ae.signals.pairing import Pairing
-from musculoskeletal_ae.validity import (
-    joints_not_finite,
-    read_array,
-    read_names,
-    read_posture,
-)
 
 
 class Series(NamedTuple):

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Control: turns targets into commands that the arm can follow safely.
+"""Control: decides what the arm may do, and checks every command.
 
-`controller` connects the parts. `supervisor` decides what the arm does. `stops` declares the stop
-causes, and `watchdog` detects them. `planner` turns targets and poses into trajectories, and
-`follower` follows them. `methods` contains the equations from postures to commands. `ramps`,
-`torque`, `exploration` and `calibrating` implement the other activities, and `stopping` computes
-the commands while the arm is stopped. Every command finally passes the `limiter`. `status` reports
-to users and programs.
+`controller` connects the parts; begin there. `watchdog` detects stop causes, which `conditions.py`
+declares, and `supervisor` decides what follows. `activities` is the interface of everything that
+the arm can do; `motion/` implements it. `stop_commands` computes the commands while the arm is
+stopped. Every command finally passes the `limiter`. `status` reports to users and programs.
 """

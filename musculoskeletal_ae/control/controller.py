@@ -32,29 +32,29 @@ from musculoskeletal_ae.awake_clock import PAUSE, AwakeClock
 from musculoskeletal_ae.conditions import ORDER, Action, Condition, ConditionKind
 from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.activities import ActivityControl, Inputs
-from musculoskeletal_ae.control.calibrating import Calibrating, gentle_limit
 from musculoskeletal_ae.control.command import LENGTH, TENSION, Command, Pull
-from musculoskeletal_ae.control.exploration import Exploration, Exploring
-from musculoskeletal_ae.control.follower import Follower
 from musculoskeletal_ae.control.holding import HoldingCheck
 from musculoskeletal_ae.control.limiter import CommandLimiter
 from musculoskeletal_ae.control.method_choice import by_follower, check_settings
-from musculoskeletal_ae.control.planner import Plan, Planner
-from musculoskeletal_ae.control.ramps import LengthRamps, RampedTarget
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.control.stopping import SafeStop
+from musculoskeletal_ae.control.stop_commands import SafeStop
 from musculoskeletal_ae.control.supervisor import Activity, Supervisor
-from musculoskeletal_ae.control.torque import GravityCompensation, TorqueControl
-from musculoskeletal_ae.control.trajectory import Setpoint
 from musculoskeletal_ae.control.watchdog import Watchdog
 from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.message_reading import TrajectoryPoints
+from musculoskeletal_ae.motion.calibrating import Calibrating, gentle_limit
+from musculoskeletal_ae.motion.exploration import Exploration, Exploring
+from musculoskeletal_ae.motion.follower import Follower
+from musculoskeletal_ae.motion.planner import Plan, Planner
+from musculoskeletal_ae.motion.ramps import LengthRamps, RampedTarget
+from musculoskeletal_ae.motion.torque import GravityCompensation, TorqueControl
+from musculoskeletal_ae.motion.trajectory import Setpoint
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence, check_posture
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
-from musculoskeletal_ae.validity import TrajectoryPoints
 
 WINDOW = 3  # number of messages in the median filter against outliers
 RESTORE = 'call estimator/restore to use isolated muscles again'

@@ -19,8 +19,8 @@ import math
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control import reach
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion import reach
 from musculoskeletal_ae.robot.robot import Robot
 
 #: report a joint that rests further than this away from its target [rad]; for prismatic joints

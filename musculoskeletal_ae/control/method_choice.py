@@ -3,9 +3,9 @@
 
 from collections.abc import Mapping
 
-from musculoskeletal_ae.control.methods import LengthMethod
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.motion.methods import LengthMethod
 from musculoskeletal_ae.parameters import naming_parameter
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot

@@ -10,10 +10,10 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
-from musculoskeletal_ae.control import reach
-from musculoskeletal_ae.control.follower import Follower
 from musculoskeletal_ae.control.holding import away_text
 from musculoskeletal_ae.control.supervisor import Activity
+from musculoskeletal_ae.motion import reach
+from musculoskeletal_ae.motion.follower import Follower
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.description import NO_TENSION

@@ -37,7 +37,7 @@ OVERLOAD = 1.1
 OVERLOAD_TIME = 0.2  # time after which an overload stops the arm [s]
 
 
-class Step(NamedTuple):
+class ControlStep(NamedTuple):
     """Time between two steps of control; each duration is at most LONGEST_STEP."""
 
     #: duration on the messages' clock [s]; of a stopped arm, it is that on the steady clock if the
@@ -70,7 +70,7 @@ class ControlSteps:
         """Restart the comparison of the clocks, because the messages' clock has jumped back."""
         self._time, self.pace = math.nan, 1.0
 
-    def step(self, now: float, time: float, is_stopped: bool) -> Step:
+    def step(self, now: float, time: float, is_stopped: bool) -> ControlStep:
         """Begin a step of control, and return the time since the previous step.
 
         Args:
@@ -92,7 +92,7 @@ class ControlSteps:
         if self.pace < SLOWEST and is_stopped:
             passed = elapsed
         dt = min(max(passed, 0.0), LONGEST_STEP)
-        return Step(dt, min(elapsed, LONGEST_STEP), elapsed > PAUSE)
+        return ControlStep(dt, min(elapsed, LONGEST_STEP), elapsed > PAUSE)
 
 
 class Overload:

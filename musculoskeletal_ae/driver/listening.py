@@ -20,18 +20,18 @@ from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.driver.pace import Pace
 from musculoskeletal_ae.driver.verdict import FAULTS, ZERO_TOLERANCE, Verdict
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.message_reading import (
+    joints_not_finite,
+    read_muscle_states,
+    read_posture,
+)
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals import joint_sensors, wiring
 from musculoskeletal_ae.signals.limits import length_range
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
-from musculoskeletal_ae.signals.readings import QUANTITIES, Presence, Row, possible_readings
+from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Presence, Row, possible_readings
 from musculoskeletal_ae.signals.wiring import Judgement, Wiring
-from musculoskeletal_ae.validity import (
-    joints_not_finite,
-    read_muscle_states,
-    read_posture,
-)
 
 MOST_REPEATED = 0.2  # largest share of messages that may repeat the previous message exactly
 QUIET = 3  # sensors that show at most this many different values count as free of noise

@@ -18,7 +18,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.readings import QUANTITIES, MuscleReading, muscle_reading
+from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, MuscleReading, muscle_reading
 
 SPEED_LIMIT = 0.25  # largest speed of a muscle module's motor [m/s]; chosen by hand
 TURN = 6.2832  # largest turn of the base, by which it is upright again [rad]
@@ -26,7 +26,7 @@ SPIKE_SHARE = 0.05  # fraction of the readings in which one muscle has a spike
 BURST_TIME, BURST_PAUSE = 0.3, 3.0  # mean duration of a burst, and of the pause before it [s]
 
 
-class Kind(NamedTuple):
+class FaultKind(NamedTuple):
     """Properties of a kind of fault."""
 
     meaning: str
@@ -45,28 +45,30 @@ SIZES = {'length': (0.05, 1.0, 'm'), 'tension': (100.0, 1e4, 'N'),
 RATES = {'length': (1e-4, 0.1, 'm/s'), 'tension': (1.0, 1e3, 'N/s'),
          'temperature': (0.1, 1e2, '°C/s'), 'theta': (0.01, 1.0, 'rad/s')}  # fmt: skip
 KINDS = {
-    'drop': Kind('readings are lost', 0.5, 1.0, 'share', of_muscle=False),
-    'delay': Kind('readings are delayed', 0.1, 10.0, 's', of_muscle=False),
-    'duplicate': Kind('readings arrive twice', 0.5, 1.0, 'share', of_muscle=False),
-    'reorder': Kind('readings are swapped with the next one', 0.5, 1.0, 'share', of_muscle=False),
-    'freeze': Kind('sensors repeat their last value', of_quantity=True),
-    'dead_sensor': Kind('sensors read 0', of_quantity=True),
-    'nan_sensor': Kind('sensors read NaN', of_quantity=True),
-    'spike': Kind('sensors have spikes of this size', *SIZES['length'], of_quantity=True),
-    'bias': Kind('sensors have this offset', *SIZES['length'], of_quantity=True),
-    'drift': Kind('sensors drift at this rate', *RATES['length'], of_quantity=True),
-    'burst': Kind('sensors read this value in bursts', *SIZES['length'], of_quantity=True),
-    'exchange': Kind('two joint sensors are exchanged', of_muscle=False),
-    'rupture': Kind('tendons are ruptured'),
-    'stuck_motor': Kind('motors are jammed'),
-    'winch_speed': Kind('motors are limited to this speed', 0.009, SPEED_LIMIT, 'm/s'),
-    'unzeroed': Kind('lengths have offsets of 0.4 to 1 times this size', 0.13, 1.0, 'm'),
-    'offset': Kind('lengths have this offset', 0.05, 1.0, 'm', signed=True),
-    'slack': Kind('tendons are longer by this size', 0.05, 1.0, 'm'),
-    'overheat': Kind('modules have at least this temperature', 90.0, 1e3, '°C'),
-    'saturate': Kind('tension sensors read at most this tension', 150.0, 1e4, 'N'),
-    'mount_x': Kind('the base is turned about x', np.pi, TURN, 'rad', of_muscle=False),
-    'mount_y': Kind('the base is turned about y', np.pi, TURN, 'rad', of_muscle=False),
+    'drop': FaultKind('readings are lost', 0.5, 1.0, 'share', of_muscle=False),
+    'delay': FaultKind('readings are delayed', 0.1, 10.0, 's', of_muscle=False),
+    'duplicate': FaultKind('readings arrive twice', 0.5, 1.0, 'share', of_muscle=False),
+    'reorder': FaultKind(
+        'readings are swapped with the next one', 0.5, 1.0, 'share', of_muscle=False
+    ),
+    'freeze': FaultKind('sensors repeat their last value', of_quantity=True),
+    'dead_sensor': FaultKind('sensors read 0', of_quantity=True),
+    'nan_sensor': FaultKind('sensors read NaN', of_quantity=True),
+    'spike': FaultKind('sensors have spikes of this size', *SIZES['length'], of_quantity=True),
+    'bias': FaultKind('sensors have this offset', *SIZES['length'], of_quantity=True),
+    'drift': FaultKind('sensors drift at this rate', *RATES['length'], of_quantity=True),
+    'burst': FaultKind('sensors read this value in bursts', *SIZES['length'], of_quantity=True),
+    'exchange': FaultKind('two joint sensors are exchanged', of_muscle=False),
+    'rupture': FaultKind('tendons are ruptured'),
+    'stuck_motor': FaultKind('motors are jammed'),
+    'winch_speed': FaultKind('motors are limited to this speed', 0.009, SPEED_LIMIT, 'm/s'),
+    'unzeroed': FaultKind('lengths have offsets of 0.4 to 1 times this size', 0.13, 1.0, 'm'),
+    'offset': FaultKind('lengths have this offset', 0.05, 1.0, 'm', signed=True),
+    'slack': FaultKind('tendons are longer by this size', 0.05, 1.0, 'm'),
+    'overheat': FaultKind('modules have at least this temperature', 90.0, 1e3, '°C'),
+    'saturate': FaultKind('tension sensors read at most this tension', 150.0, 1e4, 'N'),
+    'mount_x': FaultKind('the base is turned about x', np.pi, TURN, 'rad', of_muscle=False),
+    'mount_y': FaultKind('the base is turned about y', np.pi, TURN, 'rad', of_muscle=False),
 }
 LEGAL = 'KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]; kinds: ' + ', '.join(KINDS)
 

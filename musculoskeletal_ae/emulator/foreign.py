@@ -18,13 +18,13 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.emulator import deviation, mjcf, tendons
+from musculoskeletal_ae.design.route_jumps import MOST_DRAWS, newly_jumping
+from musculoskeletal_ae.emulator import deviation, mujoco_model, tendons
 from musculoskeletal_ae.emulator.effects import NONE, Draw, Effects
 from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import STEP, Arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import Wrap
-from musculoskeletal_ae.robot.jumps import MOST_DRAWS, newly_jumping
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -123,11 +123,13 @@ def _individual_model(robot: Robot, draw: Draw) -> Any:
     so some tendons may still jump.
     """
     again = np.zeros(robot.muscle_count, dtype=np.int64)
-    model = mjcf.from_directory(robot, draw, again).compile()
+    model = mujoco_model.from_directory(robot, draw, again).compile()
     if not any(isinstance(item, Wrap) for route in robot.description.routes for item in route):
         return model
 
-    nominal = ForeignBody(robot, mjcf.from_directory(robot, Draw(0, NONE), again).compile(), draw)
+    nominal = ForeignBody(
+        robot, mujoco_model.from_directory(robot, Draw(0, NONE), again).compile(), draw
+    )
 
     def slipping(model: Any) -> Bools:
         body = ForeignBody(robot, model, draw)
@@ -135,7 +137,7 @@ def _individual_model(robot: Robot, draw: Draw) -> Any:
 
     while again.max() < MOST_DRAWS and (wrong := slipping(model)).any():
         again += wrong
-        model = mjcf.from_directory(robot, draw, again).compile()
+        model = mujoco_model.from_directory(robot, draw, again).compile()
     return model
 
 
@@ -297,7 +299,7 @@ class ForeignArm(Arm):
             self.effects = deviation.effects(robot)
         draw = self._draw = Draw(seed, self.effects)
         try:
-            model = mjcf.from_file(robot, file) if file else _individual_model(robot, draw)
+            model = mujoco_model.from_file(robot, file) if file else _individual_model(robot, draw)
             self._model = model
             if file is not None and deviates:
                 _deviate(robot, model, draw)
@@ -316,7 +318,7 @@ class ForeignArm(Arm):
             model.dof_frictionloss[:] = model.tendon_frictionloss[:] = 0.0
         self._angles, self._rates = data.qpos, data.qvel
         self._order = np.array([model.joint(name).id for name in robot.joints])
-        self._hand = model.body(mjcf.HAND).id
+        self._hand = model.body(mujoco_model.HAND).id
         self._guides = self._make_guides()
         muscles = robot.muscle_count
         self._memory = tendons.Memory(*(np.zeros(muscles) for _ in tendons.Memory._fields))
@@ -367,7 +369,7 @@ class ForeignArm(Arm):
         root.
         """
         robot, model, data = self.robot, self._model, self._data
-        known = mjcf.bodies_as_imported(model)
+        known = mujoco_model.bodies_as_imported(model)
         links = [str(frame.name) for frame in body_frames(robot.description.model)]  # root first
         # `from_file` has checked that the file contains the end effector.
         link = next((link for link in links if link in known), robot.description.end_effector)

@@ -26,14 +26,14 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.arrival import INTERRUPTION, LONGEST_STEP, SILENCE
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation import status
-from musculoskeletal_ae.estimation.checked_calibration import CheckedCalibration
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
 from musculoskeletal_ae.estimation.detectors.joint_disagreement import GAP_LEARNED, GAP_YOUNG
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
 from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.joint_check import JointCheck
-from musculoskeletal_ae.estimation.length_trust import EVIDENCE_OF, Evidence, LengthTrust
+from musculoskeletal_ae.estimation.lengths.checked_calibration import CheckedCalibration
+from musculoskeletal_ae.estimation.lengths.length_trust import EVIDENCE_OF, Evidence, LengthTrust
 from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
 from musculoskeletal_ae.estimation.mounting import MountingCheck

@@ -14,8 +14,8 @@ from musculoskeletal_ae.estimation.detectors.length_jump import LengthJump
 from musculoskeletal_ae.estimation.detectors.missing_values import MissingValues
 from musculoskeletal_ae.estimation.detectors.saturated_sensor import SaturatedSensor
 from musculoskeletal_ae.estimation.detectors.thermal_drift import ThermalDrift
-from musculoskeletal_ae.estimation.exchange import ExchangeCheck
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
+from musculoskeletal_ae.estimation.lengths.exchange import ExchangeCheck
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot

@@ -47,8 +47,8 @@ from musculoskeletal_ae.estimation.verification import (
     ModuleLaw,
     Outcome,
     PositionLaw,
-    Verdict,
     Verification,
+    VerificationVerdict,
 )
 from musculoskeletal_ae.remedy import REPAIR
 from musculoskeletal_ae.robot.robot import Robot
@@ -78,8 +78,8 @@ class SuspectHandling:
         self.settings = Settings()
         self.finding: Finding | None = None
         self.verification: Verification | None = None
-        self.last_verdict: tuple[int, Verdict] | None = None
-        self.faults: dict[int, Verdict] = {}
+        self.last_verdict: tuple[int, VerificationVerdict] | None = None
+        self.faults: dict[int, VerificationVerdict] = {}
         self._acquitted: list[float] = []  # times at which suspects were verified as healthy [s]
 
     @property
@@ -111,7 +111,7 @@ class SuspectHandling:
         isolated, muscle = tuple(isolated), finding.muscle
         isolates = self.settings.on_anomaly == ISOLATE
         if finding.kind.reaction in AT_ONCE and isolates and muscle not in isolated:
-            self.last_verdict = muscle, Verdict(Outcome(finding.kind.identifier))
+            self.last_verdict = muscle, VerificationVerdict(Outcome(finding.kind.identifier))
             self.faults[muscle] = self.last_verdict[1]
             return (*isolated, muscle)
         if finding.kind.reaction is Reaction.ISOLATE_ONLY:
@@ -151,7 +151,9 @@ class SuspectHandling:
             PositionLaw(bias, lambda tension: float(elastic.elongation(at_zero, tension))),
         )
 
-    def conclude(self, verdict: Verdict, isolated: Iterable[int], now: float) -> tuple[int, ...]:
+    def conclude(
+        self, verdict: VerificationVerdict, isolated: Iterable[int], now: float
+    ) -> tuple[int, ...]:
         """End verification and anomaly; return the indices of the muscles isolated from now on.
 
         A healthy suspect is restored, a faulty one stays isolated.

@@ -107,7 +107,7 @@ _TEXTS = {
 }
 
 
-class Verdict(NamedTuple):
+class VerificationVerdict(NamedTuple):
     """The outcome of a verification, with its evidence."""
 
     outcome: Outcome
@@ -228,7 +228,7 @@ class Verification:
 
     def step(
         self, tension: float, length: float, command: float | None, likely: float, dt: float
-    ) -> Verdict | None:
+    ) -> VerificationVerdict | None:
         """Record the readings of one message, and classify the suspect once there are enough.
 
         Args:
@@ -262,10 +262,10 @@ class Verification:
             return None
         if tension > demand + JAM_EXCESS * self._scale:
             # the tension is high although the suspect was not wound in
-            return Verdict(Outcome.JAMMED)
-        return Verdict(Outcome.NOT_WOUND_IN)
+            return VerificationVerdict(Outcome.JAMMED)
+        return VerificationVerdict(Outcome.NOT_WOUND_IN)
 
-    def _judge(self) -> Verdict:
+    def _judge(self) -> VerificationVerdict:
         tension, length, demand, excess, *_ = np.array(self._rows).T
         first_quarter = slice(max(len(tension) // 4, 1))
         last_quarter = slice(-max(len(tension) // 4, 1), None)
@@ -273,26 +273,26 @@ class Verification:
         is_slack = reached < LIMITS.slack_share * self._bias
         follows_the_winch = excess[0] - excess[-1] > RUPTURE_CHANGE
         if np.ptp(length) < FROZEN:
-            return Verdict(Outcome.LENGTH_SENSOR_FROZEN)
+            return VerificationVerdict(Outcome.LENGTH_SENSOR_FROZEN)
         if is_slack and (beside < -FAR or follows_the_winch):
-            return Verdict(Outcome.RUPTURED)
+            return VerificationVerdict(Outcome.RUPTURED)
         if np.ptp(tension) < FROZEN:
-            return Verdict(Outcome.TENSION_SENSOR_FROZEN)
+            return VerificationVerdict(Outcome.TENSION_SENSOR_FROZEN)
         if not is_slack and abs(beside) > FAR:
-            return Verdict(Outcome.LENGTH_SENSOR_OFFSET, f'{1e3 * beside:.0f} mm')
+            return VerificationVerdict(Outcome.LENGTH_SENSOR_OFFSET, f'{1e3 * beside:.0f} mm')
         stands = abs(length[first_quarter].mean() - length[last_quarter].mean()) < STANDS
         close = CLOSE * self._scale
         rise, demanded_rise = reached - self._before[0], wanted - self._before[1]
         rises = rise >= SHARE * demanded_rise or demanded_rise <= close
         if stands and (is_slack or not rises):
-            return Verdict(Outcome.JAMMED)
+            return VerificationVerdict(Outcome.JAMMED)
         if is_slack:
-            return Verdict(Outcome.TENSION_SENSOR_FROZEN)
+            return VerificationVerdict(Outcome.TENSION_SENSOR_FROZEN)
         if abs(reached - wanted) < close + SHARE * (wanted - self._bias):
-            return Verdict(Outcome.HEALTHY)
-        return Verdict(Outcome.JAMMED)
+            return VerificationVerdict(Outcome.HEALTHY)
+        return VerificationVerdict(Outcome.JAMMED)
 
-    def _judge_position(self, law: PositionLaw) -> Verdict | None:
+    def _judge_position(self, law: PositionLaw) -> VerificationVerdict | None:
         rows = self._rows[len(self._rows) // 2 :]
         tension, length, demand, excess, command, stretch = np.median(rows[-10:], axis=0)
         is_slack = tension < LIMITS.slack_share * self._bias
@@ -304,23 +304,23 @@ class Verification:
         first = self._rows[0]
         followed, asked = first.length - length, first.command - command
         if spread[1] < FROZEN:
-            return Verdict(Outcome.LENGTH_SENSOR_FROZEN)
+            return VerificationVerdict(Outcome.LENGTH_SENSOR_FROZEN)
         if asked > BEHIND and followed < 0.5 * asked:
-            return Verdict(Outcome.JAMMED)
+            return VerificationVerdict(Outcome.JAMMED)
         if is_slack and is_stretched:
-            return Verdict(Outcome.RUPTURED)
+            return VerificationVerdict(Outcome.RUPTURED)
         if spread[0] < FROZEN:
-            return Verdict(Outcome.TENSION_SENSOR_FROZEN)
+            return VerificationVerdict(Outcome.TENSION_SENSOR_FROZEN)
         if is_slack:
-            return Verdict(Outcome.NOT_WOUND_IN)
+            return VerificationVerdict(Outcome.NOT_WOUND_IN)
         if math.isnan(tension):
-            return Verdict(Outcome.TENSION_UNKNOWN)
+            return VerificationVerdict(Outcome.TENSION_UNKNOWN)
         if abs(excess) > FAR:
-            return Verdict(Outcome.LENGTH_SENSOR_OFFSET, f'{1e3 * excess:.0f} mm')
+            return VerificationVerdict(Outcome.LENGTH_SENSOR_OFFSET, f'{1e3 * excess:.0f} mm')
         rise, demanded = tension - self._before[0], demand - self._before[1]
         if rise >= SHARE * demanded or demanded <= CLOSE * self._scale:
-            return Verdict(Outcome.HEALTHY)
-        return Verdict(Outcome.TENSION_SENSOR_FROZEN)
+            return VerificationVerdict(Outcome.HEALTHY)
+        return VerificationVerdict(Outcome.TENSION_SENSOR_FROZEN)
 
 
 def _late_median(values: Array) -> float:

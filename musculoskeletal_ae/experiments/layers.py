@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
+from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.online_learning import TEST_STATES, teach

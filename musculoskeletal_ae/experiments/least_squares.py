@@ -21,11 +21,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.emulator.modules import LENGTH_NOISE, TENSION_NOISE, Arm
 from musculoskeletal_ae.experiments.recording import Recording, mean_error
 from musculoskeletal_ae.gauss_newton import minimise_each
-from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 

@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.methods import proposed
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import Motion, columns
@@ -34,6 +33,7 @@ from musculoskeletal_ae.experiments.study import (
     first_individual,
 )
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.methods import proposed
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension

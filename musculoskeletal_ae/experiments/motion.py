@@ -37,12 +37,7 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.exploration_steps import TRIES, holdable_postures
-from musculoskeletal_ae.control.hand import POSITION
-from musculoskeletal_ae.control.ramps import RAMP_SHARE
-from musculoskeletal_ae.control.reach import lacking
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.emulator.arm import VISCOUS
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.emulator.individual import Individual
@@ -59,6 +54,11 @@ from musculoskeletal_ae.experiments.study import (
     first_individual,
 )
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.exploration_steps import TRIES, holdable_postures
+from musculoskeletal_ae.motion.hand import POSITION
+from musculoskeletal_ae.motion.ramps import RAMP_SHARE
+from musculoskeletal_ae.motion.reach import lacking
+from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension

@@ -12,15 +12,15 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.control.command import LENGTH, Command
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.exploration import Exploration
-from musculoskeletal_ae.control.exploration_steps import Step
-from musculoskeletal_ae.control.methods import first_command
-from musculoskeletal_ae.control.ramps import RAMP_SHARE
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.exploration import Exploration
+from musculoskeletal_ae.motion.exploration_steps import ExplorationStep
+from musculoskeletal_ae.motion.methods import first_command
+from musculoskeletal_ae.motion.ramps import RAMP_SHARE
 from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.signals.friction import FrictionDirection, directions
 
@@ -145,7 +145,11 @@ class ClosedLoop:
 
 
 def record(
-    arm: Arm, mae: Mae, stream: int | Iterable[Step], duration: float, script: Script | None = None
+    arm: Arm,
+    mae: Mae,
+    stream: int | Iterable[ExplorationStep],
+    duration: float,
+    script: Script | None = None,
 ) -> Recording:
     """Drive an arm through the three steps of exploration with a fixed list of commands.
 

@@ -32,8 +32,6 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.command import Command
-from musculoskeletal_ae.control.exploration_steps import TRIES
-from musculoskeletal_ae.control.progress import FALLEN
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import Arm
@@ -49,6 +47,8 @@ from musculoskeletal_ae.experiments.detection import grasp_and_release
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, make_error_function
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.exploration_steps import TRIES
+from musculoskeletal_ae.motion.progress import FALLEN
 from musculoskeletal_ae.robot.tension import holding_tension
 
 EVERY = 10  # every tenth message of the held-out motion is evaluated

@@ -22,7 +22,7 @@ from typing import Any
 from musculoskeletal_ae.experiments import NAMES, kept, online_learning
 from musculoskeletal_ae.experiments.study import Measured, Study, round_numbers
 from musculoskeletal_ae.presets.registry import PRESETS
-from musculoskeletal_ae.stop_signals import STOP, Reaction, interrupts_blocked
+from musculoskeletal_ae.process_signals import STOP, Reaction, interrupts_blocked
 
 EXPERIMENTS = {
     name: import_module(f'musculoskeletal_ae.experiments.{name}').EXPERIMENT for name in NAMES

@@ -21,6 +21,7 @@ which used all joint sensors. All are evaluated on the held-out motion.
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.body_model.covariance import ellipsoids
 from musculoskeletal_ae.emulator.modules import accelerometer_reading, camera_reading
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.online_learning import JointView, new_learner, teach
@@ -33,7 +34,6 @@ from musculoskeletal_ae.experiments.recording import (
 from musculoskeletal_ae.experiments.roles import elbows
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
 from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR
-from musculoskeletal_ae.learning.covariance import ellipsoids
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics

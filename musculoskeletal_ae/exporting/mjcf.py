@@ -2,7 +2,7 @@
 """Export a learned body as an MJCF model, and compare the model with the network.
 
 Links, joints, limits and masses are those of the robot directory. Route points are learned: the
-calibrated body without a residual model is fitted to the network (`learning.fit.fit_to_network`).
+calibrated body without a residual model is fitted to the network (`body_model.fit.fit_to_network`).
 Each tendon has an actuator that represents a motor and its series elastic element. The control u is
 the length of the tendon at which the element is slack:
 
@@ -23,13 +23,13 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator import mjcf
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.body_model.fit import fit_to_network
+from musculoskeletal_ae.emulator import mujoco_model
 from musculoskeletal_ae.emulator.effects import NONE, Draw
 from musculoskeletal_ae.emulator.modules import joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.files import new_directory
-from musculoskeletal_ae.learning.body import CalibratedBody
-from musculoskeletal_ae.learning.fit import fit_to_network
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.description import Route, RoutePoint
 from musculoskeletal_ae.robot.drawing import SHORTEST_BONE
@@ -190,8 +190,8 @@ def _moved(robot: Robot, shift: Array) -> tuple[Route, ...]:
 def _spec(robot: Robot, mae: Mae, springs: Springs) -> Any:
     """Return the MjSpec of a robot with learned route points, tendon friction and actuators."""
     exact, once = Draw(0, NONE), np.zeros(robot.muscle_count, dtype=np.int64)
-    spec, bodies = mjcf.skeleton(robot, exact)
-    mjcf.add_routes(robot, exact, once, spec, bodies)
+    spec, bodies = mujoco_model.skeleton(robot, exact)
+    mujoco_model.add_routes(robot, exact, once, spec, bodies)
     spec.modelname = robot.description.directory.name
     spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST

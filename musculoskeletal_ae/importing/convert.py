@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 
+from musculoskeletal_ae.design.checks import RobotCheck, check_robot
+from musculoskeletal_ae.design.route_jumps import jump_choices
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import new_directory, read_text
 from musculoskeletal_ae.importing.cardsflow import read_cardsflow, read_urdf_skeleton
@@ -23,9 +25,7 @@ from musculoskeletal_ae.importing.source import (
     refuse,
     write,
 )
-from musculoskeletal_ae.robot.checks import RobotCheck, check_robot
 from musculoskeletal_ae.robot.joint_tree import resolved
-from musculoskeletal_ae.robot.jumps import jump_choices
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 

@@ -1,2 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Online learning: collecting samples, fitting the calibrated body, updating the network."""
+"""Online learning: collects samples, and updates body and network.
+
+`learner` connects the parts; begin there. `body_model/` has the body that an update fits.
+"""

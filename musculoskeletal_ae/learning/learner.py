@@ -7,7 +7,7 @@
                             decisions of the estimator ─────►    │
                                                                  └─► disk
 
-The estimator validates the candidates (`estimation/checkpoint_validation.py`). Whatever it decides,
+The estimator validates the candidates (`estimation/network_validation/`). Whatever it decides,
 training continues from the newest samples and weights.
 
 Isolated muscles are not learned: samples do not describe them, and the published network lists
@@ -29,18 +29,18 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.arrival import Arrival
+from musculoskeletal_ae.body_model.joint_stops import LARGEST_OFFSET
 from musculoskeletal_ae.conditions import Condition
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
 from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR, SampleCollector
 from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.learning.joint_history import JointHistory
-from musculoskeletal_ae.learning.joint_stops import LARGEST_OFFSET
 from musculoskeletal_ae.learning.keeper import CheckpointKeeper
 from musculoskeletal_ae.learning.offset_history import HELD_TIME, OffsetHistory
-from musculoskeletal_ae.learning.report import learner_conditions, learner_report
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.scheduler import LEAST_BLIND, STEPS, UpdateScheduler
+from musculoskeletal_ae.learning.status import learner_conditions, learner_report
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.report import Report
@@ -48,9 +48,9 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.muscle_readings import muscle_reading
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, RejectionError
 from musculoskeletal_ae.signals.pairing import Paired
-from musculoskeletal_ae.signals.readings import muscle_reading
 
 
 class Learner:

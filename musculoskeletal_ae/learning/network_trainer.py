@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.synthetic import TrainingData
+from musculoskeletal_ae.body_model.synthetic import TrainingData
 from musculoskeletal_ae.mae.network import Network
 from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.training import TINY, one_thread

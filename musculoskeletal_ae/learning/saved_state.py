@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from musculoskeletal_ae.arrays import Bools
-from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
+from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.exceptions import CheckpointError, StateError
 from musculoskeletal_ae.learning.samples import Sample, SampleStore, StoredSample
 from musculoskeletal_ae.mae import checkpoint

@@ -26,11 +26,11 @@ from musculoskeletal_ae.learning.job import Job, Update
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import preset_named
+from musculoskeletal_ae.process_signals import interrupts_blocked
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.stop_signals import interrupts_blocked
 
 if TYPE_CHECKING:
-    from musculoskeletal_ae.learning.body import CalibratedBody
+    from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
     from musculoskeletal_ae.learning.updater import Updater
 
 

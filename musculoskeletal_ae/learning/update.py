@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """An update of preset `default`: fits the calibrated body, then trains the network on it.
 
-1. Fit the calibrated body to the samples (`body`). Shift the network's lengths by the mean change
-   of each muscle's length, so that length offsets and creep need no training.
+1. Fit the calibrated body to the samples (`body_model/`). Shift the network's lengths by the mean
+   change of each muscle's length, so that length offsets and creep need no training.
 2. Draw synthetic samples of the body, and replace some of them by real ones: rest samples and
    motion samples. There are many more motion samples than rest samples. They also contain what rest
    samples and the body model lack, such as tendon sliding.
@@ -22,19 +22,19 @@ from dataclasses import replace
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.body import CalibratedBody
-from musculoskeletal_ae.learning.body_fit import (
+from musculoskeletal_ae.body_model.body_fit import (
     LEAST_CHANGE,
     OUTLIER,
     BodyFit,
     contradicted_muscles,
 )
-from musculoskeletal_ae.learning.covariance import MANY_MESSAGES, observed_theta
-from musculoskeletal_ae.learning.fit import Fit
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.body_model.covariance import MANY_MESSAGES, observed_theta
+from musculoskeletal_ae.body_model.fit import Fit
+from musculoskeletal_ae.body_model.synthetic import TrainingData, synthetic_samples
 from musculoskeletal_ae.learning.job import Job, Update
 from musculoskeletal_ae.learning.network_trainer import BATCH, NetworkTrainer
 from musculoskeletal_ae.learning.samples import Observations
-from musculoskeletal_ae.learning.synthetic import TrainingData, synthetic_samples
 from musculoskeletal_ae.learning.updater import LEARNED, Updater
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import from_mae

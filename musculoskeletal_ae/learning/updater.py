@@ -15,14 +15,14 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from musculoskeletal_ae.learning.body import CalibratedBody
-from musculoskeletal_ae.learning.calibration import recalibrated, uncalibrated
-from musculoskeletal_ae.learning.covariance import (
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.body_model.covariance import (
     drive_covariance,
     estimate_covariance,
     observed_theta,
 )
-from musculoskeletal_ae.learning.fit import Fit
+from musculoskeletal_ae.body_model.fit import Fit
+from musculoskeletal_ae.learning.calibration import recalibrated, uncalibrated
 from musculoskeletal_ae.learning.job import Job, Update
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, to_mae

@@ -17,7 +17,11 @@ from visualization_msgs.msg import Marker, MarkerArray
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.arrival import LONGEST_STEP
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.messages import (
+from musculoskeletal_ae.message_reading import read_wrench
+from musculoskeletal_ae.nodes.shell import Shell
+from musculoskeletal_ae.robot.drawing import BONE_COLOUR, Line
+from musculoskeletal_ae.robot.kinematics import body_frames
+from musculoskeletal_ae.ros.messages import (
     LATCHED,
     RELIABLE,
     add_joints,
@@ -26,13 +30,9 @@ from musculoskeletal_ae.nodes.messages import (
     joint_message,
     motor_message,
 )
-from musculoskeletal_ae.nodes.shell import Shell
-from musculoskeletal_ae.nodes.sources import COMMANDS, MOTOR_COMMAND
-from musculoskeletal_ae.robot.drawing import BONE_COLOUR, Line
-from musculoskeletal_ae.robot.kinematics import body_frames
+from musculoskeletal_ae.ros.second_publishers import COMMANDS, MOTOR_COMMAND
 from musculoskeletal_ae.signals.motor_interface import STATES
-from musculoskeletal_ae.signals.readings import reading_rows
-from musculoskeletal_ae.validity import read_wrench
+from musculoskeletal_ae.signals.muscle_readings import reading_rows
 
 MARKER_RATE = 10.0  # rate of the markers [Hz]
 NAME_HEIGHT = 0.018  # height of the muscles' names [m]

@@ -20,7 +20,6 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.arrival import SILENCE
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import printable
-from musculoskeletal_ae.nodes.messages import RELIABLE, SENSOR
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.situation import Situation, figures, nodes_in_graph
 from musculoskeletal_ae.report import (
@@ -31,6 +30,7 @@ from musculoskeletal_ae.report import (
     overload_note,
     with_load,
 )
+from musculoskeletal_ae.ros.messages import RELIABLE, SENSOR
 
 #: time after the first estimate during which problems are not shown, because most of them end by
 #: themselves while the nodes start [s]

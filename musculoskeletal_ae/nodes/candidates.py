@@ -24,13 +24,13 @@ import numpy as np
 from diagnostic_msgs.msg import KeyValue
 from std_msgs.msg import UInt8MultiArray
 
-from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
+from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.exceptions import CheckpointError, printable
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, REJECTED
-from musculoskeletal_ae.nodes.messages import LATCHED, bytes_message
 from musculoskeletal_ae.nodes.shell import Shell
+from musculoskeletal_ae.ros.messages import LATCHED, bytes_message
 
 
 class Candidates:

@@ -32,22 +32,7 @@ from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.control.stop_memory import BEFORE, StopMemory
 from musculoskeletal_ae.estimation.verification import LONGEST
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
-from musculoskeletal_ae.nodes.messages import (
-    LATCHED,
-    RELIABLE,
-    SENSOR,
-    array_message,
-    motor_command,
-    serve,
-)
-from musculoskeletal_ae.nodes.shell import STEADY, Shell
-from musculoskeletal_ae.nodes.sources import AUTHORS
-from musculoskeletal_ae.nodes.stop_recording import StopRecording
-from musculoskeletal_ae.parameters import naming_parameter, parameters_of
-from musculoskeletal_ae.remedy import Step, sentence
-from musculoskeletal_ae.report import Report
-from musculoskeletal_ae.signals.limits import LIMITS
-from musculoskeletal_ae.validity import (
+from musculoskeletal_ae.message_reading import (
     read_pose,
     read_posture,
     read_target,
@@ -55,6 +40,21 @@ from musculoskeletal_ae.validity import (
     read_twist,
     without_orientation,
 )
+from musculoskeletal_ae.nodes.shell import STEADY, Shell
+from musculoskeletal_ae.nodes.stop_recording import StopRecording
+from musculoskeletal_ae.parameters import naming_parameter, parameters_of
+from musculoskeletal_ae.remedy import Step, sentence
+from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.ros.messages import (
+    LATCHED,
+    RELIABLE,
+    SENSOR,
+    array_message,
+    motor_command,
+    serve,
+)
+from musculoskeletal_ae.ros.second_publishers import AUTHORS
+from musculoskeletal_ae.signals.limits import LIMITS
 
 
 class Controller(Shell):

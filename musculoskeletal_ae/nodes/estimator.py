@@ -26,15 +26,18 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.estimation.estimator import Output
-from musculoskeletal_ae.estimation.length_calibration import check_stated_posture
-from musculoskeletal_ae.estimation.length_trust import Evidence
-from musculoskeletal_ae.estimation.offset_memory import OffsetMemory
+from musculoskeletal_ae.estimation.lengths.length_calibration import check_stated_posture
+from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
+from musculoskeletal_ae.estimation.lengths.offset_memory import OffsetMemory
 from musculoskeletal_ae.estimation.settings import Settings
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.message_reading import read_pose
 from musculoskeletal_ae.nodes.arm import Frames, Markers
 from musculoskeletal_ae.nodes.candidates import Candidates
-from musculoskeletal_ae.nodes.messages import (
+from musculoskeletal_ae.nodes.shell import Shell
+from musculoskeletal_ae.robot.drawing import Line, draw_arm
+from musculoskeletal_ae.ros.messages import (
     LATCHED,
     RELIABLE,
     SENSOR,
@@ -43,13 +46,10 @@ from musculoskeletal_ae.nodes.messages import (
     joint_message,
     serve,
 )
-from musculoskeletal_ae.nodes.shell import Shell
-from musculoskeletal_ae.nodes.sources import AUTHORS
-from musculoskeletal_ae.robot.drawing import Line, draw_arm
+from musculoskeletal_ae.ros.second_publishers import AUTHORS
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, RejectionError
-from musculoskeletal_ae.validity import read_pose
 
 OWN_TOPICS = [topic for topic, author in AUTHORS.items() if author == 'the estimator']
 

@@ -23,10 +23,10 @@ from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.emulator.sensors import read_sensors
 from musculoskeletal_ae.nodes.arm import Arm, Markers
-from musculoskeletal_ae.nodes.messages import RELIABLE, serve
 from musculoskeletal_ae.parameters import naming_parameter
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
+from musculoskeletal_ae.ros.messages import RELIABLE, serve
 
 PACE_TIME = 5.0  # time over which the real-time factor is averaged [s]
 

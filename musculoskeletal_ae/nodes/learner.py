@@ -22,13 +22,13 @@ from musculoskeletal_ae.learning import learner
 from musculoskeletal_ae.learning.trainer import TrainerProcess
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.message_reading import read_imu
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, REJECTED
-from musculoskeletal_ae.nodes.messages import LATCHED, SENSOR, bytes_message, serve
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
-from musculoskeletal_ae.nodes.sources import SEVERAL, LinkSensors, publishers_of
 from musculoskeletal_ae.parameters import naming_parameter
 from musculoskeletal_ae.robot.kinematics import body_frames
-from musculoskeletal_ae.validity import read_imu
+from musculoskeletal_ae.ros.messages import LATCHED, SENSOR, bytes_message, serve
+from musculoskeletal_ae.ros.second_publishers import SEVERAL, LinkSensors, publishers_of
 
 IMU = 'imu'  # topic of the accelerometers
 MOST_DIGITS = 15  # reject a version of a network with more digits

@@ -32,7 +32,7 @@ from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.conditions import Condition, ConditionKind
-from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
+from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.exceptions import (
     CheckpointError,
     MessageError,
@@ -41,15 +41,25 @@ from musculoskeletal_ae.exceptions import (
 )
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.message_reading import (
+    joints_not_finite,
+    read_array,
+    read_names,
+    read_posture,
+)
 from musculoskeletal_ae.nodes.anomaly_latch import AnomalyLatch
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, CheckpointQueue
-from musculoskeletal_ae.nodes.diagnostics import MANY_REPORTS, PERIOD, Diagnostics
-from musculoskeletal_ae.nodes.executor import parameter_overrides
-from musculoskeletal_ae.nodes.messages import LATCHED, RELIABLE, SENSOR, refuse
-from musculoskeletal_ae.nodes.needed_topics import NeededTopics
-from musculoskeletal_ae.nodes.node_parameters import NodeParameters
 from musculoskeletal_ae.nodes.parameters import check_names
-from musculoskeletal_ae.nodes.sources import (
+from musculoskeletal_ae.reception import SHOWN, Reception
+from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.ros.diagnostics import MANY_REPORTS, PERIOD, Diagnostics
+from musculoskeletal_ae.ros.executor import parameter_overrides
+from musculoskeletal_ae.ros.messages import LATCHED, RELIABLE, SENSOR, refuse
+from musculoskeletal_ae.ros.needed_topics import NeededTopics
+from musculoskeletal_ae.ros.node_parameters import NodeParameters
+from musculoskeletal_ae.ros.second_publishers import (
     AUTHORS,
     CLOCK,
     LOOK_PERIOD,
@@ -57,19 +67,9 @@ from musculoskeletal_ae.nodes.sources import (
     Sources,
     Twins,
 )
-from musculoskeletal_ae.reception import SHOWN, Reception
-from musculoskeletal_ae.remedy import Step
-from musculoskeletal_ae.report import Report
-from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
 from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.motor_interface import STATES, MotorInterface
-from musculoskeletal_ae.validity import (
-    joints_not_finite,
-    read_array,
-    read_names,
-    read_posture,
-)
 
 if TYPE_CHECKING:  # a slow import, because it loads the bag writer
     from musculoskeletal_ae.nodes.stop_recording import StopRecording
@@ -409,7 +409,8 @@ class Shell(Node):
         """Subscribe, and count messages that are repeated, late or refused by the callback.
 
         A topic in `AUTHORS` should have exactly one publisher. While such a topic has several
-        publishers, its messages are rejected (`sources`), unless it is in `accepted_from_all`.
+        publishers, its messages are rejected (`second_publishers`), unless it is in
+        `accepted_from_all`.
 
         Args:
             kind: Message type.

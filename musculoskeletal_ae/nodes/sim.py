@@ -18,15 +18,15 @@ from sensor_msgs.msg import JointState
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.message_reading import read_target
 from musculoskeletal_ae.nodes.arm import Arm, Markers
-from musculoskeletal_ae.nodes.messages import RELIABLE
-from musculoskeletal_ae.nodes.sources import MOTOR_COMMAND
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
+from musculoskeletal_ae.ros.messages import RELIABLE
+from musculoskeletal_ae.ros.second_publishers import MOTOR_COMMAND
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
 from musculoskeletal_ae.simulation.simulation import Simulation
-from musculoskeletal_ae.validity import read_target
 
 TEMPERATURE = 25.0  # reported temperature of all modules [°C]
 

@@ -18,9 +18,9 @@ from rclpy.node import Node as RosNode
 from musculoskeletal_ae import conditions
 from musculoskeletal_ae.conditions import CONDITIONS, KINDS, LEVELS, Condition, ConditionKind, Level
 from musculoskeletal_ae.control.supervisor import Activity, StopState
-from musculoskeletal_ae.nodes.diagnostics import NODE_SILENCE
 from musculoskeletal_ae.remedy import Step, sentence
 from musculoskeletal_ae.report import with_load
+from musculoskeletal_ae.ros.diagnostics import NODE_SILENCE
 
 #: forget other nodes than NEEDED without a report for this time [s]; it exceeds NODE_SILENCE,
 #: because nodes of other packages may report less often

@@ -25,9 +25,9 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.command import msc_compensation
-from musculoskeletal_ae.control.methods import LengthMethod, Solution
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import TENSION_SCALE, Mask
+from musculoskeletal_ae.motion.methods import LengthMethod, Solution
 from musculoskeletal_ae.paper.constants import (
     CONTROL_CANDIDATES,
     CONTROL_EPOCHS,

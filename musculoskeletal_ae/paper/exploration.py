@@ -7,7 +7,7 @@
 
 The paper does not state the following, which we chose. Targets are drawn from the postures that the
 arm can hold with tensions in [T_bias, T_limit]. Each step ramps the command and then holds it,
-because the body is learned from rest samples (`control/ramps.py`).
+because the body is learned from rest samples (`motion/ramps.py`).
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.exploration_steps import TRIES, Step, holdable_postures
+from musculoskeletal_ae.motion.exploration_steps import TRIES, ExplorationStep, holdable_postures
 from musculoskeletal_ae.paper.constants import DURATIONS
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -35,7 +35,7 @@ def three_steps(
     rng: np.random.Generator,
     posture: Callable[[Robot, np.random.Generator], Array] = random_posture,
     constant_tension: Callable[[Robot, Array, np.random.Generator], Array] = random_tension,
-) -> tuple[Step, Step, Step]:
+) -> tuple[ExplorationStep, ExplorationStep, ExplorationStep]:
     """Draw a random holdable posture, and return the three steps of exploration at this posture.
 
     Args:
@@ -52,7 +52,7 @@ def three_steps(
     ((theta, holding),) = holdable_postures(robot, postures, 1)
     constant = constant_tension(robot, theta, rng)
     return (
-        Step('first', theta, bias, DURATIONS[0]),
-        Step('second', theta, holding, DURATIONS[1]),
-        Step('first', theta, constant, DURATIONS[2]),
+        ExplorationStep('first', theta, bias, DURATIONS[0]),
+        ExplorationStep('second', theta, holding, DURATIONS[1]),
+        ExplorationStep('first', theta, constant, DURATIONS[2]),
     )

@@ -12,14 +12,14 @@ from musculoskeletal_ae.presets.names import DEFAULT
 if TYPE_CHECKING:
     import numpy as np
 
-    from musculoskeletal_ae.control.exploration_steps import Step
-    from musculoskeletal_ae.control.methods import LengthMethod
     from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
     from musculoskeletal_ae.estimation.finding import Detector
     from musculoskeletal_ae.learning.updater import Updater
     from musculoskeletal_ae.mae.mae import Mae
     from musculoskeletal_ae.mae.training import Progress, TrainedNetwork
     from musculoskeletal_ae.mae.units import State
+    from musculoskeletal_ae.motion.exploration_steps import ExplorationStep
+    from musculoskeletal_ae.motion.methods import LengthMethod
     from musculoskeletal_ae.robot.groups import Group
     from musculoskeletal_ae.robot.robot import Robot
     from musculoskeletal_ae.simulation.simulated_body import SimulatedBody
@@ -84,13 +84,13 @@ class DefaultPreset:
 
         return {name: method for name, method in METHODS.items() if name != 'proposed'}
 
-    def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Step]]:
+    def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[ExplorationStep]]:
         """Return a function that draws the paper's three steps.
 
         In the targets, some joints are at their limits. The tensions of the third step press these
         joints against their stops.
         """
-        from musculoskeletal_ae.control.exploration_steps import posture_at_limits, pressing_tension
+        from musculoskeletal_ae.motion.exploration_steps import posture_at_limits, pressing_tension
         from musculoskeletal_ae.paper.exploration import three_steps
 
         return partial(three_steps, posture=posture_at_limits, constant_tension=pressing_tension)

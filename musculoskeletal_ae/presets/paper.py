@@ -12,14 +12,14 @@ from musculoskeletal_ae.presets.names import PAPER_PRESET
 if TYPE_CHECKING:
     import numpy as np
 
-    from musculoskeletal_ae.control.exploration_steps import Step
-    from musculoskeletal_ae.control.methods import LengthMethod
     from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
     from musculoskeletal_ae.estimation.finding import Detector
     from musculoskeletal_ae.learning.updater import Updater
     from musculoskeletal_ae.mae.mae import Mae
     from musculoskeletal_ae.mae.training import Progress, TrainedNetwork
     from musculoskeletal_ae.mae.units import State
+    from musculoskeletal_ae.motion.exploration_steps import ExplorationStep
+    from musculoskeletal_ae.motion.methods import LengthMethod
     from musculoskeletal_ae.robot.groups import Group
     from musculoskeletal_ae.robot.robot import Robot
     from musculoskeletal_ae.simulation.simulated_body import SimulatedBody
@@ -76,7 +76,7 @@ class PaperPreset:
 
         return METHODS
 
-    def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Step]]:
+    def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[ExplorationStep]]:
         """Return the function that draws the three steps of random motion (§IV-A)."""
         from musculoskeletal_ae.paper.exploration import three_steps
 

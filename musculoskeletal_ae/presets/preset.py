@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Protocol
 if TYPE_CHECKING:
     import numpy as np
 
-    from musculoskeletal_ae.control.exploration_steps import Step
-    from musculoskeletal_ae.control.methods import LengthMethod
     from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
     from musculoskeletal_ae.estimation.finding import Detector
     from musculoskeletal_ae.learning.updater import Updater
     from musculoskeletal_ae.mae.mae import Mae
     from musculoskeletal_ae.mae.training import Progress, TrainedNetwork
     from musculoskeletal_ae.mae.units import State
+    from musculoskeletal_ae.motion.exploration_steps import ExplorationStep
+    from musculoskeletal_ae.motion.methods import LengthMethod
     from musculoskeletal_ae.robot.groups import Group
     from musculoskeletal_ae.robot.robot import Robot
     from musculoskeletal_ae.simulation.simulated_body import SimulatedBody
@@ -75,7 +75,7 @@ class Preset(Protocol):
         All other methods follow trajectories or command tensions.
         """
 
-    def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Step]]:
+    def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[ExplorationStep]]:
         """Return a function that draws the next steps of exploration.
 
         Its arguments are the robot and a random generator.

@@ -28,7 +28,8 @@ ROWS = 4  # number of rows in a message on `muscle_length_zeros`
 class Trust(IntEnum):
     """Whether the length offset of a muscle may be used, as published in `muscle_length_zeros`.
 
-    The estimator decides this in `estimation/length_trust.py`, and all other nodes follow it.
+    The estimator decides this in `estimation/lengths/length_trust.py`, and all other nodes follow
+    it.
     """
 
     KNOWN = 0

@@ -30,7 +30,7 @@ from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.limits import LENGTH_JUMPED, LIMITS
 
 
-class Verdict(NamedTuple):
+class JumpVerdict(NamedTuple):
     """What the lengths of one message show.
 
     Attributes:
@@ -166,7 +166,7 @@ class LengthJumps:
 
     def step(
         self, length: Array, tension: Array, used: Bools, now: float, delay: float = 0.0
-    ) -> Verdict:
+    ) -> JumpVerdict:
         """Return what the lengths of the newest message show.
 
         Args:
@@ -179,7 +179,7 @@ class LengthJumps:
         last, pause = self._last, self._pause(now, delay)
         self._last, self._last_at, self._last_delay = length, now, delay
         if last is None:
-            return Verdict()
+            return JumpVerdict()
         allowed = LIMITS.step + LIMITS.speed * min(pause, LIMITS.longest_step)
         change = length - last
         jumps = (np.abs(change) > allowed) & used
@@ -190,15 +190,15 @@ class LengthJumps:
         jump = self._jump
         if jump is None or not jump.remaining(used).any():
             self._jump = None
-            return Verdict(None, self._rupture.refuted(tension, used, now), self._was_unseen)
+            return JumpVerdict(None, self._rupture.refuted(tension, used, now), self._was_unseen)
         if now - jump.last_at <= LIMITS.settled:
-            return Verdict(self._problem(jump, used))
+            return JumpVerdict(self._problem(jump, used))
         # The new level has lasted, so it is accepted.
         self._jump, self._was_unseen = None, jump.is_unseen
         if self._rupture.explains(jump, tension, used):
-            return Verdict()
+            return JumpVerdict()
         muscles = np.flatnonzero(jump.remaining(used)).tolist()
-        return Verdict(None, tuple(muscles), jump.is_unseen)
+        return JumpVerdict(None, tuple(muscles), jump.is_unseen)
 
     def jumping(self, used: Bools) -> tuple[int, ...]:
         """Return the muscles in `used` (M,) whose new level has not been accepted yet."""
@@ -235,7 +235,7 @@ class DisplacedMuscles:
     jumps: int = 0
     is_unseen: bool = False
 
-    def note(self, verdict: Verdict) -> None:
+    def note(self, verdict: JumpVerdict) -> None:
         """Record the muscles that are displaced from now on."""
         if verdict.displaced:
             self.muscles |= set(verdict.displaced)

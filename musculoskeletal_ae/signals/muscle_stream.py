@@ -27,14 +27,14 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, median_of_rows
 from musculoskeletal_ae.arrival import longer_pause
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.message_reading import muscle_rows, read_muscle_states
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.friction import FrictionDirection, Transmission
-from musculoskeletal_ae.signals.length_jumps import DisplacedMuscles, LengthJumps, Verdict
+from musculoskeletal_ae.signals.length_jumps import DisplacedMuscles, JumpVerdict, LengthJumps
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence
+from musculoskeletal_ae.signals.muscle_readings import Row
 from musculoskeletal_ae.signals.plausibility import LevelCheck, TemperatureCheck
-from musculoskeletal_ae.signals.readings import Row
-from musculoskeletal_ae.validity import muscle_rows, read_muscle_states
 
 
 class RejectionError(MessageError):
@@ -308,7 +308,7 @@ class MuscleStream:
             delay=delay,
         )
 
-    def _judge(self, read: Array, states: Array, now: float) -> Verdict:
+    def _judge(self, read: Array, states: Array, now: float) -> JumpVerdict:
         """Check all values for plausible levels, and the lengths for jumps.
 
         Args:
@@ -319,7 +319,7 @@ class MuscleStream:
         known, used = self.body.offsets.known, self.body.used
         problem = self._levels.problem(states, used, known)
         if problem is not None:
-            return Verdict(problem)
+            return JumpVerdict(problem)
         verdict = self._jumps.step(read[Row.LENGTH], read[Row.TENSION], used, now, self._delay)
         self.displaced.note(verdict)
         # While the length offsets are unknown, lengths are unreliable in any case, so that a jump

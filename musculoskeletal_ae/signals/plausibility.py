@@ -11,7 +11,7 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
-from musculoskeletal_ae.signals.readings import QUANTITIES, Row, possible_readings
+from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Row, possible_readings
 
 
 class LevelCheck:

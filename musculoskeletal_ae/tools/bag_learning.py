@@ -15,9 +15,9 @@ from musculoskeletal_ae.arrival import LONGEST_STEP
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
-from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
 from musculoskeletal_ae.estimation.finding import Finding, observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
+from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.exceptions import (
     BagError,
     CheckpointError,
@@ -29,12 +29,12 @@ from musculoskeletal_ae.learning.rest import REST_TIME
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import DEFAULT_SEED
+from musculoskeletal_ae.process_signals import STOP, Reaction
 from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
+from musculoskeletal_ae.signals.muscle_readings import MuscleReading, muscle_reading
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
-from musculoskeletal_ae.signals.readings import MuscleReading, muscle_reading
-from musculoskeletal_ae.stop_signals import STOP, Reaction
 from musculoskeletal_ae.tools.model_training import prepare, train_on_model
 from musculoskeletal_ae.tools.network_cache import network_file
 

@@ -2,7 +2,7 @@
 """`check_robot`: checks whether a robot description is sound, and names its faults."""
 
 from musculoskeletal_ae.options import Parser, exit_status, number, whole
-from musculoskeletal_ae.stop_signals import import_heavy
+from musculoskeletal_ae.process_signals import import_heavy
 
 REACH = 0.02  # default of --reach [m]
 
@@ -36,5 +36,5 @@ def main(argv: list[str] | None = None) -> int:
         parser.error('--reach needs --suggest; add it, or remove --reach')
     args.reach = args.reach or REACH
     return exit_status(
-        lambda: import_heavy('musculoskeletal_ae.tools.robot_report').check(args), out=args.out
+        lambda: import_heavy('musculoskeletal_ae.design.robot_report').check(args), out=args.out
     )

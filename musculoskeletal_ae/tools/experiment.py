@@ -7,7 +7,7 @@ from pathlib import Path
 
 from musculoskeletal_ae.experiments import NAMES, PAPER
 from musculoskeletal_ae.options import Parser, exit_status, whole
-from musculoskeletal_ae.stop_signals import import_heavy
+from musculoskeletal_ae.process_signals import import_heavy
 
 # Two minutes of exploration are enough to calibrate the detector, so that every result has a value.
 QUICK_MINUTES, QUICK_SEEDS = 2.0, (0,)

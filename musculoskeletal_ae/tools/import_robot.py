@@ -4,7 +4,7 @@
 from pathlib import Path
 
 from musculoskeletal_ae.options import Parser, exit_status, names
-from musculoskeletal_ae.stop_signals import import_heavy
+from musculoskeletal_ae.process_signals import import_heavy
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from musculoskeletal_ae.design.route_jumps import jump_warning
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.figures import save_plot
 from musculoskeletal_ae.mae import checkpoint
@@ -18,7 +19,6 @@ from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.description import shown
-from musculoskeletal_ae.robot.jumps import jump_warning
 from musculoskeletal_ae.robot.robot import Robot
 
 HELD_OUT_STATES = 5000  # number of states of the geometric model over which errors are averaged

@@ -31,7 +31,7 @@ DASHES = 5  # number of tubes per straight piece of a muscle; only dashed muscle
 ENDS = LOOSE, TIGHT = np.array([0, 114, 178]), np.array([230, 97, 0])
 
 
-class Kind(IntEnum):
+class DrawnState(IntEnum):
     """State of a muscle, as far as it is known."""
 
     SOUND = 0
@@ -42,7 +42,11 @@ class Kind(IntEnum):
 
 MARKS = ('', '? ', '⊘ ', '✂ ')  # text before the name of a muscle, by kind
 #: red, green, blue of muscles that are not coloured by tension
-COLOURS = {Kind.SUSPECT: (200, 0, 130), Kind.ISOLATED: (140, 140, 140), Kind.RUPTURED: (0, 0, 0)}
+COLOURS = {
+    DrawnState.SUSPECT: (200, 0, 130),
+    DrawnState.ISOLATED: (140, 140, 140),
+    DrawnState.RUPTURED: (0, 0, 0),
+}
 
 
 def colours(robot: Robot, tension: Array, kinds: Ints) -> Array:
@@ -215,9 +219,9 @@ def muscle_tubes(robot: Robot, theta: Array, tension: Array, kinds: Ints) -> dic
     middle = (np.arange(DASHES) + 0.5) / DASHES
     position = first[:, None] + middle[:, None] * line[:, None]
     radius = 0.5 * drawing.MUSCLE_WIDTH * (1.0 + 1.5 * drawing.tension_share(robot, tension))
-    radius = np.where(kinds == Kind.SUSPECT, drawing.MUSCLE_WIDTH * 1.5, radius)[owner]
+    radius = np.where(kinds == DrawnState.SUSPECT, drawing.MUSCLE_WIDTH * 1.5, radius)[owner]
     # Tubes of healthy muscles overlap slightly to hide the seams.
-    dash = np.where(kinds >= Kind.ISOLATED, 0.55, 1.02)[owner] * length / DASHES
+    dash = np.where(kinds >= DrawnState.ISOLATED, 0.55, 1.02)[owner] * length / DASHES
     each = {
         'batched_wxyzs': turn,
         'batched_scales': np.stack([radius, radius, dash], axis=1),

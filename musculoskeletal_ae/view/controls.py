@@ -25,7 +25,7 @@ import viser
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.view.body import Kind
+from musculoskeletal_ae.view.body import DrawnState
 from musculoskeletal_ae.view.entries import Entries, Key
 from musculoskeletal_ae.view.scene import Scene
 
@@ -208,7 +208,7 @@ class Controls:
             handle.visible = node in nodes
         if 'controller' not in nodes:
             self._gizmo.visible = False
-        self._restore.visible = bool((self._scene.kinds == Kind.ISOLATED).any())
+        self._restore.visible = bool((self._scene.kinds == DrawnState.ISOLATED).any())
         self._explore.visible, self._end_exploring.visible = not explores, explores
         is_free = explores and not self._entries.are_recent('targets', monotonic())
         self._is_targeted = self._is_targeted and not is_free

@@ -17,7 +17,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import whole
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.view import body
-from musculoskeletal_ae.view.body import MARKS, Kind
+from musculoskeletal_ae.view.body import MARKS, DrawnState
 from musculoskeletal_ae.view.controls import Controls, with_buttons
 from musculoskeletal_ae.view.readings import HTML, History, Readings
 from musculoskeletal_ae.view.scene import RIGHT_PANEL, Scene
@@ -157,7 +157,7 @@ class Page:
             'heat': 100.0 * np.clip(np.nan_to_num(temperature) / HOT, 0.0, 1.0),
             'name': self._robot.muscles,
             'mark': [MARKS[kind] for kind in self.scene.kinds],
-            'kind': [Kind(kind).name.lower() for kind in self.scene.kinds],
+            'kind': [DrawnState(kind).name.lower() for kind in self.scene.kinds],
             'pull': [whole(each, 'N') for each in tension],
             'warm': [whole(each, '°C') for each in temperature],
         }

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.view import body
-from musculoskeletal_ae.view.body import MARKS, Kind
+from musculoskeletal_ae.view.body import MARKS, DrawnState
 from musculoskeletal_ae.view.readings import ARMS, LEFT_PANEL
 
 CAMERA_FOV = 0.8  # vertical field of view [rad]
@@ -30,7 +30,7 @@ class Scene:
     Attributes:
         notes: Problems of the robot's meshes, as texts for users.
         posture: The drawn θ [rad] (D,) of each arm that is known.
-        kinds: The drawn `body.Kind` of each muscle, (M,).
+        kinds: The drawn `body.DrawnState` of each muscle, (M,).
         size: Half of the diagonal of the space that the arm can reach [m].
         tubes: Handle of the drawn muscles.
     """
@@ -120,7 +120,7 @@ class Scene:
         Args:
             posture: θ [rad] (D,) of each arm to draw, by name of the arm.
             tension: T [N] (M,); None hides the muscles.
-            kinds: The `body.Kind` of each muscle, (M,).
+            kinds: The `body.DrawnState` of each muscle, (M,).
 
         Returns:
             θ at which the muscles are drawn; None if they are not drawn.
@@ -164,5 +164,5 @@ class Scene:
     def _mark(self) -> None:
         """Label muscles: all if requested, else those that are picked or faulty."""
         for name, kind, label in zip(self._robot.muscles, self.kinds.tolist(), self._labels):
-            label.visible = self._names.value or kind > Kind.SOUND or name == self._picked
-            label.text = MARKS[kind] + name + (f' {Kind(kind).name.lower()}' if kind else '')
+            label.visible = self._names.value or kind > DrawnState.SOUND or name == self._picked
+            label.text = MARKS[kind] + name + (f' {DrawnState(kind).name.lower()}' if kind else '')

@@ -21,12 +21,12 @@ from trajectory_msgs.msg import JointTrajectory
 from bags import bag_samples as samples
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError
-from musculoskeletal_ae.nodes import record as record_tool
-from musculoskeletal_ae.nodes import replay as replay_tool
+from musculoskeletal_ae.message_reading import read_array
 from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.learner import Learner
-from musculoskeletal_ae.nodes.messages import SENSOR
-from musculoskeletal_ae.validity import read_array
+from musculoskeletal_ae.ros.messages import SENSOR
+from musculoskeletal_ae.ros_tools import record as record_tool
+from musculoskeletal_ae.ros_tools import replay as replay_tool
 
 from .arm_bag import JOINTS, joints
 

@@ -7,7 +7,7 @@ from bags import bag_samples as samples
 from musculoskeletal_ae.bags.check import check_bag
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError
-from musculoskeletal_ae.nodes import record
+from musculoskeletal_ae.ros_tools import record
 
 from .bare_file import write
 

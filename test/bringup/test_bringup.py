@@ -21,8 +21,8 @@ from std_msgs.msg import Bool, String, UInt8MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.importing.convert import import_robot
-from musculoskeletal_ae.nodes.messages import LATCHED
 from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.ros.messages import LATCHED
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.usefixtures('both_cores')

@@ -16,8 +16,8 @@ from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.faults import KINDS
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.message_reading import read_muscle_states
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.validity import read_muscle_states
 
 ROBOT = Robot.load('arm26')
 MUSCLE = ROBOT.muscles[3]

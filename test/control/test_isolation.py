@@ -12,25 +12,25 @@ from readings import reading
 from robots import write_robot
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.control import reach
-from musculoskeletal_ae.control.assumed_friction import FRICTION
 from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import APPROACHES, LOST_TIME
-from musculoskeletal_ae.control.planner import Planner
-from musculoskeletal_ae.control.reach import lacking
 from musculoskeletal_ae.control.settings import METHODS, Settings
-from musculoskeletal_ae.control.slowness import slowness
-from musculoskeletal_ae.control.stopping import LARGEST_RISE, PAYING_OUT
-from musculoskeletal_ae.control.tension_plan import TURNING
-from musculoskeletal_ae.control.trajectory import Setpoint, Trajectory
+from musculoskeletal_ae.control.stop_commands import LARGEST_RISE, PAYING_OUT
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
+from musculoskeletal_ae.message_reading import TrajectoryPoints
+from musculoskeletal_ae.motion import reach
+from musculoskeletal_ae.motion.assumed_friction import FRICTION
+from musculoskeletal_ae.motion.planner import Planner
+from musculoskeletal_ae.motion.reach import lacking
+from musculoskeletal_ae.motion.slowness import slowness
+from musculoskeletal_ae.motion.tension_plan import TURNING
+from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.actuation import DEPTH
 from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme, least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
-from musculoskeletal_ae.validity import TrajectoryPoints
 
 LOST = 0
 USED = np.arange(ROBOT.muscle_count) != LOST

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from musculoskeletal_ae.control.ramps import Ramp
+from musculoskeletal_ae.motion.ramps import Ramp
 
 values = st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3).map(np.array)
 

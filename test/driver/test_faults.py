@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from driver.scripted import Driver, RecordedArm, array, joint_state, record
-from musculoskeletal_ae import validity
+from musculoskeletal_ae import message_reading
 from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.driver.motion import ABOVE_BIAS, RUN_AWAY_TENSION
@@ -370,9 +370,9 @@ def test_advice_on_a_rejected_message_is_that_of_its_topic():
 
 def test_every_reason_to_reject_a_message_of_a_driver_has_its_own_advice():
     readers = {
-        ('muscle_states', validity): ('read_muscle_states', '_values'),
-        ('joint_states', validity): ('read_posture', 'joint_names'),
-        ('motors', validity): ('read_muscle_states', 'joint_names'),
+        ('muscle_states', message_reading): ('read_muscle_states', '_values'),
+        ('joint_states', message_reading): ('read_posture', 'joint_names'),
+        ('motors', message_reading): ('read_muscle_states', 'joint_names'),
         ('motors', motor_interface): ('reading', '_find'),
     }
     for (topic, module), functions in readers.items():

@@ -15,9 +15,9 @@ from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.emulator.foreign import ForeignArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
 from musculoskeletal_ae.emulator.reality import make_arm
+from musculoskeletal_ae.message_reading import MOST_WRENCH
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
-from musculoskeletal_ae.validity import MOST_WRENCH
 
 
 @pytest.fixture(scope='module', params=['kin', 'foreign'])

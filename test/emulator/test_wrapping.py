@@ -9,9 +9,9 @@ import pytest
 from differences import slopes
 from robots import read_muscles, write_muscles, write_robot
 
+from musculoskeletal_ae.design import route_jumps
 from musculoskeletal_ae.emulator.foreign import ForeignArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual, Spread
-from musculoskeletal_ae.robot import jumps
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -49,7 +49,7 @@ def test_a_seed_determines_the_individual():
 
 
 def test_individuals_keep_drums_drums_and_rings_rings(tmp_path, monkeypatch):
-    monkeypatch.setattr(jumps, 'LINES', 5)  # saves time; lengths that jump do not matter here
+    monkeypatch.setattr(route_jumps, 'LINES', 5)  # saves time; lengths that jump do not matter here
     document = read_muscles(write_robot(tmp_path))
     for m, share in ((6, 1.02), (7, 0.98)):
         side = {'side': [-0.03 * share, 0.0, -0.3]}

@@ -14,15 +14,15 @@ import pytest
 from network_attacks import ATTACKS, CONSISTENT, ON_MESSAGES
 from robots import DRUM_ENDS, behind_a_drum
 
-from musculoskeletal_ae.estimation.checkpoint_validation import (
+from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
+from musculoskeletal_ae.estimation.network_validation.message_errors import FLOOR
+from musculoskeletal_ae.estimation.network_validation.postures import LIMITS
+from musculoskeletal_ae.estimation.network_validation.validator import (
     DETECTION_DELAY,
     MOST_USED,
     PROOF,
     CheckpointValidator,
 )
-from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
-from musculoskeletal_ae.estimation.validation.message_errors import FLOOR
-from musculoskeletal_ae.estimation.validation.postures import LIMITS
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.learning.calibration import Healthy, calibrate
 from musculoskeletal_ae.mae.initial_training import initial_mae

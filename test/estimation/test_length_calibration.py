@@ -8,10 +8,13 @@ import numpy as np
 import pytest
 from readings import reading
 
-from musculoskeletal_ae.estimation import length_calibration
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.length_calibration import LARGEST_RESIDUAL, LengthCalibration
-from musculoskeletal_ae.estimation.length_moments import WINDOW
+from musculoskeletal_ae.estimation.lengths import length_calibration
+from musculoskeletal_ae.estimation.lengths.length_calibration import (
+    LARGEST_RESIDUAL,
+    LengthCalibration,
+)
+from musculoskeletal_ae.estimation.lengths.length_moments import WINDOW
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.robot.robot import Robot

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.estimation.length_trust import (
+from musculoskeletal_ae.estimation.lengths.length_trust import (
     EVIDENCE_OF,
     TRANSITIONS,
     Evidence,

@@ -11,7 +11,7 @@ from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.length_trust import Evidence
+from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
 from musculoskeletal_ae.estimation.settings import Settings
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.remedy import REPAIR, Step, sentence

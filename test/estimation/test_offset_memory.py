@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from musculoskeletal_ae.estimation.offset_memory import FILE, OffsetMemory
+from musculoskeletal_ae.estimation.lengths.offset_memory import FILE, OffsetMemory
 from musculoskeletal_ae.signals.body_state import LengthOffsets, Trust
 
 MUSCLES = ['biceps', 'triceps']

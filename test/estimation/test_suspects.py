@@ -7,7 +7,7 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Finding
 from musculoskeletal_ae.estimation.settings import Settings
 from musculoskeletal_ae.estimation.suspects import ACQUITTALS, WITHIN, SuspectHandling
-from musculoskeletal_ae.estimation.verification import Outcome, Verdict
+from musculoskeletal_ae.estimation.verification import Outcome, VerificationVerdict
 
 DISTANCE = Finding(1, ConditionKind.RESIDUAL_DISTANCE, 'd = 9')
 
@@ -72,7 +72,7 @@ def test_only_a_jump_of_the_suspect_alone_is_explained_by_its_repair(suspects, k
 
 def test_the_fault_of_an_isolated_muscle_is_known_until_the_muscle_is_restored(suspects):
     isolated = suspects.take(DISTANCE, (), 0.0)
-    isolated = suspects.conclude(Verdict(Outcome.RUPTURED), isolated, 1.0)
+    isolated = suspects.conclude(VerificationVerdict(Outcome.RUPTURED), isolated, 1.0)
     isolated = suspects.take(Finding(2, ConditionKind.VALUES_MISSING, ''), isolated, 2.0)
     outcomes = {muscle: fault.outcome for muscle, fault in suspects.faults.items()}
     assert outcomes == {1: Outcome.RUPTURED, 2: Outcome.VALUES_MISSING}
@@ -83,11 +83,11 @@ def test_the_fault_of_an_isolated_muscle_is_known_until_the_muscle_is_restored(s
 @pytest.mark.parametrize('outcome', Outcome)
 def test_only_a_healthy_suspect_is_restored_and_either_way_the_anomaly_is_over(suspects, outcome):
     isolated = suspects.take(DISTANCE, (4,), 0.0)
-    isolated = suspects.conclude(Verdict(outcome), isolated, 1.0)
+    isolated = suspects.conclude(VerificationVerdict(outcome), isolated, 1.0)
     assert (1 in isolated) == (outcome is not Outcome.HEALTHY)
     assert 4 in isolated
     assert suspects.finding is suspects.verification is None
-    assert suspects.last_verdict == (1, Verdict(outcome))
+    assert suspects.last_verdict == (1, VerificationVerdict(outcome))
 
 
 @pytest.mark.parametrize(('later', 'isolates'), [(1.0, False), (WITHIN, True)])
@@ -97,6 +97,6 @@ def test_after_several_healthy_suspects_the_arm_stays_stopped_for_a_while(
     for _ in range(ACQUITTALS):
         isolated = suspects.take(DISTANCE, (), 0.0)
         assert isolated == (1,)
-        suspects.conclude(Verdict(Outcome.HEALTHY), isolated, 0.0)
+        suspects.conclude(VerificationVerdict(Outcome.HEALTHY), isolated, 0.0)
     assert (suspects.take(DISTANCE, (), later) == (1,)) == isolates
     assert suspects.finding is DISTANCE

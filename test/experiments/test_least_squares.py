@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.experiments.least_squares import (
@@ -13,7 +14,6 @@ from musculoskeletal_ae.experiments.least_squares import (
     oracle_errors,
 )
 from musculoskeletal_ae.experiments.recording import Recording
-from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.robot.robot import Robot
 
 COUNT = 50

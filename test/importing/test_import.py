@@ -12,11 +12,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from musculoskeletal_ae.design.checks import check_robot
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.importing import convert
 from musculoskeletal_ae.importing.convert import import_robot, read_source
 from musculoskeletal_ae.importing.source import SourceError, cut, urdf
-from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.description import TENSION_DEFAULT
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.import_robot import main

@@ -6,10 +6,10 @@ import copy
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.learning.body import CalibratedBody
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.body_model.priors import PRIOR
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.job import Job
-from musculoskeletal_ae.learning.priors import PRIOR
 from musculoskeletal_ae.learning.samples import Observations, Sample, SampleStore
 from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.robot.robot import Robot

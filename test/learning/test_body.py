@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from learning.conftest import drawn_body
-from musculoskeletal_ae.learning.body import CalibratedBody, ResidualModel
-from musculoskeletal_ae.learning.fit import fit_body, fit_to_network
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody, ResidualModel
+from musculoskeletal_ae.body_model.fit import fit_body, fit_to_network
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.robot.robot import Robot
 

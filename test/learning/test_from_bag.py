@@ -18,9 +18,9 @@ from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.checkpoint import load
 from musculoskeletal_ae.mae.initial_training import initial_mae
+from musculoskeletal_ae.process_signals import INTERRUPTED
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.stop_signals import INTERRUPTED
 from musculoskeletal_ae.tools import bag_learning, model_training, network_cache
 from musculoskeletal_ae.tools.bag_learning import anomaly_in, error, learn, read, repetition
 from musculoskeletal_ae.tools.network_cache import network_file

@@ -9,11 +9,11 @@ import pytest
 from robots import write_robot
 
 from learning.conftest import Stage, drawn_body
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.body_model.covariance import ellipsoids, estimate_covariance
+from musculoskeletal_ae.body_model.fit import fit_body
+from musculoskeletal_ae.body_model.posture_model import Bent, PostureModel, Unknowns
 from musculoskeletal_ae.experiments.least_squares import on_calibrated_body
-from musculoskeletal_ae.learning.body import CalibratedBody
-from musculoskeletal_ae.learning.covariance import ellipsoids, estimate_covariance
-from musculoskeletal_ae.learning.fit import fit_body
-from musculoskeletal_ae.learning.posture_model import Bent, PostureModel, Unknowns
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.robot import Robot
 

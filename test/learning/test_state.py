@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from robots import copy_robot, read_muscles, write_muscles
 
-from musculoskeletal_ae.estimation.checkpoint_validation import CheckpointValidator
+from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.exceptions import GateError, StateError
 from musculoskeletal_ae.learning import state as states
 from musculoskeletal_ae.learning.learner import Learner

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.body_model.synthetic import UNKNOWN_FRICTION, synthetic_samples
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.network_trainer import NetworkTrainer
-from musculoskeletal_ae.learning.synthetic import UNKNOWN_FRICTION, synthetic_samples
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.learning.update import BodyUpdater, learned_steps
 from musculoskeletal_ae.mae import checkpoint

@@ -10,10 +10,10 @@ import pytest
 from graph import PATIENCE
 from std_msgs.msg import Float32MultiArray, Float64MultiArray
 
-from musculoskeletal_ae.nodes import check_driver
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.ros_tools import check_driver
 
 RATE = 50.0  # rate of the driver's messages [Hz]; 100 Hz would take twice the processor time
 COMMON = ['--robot', 'arm26', '--rate', f'{RATE:g}']

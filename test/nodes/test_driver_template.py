@@ -14,8 +14,8 @@ from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.nodes.controller import Controller
-from musculoskeletal_ae.nodes.messages import array_message, joint_message
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.ros.messages import array_message, joint_message
 
 TEMPLATE = Path(__file__).parents[2] / 'examples' / 'driver.py'
 ROBOT = Robot.load('arm26')

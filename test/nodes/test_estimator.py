@@ -18,8 +18,8 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
-from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.ros.messages import LATCHED, array_message
 
 
 @pytest.fixture

@@ -14,8 +14,8 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes import executor
 from musculoskeletal_ae.nodes.bringup_status import BringupStatus
+from musculoskeletal_ae.ros import executor
 
 
 @pytest.fixture

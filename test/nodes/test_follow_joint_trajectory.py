@@ -18,7 +18,7 @@ from rclpy.guard_condition import GuardCondition
 from rclpy.waitable import NumberOfEntities, Waitable
 from trajectory_msgs.msg import JointTrajectory
 
-from musculoskeletal_ae.nodes import executor
+from musculoskeletal_ae.ros import executor
 
 from .test_motion import HERE, THERE, trajectory
 

@@ -11,10 +11,10 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.message_reading import read_muscle_states
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
-from musculoskeletal_ae.nodes.messages import LATCHED, array_message
 from musculoskeletal_ae.remedy import Step
-from musculoskeletal_ae.validity import read_muscle_states
+from musculoskeletal_ae.ros.messages import LATCHED, array_message
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.messages import LATCHED
+from musculoskeletal_ae.ros.messages import LATCHED
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -0.9])
 

@@ -26,8 +26,8 @@ from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.learner import Learner
-from musculoskeletal_ae.nodes.messages import LATCHED, array_message
-from musculoskeletal_ae.nodes.running import NICENESS
+from musculoskeletal_ae.ros.messages import LATCHED, array_message
+from musculoskeletal_ae.ros.running import NICENESS
 
 REST, MOVE = 0.8, 0.1  # duration of a rest, and of the motion between two rests [s]
 DT = 0.02

@@ -14,11 +14,11 @@ from std_msgs.msg import Float64MultiArray
 from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes import render
 from musculoskeletal_ae.nodes.arm import Frames
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.shell import Shell
+from musculoskeletal_ae.ros_tools import render
 
 CONFIG = Path(__file__).parents[2] / 'config'
 

@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator
 import pytest
 from graph import DEADLINE
 
-from musculoskeletal_ae.nodes.progress import STALLED, ProgressWatch, waited_for_processor
+from musculoskeletal_ae.ros.hang_detection import STALLED, ProgressWatch, waited_for_processor
 
 START = (
-    'from musculoskeletal_ae.nodes.progress import ProgressWatch\n'
+    'from musculoskeletal_ae.ros.hang_detection import ProgressWatch\n'
     'import time\n'
     'watch = ProgressWatch(longest=1.0, look_period=0.1)\n'
     'watch.start()\n'

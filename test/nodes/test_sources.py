@@ -13,10 +13,10 @@ from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.nodes.controller import Controller
-from musculoskeletal_ae.nodes.diagnostics import NODE_SILENCE
 from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.messages import LATCHED, array_message, joint_message
-from musculoskeletal_ae.nodes.sources import (
+from musculoskeletal_ae.ros.diagnostics import NODE_SILENCE
+from musculoskeletal_ae.ros.messages import LATCHED, array_message, joint_message
+from musculoskeletal_ae.ros.second_publishers import (
     LEASE,
     LINK_PATIENCE,
     NAMING,

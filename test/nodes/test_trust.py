@@ -16,14 +16,14 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64MultiArray
 from std_srvs.srv import Trigger
 
-from musculoskeletal_ae.estimation import checkpoint_validation
+from musculoskeletal_ae.estimation.network_validation import validator
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.learner import Learner
-from musculoskeletal_ae.nodes.messages import LATCHED, array_message, joint_message
 from musculoskeletal_ae.nodes.sim import Sim
+from musculoskeletal_ae.ros.messages import LATCHED, array_message, joint_message
 
 HERE = np.array([-0.5, -1.2])
 REFUSED = 'mae_checkpoint: does not explain the arm'
@@ -104,7 +104,7 @@ def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_n
     arm, trained, monkeypatch
 ):
     # The new network must not be proven before the anomaly, however slow the machine is.
-    monkeypatch.setattr(checkpoint_validation, 'PROOF', 1e6)
+    monkeypatch.setattr(validator, 'PROOF', 1e6)
     nodes = arm.estimator, arm.controller
     first = trained['default'].version
     network = replace(trained['paper'], version=first + 1)

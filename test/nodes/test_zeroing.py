@@ -7,12 +7,12 @@ from graph import DEADLINE
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from musculoskeletal_ae.estimation import length_calibration
+from musculoskeletal_ae.estimation.lengths import length_calibration
 from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.learner import Learner
-from musculoskeletal_ae.nodes.messages import LATCHED, array_message
+from musculoskeletal_ae.ros.messages import LATCHED, array_message
 from musculoskeletal_ae.signals.body_state import LengthOffsets, Trust
 
 

@@ -9,15 +9,15 @@ from graph import executable
 from robots import copy_robot, read_muscles, write_muscles, write_robot
 from scipy.linalg import eigh
 
+from musculoskeletal_ae.design.checks import check_robot
+from musculoskeletal_ae.design.holding_remedies import remedies
+from musculoskeletal_ae.design.robot_report import plot
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.figures import save_figure
-from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.kinematics import RACK
-from musculoskeletal_ae.robot.remedies import remedies
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.tools.check_robot import main
-from musculoskeletal_ae.tools.robot_report import plot
 
 #: a route on a single link, which crosses no joint
 IDLE = [{'link': 'upper', 'xyz': [0.0, 0.03, z]} for z in (-0.1, -0.2)]

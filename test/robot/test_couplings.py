@@ -10,8 +10,8 @@ from differences import slopes
 from nominal_body import nominal_arm
 from robots import read_muscles, write_muscles, write_robot
 
+from musculoskeletal_ae.design.checks import check_robot
 from musculoskeletal_ae.exceptions import RobotDescriptionError
-from musculoskeletal_ae.robot.checks import check_robot
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 from musculoskeletal_ae.simulation.load import Load

@@ -9,10 +9,14 @@ import pytest
 from exact_mae import ExactMae
 from robots import read_muscles, write_muscles, write_robot
 
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.body_model.fit import fit_body
+from musculoskeletal_ae.body_model.posture_model import Bent, PostureModel, Unknowns
 from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.methods import StiffnessModel
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.design.checks import check_robot
+from musculoskeletal_ae.design.robot_report import summary
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.effects import NONE
 from musculoskeletal_ae.emulator.foreign import ForeignArm
@@ -21,23 +25,19 @@ from musculoskeletal_ae.estimation.contact import ContactEstimator
 from musculoskeletal_ae.exceptions import CheckpointError, InfeasibleError, RobotDescriptionError
 from musculoskeletal_ae.exporting.mjcf import export
 from musculoskeletal_ae.importing.convert import import_robot
-from musculoskeletal_ae.learning.body import CalibratedBody
 from musculoskeletal_ae.learning.calibration import Healthy
-from musculoskeletal_ae.learning.fit import fit_body
 from musculoskeletal_ae.learning.job import Job
-from musculoskeletal_ae.learning.posture_model import Bent, PostureModel, Unknowns
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
-from musculoskeletal_ae.robot.checks import check_robot
+from musculoskeletal_ae.motion.methods import StiffnessModel
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 from musculoskeletal_ae.simulation.load import Load
 from musculoskeletal_ae.simulation.simulation import Simulation
-from musculoskeletal_ae.tools.robot_report import summary
 
 #: entries of joint_elasticity: the spring of `bend` opposes the muscle that bends; the springs of
 #: `lift` and `swing` are softer and coupled

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from robots import DRUM_ENDS, behind_a_drum
 
+from musculoskeletal_ae.design import route_jumps as robot_jumps
+from musculoskeletal_ae.design.checks import check_robot
+from musculoskeletal_ae.design.route_jumps import JUMP, jump_choices, jumps
 from musculoskeletal_ae.emulator import foreign, individual
 from musculoskeletal_ae.emulator.foreign import ForeignArm
 from musculoskeletal_ae.emulator.individual import Individual
-from musculoskeletal_ae.robot import jumps as robot_jumps
-from musculoskeletal_ae.robot.checks import check_robot
-from musculoskeletal_ae.robot.jumps import JUMP, jump_choices, jumps
 
 
 def jumping(lengths, robot):

@@ -15,11 +15,11 @@ from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
 from musculoskeletal_ae.experiments.recording import ClosedLoop
+from musculoskeletal_ae.message_reading import read_muscle_states
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import Transmission
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
-from musculoskeletal_ae.validity import read_muscle_states
 
 DRIVE = {'torque_constant': 0.05, 'gear': 20.0, 'spool_radius': 0.01}
 PER_AMPERE = 100.0  # tension per motor current of DRIVE [N per A]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from robots import copy_robot, read_muscles, write_muscles
 
-from musculoskeletal_ae.robot import suggestion
-from musculoskeletal_ae.robot.checks import check_robot
+from musculoskeletal_ae.design import suggestion
+from musculoskeletal_ae.design.checks import check_robot
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.check_robot import main
 

@@ -8,10 +8,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from robots import read_muscles, write_muscles, write_robot
 
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.design import route_jumps
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
-from musculoskeletal_ae.learning.body import CalibratedBody
-from musculoskeletal_ae.robot import jumps
 from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.wrapping import WrapObjects, wrapped_segments
@@ -130,7 +130,7 @@ def test_the_gradient_is_the_derivative_of_the_length(robot):
 
 
 def test_the_emulator_without_differences_is_the_geometric_model(robot, monkeypatch):
-    monkeypatch.setattr(jumps, 'LINES', 5)  # saves time; lengths that jump do not matter here
+    monkeypatch.setattr(route_jumps, 'LINES', 5)  # saves time; lengths that jump do not matter here
     theta = robot.random_postures(20, np.random.default_rng(1))
     body = Individual(robot, 0, NOMINAL)
     np.testing.assert_allclose(

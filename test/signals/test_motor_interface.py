@@ -12,11 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.message_reading import read_muscle_states
 from musculoskeletal_ae.robot.motors import Motors, MotorTopics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
-from musculoskeletal_ae.validity import read_muscle_states
 
 MOTORS = 'm0', 'm1', 'm2'
 CONNECTED = Motors(

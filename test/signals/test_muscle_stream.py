@@ -10,15 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from readings import reading
 
-from musculoskeletal_ae import validity
+from musculoskeletal_ae import message_reading
 from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals import plausibility, readings
+from musculoskeletal_ae.signals import muscle_readings, plausibility
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets, Trust
 from musculoskeletal_ae.signals.friction import Transmission
 from musculoskeletal_ae.signals.limits import LIMITS, longest_lengths
+from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Presence, Quantity
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
-from musculoskeletal_ae.signals.readings import QUANTITIES, Presence, Quantity
 
 ROBOT = Robot.load('arm26')
 M = ROBOT.muscle_count
@@ -61,7 +61,7 @@ def test_an_optional_quantity_is_one_entry_of_the_layout(monkeypatch):
     voltage = Quantity(
         'voltage', 'V', 'impossible voltage', lambda _: (5.0, 60.0), Presence.OPTIONAL
     )
-    for module in (readings, validity):
+    for module in (muscle_readings, message_reading):
         monkeypatch.setattr(module, 'QUANTITIES', (*QUANTITIES, voltage))
     monkeypatch.setattr(plausibility, 'QUANTITIES', (*QUANTITIES, voltage))
     stream, volts = MuscleStream(ROBOT), np.full(M, 24.0)

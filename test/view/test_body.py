@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 from musculoskeletal_ae.robot.robot import Robot  # noqa: E402
 from musculoskeletal_ae.view.body import (  # noqa: E402
     DASHES,
-    Kind,
+    DrawnState,
     link_solids,
     muscle_tubes,
     pieces,
@@ -85,8 +85,8 @@ def test_ruptured_isolated_and_suspect_muscles_look_different(robot, theta):
         np.diff(robot.routes.points(theta[None])[0], axis=0)[robot.routes.first], axis=1
     ).repeat(DASHES)
     filled = tubes['batched_scales'][:, 2] * DASHES / length
-    assert (filled[kind >= Kind.ISOLATED] < 0.7).all() and (
-        filled[kind < Kind.ISOLATED] > 1.0
+    assert (filled[kind >= DrawnState.ISOLATED] < 0.7).all() and (
+        filled[kind < DrawnState.ISOLATED] > 1.0
     ).all()
     looks = {tuple(colour) for colour in tubes['batched_colors']}
     assert len(looks) == 4

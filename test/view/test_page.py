@@ -23,8 +23,8 @@ from std_msgs.msg import Bool, String
 
 from musculoskeletal_ae.conditions import stop_causes
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.messages import LATCHED
 from musculoskeletal_ae.remedy import Step, sentence
+from musculoskeletal_ae.ros.messages import LATCHED
 
 pytest.importorskip('viser', reason='./bringup.sh --view installs what the page needs')
 

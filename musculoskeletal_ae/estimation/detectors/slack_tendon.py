@@ -19,7 +19,7 @@ d is the stretch: the length that the network computes for a barely taut tendon,
 length l. The joint angles θ are estimated from the tendons that are not slack. d contains errors of
 the network, which may be centimetres before the network has learned the arm. Mean d̄ and standard
 deviation σ of these errors follow from the readings with which the tendon was last taut, and from
-the covariance of the network's errors (`estimation/length_errors.py`). Just after a loss of
+the covariance of the network's errors (`estimation/lengths/length_errors.py`). Just after a loss of
 tension, σ is small. The farther the arm moves from the posture in which the tendon was taut, the
 larger σ becomes. If a tendon ruptures while it carries no load, the rupture is detected as soon as
 the tendon should carry load.
@@ -32,7 +32,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
-from musculoskeletal_ae.estimation.length_errors import LengthErrors, Prediction
+from musculoskeletal_ae.estimation.lengths.length_errors import LengthErrors, Prediction
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS, share_outside

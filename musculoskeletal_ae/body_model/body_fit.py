@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fits the calibrated body of one arm again in every update.
+
+Every update fits the body to all samples and starts from the last fit. The prior is the geometric
+model. If a network has already learned a real arm, the prior is a body that was fitted to this
+network (`fit_to_network`). The geometric model replaces it if the first samples show that the
+network learned another arm.
+"""
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.body_model.fit import Fit, fit_body, fit_to_network
+from musculoskeletal_ae.body_model.synthetic import held_tensions
+from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+PROBES = 200  # number of postures over which the mean length of each muscle is computed
+# A muscle has changed if at least its LEAST_NEWEST newest samples contradict the body, all with
+# residuals of the same sign, and at least LEAST_BEFORE samples came before them.
+LEAST_NEWEST = 4
+LEAST_BEFORE = 8
+LEAST_CHANGE = 0.004  # smallest residual of a sample that contradicts the body [m]
+OUTLIER = 6.0  # smallest residual of a sample that contradicts the body, in standard deviations
+
+
+class BodyFit:
+    """Fits the calibrated body of one arm and stores the result.
+
+    Attributes:
+        body: The most recently fitted body.
+    """
+
+    def __init__(self, robot: Robot, mae: Mae | None, seed: int = 0) -> None:
+        """Begin with a body that is fitted to `mae`, or with the geometric model if it is None."""
+        if mae is not None:
+            robot = robot.with_elasticity(mae.elasticity)
+        self.body = CalibratedBody(robot, seed=seed)
+        #: parameters fitted to the network, which replace the geometric model as prior mean
+        self._prior_mean: list[Array] | None = None
+        if mae is not None:
+            fit_to_network(self.body, mae, seed)
+            self._prior_mean = list(self.body.parameters)
+        self._is_prior_confirmed = False
+        rng = np.random.default_rng([seed, 0x3E])
+        self._probe = robot.random_postures(PROBES, rng), held_tensions(robot, PROBES, rng)
+        self._mean_length = self._probe_lengths()  # [m], (M,)
+
+    def is_of_another_arm(self, observed: Observations) -> bool:
+        """Return whether samples contradict the body that was fitted to the network.
+
+        The check runs once, as soon as there are enough samples. All other calls return False.
+        """
+        observed = observed.with_all_angles()
+        if self._prior_mean is None or self._is_prior_confirmed or len(observed) < LEAST_NEWEST:
+            return False
+        self._is_prior_confirmed = True
+        body = CalibratedBody(self.body.robot, self._prior_mean, smooth=self.body.smooth)
+        (length,) = body.lengths(observed.theta, observed.tension, observed.direction)
+        return bool(np.median(np.abs(observed.length - length)[observed.known]) > LEAST_CHANGE)
+
+    def start_anew(self) -> None:
+        """Start again from the geometric model."""
+        self._prior_mean = None
+        robot = self.body.robot.with_elasticity(None)
+        self.body = CalibratedBody(robot, smooth=self.body.smooth)
+
+    def fit(self, observed: Observations, guess: Array) -> Fit:
+        """Fit the body to samples.
+
+        Args:
+            observed: The samples.
+            guess: Initial values for joint angles that were not measured [rad], (N, D).
+        """
+        return fit_body(self.body, observed, self._prior_mean, guess)
+
+    def lengthened(self) -> Array:
+        """Return the growth of each muscle's mean length since the previous call [m], (M,).
+
+        The mean is taken over a fixed set of postures and tensions.
+        """
+        before, self._mean_length = self._mean_length, self._probe_lengths()
+        return self._mean_length - before
+
+    def _probe_lengths(self) -> Array:
+        """Return the mean lengths [m] (M,) over a fixed set of postures and tensions."""
+        (length,) = self.body.lengths(*self._probe, np.zeros_like(self._probe[1]))
+        return length.mean(axis=0)
+
+
+def contradicted_muscles(observed: Observations, fit: Fit) -> tuple[tuple[int, int], ...]:
+    """Return the muscles that seem to have changed, because their newest samples do not fit.
+
+    The newest samples of such a muscle all have large length residuals of the same sign, while
+    enough earlier samples exist.
+
+    Returns:
+        The index of each such muscle, and the number of its newest samples with such residuals.
+    """
+    muscles = []
+    for m, noise in enumerate(fit.noise):
+        residual = fit.residual[observed.known[:, m], m]
+        odd = np.abs(residual) > max(OUTLIER * noise, LEAST_CHANGE)
+        same = odd & (np.sign(residual) == np.sign(residual[-1])) if len(residual) else odd
+        fits = np.flatnonzero(~same)
+        run = len(same) - 1 - fits[-1] if len(fits) else 0
+        if run >= LEAST_NEWEST and len(same) - run >= LEAST_BEFORE:
+            muscles.append((m, int(run)))
+    return tuple(muscles)

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Covariances of a network's estimation errors, and of the learned constants of motor currents."""
+
+import math
+
+import numpy as np
+from scipy.linalg import solve_triangular
+from scipy.special import gammaincinv
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.body_model.fit import Fit
+from musculoskeletal_ae.body_model.priors import INDEPENDENT_SAMPLES, PRIOR
+from musculoskeletal_ae.body_model.synthetic import UNKNOWN_FRICTION
+from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.training import TINY
+
+#: number of validation messages that are enough to scale the covariance
+MANY_MESSAGES = 200
+#: Number of bodies drawn from the posterior. There are many more of them than joints, because a
+#: covariance of few draws underestimates the errors of other draws.
+BODIES = 100
+POSTURES_PER_BODY = 10  # number of postures at which errors of each body are drawn
+#: Factor of the covariance if there are fewer than MANY_MESSAGES validation messages. It stands for
+#: errors that are common to all samples and that no prior describes, for example because tendons
+#: wrap round bones. No single factor suits all arms: with this one, the ellipsoids contain 95 % of
+#: the true angles on emulator model `foreign`, and on `kin` if no joint reaches its limits. If
+#: joints reach their limits, the ellipsoids are too large on `kin` (doc/limitations.md, `python -m
+#: bench covariance`).
+UNVALIDATED_FACTOR = 1.7
+CONTAINED_SHARE = 0.95  # share of the errors that the ellipsoid of a covariance has to contain
+
+
+def estimate_covariance(
+    mae: Mae,
+    body: CalibratedBody,
+    fit: Fit,
+    tension: Array,
+    seed: int,
+    judging: Observations | None,
+) -> Array:
+    """Return the expected covariance of a network's errors θ_est − θ [rad²], (D, D).
+
+    The covariance is computed from errors that are drawn at random postures with tensions of the
+    samples. An error has two parts. The first part is the error of the joint-sensor offset.
+    Validation messages do not show this part, because they contain the same offset. The second part
+    is everything else. If there are at least MANY_MESSAGES validation messages, it is multiplied by
+    a ratio: the network's actual errors on these messages, relative to errors that are drawn at the
+    same postures. The postures have to be the same, because validation messages are mostly near the
+    samples, where errors are smaller than at random postures. With fewer validation messages, the
+    covariance is multiplied by UNVALIDATED_FACTOR instead.
+
+    Args:
+        mae: The network.
+        body: The calibrated body.
+        fit: The fit of that body.
+        tension: Tensions at the elastic elements in the samples [N], (N, M).
+        seed: Seed of the draws.
+        judging: Validation messages, or None.
+    """
+    rng = np.random.default_rng(seed)
+
+    def draw(theta: Array) -> tuple[Array, Array]:
+        # Draw the same bodies and length errors in both calls, so that only the postures differ.
+        return _drawn_errors(mae, body, fit, theta, tension, np.random.default_rng(seed))
+
+    error, offset = draw(body.robot.random_postures(BODIES * POSTURES_PER_BODY, rng))
+    if judging is None or len(judging) < MANY_MESSAGES:
+        return UNVALIDATED_FACTOR * _spread(error)
+    rows = rng.integers(len(judging), size=BODIES * POSTURES_PER_BODY)
+    here, offset_here = draw(judging.theta[rows])
+    actual = observed_theta(mae, judging) - judging.theta
+    ratio = math.sqrt(_excess(_spread(here - offset_here), actual))
+    return _spread(offset + ratio * (error - offset))
+
+
+def drive_covariance(body: CalibratedBody, fit: Fit) -> Array | None:
+    """Return the posterior covariances of the constants γ, b and F of motor currents.
+
+    `Transmission` explains the constants. All samples together count as at most
+    INDEPENDENT_SAMPLES samples, because errors of the body model are common to all of them.
+
+    Returns:
+        The covariance of γ, b [N] and F [N] for each muscle, (M, 3, 3), or None if the robot has
+        tension sensors.
+    """
+    if body.drive is None:
+        return None
+    covariance = np.empty((len(body.layouts), 3, 3))
+    share = min(1.0, INDEPENDENT_SAMPLES / len(fit.theta))
+    for muscles, root in fit.root:
+        end = 0
+        for m in muscles.tolist():
+            layout = body.layouts[m]
+            places = end + np.arange(layout.size)[layout.drive]
+            unit = np.zeros((len(root), 3))
+            unit[places, range(3)] = 1.0
+            half = solve_triangular(root, unit, trans='T')
+            prior = np.diag(1.0 / np.square(PRIOR.drive))
+            observed = np.linalg.inv(half.T @ half) - prior
+            widened = np.linalg.inv(prior + share * observed)
+            scale = body.drive_units[:, m]
+            covariance[m] = scale[:, None] * (0.5 * (widened + widened.T)) * scale
+            end += layout.size
+    return covariance
+
+
+def _drawn_errors(
+    mae: Mae,
+    body: CalibratedBody,
+    fit: Fit,
+    theta: Array,
+    tension: Array,
+    rng: np.random.Generator,
+) -> tuple[Array, Array]:
+    """Draw one estimation error for each posture, and the error of the joint-sensor offsets in it.
+
+    Bodies and joint-sensor offsets are drawn from the posterior of the fit. The posterior is a
+    Laplace approximation, in which lengths are linear in the parameters. The network estimates θ
+    from the lengths of each drawn body.
+
+    Returns:
+        The errors θ_est − θ [rad], and the errors of the joint-sensor offsets [rad], both of shape
+        (BODIES · POSTURES_PER_BODY, D).
+    """
+    bodies = np.repeat(np.arange(BODIES), POSTURES_PER_BODY)
+    tension = tension[rng.integers(len(tension), size=len(bodies))]
+    direction = UNKNOWN_FRICTION * np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, tension.shape))
+    poses, length = body.poses(theta), fit.noise * rng.standard_normal(tension.shape)
+    offset = np.zeros((BODIES, theta.shape[1]))
+    for group, (muscles, root) in zip(body.robot.groups, fit.root, strict=True):
+        steps = solve_triangular(root, rng.standard_normal((len(root), BODIES))).T
+        ends = np.cumsum([body.layouts[m].size for m in muscles])
+        for m, step in zip(muscles.tolist(), np.split(steps, ends, axis=1)):
+            smooth = body.smooth[m].at(theta)
+            observed, slope = body.linearised(poses, smooth, tension[:, m], direction[:, m], m)
+            length[:, m] += observed + (slope * step[bodies]).sum(axis=1)
+        joints = list(group.joints)
+        offset[:, joints] = steps[:, ends[-1] : ends[-1] + len(joints)]
+    return mae.estimate(tension, length).theta - theta, offset[bodies]
+
+
+def _spread(error: Array) -> Array:
+    """Return a covariance whose 95 % ellipsoid contains 95 % of the errors (N, D).
+
+    The ellipsoid of the plain covariance would contain less than 95 % of the errors, because they
+    have heavier tails than a normal distribution.
+    """
+    covariance = error.T @ error / len(error) + TINY * np.eye(error.shape[1])
+    covariance = 0.5 * (covariance + covariance.T)
+    return covariance * _excess(covariance, error)
+
+
+def _excess(covariance: Array, error: Array) -> float:
+    """Return the factor by which a covariance must grow for its ellipsoid to hold 95 % of errors.
+
+    `covariance` [rad²] has the shape (D, D), and `error` [rad] the shape (N, D).
+    """
+    return float(np.quantile(ellipsoids(covariance, error), CONTAINED_SHARE))
+
+
+def ellipsoids(covariance: Array, error: Array) -> Array:
+    """Return by which factor the covariance must grow for its ellipsoid to reach each error, (N,).
+
+    The ellipsoid of a covariance contains the share CONTAINED_SHARE of its normal distribution.
+
+    Args:
+        covariance: A covariance [rad²], (D, D).
+        error: Errors [rad], (N, D).
+    """
+    squares = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error.T).T)
+    # Quantile of χ² with D degrees of freedom; importing scipy.stats for it would take 0.7 s.
+    bounded: Array = squares / (2.0 * gammaincinv(0.5 * error.shape[1], CONTAINED_SHARE))
+    return bounded
+
+
+def observed_theta(mae: Mae, observed: Observations) -> Array:
+    """Return θ [rad] (N, D) as a network estimates it from observations."""
+    return mae.estimate(observed.end_tension(mae.transmission), observed.length).theta

@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fits the calibrated body to samples.
+
+The fit is a robust maximum a posteriori estimate (`gauss_newton`) of the parameters together with
+the samples' postures (`postures`). It starts from the last fit. The prior spreads s have physical
+causes: attachments are placed by hand with limited accuracy, and elastic elements of one kind
+differ. With known postures, each muscle is fitted separately:
+
+    min_w  Σ_n ω_n (l_n − l(θ_n, T_n; w))² / σ² + Σ_k ((w_k − w̄_k) / s_k)²
+
+w are the parameters of the muscle with prior mean w̄, σ is the noise of its lengths, and ω_n are
+robust weights of the samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody, Poses
+from musculoskeletal_ae.body_model.postures import FIRST_NOISE, fit_jointly
+from musculoskeletal_ae.body_model.priors import PRIOR, REOPENED, MusclePrior
+from musculoskeletal_ae.gauss_newton import (
+    Equations,
+    RightSides,
+    SolvedStep,
+    determined,
+    minimise,
+    noise_and_weight,
+)
+from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.mae.mae import Mae
+
+ROUNDS = 30  # largest number of Gauss–Newton iterations for one muscle
+LEAST_DECREASE = 1e-11  # decrease of the cost, per measured length, that ends the iterations
+LEAST_NOISE = 0.0003  # smallest σ of a length at rest [m]
+#: number of samples from before the change of a muscle that are required to derive a new prior
+LEAST_BEFORE_CHANGE = 8
+
+
+class Fit(NamedTuple):
+    """Result of a fit."""
+
+    #: l − l(θ, T; w) [m], (N, M), at the measured angles, or at fitted ones where there are none
+    residual: Array
+    noise: Array  # σ of each muscle's length [m], (M,)
+    weight: Array  # ω in (0, 1], (N, M); 0 where a sample does not describe a muscle
+    theta: Array  # fitted postures [rad], (N, D)
+    #: for each group, its muscles and R; (RᵀR)⁻¹ is the covariance of w, z and e (`postures`)
+    root: list[tuple[Ints, Array]]
+
+
+def fit_body(
+    body: CalibratedBody,
+    observed: Observations,
+    prior_mean: list[Array] | None = None,
+    guess: Array | None = None,
+) -> Fit:
+    """Fit the parameters of a body in place, together with the samples' postures.
+
+    The fit starts from the present parameters. A muscle counts as changed if at least
+    LEAST_BEFORE_CHANGE samples no longer describe it, although it was not isolated when they were
+    taken. Such a muscle is first fitted to these earlier samples, and the result is the prior mean
+    of its new parameters.
+
+    Args:
+        body: The body.
+        observed: The samples.
+        prior_mean: Prior mean that replaces the geometric model, one vector for each muscle. It
+            is used if parameters were learned from samples that no longer exist.
+        guess: Initial values for joint angles that were not measured [rad], (N, D); by default the
+            middle of each joint's range.
+    """
+    robot = body.robot
+    if guess is None:
+        guess = np.tile(0.5 * (robot.lower + robot.upper), (len(observed), 1))
+    start = np.where(
+        np.isnan(observed.theta), np.clip(guess, robot.lower, robot.upper), observed.theta
+    )
+    priors = []
+    for m in range(len(body.layouts)):
+        prior = _prior(body, observed, m)
+        if prior_mean is not None:
+            prior = prior._replace(mean=prior_mean[m])
+        priors.append(_reopened(body, replace(observed, theta=start), prior, m))
+    means, spreads = map(list, zip(*priors, strict=True))
+    is_learned = prior_mean is not None
+    return Fit(*fit_jointly(body, observed, start, means, spreads, LEAST_NOISE, is_learned))
+
+
+def _prior(body: CalibratedBody, observed: Observations, m: int) -> MusclePrior:
+    """Return the prior of a muscle around the geometric model."""
+    layout = body.layouts[m]
+    spread = PRIOR.spread(layout)
+    # The prior of the offset describes the tendon before it crept. Creep since then widens the
+    # prior.
+    spread[layout.offset] = np.hypot(PRIOR.offset, PRIOR.creep * observed.age.max(initial=0.0))
+    return MusclePrior(PRIOR.mean(layout), spread)
+
+
+def _reopened(
+    body: CalibratedBody, observed: Observations, prior: MusclePrior, m: int
+) -> MusclePrior:
+    """Return a wide prior for muscle `m` if the muscle was changed, else return `prior`.
+
+    The wide prior lies around the parameters before the change. They are fitted to the samples from
+    before the change, and are set in `body`.
+    """
+    # Exclude tensions of 0 N, which mean that the muscle was isolated.
+    before = ~observed.known[:, m] & (observed.tension[:, m] != 0.0)
+    if before.sum() < LEAST_BEFORE_CHANGE:
+        return prior
+    poses = body.poses(observed.theta)
+    problem = MuscleFit(body, poses, observed, before, prior, LEAST_NOISE, m)
+    body.parameters[m] = problem.run()
+    return MusclePrior(body.parameters[m], REOPENED.spread(body.layouts[m]))
+
+
+class MusclePoint(NamedTuple):
+    """Parameters of one muscle, with residuals and derivatives."""
+
+    parameters: Array  # w, (P,)
+    residual: Array  # l − l(θ, T; w) [m], (N, 1)
+    jacobian: Array  # ∂l/∂w, (N, P)
+
+
+class MuscleFit:
+    """Fit of one muscle at known postures, as a `gauss_newton.Problem`."""
+
+    def __init__(
+        self,
+        body: CalibratedBody,
+        poses: Poses,
+        observed: Observations,
+        used: Bools,
+        prior: MusclePrior,
+        least_noise: float,
+        m: int,
+    ) -> None:
+        """Prepare the fit of muscle `m` to the samples where `used` (N,) is True."""
+        self._body, self._m = body, m
+        self._poses, self._smooth = poses, body.smooth[m].at(observed.theta)
+        self._observed = observed
+        self._known = used.astype(float)[:, None]
+        self._mean = prior.mean
+        self._least_noise = least_noise
+        self._noise = np.array([FIRST_NOISE])
+        self._determined = np.zeros(1)
+        self.usual = np.zeros(0), 1.0 / prior.spread**2
+
+    @property
+    def _precision(self) -> Array:
+        return self.usual[1]
+
+    def run(self) -> Array:
+        """Return the fitted parameters, starting from the body's present ones."""
+        start = self.point(self._body.parameters[self._m])
+        enough = LEAST_DECREASE * float(self._known.sum())
+        return minimise(self, start, ROUNDS, enough).point.parameters
+
+    def point(self, parameters: Array) -> MusclePoint:
+        """Return these parameters with their residuals and derivatives."""
+        m, observed = self._m, self._observed
+        of_all = list(self._body.parameters)
+        of_all[m] = parameters
+        length, jacobian = self._body.with_parameters(of_all).linearised(
+            self._poses,
+            self._smooth,
+            observed.tension[:, m],
+            observed.direction[:, m],
+            m,
+            observed.age,
+        )
+        return MusclePoint(parameters, (observed.length[:, m] - length)[:, None], jacobian)
+
+    def weigh(self, point: MusclePoint) -> None:
+        """Compute the noise of the lengths and the robust weights from the residuals at a point."""
+        self._noise, weight = noise_and_weight(
+            point.residual, self._known, self._noise, self._determined, self._least_noise
+        )
+        self._weight = weight / self._noise**2
+
+    def cost(self, point: MusclePoint) -> float:
+        """Return the cost of a point with the present weights."""
+        deviation = self._mean - point.parameters
+        return float((self._weight * point.residual**2).sum() + self._precision @ deviation**2)
+
+    def equations(self, point: MusclePoint) -> Equations:
+        """Return the normal equations at a point."""
+        curvature = (point.jacobian * self._weight).T @ point.jacobian
+        self._determined = np.array([determined(curvature, self._precision)])
+        return Equations.of_common(curvature + np.diag(self._precision))
+
+    def right_sides(self, point: MusclePoint) -> RightSides:
+        """Return the right sides of the normal equations."""
+        by_samples = point.jacobian.T @ (self._weight * point.residual)[:, 0]
+        by_prior = self._precision * (self._mean - point.parameters)
+        return RightSides.of_common(by_samples + by_prior)
+
+    def moved(self, point: MusclePoint, step: SolvedStep) -> MusclePoint:
+        """Return the parameters after a step of the solver, with residuals and derivatives."""
+        return self.point(point.parameters + step.common)
+
+
+NETWORK_STATES = 400  # number of states at which the network is evaluated
+NETWORK_ERROR = 0.001  # smallest σ of the network's lengths [m]
+FIXED = 1e-6  # prior spread of a parameter that a fit must not change
+
+
+def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
+    """Fit a body in place to the muscle lengths of a network that has learned a real arm.
+
+    The samples from which the network was learned may be missing (after `train --from-bag`, on
+    another machine, or if the state was lost). With this fit as prior, learning still continues
+    from the learned body and does not start again from the geometric model. An exported model of
+    the learned body is fitted in the same way.
+    """
+    robot, rng = body.robot, np.random.default_rng([seed, 0x1B])
+    theta = robot.random_postures(NETWORK_STATES, rng)
+    shape = NETWORK_STATES, robot.muscle_count
+    tension = rng.uniform(robot.tension.bias, robot.tension.limit, shape)
+    everything = np.ones(shape, dtype=bool)
+    lengths = mae.lengths(theta, tension)
+    read = mae.transmission.reading(tension, np.zeros(shape))
+    observed = Observations(theta, read, lengths, np.zeros(shape), everything)
+    poses = body.poses(theta)
+    for m, layout in enumerate(body.layouts):
+        mean, spread = PRIOR.mean(layout), PRIOR.spread(layout)
+        # The network's lengths contain no information about friction and drive, because its input
+        # is T_end. Their prior means are therefore the values that were learned with the network.
+        spread[layout.drive] = FIXED
+        if mae.touch is not None:
+            mean[layout.friction] = mae.friction[m]
+            if mae.touch.drive is not None:
+                mean[layout.drive] = mae.touch.drive[:, m] / body.drive_units[:, m]
+        prior = MusclePrior(mean, spread)
+        problem = MuscleFit(body, poses, observed, everything[:, m], prior, NETWORK_ERROR, m)
+        body.parameters[m] = problem.run()

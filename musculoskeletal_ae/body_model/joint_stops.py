@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Estimates joint-sensor offsets from the joints' mechanical stops.
+
+A joint that reaches its limit is stopped there, in any posture of the other joints and under any
+load. Readings of different rests then cluster at one value, and hardly any lie beyond it. Muscles
+and gravity hardly determine the offset z of a joint sensor, but such a cluster determines it to a
+fraction of a degree. For the readings y_n of a joint at rest and each of its two limits
+
+    p(y | z, π, σ) = (1 − π) / range + π N(y − z − limit; σ)
+    p(z | y) ∝ p(z) Π_limits Σ_π,σ p(π, σ) Π_n p(y_n | z, π, σ)
+
+Here π is the share of rests at that stop, which is often 0, σ is the width of the cluster, and N is
+the normal density. Beyond the limit, the first term is nearly 0 and the cluster is wider, because
+stops are compliant. A sensor is calibrated accurately or roughly with equal probability, so the
+prior p(z) is the sum of a narrow and a wide normal density. A limit may also not be a mechanical
+stop, in which case the readings near it do not determine z.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools
+
+if TYPE_CHECKING:
+    from musculoskeletal_ae.body_model.posture_model import PostureModel
+
+# The following angles [rad] apply to revolute joints; for prismatic joints they are multiplied by
+# `kinematics.RACK` [m].
+ROUGH_OFFSET = np.deg2rad(2.0)  # σ of z of a roughly calibrated sensor [rad]
+ACCURATE_OFFSET = 0.003  # σ of z of an accurately calibrated sensor [rad]
+#: refuse an update that finds a larger |z|: ten times σ of a roughly calibrated sensor [rad]
+LARGEST_OFFSET = 10.0 * ROUGH_OFFSET
+STOP_SPREAD = 0.01  # standard deviation of the distance between a stop and its limit [rad]
+OFFSETS = np.linspace(-4.0 * ROUGH_OFFSET, 4.0 * ROUGH_OFFSET, 281)  # grid of z [rad]
+NO_STOPS = 0.1  # probability that a joint's limits are not mechanical stops
+NOT_REACHED = 0.5  # probability that a stop is never reached
+SHARES = 0.03, 0.1, 0.3  # grid of π, if the stop is reached
+WIDTHS = 0.001, 0.002, 0.004  # grid of σ, if the stop is reached [rad]
+WIDTH_RATIO = 2.0  # σ beyond a limit, relative to σ within the range
+DENSITY_RATIO = 0.01  # density of readings beyond a limit, relative to that within the range
+# A joint is at its stop if it is near a limit and the muscles push it there.
+NEAR_STOP = 0.05  # largest distance of a joint without a sensor from the limit [rad]
+LEAST_PUSH = 3.0  # smallest torque towards the limit, relative to the usual residual torque
+SMALL = 1e-6  # weight of every angle, relative to the weight of a stop
+NEAR_LIMIT = 0.3  # distance from a limit within which readings may belong to its cluster [rad]
+# Two rests are distinct if another joint or the reading itself differs.
+OTHER_DIFFERENCE = 0.1  # smallest difference of another joint [rad]
+OWN_DIFFERENCE = 0.01  # smallest difference of the reading [rad]
+
+
+def sensor_zeros(read: Array, lower: Array, upper: Array, radian: Array) -> tuple[Array, Array]:
+    """Return the joint-sensor offsets and their standard deviations, both [rad or m] (D,).
+
+    Args:
+        read: Sensor readings at rest, (N, D); NaN where nothing was measured.
+        lower: Lower limits, (D,).
+        upper: Upper limits, (D,).
+        radian: 1 rad for a revolute joint, and for a prismatic joint the displacement [m] that
+            counts as 1 rad, (D,).
+    """
+    theta, lower, upper = (read / radian).T, lower / radian, upper / radian
+    apart = np.abs(theta[:, None] - theta[:, :, None])  # (D, N, N)
+    elsewhere: Bools = np.logical_or.reduce(apart > OTHER_DIFFERENCE)
+    estimates = [_zero(*each, elsewhere) for each in zip(theta, lower.tolist(), upper.tolist())]
+    zero, spread = np.reshape(estimates, (-1, 2)).T
+    return zero * radian, np.hypot(spread, STOP_SPREAD) * radian
+
+
+def _zero(own: Array, lower: float, upper: float, elsewhere: Bools) -> tuple[float, float]:
+    own = _different(own, elsewhere)
+    stops = _at_stop(own - lower, upper - lower) + _at_stop(upper - own, upper - lower)[::-1]
+    log = np.logaddexp(np.log(1.0 - NO_STOPS) + stops, np.log(NO_STOPS))
+    prior = _normal(OFFSETS, ROUGH_OFFSET) + _normal(OFFSETS, ACCURATE_OFFSET)
+    weight = np.exp(log - log.max()) * prior
+    weight /= weight.sum()
+    # Use the median: with little evidence it stays near 0, where most offsets are.
+    zero = float(np.interp(0.5, np.cumsum(weight) - 0.5 * weight, OFFSETS))
+    return zero, float(np.sqrt(weight @ (OFFSETS - zero) ** 2))
+
+
+def _at_stop(within: Array, span: float) -> Array:
+    """Return the log likelihood of a joint's readings y near one limit, for each offset in OFFSETS.
+
+    The likelihood is relative to that of readings which are uniform over the joint's range.
+
+    Args:
+        within: Distances of the readings from the limit, positive within the range [rad], (N,).
+        span: The joint's range [rad].
+    """
+    single = np.float32  # logarithms in single precision take a fraction of the time
+    distance = (within[within < NEAR_LIMIT, None] - OFFSETS).astype(single)
+    even = np.where(distance > 0.0, single(1.0), single(DENSITY_RATIO))
+    wide = np.where(distance > 0.0, single(1.0), single(WIDTH_RATIO))
+    logs = [np.log(NOT_REACHED) + np.log(even).sum(axis=0, dtype=float)]
+    for width in WIDTHS:
+        mean = 0.5 * (1.0 + WIDTH_RATIO) * width
+        pile = span / mean * _normal(distance / (width * wide), 1.0)
+        for share in SHARES:
+            log = np.log((1.0 - share) * even + share * pile).sum(axis=0, dtype=float)
+            log += (len(within) - len(distance)) * np.log(1.0 - share)
+            logs.append(log + np.log((1.0 - NOT_REACHED) / (len(WIDTHS) * len(SHARES))))
+    total: Array = np.logaddexp.reduce(logs)
+    return total
+
+
+def _different(own: Array, elsewhere: Bools) -> Array:
+    """Return those readings of a joint that were taken at distinct rests.
+
+    Repeated readings of a parked joint, or of an arm that returns to the same posture, would
+    otherwise look like a cluster at a stop.
+
+    Args:
+        own: Readings of the joint, (N,).
+        elsewhere: Whether the postures of two rests differ, (N, N).
+    """
+    read = np.flatnonzero(np.isfinite(own))
+    moved = read[np.abs(np.diff(own[read], prepend=np.inf)) > OWN_DIFFERENCE]
+    own = own[moved]
+    alike = (np.abs(own[:, None] - own) < OWN_DIFFERENCE) & ~elsewhere[np.ix_(moved, moved)]
+    kept = np.ones(len(own), dtype=bool)
+    for n in np.flatnonzero(np.tril(alike, -1).any(axis=1)):
+        kept[n] = not (alike[n, :n] & kept[:n]).any()
+    return own[kept]
+
+
+def _normal(x: Array, sigma: float) -> Array:
+    density: Array = np.exp(-0.5 * (x / sigma) ** 2) / (math.sqrt(2.0 * math.pi) * sigma)
+    return density
+
+
+class Stops:
+    """Detects joints at their mechanical stops, and computes their displacements back to the stops.
+
+    These displacements keep the postures that a fit estimates within the joints' ranges.
+    """
+
+    def __init__(self, model: PostureModel) -> None:
+        """Start with no joint at a stop."""
+        robot, observed = model.body.robot, model.observed
+        self._lower, self._upper = robot.lower, robot.upper
+        self._radian = robot.kinematics.radian
+        self._by_sensor = model.by_sensor
+        self._near = self._radian * np.where(model.by_sensor, 2.0 * ROUGH_OFFSET, NEAR_STOP)
+        # Samples from before the change of a muscle give no torque balance, because the earlier
+        # torque of the muscle cannot be computed from its new parameters. A tension of 0 N,
+        # however, means that the muscle was only isolated.
+        changed = ~observed.known & (observed.tension != 0.0)
+        #: joints whose torque balance is informative, (N, D)
+        self.is_balanced = ~(changed @ robot.routes.crossed)
+        if not robot.tension_source.is_known:
+            self.is_balanced[:] = False
+        #: limit [rad] at whose stop each joint is, NaN for joints that are not at a stop, (N, D)
+        self._at = np.full(model.by_sensor.shape, np.nan)
+
+    def lean(self, own: Array, score: Array) -> Bools:
+        """Detect which joints are at their stops.
+
+        Args:
+            own: θ [rad], (N, D).
+            score: Residual torque at each joint relative to its usual size, (N, D). A positive
+                torque pushes the joint towards its upper limit.
+
+        Returns:
+            A mask (N, D) of the joints whose torque balance the fit can use. A joint at its stop is
+            not among them, because the stop exerts an unknown torque.
+        """
+        # A joint with a sensor stays at its stop until the torque pulls it away. The score of a
+        # joint without a sensor has to exceed LEAST_PUSH at every call. Otherwise a stop that was
+        # assumed wrongly would hold the joint and distort the other joints.
+        enough = np.where(self._by_sensor & np.isfinite(self._at), 0.0, LEAST_PUSH)
+        above = self.is_balanced & (own > self._upper - self._near) & (score > enough)
+        below = self.is_balanced & (own < self._lower + self._near) & (score < -enough)
+        self._at = np.where(above, self._upper, np.where(below, self._lower, np.nan))
+        return self.is_balanced & ~(above | below)
+
+    def pull(self, own: Array, repeated: Array) -> tuple[Array, Array]:
+        """Return the displacements [rad] that move joints back to their stops, and their weights.
+
+        Both have the shape (N, D). They are 0 for all joints that are neither at a stop nor beyond
+        a joint limit.
+
+        Args:
+            own: θ [rad], (N, D).
+            repeated: Number of readings of each joint's sensor that together count as a single
+                independent one, (D,).
+        """
+        goal = np.where(np.isnan(self._at), np.clip(own, self._lower, self._upper), self._at)
+        is_pulled = ~np.isnan(self._at) | (goal != own)
+        return goal - own, is_pulled / (STOP_SPREAD * self._radian) ** 2 / repeated
+
+    @property
+    def least_weight(self) -> Array:
+        """A small weight for each joint angle, which keeps the normal equations regular, (D,)."""
+        weight: Array = SMALL / (STOP_SPREAD * self._radian) ** 2
+        return weight

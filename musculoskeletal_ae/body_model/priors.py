@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Priors of the body's parameters: physical spreads around the geometric model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.body_model.calibrated_body import Layout
+from musculoskeletal_ae.body_model.joint_stops import sensor_zeros
+from musculoskeletal_ae.body_model.posture_model import PostureModel
+from musculoskeletal_ae.robot.model_errors import ATTACHMENT, ELASTIC
+from musculoskeletal_ae.signals.friction import DRIVE_FRICTION_MEAN, DRIVE_SPREAD
+
+#: Errors of the body model are common to all samples. Therefore all samples together count as at
+#: most this number of independent ones, for joint-sensor offsets, for springs of the joints, for
+#: the constants of motor currents, and for the posterior uncertainty from the torque and the stops
+#: of joints without a sensor.
+INDEPENDENT_SAMPLES = 10.0
+# The following angles [rad] apply to revolute joints; for prismatic joints they are multiplied by
+# `kinematics.RACK` [m].
+SENSOR_NOISE = 0.002  # σ_y of a joint sensor [rad]
+LEAST_ANGLE_NOISE = 1e-6  # smallest σ_y [rad]
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Means and standard deviations σ of the differences between a body and its geometric model."""
+
+    attachment: float = ATTACHMENT  # σ of each coordinate of each route point [m]
+    elastic: float = ELASTIC  # σ of the logarithm of each elastic constant
+    friction: float = 0.05  # σ of μ around `friction_mean`
+    friction_mean: float = 0.05  # mean of μ
+    offset: float = 0.001  # σ of the offset of the length sensor [m]
+    creep: float = 1e-5  # σ of the creep of a tendon from one sample to the next [m]
+    smooth: float = 0.002  # σ of the parameters of the residual model [m]
+    #: σ of the logarithm of a motor current's scale, and of its offset and drive friction as shares
+    #: of T_limit
+    drive: tuple[float, float, float] = DRIVE_SPREAD
+    #: mean of the drive friction as a share of T_limit
+    drive_friction_mean: float = DRIVE_FRICTION_MEAN
+
+    def spread(self, layout: Layout) -> Array:
+        """Return the prior spread s of every parameter of a muscle."""
+        spread = np.empty(layout.size)
+        spread[layout.attachment] = self.attachment
+        spread[layout.elastic] = self.elastic
+        spread[layout.friction] = self.friction
+        spread[layout.offset], spread[layout.creep] = self.offset, self.creep
+        spread[layout.rest] = self.smooth
+        spread[layout.drive] = self.drive[: layout.drive.stop - layout.drive.start]
+        return spread
+
+    def mean(self, layout: Layout) -> Array:
+        """Return the prior mean of every parameter of a muscle."""
+        mean = np.zeros(layout.size)
+        mean[layout.friction] = self.friction_mean
+        mean[layout.drive][2:] = self.drive_friction_mean
+        return mean
+
+
+PRIOR = Prior()
+#: prior of a muscle that was replaced or whose tendon was renewed, around its earlier parameters
+REOPENED = Prior(attachment=0.004, elastic=0.3, offset=0.03, smooth=0.001)
+
+
+class MusclePrior(NamedTuple):
+    """Mean w̄ and spread s of the parameters of one muscle, (P,) each."""
+
+    mean: Array
+    spread: Array
+
+
+@dataclass
+class GroupPrior:
+    """Prior of one group, and the accuracy of its joint sensors.
+
+    Attributes:
+        mean: Prior mean of the parameters w̄, (W,).
+        precision: 1/s², (W,).
+        zero: Prior mean of the joint-sensor offsets z̄ [rad], (D,).
+        zero_precision: 1/s_z², (D,).
+        angle_precision: 1/σ_y²; 0 where the angle was not measured, (N, D).
+        repeated: Number of readings of a joint sensor that together count as a single independent
+            one, (D,).
+        unread: Number of samples that together count as a single independent one for a joint
+            without a sensor, (D,).
+        spring_precision: 1/s_e² of α of all S joints with springs, then of β, (2S,).
+    """
+
+    mean: Array
+    precision: Array
+    zero: Array
+    zero_precision: Array
+    angle_precision: Array
+    repeated: Array
+    unread: Array
+    spring_precision: Array
+
+    @classmethod
+    def of(cls, model: PostureModel, mean: list[Array], spread: list[Array]) -> GroupPrior:
+        """Return the prior of a group from the `mean` and `spread` of each of its muscles."""
+        observed, robot, by_sensor = model.observed, model.body.robot, model.by_sensor
+        radian = robot.kinematics.radian
+        angle_spread = np.where(by_sensor, SENSOR_NOISE * radian, observed.spread)
+        repeated = np.maximum(1.0, by_sensor.sum(axis=0) / INDEPENDENT_SAMPLES)
+        readings = np.where(by_sensor, observed.theta, np.nan)
+        zero, zero_spread = sensor_zeros(readings, robot.lower, robot.upper, radian)
+        repeated_samples = max(1.0, len(readings) / INDEPENDENT_SAMPLES)
+        return cls(
+            mean=np.concatenate(mean),
+            precision=np.concatenate([1.0 / each**2 for each in spread]),
+            zero=zero,
+            zero_precision=repeated / zero_spread**2,
+            angle_precision=np.where(
+                model.is_read, 1.0 / np.maximum(angle_spread, LEAST_ANGLE_NOISE) ** 2, 0.0
+            ),
+            repeated=repeated,
+            unread=np.maximum(1.0, (~by_sensor).sum(axis=0) / INDEPENDENT_SAMPLES),
+            spring_precision=repeated_samples / model.spring_spread.ravel() ** 2,
+        )
+
+    def deviation(self, parameters: list[Array]) -> Array:
+        """Return the difference w̄ − w between the prior mean and given parameters, (W,)."""
+        return self.mean - np.concatenate(parameters)

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Synthetic training samples of the calibrated body, which complement the real samples."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.mae.default_training import highest_tensions
+from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.robot.robot import Robot
+
+#: share of samples with most muscles near T_bias, as under muscle stiffness control
+HELD_SHARE = 0.5
+#: share of a joint's range by which postures may exceed its limits, because friction or contact can
+#: move a joint slightly beyond a limit
+MARGIN = 0.02
+
+
+class TrainingData(NamedTuple):
+    """N samples in scaled units; each array has the shape (N, D+2M)."""
+
+    entered: Array  # network input, with noisy lengths
+    true: Array  # target of the network's output
+
+
+#: share of the friction that remains unknown although the direction of sliding is estimated
+UNKNOWN_FRICTION = 0.25
+
+
+def synthetic_samples(
+    body: CalibratedBody,
+    noise: Array,
+    count: int,
+    rng: np.random.Generator,
+) -> TrainingData:
+    """Draw random samples of a body with length noise and residual friction.
+
+        target: (θ_r, T_r, l(θ_r, T_r; s = 0)),   input: (θ_r, T_r, l(θ_r, T_r; u s_r) + ε)
+
+    θ_r are random postures, T_r random tensions at the elastic elements, and s_r random directions
+    of sliding. From measured tensions, an estimator can compute T_r except for a share u of the
+    friction (UNKNOWN_FRICTION). The lengths in the network's input contain this share of the
+    friction and the noise ε, and those in its target do not. The network therefore learns to weight
+    muscles by the accuracy of their lengths when it estimates θ from T and l, as in weighted least
+    squares.
+
+    Args:
+        body: The calibrated body.
+        noise: σ of ε for each muscle [m], (M,).
+        count: Number of samples.
+        rng: The random generator.
+    """
+    robot = body.robot
+    shape = count, robot.muscle_count
+    theta = robot.random_postures(count, rng, MARGIN)
+    tension = held_tensions(robot, count, rng)
+    # Draw directions mostly near −1 and 1, where sliding leaves them most of the time.
+    direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, shape))
+    read = body.transmission.reading(tension, np.zeros(shape))
+    length, scattered = body.lengths(theta, read, np.zeros(shape), UNKNOWN_FRICTION * direction)
+    scattered = scattered + noise * rng.standard_normal(shape)
+    true, entered = State(theta, tension, length), State(theta, tension, scattered)
+    return TrainingData(entered.scaled(), true.scaled())
+
+
+def held_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
+    """Draw random tensions [N] for `count` samples, (count, M).
+
+    In a share HELD_SHARE of the samples, most tensions are near T_bias, as in an arm that holds a
+    posture. In all other samples, tensions are uniform from 0 to `highest_tensions`.
+    """
+    shape, highest = (count, robot.muscle_count), highest_tensions(robot, count, rng)
+    anywhere = rng.uniform(0.0, 1.0, shape) * highest
+    lowest = robot.tension.bias * rng.uniform(0.7, 1.0, shape)
+    held = lowest + rng.uniform(0.0, 1.0, shape) ** 3 * (highest - lowest)
+    return np.where(rng.uniform(size=(count, 1)) < HELD_SHARE, held, anywhere)

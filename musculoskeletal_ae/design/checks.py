@@ -1,0 +1,520 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Check whether the muscles of an arm can hold it (`check_robot`).
+
+For postures drawn uniformly within the joint limits, the check computes
+
+- the tension nearest to 0.3 T_limit within [T_bias, T_limit] that holds weight and springs,
+- the joint stiffness at that tension (`stiffness`), with the springs, and
+- the moment arms r(θ) = −∂l/∂θ [m], the joint torque for one newton of tension. A muscle with
+  r > 0 moves the joint in its positive direction.
+
+To give all joints the same unit, the check assumes that a pinion of radius RACK moves each
+prismatic joint. A tendon parallel to the axis of the joint then has r = RACK.
+
+doc/explanation/method.md ("An arm must be holdable") defines a sound arm. A joint with a spring of
+its own may have muscles on one side only, if these muscles can hold the joint. The report also
+shows the one-sided stiffness, for information only. In it, muscles at the tension that their
+modules maintain (T_bias, or 0 for position-controlled modules) count as slack.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.design.route_jumps import jumping_muscles
+from musculoskeletal_ae.exceptions import RobotDescriptionError
+from musculoskeletal_ae.files import read_csv, read_table
+from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
+from musculoskeletal_ae.robot.description import RobotDescription, Wrap, refusal, shown
+from musculoskeletal_ae.robot.kinematics import RACK
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
+from musculoskeletal_ae.robot.tension import least_tension
+from musculoskeletal_ae.schema import Strict
+
+#: share of postures that a sound arm must at least hold, and in which it must be stiff enough
+REQUIRED_SHARE = 0.95
+# The required stiffness is the smaller of REQUIRED_STIFFNESS and STIFFNESS_PER_LOAD times the
+# largest load of a joint. With the latter, a change of that load by a tenth moves no joint by more
+# than 0.05 rad.
+REQUIRED_STIFFNESS = 5.0  # [N·m/rad]
+STIFFNESS_PER_LOAD = 2.0  # [1/rad]
+LEAST_INERTIA = 1e-12  # inertia of a joint below which the value is a rounding error [kg·m²]
+#: a muscle counts as slack up to this much above the tension that its module maintains [N], because
+#: the solver rounds
+SLACK_MARGIN = 1e-3
+# A moment arm counts if it is longer than the smaller of COUNTED_ARM and COUNTED_ARM_SHARE of the
+# longest one at its joint, but at least LEAST_COUNTED_ARM.
+COUNTED_ARM = 0.003  # moment arm with which a tension of 300 N produces about 1 N·m [m]
+COUNTED_ARM_SHARE = 0.1
+LEAST_COUNTED_ARM = 1e-4  # [m]
+#: moment arms below this length deviate by half or more in emulated individuals [m]
+SHORT_ARM = 0.015
+#: share of postures in which a muscle may act with the wrong sign, or a joint may lack muscles on
+#: one side
+TOLERATED_SHARE = 0.05
+LEAST_DETOUR = 1e-6  # length added by wrapping below which the value is a rounding error [m]
+LONGEST_ARM = 1.0  # moment arm above which the points are assumed to be in millimetres [m]
+MILLIMETRES = 5.0  # typical moment arm above which all points must be in millimetres [m]
+#: ranges above which joint limits are assumed to be in degrees (revolute, [rad]) or in millimetres
+#: (prismatic, [m])
+WIDEST_RANGES = 4.0 * np.pi, 10.0
+DECLARATION_FILE = 'moment_arms.csv'
+COLUMNS = ['muscle', 'joint', 'sign']
+
+
+class FindingTexts(Strict, frozen=True, array_like=True):
+    """Message and remedy for one kind of finding, as findings.yaml contains them."""
+
+    message: str
+    remedy: str
+
+
+#: texts by kind of finding; the part of a key after a comma distinguishes variants of a kind
+FINDINGS = read_table(__file__, 'findings.yaml', dict[str, FindingTexts])
+
+
+class Finding(NamedTuple):
+    """A fault or warning about a robot, with its remedy."""
+
+    kind: str  # an identifier, such as 'wrong_sign'
+    message: str  # text that names the muscles and joints
+    #: text; '' for 'not_held' and 'not_stiff', for which `holding_remedies` computes it
+    remedy: str = ''
+    #: for 'not_held' and 'not_stiff': index of the joint that is most often the weakest, or -1
+    joint: int = -1
+
+
+class Setting(NamedTuple):
+    """A robot in N postures, with the quantities that determine holding and stiffness.
+
+    For a prismatic joint, all quantities except `theta` are those of a pinion of radius RACK that
+    moves the joint.
+    """
+
+    robot: Robot
+    theta: Array  # [rad] or [m], (N, D)
+    jacobian: Array  # G [m/rad], (N, M, D)
+    hessian: Array  # ∂²l/∂θ² [m/rad²], (N, M, D, D)
+    torque: Array  # g + K θ − b, which holds the arm against weight and springs [N·m], (N, D)
+    weight: Array  # g [N·m], (N, D)
+    springs: Array  # K [N·m/rad], (D, D)
+
+    @classmethod
+    def of(cls, robot: Robot, theta: Array) -> Setting:
+        """Return a robot in postures θ [rad] or [m], (N, D), with all quantities computed."""
+        radian = robot.kinematics.radian
+        weight = radian * robot.kinematics.weight_torque(theta)
+        elasticity = robot.kinematics.elasticity
+        torque = weight + radian * elasticity.holding_torque(theta)
+        springs = radian[:, None] * elasticity.stiffness * radian
+        return cls(robot, theta, *_slopes(robot, theta), torque, weight, springs)
+
+    def rerouted(self, robot: Robot) -> Setting:
+        """Return the quantities of a robot that differs from this one only in its routes."""
+        jacobian, hessian = _slopes(robot, self.theta)
+        return self._replace(robot=robot, jacobian=jacobian, hessian=hessian)
+
+
+def _slopes(robot: Robot, theta: Array) -> tuple[Array, Array]:
+    """Return `jacobian` and `hessian` of a `Setting`."""
+    jacobian, radian = robot.routes.muscle_jacobian, robot.kinematics.radian
+    hessian = radian[:, None] * muscle_hessian(jacobian, theta) * radian
+    return radian * jacobian(theta), hessian
+
+
+@dataclass(frozen=True)
+class RobotCheck:
+    """Results of `check_robot` in N postures."""
+
+    setting: Setting
+    moment_arms: Array  # r [m], (N, M, D)
+    tension: Array  # holding tension [N], (N, M); NaN where the posture is not held
+    missing_torque: Array  # torque that the muscles lack to hold a posture [N·m], (N, D)
+    stiffness: Array  # smallest joint-stiffness eigenvalue [N·m/rad], (N,); NaN if not held
+    #: like `stiffness`, but muscles at the tension that their modules maintain count as slack, (N,)
+    one_sided: Array
+    required: float  # required stiffness [N·m/rad]
+    matters: Array  # smallest moment arm at each joint that is taken into account [m], (D,)
+    softest: Ints  # index of the softest joint in each posture that is held but not stiff
+    faults: tuple[Finding, ...] = ()  # reasons why the arm is not sound; empty if it is sound
+    warnings: tuple[Finding, ...] = ()  # questionable properties that do not make it unsound
+
+    @property
+    def held(self) -> Bools:
+        """Whether the muscles hold the arm in each posture, shape (N,)."""
+        return np.isfinite(self.stiffness)
+
+    @property
+    def stiff(self) -> Bools:
+        """Whether the arm is held and stiff enough in each posture, shape (N,)."""
+        return self.stiffness >= self.required
+
+
+def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
+    """Check the muscles of a robot in random postures, and its description for suspicious values.
+
+    Args:
+        robot: The robot.
+        postures: Number of postures.
+        seed: Random seed of the postures.
+
+    Raises:
+        RobotDescriptionError: If the directory's `moment_arms.csv` is not valid.
+    """
+    theta = robot.random_postures(postures, np.random.default_rng(seed))
+    result = judge(Setting.of(robot, theta))
+    arms = result.moment_arms
+    if wrong_unit := tuple(_millimetres(arms)):
+        return replace(result, faults=wrong_unit, warnings=())
+    suspicious = (
+        *_other_units(robot, arms),
+        *_small_joints(robot, arms),
+        *_jumping_muscles(robot),
+        *_idle_objects(robot, theta),
+    )
+    faults = (*result.faults, *_inertia_faults(robot, theta))
+    return replace(result, faults=faults, warnings=(*result.warnings, *suspicious))
+
+
+def judge(setting: Setting) -> RobotCheck:
+    """Check whether the muscles of a robot hold and stiffen it in given postures.
+
+    Args:
+        setting: The robot and the postures.
+
+    Raises:
+        RobotDescriptionError: If the directory's `moment_arms.csv` is not valid.
+    """
+    result, robot = measure(setting), setting.robot
+    arms, matters = result.moment_arms, result.matters
+    faults = (
+        *_wrong_signs(robot, arms),
+        *_one_way_joints(robot, arms, matters),
+        *_useless_muscles(robot, arms, matters),
+        *_holding_faults(result),
+    )
+    return replace(result, faults=faults, warnings=tuple(_flipping_muscles(robot, arms)))
+
+
+def measure(setting: Setting) -> RobotCheck:
+    """Compute tensions, stiffness and moment arms in given postures, without any finding."""
+    robot, theta, jacobian, hessian, torque, *_ = setting
+    bias, limit, arms = robot.tension.bias, robot.tension.limit, -jacobian
+    tension, missing = np.full(arms.shape[:2], np.nan), np.zeros(torque.shape)
+    load = float(robot.joint_load(setting.weight, jacobian).max())
+    required = min(REQUIRED_STIFFNESS, STIFFNESS_PER_LOAD * load)
+    longest = np.abs(arms).max(axis=(0, 1))
+    matters = np.clip(COUNTED_ARM_SHARE * longest, LEAST_COUNTED_ARM, COUNTED_ARM)
+    for n, (at, weight) in enumerate(zip(jacobian, torque, strict=True)):
+        exertion = least_tension(at, weight, bias, limit, DESIRED_SHARE * limit)
+        missing[n] = exertion.missing_torque
+        tension[n] = np.nan if missing[n].any() else exertion.tension
+    held = np.isfinite(tension[:, 0])
+    stiffness, one_sided = np.full((2, len(theta)), np.nan)
+    k = robot.muscle_stiffness(theta[held], tension[held])
+    # A position-controlled module holds its length, so its muscle resists even at T_bias and counts
+    # as taut.
+    is_taut = tension[held] > robot.actuation.kept_tension + SLACK_MARGIN
+    taut = np.where(is_taut, k, 0.0)
+    full, sided = (
+        setting.springs + joint_stiffness(jacobian[held], hessian[held], x, tension[held])
+        for x in (k, taut)
+    )
+    values, vectors = np.linalg.eigh(full)
+    stiffness[held], one_sided[held] = values[:, 0], np.linalg.eigvalsh(sided)[:, 0]
+    softest = np.abs(vectors[:, :, 0]).argmax(axis=1)[values[:, 0] < required]
+    return RobotCheck(
+        setting, arms, tension, missing, stiffness, one_sided, required, matters, softest
+    )
+
+
+class ArmTerms(NamedTuple):
+    """Unit and wording for moment arms at a joint.
+
+    At a prismatic joint, a moment arm is shown as the share of the tension that acts along the axis
+    of the joint.
+    """
+
+    scale: float  # factor from a moment arm in metres to the shown number [1/m]
+    unit: str  # unit of the shown number
+    name: str
+    other: str  # where to route a muscle that must act in the other direction
+    better: str  # where to route a muscle for a larger moment arm
+    guided: str  # how to keep a tendon on one side of the joint, as the end of a sentence, or ''
+
+    def decimals(self, longest: float) -> int:
+        """Return the number of decimals for moment arms of at most `longest` [m]."""
+        return int(self.scale * longest < 10.0)
+
+
+def arm_terms(robot: Robot, joint: int) -> ArmTerms:
+    """Return unit and wording for moment arms at a joint."""
+    if robot.kinematics.slides[joint]:
+        towards_other_end = 'towards the other end of'
+        return ArmTerms(100.0 / RACK, '%', 'force share', towards_other_end, 'more parallel to', '')
+    guided = ', or keep it on one side of the axis by `wrap: cylinder` around the axis'
+    return ArmTerms(1e3, 'mm', 'moment arm', 'to the other side of', 'further from', guided)
+
+
+def required_stiffness(robot: Robot, required: float) -> str:
+    """Return the required joint stiffness as a text, such as '5 N·m/rad'.
+
+    If the robot has prismatic joints, the text also states the value in N/m.
+
+    Args:
+        robot: The robot.
+        required: Smallest permitted eigenvalue of the joint stiffness [N·m/rad].
+    """
+    text = f'{required:.2g} N·m/rad'
+    if robot.kinematics.slides.any():
+        text += f' ({required / RACK**2:.0f} N/m for prismatic joints)'
+    return text
+
+
+def rounded_text(value: float, least: int = 1, largest: float | None = None) -> str:
+    """Return a value as text, with the decimals that give `largest` two significant digits.
+
+    Args:
+        value: The value.
+        least: Smallest number of decimals.
+        largest: The largest of the values that are shown together; by default `value`.
+
+    Returns:
+        The number as text, without a sign if it rounds to zero.
+    """
+    size = abs(value if largest is None else largest)
+    decimals = max(least, 1 - int(np.floor(np.log10(size)))) if size else least
+    return f'{round(value, decimals) + 0.0:.{decimals}f}'
+
+
+def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int], int]:
+    """Return the signs of moment arms (±1) that `moment_arms.csv` declares.
+
+    The keys are pairs of indices (muscle, joint). The result is empty if there is no such file.
+
+    Raises:
+        RobotDescriptionError: If the file is invalid; the message names the line and the legal
+            values.
+    """
+    file = description.directory / DECLARATION_FILE
+    legal = (description.muscles, description.joints, ('+', '-'))
+    actions: dict[tuple[int, int], int] = {}
+    if not os.path.lexists(file):
+        return actions
+    for line, text, cells in read_csv(file, COLUMNS, refusal):
+        where = f'{file}: line {line}'
+        if len(cells) != len(COLUMNS):
+            expected = f'3 values ({",".join(COLUMNS)})'
+            raise RobotDescriptionError(f'{where}: expected {expected}, got {text.strip()!r}')
+        row = [*cells[:2], cells[2].replace('−', '-')]
+        for column, cell, names in zip(COLUMNS, row, legal, strict=True):
+            if cell not in names:
+                raise RobotDescriptionError(
+                    f'{where}: unknown {column} {cell!r}; legal: {", ".join(names)}'
+                )
+        muscle, joint, sign = (names.index(cell) for cell, names in zip(row, legal, strict=True))
+        if (muscle, joint) in actions:
+            problem = f'the sign of {row[0]} at {row[1]} is declared twice; remove one line'
+            raise RobotDescriptionError(f'{where}: {problem}')
+        actions[muscle, joint] = 1 - 2 * sign
+    return actions
+
+
+def _finding(key: str, **fields: object) -> Finding:
+    """Return a finding with the texts that findings.yaml has under a key.
+
+    `fields` are the values of the placeholders in these texts.
+    """
+    texts = FINDINGS[key]
+    kind = key.partition(',')[0]
+    return Finding(kind, texts.message.format(**fields), texts.remedy.format(**fields))
+
+
+def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
+    """Yield a fault for each moment arm whose declared sign is wrong in too many postures."""
+    for (muscle, joint), sign in read_declared_actions(robot.description).items():
+        arm, terms = moment_arms[:, muscle, joint], arm_terms(robot, joint)
+        against = np.mean(arm * sign <= 0.0)
+        expected, actual = '+-' if sign > 0 else '-+'
+        if not arm.any():
+            actual = '0 (it does not cross the joint)'
+        if against > TOLERATED_SHARE:
+            yield _finding(
+                'wrong_sign', muscle=robot.muscles[muscle], joint=robot.joints[joint], terms=terms,
+                expected=expected, actual=actual, against=100 * against,
+                median=terms.scale * np.median(arm), file=DECLARATION_FILE,
+            )  # fmt: skip
+
+
+def _one_way_joints(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[Finding]:
+    """Yield a fault for each joint that lacks necessary muscles in too many postures.
+
+    A joint needs muscles on both sides, or on one side if it has a spring of its own.
+    """
+    lacks = {
+        '+': np.max(moment_arms, axis=1) <= matters,
+        '-': np.min(moment_arms, axis=1) >= -matters,
+    }
+    median, longest = np.median(moment_arms, axis=0), np.abs(moment_arms).max(axis=0)
+    one_way = np.mean(lacks['+'] | lacks['-'], axis=0) > TOLERATED_SHARE
+    # A joint with a spring needs muscles on one side only, because the spring turns it back.
+    has_muscle = ~(lacks['+'] & lacks['-']).any(axis=0)
+    one_way &= ~(robot.kinematics.elasticity.is_sprung & has_muscle)
+    for joint in np.flatnonzero(one_way).tolist():
+        missing = ' and '.join(
+            f'{sign} (in {100 * lacking[:, joint].mean():.0f} % of postures)'
+            for sign, lacking in lacks.items()
+            if lacking[:, joint].any()
+        )
+        terms = arm_terms(robot, joint)
+        decimals = terms.decimals(longest[:, joint].max())
+        acting = ', '.join(
+            f'{robot.muscles[m]} ({terms.scale * median[m, joint]:+.{decimals}f} {terms.unit})'
+            for m in np.flatnonzero(longest[:, joint] > matters[joint])
+        )
+        key = 'one_way_joint' if acting else 'one_way_joint, idle'
+        yield _finding(key, joint=robot.joints[joint], missing=missing, acting=acting, terms=terms)
+
+
+def _useless_muscles(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[Finding]:
+    """Yield a fault for each muscle that has no effective moment arm at any joint."""
+    along = ', or parallel to that of a prismatic joint' * bool(robot.kinematics.slides.any())
+    for muscle, arms in zip(robot.muscles, np.abs(moment_arms).max(axis=0), strict=True):
+        if (arms < matters).all():
+            terms, least = arm_terms(robot, int(arms.argmax())), 1e3 * matters.max()
+            fields = {'arm': terms.scale * arms.max(), 'least': least, 'along': along}
+            yield _finding('useless_muscle', muscle=muscle, terms=terms, **fields)
+
+
+def main_actions(moment_arms: Array) -> tuple[Ints, Array]:
+    """Return the joint on which each muscle acts most, and how often its action is reversed there.
+
+    Args:
+        moment_arms: Moment arms in N postures [m], (N, M, D).
+
+    Returns:
+        Index of the joint, (M,), and the share of the postures in which the moment arm at this
+        joint has the opposite sign of its median, (M,).
+    """
+    median, muscles = np.median(moment_arms, axis=0), np.arange(moment_arms.shape[1])
+    main = np.abs(median).argmax(axis=1)
+    against = moment_arms[:, muscles, main] * np.sign(median[muscles, main]) < 0.0
+    return main, against.mean(axis=0)
+
+
+def _flipping_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
+    """Yield a warning for each muscle whose main action changes its sign within joint limits."""
+    for m, (joint, against) in enumerate(zip(*main_actions(moment_arms), strict=True)):
+        if against > TOLERATED_SHARE:
+            names = {'muscle': robot.muscles[m], 'joint': robot.joints[joint]}
+            terms = arm_terms(robot, joint)
+            yield _finding('flipping_muscle', **names, against=100 * against, terms=terms)
+
+
+def _millimetres(moment_arms: Array) -> Iterator[Finding]:
+    """Yield a fault if most route points seem to be in millimetres instead of metres.
+
+    All other faults would then be consequences of this one.
+    """
+    typical = float(np.median(np.abs(moment_arms).max(axis=(0, 2))))
+    if typical > MILLIMETRES:
+        yield _finding('other_units, points', arm=typical)
+
+
+def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
+    """Yield a warning for each moment arm or joint limit that looks like millimetres or degrees."""
+    longest, slides = np.abs(moment_arms).max(axis=0), robot.kinematics.slides
+    for m, j in np.argwhere((longest > LONGEST_ARM) & ~slides).tolist():
+        names = {'muscle': robot.muscles[m], 'joint': robot.joints[j]}
+        yield _finding('other_units, arm', **names, arm=longest[m, j])
+    for j, (low, high) in enumerate(zip(robot.lower, robot.upper)):
+        if high - low > WIDEST_RANGES[int(slides[j])]:
+            wrong = 'metres, not millimetres' if slides[j] else 'radians, not degrees'
+            limits = {'low': low, 'high': high, 'unit': robot.units[j].theta}
+            yield _finding('other_units, limits', joint=robot.joints[j], wrong=wrong, **limits)
+
+
+def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
+    """Yield a warning about the joints at which all moment arms are shorter than 15 mm."""
+    # Skip joints without muscles, which are reported as one-way joints.
+    longest = np.abs(moment_arms).max(axis=(0, 1))
+    small = np.flatnonzero((longest > LEAST_COUNTED_ARM) & (longest < SHORT_ARM)).tolist()
+    if small:
+        each = ', '.join(f'{robot.joints[j]} ({1e3 * longest[j]:.1f} mm)' for j in small)
+        yield _finding('small_joints', joints=each)
+
+
+def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
+    """Yield a warning for each muscle whose length jumps where its tendon slips over an object."""
+    for m, size, theta in jumping_muscles(robot):
+        crossed = np.flatnonzero(robot.routes.crossed[m])
+        place = ', '.join(f'{robot.joints[j]} {theta[j]:.2f}' for j in crossed)
+        yield _finding('jumping_muscle', muscle=robot.muscles[m], size=1e3 * size, place=place)
+
+
+def _idle_objects(robot: Robot, theta: Array) -> Iterator[Finding]:
+    """Yield a warning about objects of routes that the tendon touches in none of the postures."""
+    described = [
+        f'{muscle} ({"sphere" if item.axis is None else "cylinder"} of '
+        f'{round(1e3 * item.radius, 1):g} mm on {item.link})'
+        for muscle, route in zip(robot.muscles, robot.description.routes, strict=True)
+        for item in route
+        if isinstance(item, Wrap)
+    ]
+    touched = robot.routes.wound(theta).max(axis=0, initial=0.0) > LEAST_DETOUR
+    if idle := [text for text, touches in zip(described, touched, strict=True) if not touches]:
+        yield _finding('idle_object', objects=', '.join(idle))
+
+
+def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
+    """Yield a fault for each joint that moves almost no mass."""
+    kin = robot.kinematics
+    least = np.min([kin.joint_inertia(posture) for posture in theta], axis=0)
+    for j in np.flatnonzero(kin.radian**2 * least < LEAST_INERTIA):
+        moved = f'{least[j]:.2g} kg' if kin.slides[j] else f'inertia {least[j]:.2g} kg·m²'
+        yield _finding('no_inertia', joint=robot.joints[j], moved=moved)
+
+
+def _holding_faults(check: RobotCheck) -> Iterator[Finding]:
+    """Yield a fault if the arm is held in too few postures, and one if it is stiff in too few."""
+    robot, stiffness, least = check.setting.robot, check.stiffness, check.required
+    held, stiff = check.held, check.stiff
+    required, worst = 100 * REQUIRED_SHARE, -1
+    if held.mean() < REQUIRED_SHARE:
+        lack = np.abs(check.missing_torque[~held])
+        most = lack.argmax(axis=1)
+        counts = Counter(sorted(most.tolist())).most_common()
+        own, units = lack / robot.kinematics.radian, robot.units
+        each = {k: rounded_text(own[most == k, k].max(), 2) for k, _ in counts}
+        where = ', '.join(
+            f'{robot.joints[k]} (in {count}, up to {each[k]} {units[k].torque})'
+            for k, count in counts
+        )
+        worst = counts[0][0]
+        yield _finding(
+            'not_held', held=100 * held.mean(), bias=shown(robot.tension.bias),
+            limit=shown(robot.tension.limit), required=required, others=len(lack),
+            force='torque' + ' or force' * bool(robot.kinematics.slides.any()), where=where,
+        )._replace(joint=worst)  # fmt: skip
+    if stiff.mean() < REQUIRED_SHARE:
+        counts = Counter(sorted(check.softest.tolist())).most_common()
+        where = ', '.join(f'{robot.joints[k]} ({count})' for k, count in counts) or 'none'
+        problem = 'not stiff'
+        if (unstable := stiffness < 0.0).any():
+            lowest = rounded_text(stiffness[unstable].min())
+            problem = (
+                f'unstable in {100 * unstable.mean():.1f} % of postures, with a stiffness '
+                f'eigenvalue down to {lowest} N·m/rad, and not stiff'
+            )
+        yield _finding(
+            'not_stiff', problem=problem, stiff=100 * stiff.mean(),
+            least=required_stiffness(robot, least), required=required, where=where,
+        )._replace(joint=counts[0][0] if counts else worst)  # fmt: skip

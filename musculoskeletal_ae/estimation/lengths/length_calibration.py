@@ -1,0 +1,247 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Length calibration: determines the offset of every length sensor after power-on.
+
+The arm moves gently, with or without measured joint angles, or it stands in a stated posture.
+`length_moments.py` collects the readings, and `length_fit.py` fits the offsets to them. This file
+decides when to fit and whether the result is reliable.
+
+Offsets cannot correct readings in a wrong order, or lengths with a wrong sign. Such readings would
+often lead to plausible but false offsets. Before offsets of a moving arm are accepted, the wiring
+is therefore judged (`signals/wiring.py`), and a wrong one is refused with the names of the muscles.
+A standing arm does not show the wiring.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.estimation.lengths.length_fit import FARTHEST, Fit, LengthFit
+from musculoskeletal_ae.estimation.lengths.length_moments import MomentCollector, Moments
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.remedy import Step, sentence
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import UNKNOWN, LengthOffsets
+from musculoskeletal_ae.signals.wiring import Judgement, judge
+
+ENOUGH_WITH_ANGLES = 20.0  # required duration of gentle motion with measured joint angles [s]
+ENOUGH = 38.0  # required duration of gentle motion without measured joint angles [s]
+STANDING = 1.0  # required duration of standing in a stated posture [s]
+FIRST_FIT = 0.5  # time until the first fit, and between fits of an arm that stands [s]
+FIT_INTERVAL = 2.0  # time between two later fits [s]
+#: A fit consists of short pieces of work, each of which takes 1 to 2 ms. At each message, one piece
+#: is done for every PIECE_TIME [s] since the previous message, but at least one and at most
+#: MOST_PIECES. A fit therefore takes equally long with messages at 50 to 200 Hz.
+PIECE_TIME = 0.005
+MOST_PIECES = 4  # largest number of pieces of work for one message
+#: median residual of a length above which a fit is rejected [m]; correct offsets leave 0.0003 m
+LARGEST_RESIDUAL = 0.02
+#: cost per residual above which a fit is rejected: correct offsets cost 0.2 to 0.5, offsets of a
+#: wrong posture 1.1, and pure noise 0.95
+LARGEST_COST = 0.75
+#: remedy if the order or the sign of the readings is wrong
+CORRECT_DRIVER = Step.CORRECT_WIRING, Step.CALIBRATE_LENGTHS
+#: remedy if a calibration in gentle motion fails, for which a network that has not learned the arm
+#: may be too inexact
+OTHER_WAY = (
+    'provide joint sensors; or set zero_posture, hold the arm there, and call estimator/zero'
+)
+CORRELATED = 10.0  # number of successive moments that together count as one independent moment
+BEYOND_STOP = 0.01  # fraction of its range by which a stated joint angle may exceed a limit
+MAD_TO_DEVIATION = 1.48  # ratio of standard deviation to median absolute deviation
+
+
+class LengthCalibration:
+    """Collects readings and fits the offsets, with a small amount of work at every message.
+
+    Attributes:
+        posture: Joint angles in which the arm stands [rad], (D,), or None if it moves gently.
+        offsets: The newest estimate of the offsets, which may still be unreliable; None before the
+            first estimate.
+        wiring: What the newest fit tells about the order and the signs of the columns; None before
+            they have been judged.
+    """
+
+    def __init__(self, robot: Robot, mae: Mae, posture: Array | None = None) -> None:
+        """Start a calibration.
+
+        Args:
+            robot: The nominal body.
+            mae: The network; its isolated muscles are ignored.
+            posture: θ [rad] (D,) if the arm stands in a stated posture, else None.
+        """
+        self._robot, self._mae, self.posture = robot, mae, posture
+        self._fit = LengthFit(robot, mae)
+        self._collector = MomentCollector(self._fit.used, robot.joint_count, posture)
+        self._since = 0.0  # time since the last fit began [s]
+        self._work: Generator[None, None, None] | None = None  # the running fit
+        self._best: Fit | None = None
+        self._has_angles = False  # whether joint angles are measured most of the time
+        self._problem = ''  # reason why the last fit is not reliable
+        self.offsets: LengthOffsets | None = None
+        self.wiring: Judgement | None = None
+
+    @property
+    def is_standing(self) -> bool:
+        """Whether the arm stands in a stated posture."""
+        return self.posture is not None
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the offsets are known."""
+        return self.offsets is not None and self.offsets.known
+
+    @property
+    def time(self) -> float:
+        """Duration of gentle motion, or of standing, so far [s]."""
+        return self._collector.time
+
+    @property
+    def enough(self) -> float:
+        """Required duration of gentle motion, or of standing [s]."""
+        if self.is_standing:
+            return STANDING
+        return ENOUGH_WITH_ANGLES if self._has_angles else ENOUGH
+
+    @property
+    def progress(self) -> str:
+        """Progress of the calibration and any problem, as a text for users."""
+        how = 'of standing still' if self.is_standing else 'of gentle motion'
+        progress = f'{self.time:.0f} of {self.enough:.0f} s {how}'
+        return f'{progress}; {self.problem}' if self.problem else progress
+
+    @property
+    def problem(self) -> str:
+        """Why the calibration does not end although it has enough data, or ''."""
+        if self._collector.has_moved_away:
+            return 'the arm moved away; hold it still and call estimator/zero again'
+        return self._problem
+
+    @property
+    def remedy(self) -> tuple[Step, ...]:
+        """What a user must do before the lengths can be calibrated; () if the wiring is right."""
+        return CORRECT_DRIVER if self.wiring is not None and self.wiring.is_faulty else ()
+
+    def step(self, tension: Array, length: Array, dt: float, theta: Array | None = None) -> None:
+        """Record the readings of one message, and continue or begin a fit if one is due.
+
+        Args:
+            tension: Tensions [N], (M,).
+            length: Muscle lengths as read, with their unknown offsets [m], (M,).
+            dt: Time since the previous message [s].
+            theta: Measured joint angles [rad], (D,), or None without joint sensors.
+        """
+        has_failed = self.is_standing and (self._problem or self._collector.has_moved_away)
+        if self.is_done or has_failed:
+            return
+        self._collector.step(tension, length, dt, theta)
+        self._since += dt
+        if self._work is not None:
+            for _ in range(min(max(1, round(dt / PIECE_TIME)), MOST_PIECES)):
+                if next(self._work, self) is self:
+                    self._work = None
+                    break
+        elif self._since >= self._pause and len(self._collector):
+            self._since = 0.0
+            self._begin_fit(self._collector.moments())
+
+    @property
+    def _pause(self) -> float:
+        return FIRST_FIT if self._best is None or self.is_standing else FIT_INTERVAL
+
+    def _begin_fit(self, moments: Moments) -> None:
+        measured = np.flatnonzero(~np.isnan(moments.theta).any(axis=1))
+        self._has_angles = 2 * len(measured) > len(moments.theta)
+        if self._has_angles:
+            moments = moments.rows(measured)
+            is_enough = self.time >= self.enough
+            if is_enough and not self.is_standing:
+                readings = moments.theta, moments.read, moments.tension
+                self.wiring = judge(self._mae.lengths, *readings, used=self._fit.used)
+            self._judge(self._fit.known_angles(moments), moments, is_enough)
+        else:
+            self._work = self._fit_unknown_angles(moments)
+
+    def _fit_unknown_angles(self, moments: Moments) -> Generator[None, None, None]:
+        """Fit the offsets, and judge the wiring once there is enough motion.
+
+        The generator yields after each short piece of work.
+        """
+        is_enough = self.time >= self.enough
+        fit = yield from self._fit.unknown_angles(moments, self._best)
+        if is_enough:
+            self.wiring = yield from self._fit.wiring(fit, moments)
+        self._judge(fit, moments, is_enough)
+
+    def _judge(self, fit: Fit, moments: Moments, is_enough: bool) -> None:
+        """Make a fit the newest estimate of the offsets, and decide whether it is reliable.
+
+        `is_enough` says whether there was enough motion for reliable offsets when the fit began.
+        """
+        muscle_count, used = self._robot.muscle_count, self._fit.used
+        expected = self._mae.lengths(fit.theta, moments.tension)
+        # An isolated muscle still receives commands and needs an offset, however uncertain.
+        of_isolated = np.median(moments.read - expected, axis=0)
+        of_isolated = np.clip(of_isolated, -FARTHEST, FARTHEST)
+        offset = np.where(used, fit.constants[:muscle_count], of_isolated)
+        residual = np.median(np.abs(used * (moments.length - offset - expected)), axis=0)
+        self._best, self._problem = fit, ''
+        deviation = np.full(muscle_count, UNKNOWN)
+        if is_enough:
+            self._problem = self._problem_of(fit, residual)
+            if not self._problem:
+                independent = max(1.0, len(fit.theta) / CORRELATED)
+                deviation = MAD_TO_DEVIATION * residual / np.sqrt(independent)
+                deviation[~used] = LARGEST_RESIDUAL
+        self.offsets = LengthOffsets(offset, deviation)
+
+    def _problem_of(self, fit: Fit, residual: Array) -> str:
+        """Return why a fit is not reliable, as a text for users, or '' if it is reliable.
+
+        Args:
+            fit: The fit.
+            residual: Median residual of each length [m], (M,).
+        """
+        if self.wiring is not None and self.remedy:
+            return f'{self.wiring.text(self._robot.muscles)}: {sentence(self.remedy)}'
+        if residual.max() > LARGEST_RESIDUAL:
+            name = self._robot.muscles[int(residual.argmax())]
+            limit = 1e3 * LARGEST_RESIDUAL
+            return (
+                f'the length of {name} differs from the fit by {1e3 * residual.max():.1f} mm; '
+                f'legal: at most {limit:g} mm; check this muscle, or {OTHER_WAY}'
+            )
+        cost = self._fit.cost_per_residual(fit)
+        # At a high cost, the fit may have found wrong postures that are similar to the true ones.
+        if not cost <= LARGEST_COST:
+            problem = 'no offsets explain the lengths and tensions'
+            excess = f'the cost is {cost:.2f}; legal: at most {LARGEST_COST:g}'
+            return f'{problem}: {excess}; {OTHER_WAY}'
+        return ''
+
+
+def check_stated_posture(robot: Robot, posture: tuple[float, ...]) -> None:
+    """Check the posture that a user has stated for a length calibration.
+
+    Args:
+        robot: The nominal body.
+        posture: Joint angles [rad], (D,); () means no posture and is legal.
+
+    Raises:
+        MusculoskeletalError: If the posture does not have one value for each joint, or is outside
+            the joint limits; the text names the legal ranges.
+    """
+    if not posture:
+        return
+    theta = np.array(posture)
+    # The measured angle of a joint at its stop may slightly exceed the limit.
+    beyond = BEYOND_STOP * (robot.upper - robot.lower)
+    low, high = robot.lower - beyond, robot.upper + beyond
+    if theta.shape == low.shape and ((theta >= low) & (theta <= high)).all():
+        return
+    limits = zip(robot.units, robot.lower, robot.upper, strict=True)
+    legal = ', '.join(f'{low:.2f} to {high:.2f} {unit.theta}' for unit, low, high in limits)
+    raise MusculoskeletalError(f'zero_posture is {list(posture)}; legal: an empty list, or {legal}')

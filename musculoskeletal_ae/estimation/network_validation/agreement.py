@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks that a candidate network agrees with joint sensors, or else with the network in use.
+
+Three quantities are compared:
+
+    θ         the joint angles that the network estimates on the recent messages
+    lengths   the muscle lengths that the network computes at the same posture
+    shape     the change of these lengths from posture to posture, on fixed random states
+
+If joint sensors measured the postures, they are the reference. The limit of the median error of
+each joint or muscle is then ANGLE_WORSE times the error of the network in use, but at least
+ANGLE_FLOOR or LENGTH_FLOOR. The shape is compared only if the candidate's mean error of length is
+larger than that of the network in use.
+
+Without joint sensors, the network in use is the reference. The limits of the median differences are
+ANGLE_MOVED and LENGTH_MOVED, and that of the relative difference in shape is SHAPE_MOVED. If there
+are too few messages, they are replaced by the fixed states with lengths that the network in use
+computes. The names in capitals are constants of this file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.estimation.network_validation.postures import PostureCheck
+from musculoskeletal_ae.estimation.network_validation.recent_messages import LEAST, RecentMessages
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+# Limits relative to joint sensors. A good learned network differed from joint sensors by 0.29 rad
+# although the network before it differed by 0.18 rad. Lengths of good learned networks differed by
+# up to 0.03 m.
+ANGLE_FLOOR = 0.35  # error of a joint that is always permitted [rad]
+LENGTH_FLOOR = 0.06  # error of a length that is always permitted [m]
+ANGLE_WORSE = 1.5  # largest error relative to the error of the network in use
+# Limits relative to the network in use. The first update of an initial network changed θ by up to
+# 0.56 rad and lengths by up to 0.05 m; an update of a learned network changed θ by up to 0.31 rad.
+ANGLE_MOVED = 0.45  # largest difference of θ from a learned network [rad]
+ANGLE_MOVED_INITIAL = 0.8  # largest difference of θ from an initial network [rad]
+LENGTH_MOVED = 0.07  # largest difference of a length from a network of either kind [m]
+# A minute of learning changed the shape of initial networks by 0.32 and of learned networks by
+# 0.18. Multiplying all lengths by 1.5 changes it by 0.5.
+SHAPE_MOVED = 0.3  # largest relative difference in shape from a learned network
+SHAPE_MOVED_INITIAL = 0.42  # largest relative difference in shape from an initial network
+
+BY_SENSORS = 'joint sensors'  # source of a reference
+BY_NETWORK = 'the network in use'  # source of a reference
+
+
+class Comparison(NamedTuple):
+    """How much one quantity of a candidate network differs from its reference."""
+
+    name: str
+    owners: tuple[str, ...]  # joint or muscle of each entry
+    error: Array  # error of each joint [rad] or muscle [m], or the relative error of all lengths
+    limit: Array  # largest permitted error of each entry
+    source: str  # source of the reference
+
+    def faults(self) -> Iterator[str]:
+        """Yield one text on the error that exceeds its limit most, or nothing if none does."""
+        excess = self.error / self.limit
+        if not excess.max() <= 1.0:
+            worst = int(excess.argmax())
+            yield (
+                f'{self.name}, {self.owners[worst]}: differs by {self.error[worst]:.2g} from '
+                f'{self.source}, limit {self.limit[worst]:.3g}'
+            )
+
+
+class AgreementCheck:
+    """Compares candidates with joint sensors or with the network in use.
+
+    Args:
+        robot: The geometric model.
+        postures: Fixed random states of the geometric model.
+        messages: The recent messages.
+        in_use: The network in use.
+        isolated: Indices of the isolated muscles, which are ignored.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        postures: PostureCheck,
+        messages: RecentMessages,
+        in_use: Mae,
+        isolated: Iterable[int],
+    ) -> None:
+        self._robot, self._postures, self._messages = robot, postures, messages
+        self._in_use, self._isolated = in_use, tuple(isolated)
+        self._has_learned = in_use.covariance is not None
+
+    def comparisons(self, mae: Mae) -> list[Comparison]:
+        """Compare a candidate with the joint sensors, or else with the network in use."""
+        if not self._messages.are_enough:
+            theta, tension = self._postures.theta, self._postures.tension
+            length = self._in_use.lengths(theta, tension)
+            return self._with_network(mae, mae.estimate(tension, length).theta, theta, tension)
+        new = mae.estimate(*self._messages.readings(mae)).theta
+        tension, length = self._messages.readings(self._in_use)
+        old = self._in_use.estimate(tension, length).theta
+        measured_rows = np.flatnonzero(np.isfinite(self._messages.theta).all(axis=1))
+        if len(measured_rows) >= LEAST:
+            return self._with_sensors(mae, new, old, measured_rows)
+        return self._with_network(mae, new, old, tension)
+
+    def _with_network(self, mae: Mae, new: Array, old: Array, tension: Array) -> list[Comparison]:
+        """Compare a candidate with the network in use.
+
+        Args:
+            mae: The candidate.
+            new: Joint angles that the candidate estimates [rad], (N, D).
+            old: Joint angles that the network in use estimates [rad], (N, D).
+            tension: Bone-side tensions [N], (N, M).
+        """
+        angle = ANGLE_MOVED if self._has_learned else ANGLE_MOVED_INITIAL
+        limit = angle * self._robot.kinematics.radian
+        change = self._length_error(mae, old, tension, self._in_use.lengths(old, tension))
+        length_limit = np.full(len(change), LENGTH_MOVED)
+        return [
+            self._angles(_median(new - old), limit, BY_NETWORK),
+            self._lengths(change, length_limit, BY_NETWORK),
+            self._shape(mae),
+        ]
+
+    def _with_sensors(self, mae: Mae, new: Array, old: Array, rows: Ints) -> list[Comparison]:
+        """Compare a candidate and the network in use with joint sensors.
+
+        Args:
+            mae: The candidate.
+            new: Joint angles that the candidate estimates [rad], (N, D).
+            old: Joint angles that the network in use estimates [rad], (N, D).
+            rows: Indices of the messages in which all joints were measured.
+        """
+        measured = self._messages.theta[rows]
+        error, error_in_use = (_median(theta[rows] - measured) for theta in (new, old))
+        least = ANGLE_FLOOR * self._robot.kinematics.radian
+        length_error, length_error_in_use = (
+            self._length_error(
+                each, measured, *(part[rows] for part in self._messages.readings(each))
+            )
+            for each in (mae, self._in_use)
+        )
+        length_limit = np.fmax(LENGTH_FLOOR, ANGLE_WORSE * length_error_in_use)
+        comparisons = [
+            self._angles(error, np.fmax(least, ANGLE_WORSE * error_in_use), BY_SENSORS),
+            self._lengths(length_error, length_limit, BY_SENSORS),
+        ]
+        if not length_error.mean() <= length_error_in_use.mean():
+            comparisons.append(self._shape(mae))
+        return comparisons
+
+    def _angles(self, error: Array, limit: Array, source: str) -> Comparison:
+        return Comparison('θ', self._robot.joints, error, limit, source)
+
+    def _lengths(self, error: Array, limit: Array, source: str) -> Comparison:
+        return Comparison('l by ① at θ', self._robot.muscles, error, limit, source)
+
+    def _shape(self, mae: Mae) -> Comparison:
+        """Compare the network `mae` with the network in use by how lengths change with posture.
+
+        Both networks compute the muscle lengths at the same fixed states.
+        """
+        theta, tension = self._postures.theta, self._postures.tension
+        used = np.delete(np.arange(self._robot.muscle_count), self._isolated)
+        new, old = (each.lengths(theta, tension)[:, used] for each in (mae, self._in_use))
+        difference = np.linalg.norm((new - old).std(axis=0)) / np.linalg.norm(old.std(axis=0))
+        limit = SHAPE_MOVED if self._has_learned else SHAPE_MOVED_INITIAL
+        error = np.array([difference])
+        return Comparison(
+            'change of l by ①', ('all muscles',), error, np.array([limit]), BY_NETWORK
+        )
+
+    def _length_error(self, mae: Mae, theta: Array, tension: Array, length: Array) -> Array:
+        """Return the median error of the lengths that a network computes at known postures.
+
+        Args:
+            mae: A network.
+            theta: The postures [rad], (N, D).
+            tension: Bone-side tensions [N], (N, M).
+            length: Lengths with which those of the network are compared [m], (N, M).
+
+        Returns:
+            The error of each muscle's length [m], (M,); 0 for isolated muscles.
+        """
+        error = _median(mae.lengths(theta, tension) - length)
+        error[list(self._isolated)] = 0.0
+        return error
+
+
+def _median(error: Array) -> Array:
+    size: Array = np.median(np.abs(error), axis=0)
+    return size

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks how exactly a candidate network restores the readings of recent messages.
+
+Three errors are compared: those of the tensions and lengths that the network restores from both
+(mask ②), and that of the lengths that it computes at the joint angles estimated by ② (mask ①).
+The limit of the median error of each muscle is WORSE times that of the network in use, but at least
+FLOOR.
+"""
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.estimation.network_validation.recent_messages import RecentMessages
+from musculoskeletal_ae.mae.mae import Mae
+
+WORSE = 2.0  # largest permitted error, relative to the error of the network in use
+#: error that is always permitted: of T [N] and of l [m]
+FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}
+
+
+def message_errors(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> dict[str, Array]:
+    """Return the median errors with which a network restores the readings of recent messages.
+
+    Returns:
+        By each name in FLOOR, such as 'T by ②', the error of every muscle [N] or [m], (M,). The
+        errors of isolated muscles are 0. The result is empty if there are too few messages.
+    """
+    if not messages.are_enough:
+        return {}
+    tension, length = messages.readings(mae)
+    muscle_count = tension.shape[1]
+    restored = mae.estimate(tension, length)
+    used = np.delete(np.arange(muscle_count), tuple(isolated))
+    parts = (
+        restored.tension - tension,
+        restored.length - length,
+        mae.lengths(restored.theta, tension) - length,
+    )
+    errors = {name: np.zeros(muscle_count) for name in FLOOR}
+    for error, part in zip(errors.values(), parts, strict=True):
+        error[used] = np.median(np.abs(part[:, used]), axis=0)
+    return errors
+
+
+def faults(
+    errors: dict[str, Array], in_use: dict[str, Array], muscles: tuple[str, ...]
+) -> Iterator[str]:
+    """Yield a text for each kind of error that exceeds its limit, on the worst muscle.
+
+    Args:
+        errors: Errors of the candidate.
+        in_use: Errors of the network in use.
+        muscles: Names of the muscles.
+    """
+    for name, error in errors.items():
+        limit = np.fmax(FLOOR[name], WORSE * in_use[name])
+        excess = error / limit
+        if not excess.max() <= 1.0:
+            worst = int(excess.argmax())
+            yield (
+                f'{name}, {muscles[worst]}: error {error[worst]:.3g} on recent messages, '
+                f'limit {limit[worst]:.3g}'
+            )

@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checkpoint validation: tests whether a candidate network is accurate enough to be used.
+
+Four checks compare a candidate with the geometric model, the arm and the network in use:
+
+    postures.py        errors on fixed states of the geometric model
+    message_errors.py  errors on the healthy messages of the last seconds
+    agreement.py       differences of joint angles and lengths; the reference is joint
+                       sensors, or else the network in use
+    detector.py        a calibrated anomaly detector reports nothing on these messages,
+                       and would detect a rupture
+
+The first network is only subject to the first and the last check, because its error on a body that
+differs from its model cannot be predicted. A network that a user has chosen is not subject to
+the third check. All limits leave a margin to the values of healthy networks: initial and learned
+networks of both presets, on arm26 and musashi_left_arm, with both emulator models. `python -m
+bench gate` prints these values, and the values of networks that must be rejected.
+
+A candidate without a calibrated detector inherits the detector in use, which would otherwise be
+switched off. A muscle that was repaired within the last 600 s (RELEARNING_TIME) may be relearned,
+and its residuals then differ from the calibrated ones. The inherited detector ignores this
+muscle and judges all others, until a network with a calibrated detector of its own takes over.
+
+When an anomaly is detected, the networks that took over less than 10 s ago (PROOF) are discarded,
+except for the oldest network. The newest of the remaining networks is used again.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from functools import cached_property
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.design.route_jumps import jump_warning
+from musculoskeletal_ae.estimation.network_validation import detector, message_errors
+from musculoskeletal_ae.estimation.network_validation.agreement import AgreementCheck, Comparison
+from musculoskeletal_ae.estimation.network_validation.postures import PostureCheck
+from musculoskeletal_ae.estimation.network_validation.recent_messages import RecentMessages
+from musculoskeletal_ae.exceptions import GateError
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+
+PROOF = 10.0  # time in use without an anomaly after which a network is proven [s]
+MOST_USED = 20  # largest number of networks that are kept for a rollback
+RELEARNING_TIME = 600.0  # time after its repair during which a muscle may be relearned [s]
+DETECTION_DELAY = 2.0  # time before a detection in which messages may already be faulty [s]
+
+
+class CheckpointValidator:
+    """Accepts or rejects candidates, and chooses the network for a rollback.
+
+    All times `now` are readings of one steady clock [s].
+
+    Attributes:
+        isolated: Indices of the isolated muscles, which are ignored.
+        postures: The check on the geometric model.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self.postures = PostureCheck(robot)
+        self._messages = RecentMessages(robot.joint_count)
+        self._used: list[tuple[float, Mae]] = []  # networks, and the times at which they took over
+        self._is_anomaly = False
+        self._repaired_at: dict[int, float] = {}  # time of each muscle's last repair [s]
+        self.isolated: tuple[int, ...] = ()
+
+    @property
+    def mae(self) -> Mae | None:
+        """The network in use; None before the first."""
+        return self._used[-1][1] if self._used else None
+
+    def is_in_use(self, mae: Mae) -> bool:
+        """Return whether a network is the one in use, which needs no further decision.
+
+        Isolated muscles, detector and residual torque do not distinguish networks.
+        """
+        in_use = self.mae
+        return (
+            in_use is not None
+            and mae.version == in_use.version
+            and np.array_equal(mae.encoder[0][0], in_use.encoder[0][0])
+        )
+
+    def message(
+        self,
+        tension: Array,
+        length: Array,
+        sliding: Array,
+        now: float,
+        theta: Array | None = None,
+    ) -> None:
+        """Record a measurement on which candidates are tested.
+
+        Args:
+            tension: Tensions as read [N], (M,).
+            length: Muscle lengths [m], (M,).
+            sliding: Direction in which each tendon slid last (`MuscleSample.sliding`), (M,).
+            now: Time of the measurement [s].
+            theta: Joint angles from joint sensors [rad], (D,), or None if there are none.
+        """
+        self._messages.note(tension, length, sliding, now, theta, is_healthy=not self._is_anomaly)
+
+    def start(self) -> None:
+        """Discard all networks and messages, so that the next network counts as the first one."""
+        self._used.clear()
+        self.forget()
+
+    def forget(self) -> None:
+        """Discard the messages, for example when the length offsets change."""
+        self._messages.clear()
+
+    def check(self, mae: Mae, is_chosen: bool = False) -> None:
+        """Check a network in a single call; `trial` does the same in steps.
+
+        Args:
+            mae: The candidate.
+            is_chosen: Whether a user has chosen this network. A chosen network need not agree with
+                the network in use.
+
+        Raises:
+            GateError: If the candidate is rejected; the text names each quantity that exceeds its
+                limit, the value and the limit.
+        """
+        try:
+            deque(self.trial(mae, is_chosen), maxlen=0)
+        except GateError as error:
+            raise GateError(f'{error}{self._likely_cause}') from error
+
+    def trial(self, mae: Mae, is_chosen: bool = False) -> Iterator[None]:
+        """Check a network in steps of some milliseconds, between which a node can do other work.
+
+        `check` describes the arguments and the error.
+        """
+        faults, steps = list[str](), self._steps(mae.without(self.isolated), is_chosen)
+        while True:
+            # An overflow is a large error of the candidate, not a reason for a warning.
+            with np.errstate(all='ignore'):
+                try:
+                    fault = next(steps)
+                except StopIteration:
+                    break
+            if fault is not None:
+                faults.append(fault)
+            yield
+        if faults:
+            raise GateError('; '.join(faults))
+
+    def declare_repaired(self, muscles: Iterable[int], now: float) -> None:
+        """Record that a user has repaired these muscles (indices) and declares them healthy."""
+        self._repaired_at |= dict.fromkeys(muscles, now)
+
+    def take(self, mae: Mae, now: float) -> None:
+        """Record that this network is in use from the time `now` [s] on."""
+        self._used.append((now, mae))
+        while len(self._used) > 1 and now - self._used[1][0] >= PROOF:
+            del self._used[0]
+        if len(self._used) > MOST_USED:
+            del self._used[1]  # the oldest network stays, because it is most likely to be proven
+
+    def anomaly(self, detected: bool, now: float) -> Mae | None:
+        """Record whether an anomaly is present, and return to a proven network when one begins.
+
+        A network is proven after 10 s in use without an anomaly. The newest proven network is used
+        again, or the oldest network if none is proven.
+
+        Returns:
+            The network that is used again, or None if the network in use does not change.
+        """
+        if detected == self._is_anomaly:
+            return None
+        self._is_anomaly = detected
+        if not detected:
+            self._messages.clear()  # they may describe the arm as it was before a repair
+            return None
+        self._messages.drop_after(now - DETECTION_DELAY)
+        in_use = self.mae
+        while len(self._used) > 1 and now - self._used[-1][0] < PROOF:
+            del self._used[-1]
+        return self.mae if self.mae is not in_use else None
+
+    def message_errors(self, mae: Mae) -> dict[str, Array]:
+        """Return the errors of a network on the recent messages; {} if these are too few."""
+        return message_errors.message_errors(mae, self._messages, self.isolated)
+
+    def agreement(self, mae: Mae) -> list[Comparison]:
+        """Compare a network with joint sensors or, without them, with the network in use.
+
+        Return [] if no network is in use.
+        """
+        if self.mae is None:
+            return []
+        in_use = self.mae.without(self.isolated)
+        check = AgreementCheck(self._robot, self.postures, self._messages, in_use, self.isolated)
+        return check.comparisons(mae)
+
+    def detector_measures(self, mae: Mae) -> Iterator[float]:
+        """Yield ratios of a network's anomaly statistic to its threshold on recent messages.
+
+        The first ratio is that of the recent messages as they are. Each following ratio is that of
+        the same messages with the tension of one muscle set to 0, as if the muscle were ruptured.
+        Nothing is yielded without a calibrated threshold, or if there are too few messages.
+        """
+        return detector.measures(mae, self._messages, self.isolated)
+
+    def with_detector(self, mae: Mae, now: float) -> Mae:
+        """Return a network with a calibrated anomaly detector, if one is available.
+
+        If `mae` has no calibrated detector of its own, the copy that is returned has the detector
+        of the network in use.
+        """
+        statistics = None if self.mae is None else self.mae.anomaly
+        has_own = mae.anomaly is not None and mae.anomaly.calibrated
+        if has_own or statistics is None or not statistics.calibrated:
+            return mae
+        repaired = [m for m, at in self._repaired_at.items() if 0.0 <= now - at < RELEARNING_TIME]
+        statistics = statistics.ignoring(repaired)
+        return detector.with_detector_of(statistics, mae, self._messages, self.isolated)
+
+    def _steps(self, mae: Mae, is_chosen: bool) -> Iterator[str | None]:
+        """Check a candidate step by step; yield a text for each fault, or None between steps."""
+        yield from self.postures.faults(mae)
+        if self.mae is not None:
+            errors = self.message_errors(mae)
+            in_use = self.message_errors(self.mae.without(self.isolated))
+            yield None
+            yield from message_errors.faults(errors, in_use, self._robot.muscles)
+            if not is_chosen:
+                for comparison in self.agreement(mae):
+                    yield from comparison.faults()
+            yield None
+        yield from detector.faults(mae, self._messages, self.isolated)
+
+    @cached_property
+    def _likely_cause(self) -> str:
+        """Text on a property of the robot that may cause a rejection; '' if there is none."""
+        warning = jump_warning(self._robot)
+        return f' ({warning})' if warning else ''

@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""The four checks of checkpoint validation, one per file; `checkpoint_validation` runs them."""

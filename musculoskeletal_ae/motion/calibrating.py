@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gentle motion that provides data for the length calibration."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.activities import ActivityControl, Inputs
+from musculoskeletal_ae.control.command import LENGTH, Command, msc_compensation
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.exceptions import InfeasibleError
+from musculoskeletal_ae.motion.ramps import Ramp
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import TensionProgramme
+
+SPEED = 0.05  # fastest change of a length command [m/s]
+DURATION = 1.5  # duration of a step, which takes longer if SPEED requires it [s]
+REST = 0.25  # duration of the rest after a step [s]
+#: largest change of each joint in a step [rad]; for prismatic joints times `kinematics.RACK` [m]
+REACH = 0.7
+INSIDE = 0.1  # smallest distance of goals from the joint limits, as a fraction of the joint range
+GOALS = 20  # number of random goals among which a holdable goal is sought
+SHARE = 0.6  # highest tension, as a fraction of the range from T_bias to T_limit
+
+
+def gentle_limit(robot: Robot) -> Array:
+    """Return the tension limit [N], (M,), that applies while the length offsets are unknown."""
+    return robot.tension.bias + SHARE * (robot.tension.limit - robot.tension.bias)
+
+
+class Calibrating(ActivityControl):
+    """The activity that moves the arm gently while its length offsets are unknown.
+
+        l_target = l + ①(θ_goal, T_goal) − ①(θ_est, T) + l_comp(T_goal)
+
+    ① is the network's prediction of the muscle lengths from a posture and tensions. The command
+    uses only the difference of two predictions, so that unknown length offsets cancel. The
+    estimated posture θ_est and the muscle Jacobian G may be wrong. Muscle stiffness control turns
+    these errors into tension errors, which are limited.
+
+    Each small, slow step leads towards a random goal in the joint range. At the end of the step,
+    the arm rests for a moment with random tensions. The calibration needs varied postures and
+    tensions, because it infers the posture from the torques that the tensions exert through G.
+    """
+
+    def __init__(self, robot: Robot, settings: Settings, seed: int = 0) -> None:
+        self._rng = np.random.default_rng([seed, 0x6E])
+        self._ramp: Ramp | None = None
+        self._rested = 0.0  # time since the end of the step [s]
+        self.use(robot, settings)
+
+    def use(self, robot: Robot, _: Settings) -> None:
+        """Use another robot description.
+
+        `robot` must already describe isolated muscles as muscles without tension.
+        """
+        self._robot = robot
+
+    def enter(self, _: Inputs) -> None:
+        """Start from the present posture."""
+        self._ramp, self._rested = None, 0.0
+
+    def step(self, inputs: Inputs) -> Command | None:
+        """Return the next length command."""
+        if self._ramp is None or (self._ramp.done and self._rested >= REST):
+            speed = float(self._robot.actuation.fastest(SPEED).min())
+            self._ramp = Ramp(inputs.length, self._goal(inputs), DURATION, speed)
+            self._rested = 0.0
+        if self._ramp.done:
+            self._rested += inputs.dt
+        return Command(LENGTH, self._ramp.step(inputs.dt))
+
+    def leave(self) -> None:
+        """Discard the present motion."""
+        self._ramp = None
+
+    def _goal(self, inputs: Inputs) -> Array:
+        """Return the length command [m], (M,), for the end of a step towards a random goal.
+
+        Up to GOALS random goals are tried, until a step towards one of them ends in a holdable
+        posture. If none does, the step whose end misses the least holding torque is chosen.
+        """
+        robot, mae, theta = self._robot, inputs.mae, inputs.theta
+        tension = inputs.sample.model_tension * inputs.sample.usable
+        limits = robot.tension.bias, gentle_limit(robot)
+        best, best_tension, least_missing = theta, tension, np.inf
+        radian = robot.kinematics.radian
+        for goal in robot.random_postures(GOALS, self._rng, -INSIDE):
+            near = theta + np.clip(goal - theta, -REACH * radian, REACH * radian)
+            jacobian = mae.muscle_jacobian(near, tension)
+            programme = TensionProgramme(jacobian, robot.kinematics.holding_torque(near), *limits)
+            try:
+                random_tension = self._rng.uniform(*limits, robot.muscle_count)
+                best_tension = programme.nearest(random_tension)
+                best = near
+                break
+            except InfeasibleError:
+                exertion = programme.compromise()
+                missing = float(np.abs(radian * exertion.missing_torque).max())
+                if missing < least_missing:
+                    best, best_tension, least_missing = near, exertion.tension, missing
+        offset = inputs.sample.length - mae.lengths(theta, tension)
+        return offset + mae.lengths(best, best_tension) + msc_compensation(robot, best_tension)

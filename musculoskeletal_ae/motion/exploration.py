@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exploration: random motion that collects training data.
+
+Each preset of settings has its own random steps (`Preset.exploration`). Preset `default` puts the
+targets of some joints at their limits, because the learner identifies joint-sensor offsets from
+joints at their stops (`body_model.joint_stops`). For each posture, this preset draws several random
+sets of tensions and uses the one that presses these joints most strongly against their stops.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.activities import ActivityControl, Inputs
+from musculoskeletal_ae.control.command import Command
+from musculoskeletal_ae.motion.exploration_steps import ExplorationStep
+from musculoskeletal_ae.motion.ramps import Goal, LengthRamps
+from musculoskeletal_ae.presets.registry import preset_named
+from musculoskeletal_ae.robot.robot import Robot
+
+
+class Exploration:
+    """An endless random sequence of exploration steps, reproducible by its seed.
+
+    A new iterator does not repeat the sequence: it continues the sequence at a new posture.
+    """
+
+    def __init__(self, robot: Robot, seed: int, preset: str = 'default') -> None:
+        """Prepare to draw the random steps of a preset for `robot`, with the random seed `seed`."""
+        self._rng = np.random.default_rng([seed, 0xE8])
+        self.use(robot, preset)
+
+    def use(self, robot: Robot, preset: str) -> None:
+        """Draw the next steps for another preset, or for a robot with other isolated muscles."""
+        self._robot, self._draw = robot, preset_named(preset).exploration()
+
+    def __iter__(self) -> Iterator[ExplorationStep]:
+        while True:
+            yield from self._draw(self._robot, self._rng)
+
+
+class Exploring(ActivityControl):
+    """The activity of exploring, which executes random steps with ramps of muscle lengths."""
+
+    def __init__(self, exploration: Exploration, ramps: LengthRamps) -> None:
+        self.stream, self.ramps = exploration, ramps
+        self._steps: Iterator[ExplorationStep] | None = None
+        self._theta: Array | None = None  # present target [rad], (D,)
+
+    def enter(self, inputs: Inputs) -> None:
+        """Start the exploration, or continue it after a pause, from the present tensions."""
+        self.ramps.start_from(inputs.length)
+        self._steps = self._steps or iter(self.stream)
+
+    def step(self, inputs: Inputs) -> Command | None:
+        """Return the next command.
+
+        Raises:
+            RobotDescriptionError: If too few postures are holdable.
+        """
+        assert self._steps is not None
+        if self.ramps.is_over_after(inputs.dt):
+            step = next(self._steps)
+            self._theta = step.theta
+            constant = step.tension if step.method == 'first' else None
+            effort = np.zeros_like(step.theta)
+            self.ramps.pursue([Goal(step.method, step.theta, effort, step.duration, constant)])
+        return self.ramps.step(inputs)
+
+    def leave(self) -> None:
+        """End the exploration; the next exploration starts with another posture."""
+        self._steps = self._theta = None
+
+    @property
+    def missing_torque(self) -> Array | None:
+        """Torque [N·m], (D,), that the muscles cannot exert at the present goal."""
+        return self.ramps.missing_torque
+
+    @property
+    def theta(self) -> Array | None:
+        """The posture to which the arm moves [rad], (D,); None before the first step.
+
+        This is not a target of the user, and does not replace `Controller.target_state`.
+        """
+        return self._theta

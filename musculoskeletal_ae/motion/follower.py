@@ -1,0 +1,228 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The follower: computes muscle lengths along a trajectory, and holds its end.
+
+At each message, for the desired θ, θ̇, θ̈ (`trajectory`) and with the network's prediction ① of the
+muscle lengths,
+
+    τ = M(θ) θ̈ + h(θ, θ̇)                                       rigid bodies (pinocchio's RNEA)
+    T = argmin ‖T‖²   subject to  −Gᵀ T = τ,  T_low ≤ T ≤ T_limit,         bone-side tension
+    l = ①(θ + k_p e + c, T),   e = θ − θ_estimated,   dc/dt = k_i e,   |c|, |k_p e + c| ≤ CORRECTION
+    l_target = l + l_comp(T e^{μ s}) + λ dl/dt
+
+Tendon friction: the motor-side tension is T e^{μ s}. Here s is the direction in which the tendon
+slides, and μ is learned or a typical value (`motion/assumed_friction.py`).
+
+Lag of the muscle modules: a motor under muscle stiffness control (MSC) turns at
+dl/dt = (T − T_MSC)/(K_stiff λ). Therefore the command has to lead by λ dl/dt. A tendon that is
+drawn out at dl/dt resists with T_bias + K_stiff λ dl/dt, even if MSC demands only T_bias. This
+tension is T_low. λ is measured while the arm moves (`winches`).
+
+Position-controlled modules turn without tension and only lag by λ. For them, l_comp and
+K_stiff λ dl/dt are 0.
+
+A trajectory that is too fast for the muscle modules is slowed as a whole before it starts
+(`slowness`). The follower also holds the end of the trajectory. G and T then stay constant, and the
+rest feedback (`feedback.RestFeedback`) continues from c.
+
+Where no tension is known, T is `Actuation.assumed_tension` in every posture, as in the samples from
+which the network was learned (doc/explanation/method.md).
+
+Method `stiffness` minimises ‖T − T_K‖² instead, where `methods.stiffness_command` computes T_K for
+a setpoint that is AHEAD seconds ahead. This method uses no feedback, because feedback would change
+the chosen stiffness.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.activities import ActivityControl, Inputs
+from musculoskeletal_ae.control.command import LENGTH, Command
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.feedback import MotionFeedback, RestFeedback
+from musculoskeletal_ae.motion.progress import Progress
+from musculoskeletal_ae.motion.ramps import Ramp
+from musculoskeletal_ae.motion.tension_plan import TensionPlan
+from musculoskeletal_ae.motion.trajectory import Trajectory
+from musculoskeletal_ae.motion.winches import Winches
+from musculoskeletal_ae.robot.robot import Robot
+
+#: gain of the rest feedback, which reduces posture error and needless tension at rest [1/s]
+FEEDBACK_GAIN = 0.5
+BLENDING = 0.3  # time in which the previous command is blended into the new plan [s]
+SETTLING = 0.8  # time after a trajectory for which the feedback of the motion continues [s]
+#: The limiter holds a muscle back if it has made the command longer by more than this [m].
+HELD_BACK = 1e-4
+
+
+class HeldPosture(NamedTuple):
+    """The plan with which the follower holds the end of a trajectory; it is computed only once."""
+
+    length: Array  # l_target without feedback [m], (M,)
+    jacobian: Array  # G [m/rad], (M, D)
+
+
+class Follower(ActivityControl):
+    """Follows trajectories, and holds the end of the last trajectory.
+
+    Attributes:
+        progress: Time, setpoint and error along the trajectories.
+        plan: The planned tensions.
+        winches: Measures the lag λ of the muscle modules.
+        feedback: The feedback at rest.
+    """
+
+    def __init__(self, robot: Robot, settings: Settings) -> None:
+        self._robot, self._settings = robot, settings
+        self.progress, self.plan = Progress(robot), TensionPlan(robot, settings)
+        self.winches, self.feedback = Winches(robot), RestFeedback(robot)
+        self._motion_feedback = MotionFeedback(self.feedback)
+        self._held: HeldPosture | None = None  # None while the arm moves or settles
+        #: ramp that reduces the difference between the last command and the present plan to 0
+        self._blend: Ramp | None = None
+        self._desired: Array | None = None  # the last desired command [m], (M,)
+
+    def use(self, robot: Robot, settings: Settings) -> None:
+        """Use another robot description and other settings.
+
+        `robot` must already describe isolated muscles as muscles without tension.
+        """
+        self._robot, self._settings = robot, settings
+        self.progress.use(robot)
+        self.plan.use(robot, settings)
+        self.winches.use(robot)
+        self.feedback.use(robot)
+
+    def use_network(self, mae: Mae) -> None:
+        """Use another network; the command changes without a jump."""
+        self.plan.use_network(mae)
+        self.plan_anew()
+
+    # -- requests -------------------------------------------------------------------------------
+
+    def follow(self, trajectory: Trajectory, delay: float = 0.0) -> None:
+        """Follow a trajectory that starts `delay` [s] from now and replaces the present one."""
+        if delay > 0.0:
+            self.progress.next = trajectory, delay
+        else:
+            self.progress.begin(trajectory)
+            self._leave_rest()
+
+    def exert(self, effort: Array) -> None:
+        """Exert a torque [N·m], (D,), in addition to inverse dynamics, until it is changed."""
+        if (effort != self.plan.effort).any():
+            self.plan.effort = effort
+            self.plan_anew()
+
+    def plan_anew(self) -> None:
+        """Plan again, with a smooth transition from the last command to the new plan.
+
+        If the arm was at rest, the feedback of the motion is active again until the arm has
+        settled.
+        """
+        if self._held is not None and self.progress.trajectory is not None:
+            self.progress.return_to_end()
+            self.feedback.relief = np.zeros(self._robot.muscle_count)
+        self._held = self._blend = None
+
+    def _leave_rest(self) -> None:
+        if self._held is not None:  # in motion, the trajectories join without a new plan
+            self.plan_anew()
+
+    @property
+    def needs_trajectory(self) -> bool:
+        """Whether there is no trajectory, or the arm has fallen away from its trajectory.
+
+        A stop discards the trajectory. Only an arm with isolated muscles counts as fallen.
+        """
+        return self.progress.trajectory is None or self.progress.has_lost_path
+
+    @property
+    def has_arrived(self) -> bool:
+        """Whether the last trajectory has ended."""
+        return not self.progress.is_moving
+
+    @property
+    def missing_torque(self) -> Array | None:
+        """Torque [N·m], (D,), that is missing because the tensions are limited.
+
+        None without a trajectory.
+        """
+        return None if self.progress.trajectory is None else self.plan.tension.missing_torque
+
+    # -- the activity ---------------------------------------------------------------------------
+
+    def enter(self, _: Inputs) -> None:
+        """Start following, or continue after a pause, from the present tensions."""
+        self._held = self._blend = self._desired = None
+        self.progress.return_to_end()  # plan the tensions of the held posture again
+        self.plan.reset()
+        self.feedback.reset()
+        self.winches.forget()
+
+    def leave(self) -> None:
+        """Discard the trajectories."""
+        self.progress.discard()
+
+    def step(self, inputs: Inputs) -> Command | None:
+        """Return the command, or None without a trajectory."""
+        progress, sent, dt = self.progress, inputs.length, inputs.dt
+        if progress.trajectory is None:
+            return None
+        if progress.is_moving:
+            sample = inputs.sample
+            self.winches.step(sample.length, inputs.pull.motor, sent, dt, sample.delay)
+        else:  # at rest, the measurements contain only noise and do not determine λ
+            self.winches.forget()
+        if progress.advance(dt):
+            self._leave_rest()
+        if self.plan.adopt_limit(inputs.limit):
+            self.plan_anew()
+        if self._held is None:
+            progress.update_desired()
+        progress.compare(inputs.theta, dt)
+        if progress.time < progress.trajectory.duration + SETTLING:
+            length = self._moving(progress.trajectory, inputs)
+        else:
+            length = self._resting(inputs)
+        length = np.where(self._robot.used, length, sent)
+        if self._blend is None:
+            rate_limit = float(self._robot.actuation.fastest(self._settings.rate_limit).min())
+            self._blend = Ramp(sent - length, np.zeros_like(length), BLENDING, rate_limit)
+        self._desired = length + self._blend.step(dt)
+        return Command(LENGTH, self._desired.copy())
+
+    def _moving(self, trajectory: Trajectory, inputs: Inputs) -> Array:
+        """Return the length command [m], (M,), during the motion and while the arm settles."""
+        error = self.progress.error
+        error = np.zeros_like(error) if self.plan.is_stiff else error
+        shift = self._motion_feedback.step(error, self._is_held_back(inputs), inputs.dt)
+        return self.plan.step(trajectory, self.progress.time, shift, self.winches.lag, inputs)
+
+    def _is_held_back(self, inputs: Inputs) -> bool:
+        """Return whether the limiter did not let a muscle wind in as far as desired.
+
+        The result makes `MotionFeedback` stop integrating. With isolated muscles, the result is
+        always False: some of the remaining muscles are then often at their limit, but without the
+        integration, the arm would sag.
+        """
+        if self._desired is None or not self._robot.used.all():
+            return False
+        return bool((inputs.length - self._desired > HELD_BACK).any())
+
+    def _resting(self, inputs: Inputs) -> Array:
+        """Return the length command [m], (M,), while the arm rests at the end of its trajectory."""
+        feedback, mae, plan = self.feedback, inputs.mae, self.plan
+        if self._held is None:
+            self._motion_feedback.continue_at_rest()
+            theta = self.progress.desired.theta
+            jacobian = mae.muscle_jacobian(theta, plan.tension.bone)
+            self._held = HeldPosture(plan.length(mae, theta), jacobian)
+        length, jacobian = self._held
+        gain = 0.0 if plan.is_stiff else FEEDBACK_GAIN
+        feedback.step(self.progress.error, jacobian, inputs.pull, inputs.limit, gain, inputs.dt)
+        return length + feedback.shift(jacobian)

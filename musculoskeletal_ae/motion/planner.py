@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plans trajectories that the arm can follow, from target postures, poses and twists.
+
+The methods that plan return a `Plan`, or raise a MessageError with the reason. All plans except
+those of `to_rest` are slowed to the speed of the muscle modules. They stay within the joint limits,
+with the tolerance `trajectory.BEYOND`. Plans of `to_pose` and `by_twist` end in a holdable posture.
+Plans of `through` are checked for this only if a muscle is isolated. `to_posture` does not check
+the target: its caller does so with `reachable`.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.message_reading import TrajectoryPoints
+from musculoskeletal_ae.motion import reach
+from musculoskeletal_ae.motion.hand import Hand
+from musculoskeletal_ae.motion.slowness import exertion_slowness, slowness
+from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
+from musculoskeletal_ae.report import distinct
+from musculoskeletal_ae.robot.robot import Robot
+
+#: Distance by which a point may exceed a joint limit [rad]; for prismatic joints times
+#: `kinematics.RACK` [m]. The points of a replayed motion are estimated postures. The estimate of an
+#: arm that is held against a joint stop exceeds the limit by less than this.
+TOLERANCE = 0.01
+SAME = 1e-6  # relative difference below which two poses count as equal
+
+
+class Plan(NamedTuple):
+    """A trajectory that the arm can follow.
+
+    Attributes:
+        trajectory: The trajectory, slowed to a speed that the muscle modules can follow.
+        unreachable_reason: Why the trajectory does not end at the requested target, or ''.
+    """
+
+    trajectory: Trajectory
+    unreachable_reason: str = ''
+
+
+class Planner:
+    """Plans trajectories with the network in use."""
+
+    def __init__(self, robot: Robot, settings: Settings) -> None:
+        self._hand = Hand(robot)
+        #: the last pose, whether its orientation counts, and the trajectory to it
+        self._last_pose: tuple[pin.SE3, bool, Trajectory] | None = None
+        self.use(robot, settings)
+
+    def use(self, robot: Robot, settings: Settings) -> None:
+        """Use another robot description and other settings.
+
+        `robot` must already describe isolated muscles as muscles without tension.
+        """
+        self._robot, self._settings = robot, settings
+
+    @property
+    def takes_nearest(self) -> bool:
+        """Whether the arm goes to the nearest holdable posture if the target is not holdable."""
+        return self._settings.unreachable == 'nearest'
+
+    def to_posture(
+        self, mae: Mae, start: Setpoint, theta: Array, duration: float, lag: float
+    ) -> Plan:
+        """Plan a motion to rest at θ [rad], (D,).
+
+        With isolated muscles, the motion avoids postures that are not holdable (`reach.way`).
+
+        Args:
+            mae: The network in use.
+            start: Setpoint from which the motion starts.
+            theta: Target posture [rad], (D,).
+            duration: Shortest time for each segment of the path [s]. The motion takes longer if the
+                muscles cannot accelerate the arm enough.
+            lag: Lag λ of the muscle modules [s].
+        """
+        way = reach.way(self._robot, mae, start.theta, theta)
+        planned = self._within_limits(mae, Trajectory.to(start, way, duration))
+        slower = exertion_slowness(self._robot, mae, planned, lag)
+        return Plan(planned if slower == 1.0 else self._within_limits(mae, planned.scaled(slower)))
+
+    def through(
+        self, mae: Mae, start: Setpoint, points: TrajectoryPoints, passed: float, lag: float
+    ) -> Plan:
+        """Plan a motion through points.
+
+        Args:
+            mae: The network in use.
+            start: Setpoint from which the motion starts.
+            points: The points.
+            passed: Time elapsed since time 0 of the points [s].
+            lag: Lag λ of the muscle modules [s].
+        """
+        points = self._clipped(points)
+        planned = self._slowed(mae, Trajectory.through(start, points, passed))
+        self.reachable(mae, start.theta, planned.end, nearest=False)
+        slower = exertion_slowness(self._robot, mae, planned, lag)
+        # Slowing changes the path of a trajectory that starts in motion. If the slowed trajectory
+        # would leave the joint limits, keep the faster one, from which the arm may then deviate.
+        with suppress(MessageError):
+            planned = self._slowed(mae, planned.scaled(slower)) if slower > 1.0 else planned
+        return Plan(planned)
+
+    def to_rest(self, start: Setpoint) -> Plan:
+        """Plan to come to rest within `trajectory.STOPPING` seconds."""
+        return Plan(Trajectory.stopping(start, self._robot))
+
+    def to_pose(self, mae: Mae, start: Setpoint, pose: pin.SE3, whole: bool, now: float) -> Plan:
+        """Plan to bring the end effector to a pose in the root link's frame.
+
+        Args:
+            mae: The network in use.
+            start: Setpoint from which the motion starts.
+            pose: Target pose of the end effector.
+            whole: Whether the orientation counts.
+            now: Time at which the pose was received [s].
+        """
+        theta, problem = self._hand.posture(mae, pose, whole, start.theta, self.takes_nearest)
+        towards = self._hand.towards(start, theta, now)
+        planned = self._within_limits(mae, towards)
+        self._last_pose = pose, whole, planned
+        return Plan(planned, problem and f'{problem}; the arm goes to the nearest posture')
+
+    def is_under_way(self, pose: pin.SE3, whole: bool, followed: Trajectory | None) -> bool:
+        """Return whether the followed trajectory already leads to this pose."""
+        if self._last_pose is None or followed is None:
+            return False
+        before, whole_before, trajectory = self._last_pose
+        same = whole == whole_before and bool(before.isApprox(pose, SAME))
+        return same and trajectory is followed
+
+    def repeat_pose(self, now: float) -> None:
+        """Record that the last pose was received again at `now` [s]."""
+        self._hand.again(now)
+
+    def by_twist(self, mae: Mae, start: Setpoint, twist: Array) -> Plan:
+        """Plan to move the end effector by a twist, (6,) in m/s and rad/s, for a short time."""
+        return Plan(self._within_limits(mae, self._hand.moved(mae, start, twist)))
+
+    def reachable(self, mae: Mae, start: Array, theta: Array, nearest: bool) -> tuple[Array, str]:
+        """Return θ if the muscles in use can hold it, else another posture.
+
+        The other posture is that of `reach.nearest_held`. If no muscle is isolated, θ is returned
+        without a check.
+
+        Args:
+            mae: The network in use.
+            start: Present posture [rad], (D,).
+            theta: Target posture [rad], (D,).
+            nearest: Whether to return the nearest holdable posture if θ is not holdable.
+
+        Returns:
+            θ and '', or another posture and the reason why θ is not holdable.
+
+        Raises:
+            MessageError: If θ is not holdable and `nearest` is false.
+        """
+        robot = self._robot
+        if robot.used.all():
+            return theta, ''
+        held, problem = reach.nearest_held(robot, mae, start, theta)
+        if not problem:
+            return theta, ''
+        isolated, verb = robot.names(robot.isolated), 'are' if len(robot.isolated) > 1 else 'is'
+        problem = (
+            f'{problem}, because {isolated} {verb} isolated; nearest holdable posture: '
+            f'{robot.posture_text(held)}'
+        )
+        if not nearest:
+            raise MessageError('not holdable', problem)
+        return held, f'{problem}; the arm moves there'
+
+    def _clipped(self, points: TrajectoryPoints) -> TrajectoryPoints:
+        """Return the points clipped to the joint limits.
+
+        Raises:
+            MessageError: If a point exceeds the joint limits by more than `TOLERANCE`.
+        """
+        robot = self._robot
+        low, high = robot.lower[points.joints], robot.upper[points.joints]
+        tolerance = TOLERANCE * robot.kinematics.radian[points.joints]
+        beyond = (points.position < low - tolerance) | (points.position > high + tolerance)
+        if not beyond.any():
+            return points._replace(position=np.clip(points.position, low, high))
+        k, j = np.argwhere(beyond)[0]
+        unit = robot.units[points.joints[j]].theta
+        value, least, most = distinct(points.position[k, j], low[j], high[j], digits=4)
+        raise MessageError(
+            'beyond the joint limits',
+            f'{robot.joints[points.joints[j]]} is {value} {unit}; legal: {least} to {most} {unit}',
+        )
+
+    def _slowed(self, mae: Mae, planned: Trajectory) -> Trajectory:
+        """Return the planned trajectory, slowed to a speed that the muscle modules can follow.
+
+        Raises:
+            MessageError: If the slowed trajectory leaves the joint limits. This can happen because
+                slowing changes the path of a trajectory that starts in motion.
+        """
+        slower = planned.scaled(slowness(self._robot, mae, planned, self._settings))
+        slower.check(self._robot)
+        return slower
+
+    def _within_limits(self, mae: Mae, planned: Trajectory) -> Trajectory:
+        """Return the planned trajectory, slowed and within the joint limits.
+
+        If the slowed trajectory would leave the joint limits, the returned trajectory first brings
+        the arm to rest and then plans the motion from there.
+        """
+        try:
+            return self._slowed(mae, planned)
+        except MessageError:
+            return self._slowed(mae, planned.after_rest(self._robot))

@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Ramps of muscle lengths, by which exploration and some control methods reach a posture.
+
+These methods have one length command for each posture; the preset lists them
+(`Preset.length_methods`). A target becomes one goal. With the method `second`, it becomes two goals
+at the same posture: the first one is reached by the method `first`. Each goal is approached by a
+ramp and then held. A ramp starts from the present command, so that the command does not jump:
+
+    c(t) = c₀ + (3u² − 2u³)(c₁ − c₀),   u = t / duration
+
+A ramp starts and ends at rest, and all muscles arrive together. The present tension T_current, on
+which the command of `second` depends, is measured only at the start of the goal: with repeated
+measurements, `second` would raise the tension without bound.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.activities import ActivityControl, Inputs
+from musculoskeletal_ae.control.command import LENGTH, Command
+from musculoskeletal_ae.control.method_choice import length_methods
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.feedback import depends_on_limit
+from musculoskeletal_ae.motion.methods import Solution
+from musculoskeletal_ae.robot.robot import Robot
+
+# Fraction of a movement's duration in which the command changes. In the remaining time, the arm
+# settles and is sampled.
+RAMP_SHARE = 0.6
+PEAK = 1.5  # ratio of peak to mean speed of a ramp
+FIRST = 'first'  # the method that uses T_const
+SECOND = 'second'  # the method that uses the measured T
+
+
+class Ramp:
+    """A smooth transition from one command to another, both of shape (M,)."""
+
+    def __init__(self, start: Array, goal: Array, duration: float, rate_limit: float) -> None:
+        """Plan a ramp of `duration` [s], or longer if the rate limit requires it.
+
+        The unit of `rate_limit` is the unit of the commands per second.
+        """
+        self._start, self._goal, self._elapsed = start.copy(), goal, 0.0
+        farthest = float(np.abs(goal - start).max())
+        self.duration = max(duration, PEAK * farthest / rate_limit)
+
+    @property
+    def done(self) -> bool:
+        """Whether the ramp has ended."""
+        return self._elapsed >= self.duration
+
+    def step(self, dt: float) -> Array:
+        """Advance by dt [s] and return the command."""
+        self._elapsed += dt
+        u = 1.0 if self.done else self._elapsed / self.duration
+        return self._start + (3.0 - 2.0 * u) * u * u * (self._goal - self._start)
+
+
+class Goal(NamedTuple):
+    """A posture, and the method that converts it into lengths.
+
+    Attributes:
+        method: One of the preset's length methods.
+        theta: θ_target [rad], (D,).
+        effort: Torque in addition to gravity compensation [N·m], (D,).
+        duration: Duration of the movement [s].
+        tension: T_const [N], (M,); None to use T_current at the start of the goal.
+    """
+
+    method: str
+    theta: Array
+    effort: Array
+    duration: float
+    tension: Array | None = None
+
+
+class LengthRamps:
+    """Moves the arm by ramps to one goal after the other, and holds the last goal.
+
+    Attributes:
+        solution: Solution of the present goal, or None.
+    """
+
+    def __init__(self, robot: Robot, settings: Settings) -> None:
+        self.use(robot, settings)
+        self._goals: list[Goal] = []
+        self._goal: Goal | None = None  # present goal, which is approached or held
+        self._remaining = 0.0  # remaining time of the goal [s]
+        self._ramp: Ramp | None = None
+        self._command: Array = np.zeros(robot.muscle_count)
+        self._tension: Array = robot.tension.bias  # T_const or T_current of the goal [N], (M,)
+        self._limit: Array = robot.tension.limit  # tension limit of the present plan [N], (M,)
+        self.solution: Solution | None = None
+
+    def use(self, robot: Robot, settings: Settings) -> None:
+        """Use another robot description and other settings.
+
+        `robot` must already describe isolated muscles as muscles without tension.
+        """
+        self._robot, self._settings = robot, settings
+
+    @property
+    def missing_torque(self) -> Array | None:
+        """Torque [N·m], (D,), that the muscles cannot exert at the present goal."""
+        return None if self.solution is None else self.solution.missing_torque
+
+    def is_over_after(self, dt: float) -> bool:
+        """Return whether the duration of the last goal will be over dt [s] from now."""
+        return self._remaining - dt <= 0.0 and not self._goals
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the last goal has been approached for its whole duration, and is now held."""
+        return self._goal is not None and self.is_over_after(0.0)
+
+    def start_from(self, command: Array) -> None:
+        """Continue from a command [m], (M,), and discard all goals."""
+        self._command, self._ramp, self._goal = command.copy(), None, None
+        self._goals, self._remaining = [], 0.0
+        self.solution = None
+
+    def pursue(self, goals: list[Goal]) -> None:
+        """Replace the pending goals; the first new one begins in the next step."""
+        self._goals, self._remaining = list(goals), 0.0
+
+    def solve_again(self) -> None:
+        """Solve the present goal again, for example with another network, and ramp to it."""
+        if self._goal is None or self._ramp is None or self._goals:
+            return
+        duration = self._settings.second_duration
+        self._goals = [self._goal._replace(duration=duration, tension=self._tension)]
+        if self._ramp.done:
+            self._remaining = 0.0
+
+    def step(self, inputs: Inputs) -> Command | None:
+        """Return the next command, or None while there is no goal."""
+        self._remaining -= inputs.dt
+        if (
+            self.solution is not None
+            and self._remaining <= 0.0
+            and depends_on_limit(self.solution.tension, self._limit, inputs.limit)
+        ):
+            self._limit = inputs.limit
+            self.solve_again()
+        if self._remaining <= 0.0 and self._goals:
+            self._begin(self._goals.pop(0), inputs)
+        if self._ramp is None:
+            return None
+        if not self._ramp.done:
+            self._command = self._ramp.step(inputs.dt)
+        return Command(LENGTH, self._command.copy())
+
+    def _begin(self, goal: Goal, inputs: Inputs) -> None:
+        actuation = self._robot.actuation
+        tension = inputs.pull.motor if goal.tension is None else goal.tension
+        self._tension = actuation.known_tension(tension)
+        if goal.method == SECOND and not actuation.knows_tension:
+            goal = goal._replace(method=FIRST)
+        self._goal, self._limit = goal, inputs.limit
+        self.solution = None  # there is no solution if the next line raises an exception
+        self.solution = self._solve(goal, inputs.mae, self._tension)
+        length = np.where(self._robot.used, self.solution.length, self._command)
+        rate_limit = float(self._robot.actuation.fastest(self._settings.rate_limit).min())
+        self._ramp = Ramp(self._command, length, RAMP_SHARE * goal.duration, rate_limit)
+        self._remaining = max(goal.duration, self._ramp.duration)
+
+    def _solve(self, goal: Goal, mae: Mae, tension: Array) -> Solution:
+        robot, method = self._robot, length_methods(self._settings)[goal.method]
+        if method.takes_tension:
+            tension = np.minimum(tension, self._limit)
+        torque = robot.kinematics.holding_torque(goal.theta) + goal.effort
+        return method.command(robot, mae, goal.theta, torque, tension)
+
+
+class RampedTarget(ActivityControl):
+    """The activity of moving to a target and holding it by a length method."""
+
+    def __init__(self, ramps: LengthRamps, robot: Robot, settings: Settings) -> None:
+        self.ramps = ramps
+        self._target: tuple[Array, Array] | None = None  # θ [rad] and effort [N·m], (D,) each
+        self.use(robot, settings)
+
+    def use(self, robot: Robot, settings: Settings) -> None:
+        """Use another robot description and other settings."""
+        self._robot, self._settings = robot, settings
+
+    def set_target(self, theta: Array, effort: Array) -> None:
+        """Set the target: a posture [rad], and a torque [N·m] besides gravity compensation.
+
+        Both arrays have the shape (D,).
+        """
+        self._target = theta, effort
+        self.ramps.pursue(self._goals())
+
+    def enter(self, inputs: Inputs) -> None:
+        """Start from the present tensions."""
+        self.ramps.start_from(inputs.length)
+        self.ramps.pursue(self._goals())
+
+    def step(self, inputs: Inputs) -> Command | None:
+        """Return the next command."""
+        return self.ramps.step(inputs)
+
+    def leave(self) -> None:
+        """End the activity; the target is kept for the next time."""
+
+    @property
+    def has_arrived(self) -> bool:
+        """Whether the movement to the target has ended."""
+        return self.ramps.is_over
+
+    @property
+    def missing_torque(self) -> Array | None:
+        """Torque [N·m], (D,), that the muscles cannot exert at the present goal."""
+        return self.ramps.missing_torque
+
+    def _goals(self) -> list[Goal]:
+        chosen = self._settings
+        method = length_methods(chosen).get(chosen.method)
+        if self._target is None or method is None:
+            return []
+        # T_const of method `first` is T_bias.
+        first = Goal(FIRST, *self._target, chosen.first_duration, self._robot.tension.bias)
+        if chosen.method == FIRST:
+            return [first]
+        if method.follows_first:
+            return [first, Goal(chosen.method, *self._target, chosen.second_duration)]
+        return [Goal(chosen.method, *self._target, chosen.first_duration)]

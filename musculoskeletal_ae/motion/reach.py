@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finds out whether a posture is holdable, and finds holdable postures and paths.
+
+All functions use the learned G and the least tensions within the limits. An arm with isolated
+muscles falls where the remaining muscles cannot hold it, until a joint's stop supports it. From
+there, the straight path to a target may lead through postures that are not holdable. `way` returns
+the cheapest path through a roadmap of random postures, with
+
+    cost of an edge = ∫ 1 + PRICE m(θ) ds,   m = max_j |τ_missing,j|
+
+where τ_missing,j is the torque of joint j that muscles and joint stops do not provide. Prismatic
+joints count as if a pinion of radius `kinematics.RACK` turned them. Tensions are limited to
+T_bias + USED (T_limit − T_bias), so that the path keeps a reserve of tension. If no path can keep
+the reserve, the cost favours postures in which little torque is missing. On an edge, tendon
+friction opposes the motion (`Limits`).
+
+A joint that is at a stop at the start is also at this stop in some postures of the roadmap. An edge
+is evaluated only if the cheapest path contains it (lazy roadmap, Bohlin and Kavraki 2000). Until
+then, its cost is approximated from the postures at its ends.
+
+`slowness` slows the motion along the path until the muscles can accelerate the arm.
+"""
+
+from itertools import pairwise
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.assumed_friction import tendon_friction
+from musculoskeletal_ae.motion.trajectory import Setpoint
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import least_tension
+
+# Constants in rad and N·m are for revolute joints. For a prismatic joint, angles are multiplied by
+# `kinematics.RACK` and become [m], and torques are divided by it and become [N].
+NOTABLE = 0.05  # missing torque above which a posture is not holdable [N·m]
+HALVINGS = 6  # bisection steps in the search for the last holdable posture of a path
+
+PRICE = 20.0  # cost of missing torque, per radian of the path [1/(N·m)]
+USED = 0.85  # fraction of the tension range above T_bias that a path may use
+POSTURES = 300  # number of random postures of the roadmap
+NEIGHBOURS = 12  # number of neighbours of each posture to which the roadmap has edges
+LOOKS = 40  # largest number of paths of which all edges are evaluated
+SPACING = 0.15  # distance between the evaluated postures of an edge [rad]
+#: change of a muscle's length per angle above which its sliding direction is certain [m/rad]
+CERTAIN = 0.005
+AT_STOP = 0.05  # distance from a stop below which a joint rests at it [rad]
+STOP = 100.0  # largest torque with which a stop supports a joint [N·m]
+
+
+def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
+    """Return a text on the largest missing torque at θ [rad], (D,), or '' if θ is holdable."""
+    limits, radian = robot.tension, robot.kinematics.radian
+    torque = radian * robot.kinematics.holding_torque(theta)
+    jacobian = radian * mae.muscle_jacobian(theta, limits.bias)
+    lacks = np.abs(least_tension(jacobian, torque, limits.bias, limits.limit).missing_torque)
+    joint = int(lacks.argmax())
+    if lacks[joint] <= NOTABLE:
+        return ''
+    torque_text = f'{lacks[joint] / radian[joint]:.2f} {robot.units[joint].torque}'
+    return f'{torque_text} at joint {robot.joints[joint]}'
+
+
+def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Array, str]:
+    """Return a holdable posture on the straight path from `start` to θ [rad], (D,).
+
+    If θ is not holdable, a bisection between `start` and θ looks for the last holdable posture
+    before θ. The bisection does not check `start` itself, and returns it if it finds no holdable
+    posture.
+
+    Returns:
+        The posture, and a text on the missing torque at θ, or '' if θ is holdable.
+    """
+    missing = lacking(robot, mae, theta)
+    if not missing:
+        return theta, ''
+    low, high = 0.0, 1.0
+    for _ in range(HALVINGS):
+        share = 0.5 * (low + high)
+        is_holdable = not lacking(robot, mae, start + share * (theta - start))
+        low, high = (share, high) if is_holdable else (low, share)
+    return start + low * (theta - start), f'at the target, the muscles lack {missing}'
+
+
+def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
+    """Return a path from `start` to θ on which the muscles hold the arm as well as possible.
+
+    The path is straight if no muscle is isolated, or if the whole straight path is holdable.
+
+    Returns:
+        The postures [rad], (K, D), that straight lines connect, without `start` itself.
+    """
+    if robot.used.all():
+        return theta[None]
+    cost = PathCost(robot, mae)
+    direct = cost.of_edge(start, theta)
+    if direct <= np.linalg.norm((theta - start) / robot.kinematics.radian):
+        return theta[None]
+    path = Roadmap(robot, cost, start, theta, direct).cheapest_path()
+    return _shortened(path, cost)[1:]
+
+
+class Limits:
+    """The bone-side tensions that a moving arm may use.
+
+        T_bias/loss ≤ T_end ≤ (T_bias + used (T_limit − T_bias))/loss,   loss = e^{μ s}
+
+    Here `used` is USED, unless a caller needs no reserve. Tendon friction opposes the motion: it
+    weakens a tendon that is wound in (s = 1), and a tendon that is drawn out (s = −1) resists with
+    more than T_bias.
+    """
+
+    def __init__(self, robot: Robot, mae: Mae, used: float = USED) -> None:
+        """Describe the limits; `used` is the usable fraction of the tension range above T_bias."""
+        limits = robot.tension
+        self._robot, self._radian = robot, robot.kinematics.radian
+        self._low = limits.bias
+        self._high = limits.bias + used * (limits.limit - limits.bias)
+        self._friction = tendon_friction(robot, mae)
+
+    def of(
+        self, jacobian: Array, direction: Array, resistance: Array | float = 0.0
+    ) -> tuple[Array, Array]:
+        """Return the lowest and the highest tension [N] that may be used, (M,) each.
+
+        Args:
+            jacobian: G [m/rad], (M, D).
+            direction: Direction in which the joints move, (D,); 0 at rest. The length of this
+                vector has no effect.
+            resistance: Tension by which the lowest tension is raised [N], (M,).
+        """
+        length = max(float(np.linalg.norm(direction / self._radian)), 1e-9)
+        loss = np.exp(-self._friction * np.tanh(jacobian @ direction / (length * CERTAIN)))
+        return np.minimum(self._low + resistance, self._high) / loss, self._high / loss
+
+    def missing_in_motion(self, jacobian: Array, at: Setpoint, lag: float, slower: float) -> float:
+        """Return the largest missing torque [N·m] at one moment of a motion.
+
+        Args:
+            jacobian: G [m/rad], (M, D).
+            at: The moment of the motion.
+            lag: Time λ by which the muscle modules lag behind their commands [s].
+            slower: Factor by which the motion is slowed; ∞ for a very slow motion.
+        """
+        robot, radian = self._robot, self._radian
+        velocity, acceleration = at.velocity / slower, at.acceleration / slower**2
+        paid_out = np.maximum(jacobian @ velocity, 0.0)
+        ends = self.of(jacobian, at.velocity, robot.actuation.tension_of_lag(lag, paid_out))
+        torque = radian * robot.kinematics.inverse_dynamics(at.theta, velocity, acceleration)
+        return float(np.abs(least_tension(radian * jacobian, torque, *ends).missing_torque).max())
+
+
+class PathCost:
+    """Computes the cost of straight paths between postures.
+
+    The cost of a path grows with its length, and with the missing torque, which neither the muscles
+    nor the joint stops provide.
+    """
+
+    def __init__(self, robot: Robot, mae: Mae) -> None:
+        self._robot, self._mae = robot, mae
+        self._radian = robot.kinematics.radian
+        self._limits = Limits(robot, mae)
+
+    def missing(self, postures: Array, direction: Array | None = None) -> Array:
+        """Return the largest missing torque m of each posture [N·m], (N,).
+
+        Missing torques up to NOTABLE count as 0.
+
+        Args:
+            postures: Postures θ [rad], (N, D).
+            direction: Direction in which the joints move slowly, (D,); None if they rest.
+        """
+        robot, bias = self._robot, self._robot.tension.bias
+        moved = np.zeros(robot.joint_count) if direction is None else direction
+        tensions = np.broadcast_to(bias, (len(postures), robot.muscle_count))
+        jacobians = self._mae.muscle_jacobian(postures, tensions)
+        torques = []
+        for theta, jacobian in zip(postures, jacobians):
+            # Model a stop as a muscle that pulls the joint away from it.
+            stops = self._stops(theta)
+            none = np.zeros(len(stops))
+            low, high = self._limits.of(jacobian, moved)
+            ends = np.concatenate([low, none]), np.concatenate([high, none + STOP])
+            torque = self._radian * robot.kinematics.holding_torque(theta)
+            exertion = least_tension(np.vstack([self._radian * jacobian, stops]), torque, *ends)
+            torques.append(exertion.missing_torque)
+        m = np.abs(torques).max(axis=1)
+        return np.where(m > NOTABLE, m, 0.0)
+
+    def _stops(self, theta: Array) -> Array:
+        """Return muscle Jacobians (S, D) that model the S joint stops at which joints rest.
+
+        A stop is modelled as a muscle that pulls the joint away from the stop.
+        """
+        robot, joints = self._robot, np.eye(self._robot.joint_count)
+        at_stop = AT_STOP * self._radian
+        is_low, is_high = theta < robot.lower + at_stop, theta > robot.upper - at_stop
+        return np.vstack([-joints[is_low], joints[is_high]])
+
+    def of_edge(self, one: Array, other: Array) -> float:
+        """Return the cost of the straight path between two postures θ [rad], (D,) each."""
+        length = float(np.linalg.norm((other - one) / self._radian))
+        shares = np.linspace(0.0, 1.0, int(length / SPACING) + 2)[:, None]
+        m = self.missing(one + shares * (other - one), other - one)
+        return length * (1.0 + PRICE * float(m.mean()))
+
+    def of_ends(self, postures: Array) -> Array:
+        """Return the cost of the edges between postures [rad], (N, D), as a matrix (N, N).
+
+        The cost is approximated from the missing torque at both ends of an edge. It is 0 for
+        postures between which the roadmap has no edge.
+        """
+        apart = np.linalg.norm((postures[:, None] - postures) / self._radian, axis=2)
+        m = self.missing(postures)
+        near = apart <= np.sort(apart, axis=1)[:, NEIGHBOURS, None]
+        cost = apart * (1.0 + PRICE * 0.5 * (m[:, None] + m))
+        return np.where(near | near.T, cost, 0.0)
+
+
+class Roadmap:
+    """Random postures with the costs of the edges between them.
+
+    Posture 0 is the start of the path, and posture 1 its goal.
+    """
+
+    def __init__(
+        self, robot: Robot, cost: PathCost, start: Array, theta: Array, direct: float
+    ) -> None:
+        """Draw the random postures, and approximate the costs of the edges between them.
+
+        Args:
+            robot: The robot.
+            cost: Computes the costs.
+            start: Start of the path [rad], (D,).
+            theta: Goal of the path [rad], (D,).
+            direct: Cost of the straight path from start to goal.
+        """
+        self._cost = cost
+        self._postures = np.vstack([start, theta, _random_postures(robot, start)])
+        self._price = cost.of_ends(self._postures)
+        self._evaluated = set[tuple[int, int]]()
+        self._set_price(0, 1, direct)
+
+    def cheapest_path(self) -> Array:
+        """Return the cheapest path as postures θ [rad], (K, D)."""
+        path = [0, 1]
+        for _ in range(LOOKS):
+            path = self._apparently_cheapest()
+            new_edges = [edge for edge in pairwise(path) if edge not in self._evaluated]
+            if not new_edges:
+                break
+            for i, j in new_edges:
+                self._set_price(i, j, self._cost.of_edge(self._postures[i], self._postures[j]))
+        return self._postures[path]
+
+    def _apparently_cheapest(self) -> list[int]:
+        """Return the indices of the postures on the path that is cheapest at the present costs."""
+        # Import here, because scipy loads slowly, and an arm with all muscles does not need it.
+        from scipy.sparse.csgraph import dijkstra
+
+        before = dijkstra(self._price, indices=[0], return_predecessors=True)[1][0]
+        path = [1]
+        while path[-1] != 0:
+            path.append(int(before[path[-1]]))
+        return path[::-1]
+
+    def _set_price(self, i: int, j: int, price: float) -> None:
+        self._price[i, j] = price
+        self._evaluated.add((i, j))
+
+
+def _random_postures(robot: Robot, start: Array) -> Array:
+    """Return random postures [rad], (POSTURES, D).
+
+    A joint that is at a stop in `start` is placed at that stop in 30 % of the postures.
+    """
+    rng = np.random.default_rng(0)
+    at_stop = AT_STOP * robot.kinematics.radian
+    postures = robot.random_postures(POSTURES, rng)
+    for joint in range(robot.joint_count):
+        for stop in (robot.lower[joint], robot.upper[joint]):
+            if abs(start[joint] - stop) < at_stop[joint]:
+                postures[rng.random(POSTURES) < 0.3, joint] = stop
+    return postures
+
+
+def _shortened(path: Array, cost: PathCost) -> Array:
+    """Remove postures from a path [rad], (K, D), as long as its cost does not increase."""
+    k = 1
+    while k < len(path) - 1:
+        around = cost.of_edge(path[k - 1], path[k]) + cost.of_edge(path[k], path[k + 1])
+        if cost.of_edge(path[k - 1], path[k + 1]) <= around:
+            path, k = np.delete(path, k, axis=0), max(k - 1, 1)
+        else:
+            k += 1
+    return path

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plans the tensions along a trajectory, and the lengths that muscle stiffness control needs.
+
+`follower` contains the equations.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.activities import Inputs
+from musculoskeletal_ae.control.command import msc_compensation
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.assumed_friction import FRICTION, tendon_friction
+from musculoskeletal_ae.motion.feedback import depends_on_limit
+from musculoskeletal_ae.motion.methods import Solution, stiffness_command
+from musculoskeletal_ae.motion.slowness import SHARE
+from musculoskeletal_ae.motion.trajectory import Trajectory
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import least_tension
+from musculoskeletal_ae.signals.friction import slid
+
+TURNING = 0.005  # scale of the speed at which a tendon's sliding direction becomes certain [m/s]
+AHEAD = 0.2  # T_K is computed at this interval, for a setpoint that is the same time ahead [s]
+
+
+class Stiffening:
+    """Computes the tensions T_K that give the desired joint stiffness (method `stiffness`).
+
+    Every AHEAD seconds, the tensions for the setpoint AHEAD seconds later are computed. T_K
+    changes towards them at a limited rate.
+    """
+
+    def __init__(self, robot: Robot, settings: Settings) -> None:
+        self.use(robot, settings)
+        self.reset()
+
+    def use(self, robot: Robot, settings: Settings) -> None:
+        """Use another robot description and other settings."""
+        self._robot, self._settings = robot, settings
+
+    def reset(self) -> None:
+        """Discard the present solution; the next step computes a new one."""
+        self.solution: Solution | None = None  # the solution that T_K approaches
+        self._near: Array = self._robot.tension.bias  # T_K [N], (M,)
+        self._solved = 0.0  # age of the solution [s]
+
+    def step(
+        self, mae: Mae, trajectory: Trajectory, time: float, effort: Array, limit: Array, dt: float
+    ) -> Array:
+        """Advance by dt [s] and return the tensions T_K [N], (M,).
+
+        The rate of T_K is limited. Trajectories may use the fraction SHARE of the rate limit of the
+        lengths, and T_K may use half of the remaining fraction.
+        """
+        robot, settings, solution = self._robot, self._settings, self.solution
+        self._solved += dt
+        if solution is None or self._solved >= AHEAD:
+            at, self._solved = trajectory.sample(time + AHEAD), 0.0
+            torque = robot.kinematics.inverse_dynamics(*at) + effort
+            desired = np.array(settings.desired_stiffness(robot.kinematics.radian))
+            near = None if solution is None else self._near
+            solution = stiffness_command(robot, mae, at.theta, torque, desired, limit, near)
+            self._near = solution.tension if near is None else near
+            self.solution = solution
+        # Use only half of the remaining rate. The other half is for the stretch of the series
+        # elastic elements, which changes with T and which the command has to follow, too.
+        actuation = robot.actuation
+        rates = actuation.fastest(settings.rate_limit) * actuation.tension_per_length(self._near)
+        largest = 0.5 * (1.0 - SHARE) * rates * dt
+        self._near = self._near + np.clip(solution.tension - self._near, -largest, largest)
+        return self._near
+
+
+class PlannedTension(NamedTuple):
+    """The tensions of one setpoint.
+
+    Attributes:
+        bone: Bone-side tension T [N], (M,).
+        motor: Motor-side tension T e^{μ s} [N], (M,).
+        missing_torque: Torque that no tensions within their limits provide [N·m], (D,).
+    """
+
+    bone: Array
+    motor: Array
+    missing_torque: Array
+
+    @classmethod
+    def at_bias(cls, robot: Robot) -> PlannedTension:
+        """Return the tensions that apply before the first setpoint: T_bias for every muscle."""
+        bias = robot.tension.bias.copy()
+        return cls(bias, bias, np.zeros(robot.joint_count))
+
+
+class TensionPlan:
+    """Computes tensions and lengths for the successive setpoints of a trajectory.
+
+    Attributes:
+        effort: Torque in addition to inverse dynamics [N·m], (D,).
+        tension: The tensions of the last setpoint.
+    """
+
+    def __init__(self, robot: Robot, settings: Settings) -> None:
+        self._robot, self._settings = robot, settings
+        self.effort: Array = np.zeros(robot.joint_count)
+        self.tension = PlannedTension.at_bias(robot)
+        self._limit: Array = robot.tension.limit  # tension limit of the present plan [N], (M,)
+        self._friction: Array = np.full(robot.muscle_count, FRICTION)  # μ, (M,)
+        #: sliding direction s of each tendon, (M,)
+        self._sliding: Array = np.zeros(robot.muscle_count)
+        self._stiffening = Stiffening(robot, settings)
+
+    def use(self, robot: Robot, settings: Settings) -> None:
+        """Use another robot description and other settings."""
+        self._robot, self._settings = robot, settings
+        self._stiffening.use(robot, settings)
+
+    def use_network(self, mae: Mae) -> None:
+        """Use the tendon friction that a network has learned."""
+        self._friction = tendon_friction(self._robot, mae)
+
+    def reset(self) -> None:
+        """Start again from the tension bias of all muscles, with unknown sliding directions."""
+        self.tension = PlannedTension.at_bias(self._robot)
+        self._sliding = np.zeros(self._robot.muscle_count)
+        self._stiffening.reset()
+
+    @property
+    def is_stiff(self) -> bool:
+        """Whether the method is `stiffness`, which uses no feedback."""
+        return self._settings.method == 'stiffness'
+
+    @property
+    def solution(self) -> Solution | None:
+        """The last solution of the method `stiffness`; None if there is none."""
+        return self._stiffening.solution
+
+    def adopt_limit(self, limit: Array) -> bool:
+        """Return whether a tension limit [N], (M,), requires a new plan; adopt the limit if so."""
+        is_other = depends_on_limit(self.tension.motor, self._limit, limit)
+        if is_other:
+            self._limit = limit
+        return is_other
+
+    def step(
+        self, trajectory: Trajectory, time: float, shift: Array, lag: float, inputs: Inputs
+    ) -> Array:
+        """Plan the next setpoint of a trajectory, and return its length command [m], (M,).
+
+        Args:
+            trajectory: The trajectory.
+            time: Time since the start of the trajectory [s].
+            shift: Shift of θ by the feedback [rad], (D,).
+            lag: Time λ by which the muscle modules lag behind their commands [s].
+            inputs: The present inputs.
+        """
+        robot, mae, dt = self._robot, inputs.mae, inputs.dt
+        at = trajectory.sample(time + 0.5 * dt)
+        jacobian = mae.muscle_jacobian(at.theta, self.tension.bone)
+        speed = jacobian @ at.velocity
+        self._sliding = slid(self._sliding, -np.tanh(speed / TURNING), speed * dt)
+        torque = robot.kinematics.inverse_dynamics(*at) + self.effort
+        actuation, low = robot.actuation, robot.tension.bias
+        low = low + actuation.tension_of_lag(lag, np.maximum(speed, 0.0))
+        loss = np.exp(self._friction * self._sliding)
+        near: Array | float = 0.0
+        if self.is_stiff:
+            limit = inputs.limit
+            near = self._stiffening.step(mae, trajectory, time, self.effort, limit, dt)
+        if actuation.knows_tension:
+            tension, missing_torque = least_tension(
+                jacobian, torque, np.minimum(low, inputs.limit) / loss, inputs.limit / loss, near
+            )
+            self.tension = PlannedTension(tension, tension * loss, missing_torque)
+        else:
+            assumed = actuation.assumed_tension
+            self.tension = PlannedTension(assumed, assumed, self.tension.missing_torque)
+        return self.length(mae, at.theta + shift) + lag * speed
+
+    def length(self, mae: Mae, theta: Array) -> Array:
+        """Return the length command [m], (M,), that exerts the planned tensions at rest.
+
+        The arm rests at the posture `theta` [rad], (D,).
+        """
+        length = mae.lengths(theta, self.tension.bone)
+        return length + msc_compensation(self._robot, self.tension.motor)

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joint trajectories: interpolation between points, replacement, and slowing.
+
+As in joint_trajectory_controller, the interpolation depends on the fields of the points:
+
+    positions                                  straight lines: velocity jumps at the points
+    positions, velocities                      cubics: velocity is continuous
+    positions, velocities, accelerations       quintics: acceleration is continuous
+
+The curve begins at the setpoint that the arm follows when the message arrives. Points whose time
+has passed are skipped. Joints that a message does not name keep the position of this setpoint. The
+arm holds the position of the last point. An empty message brings the arm to rest.
+
+A trajectory is slowed as a whole by a factor s: all times are multiplied by s, velocities divided
+by s and accelerations divided by s². If it starts at rest, its path stays the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.message_reading import TrajectoryPoints
+from musculoskeletal_ae.report import distinct
+from musculoskeletal_ae.robot.robot import Robot
+
+#: largest allowed excess over the joint limits between points [rad]; for prismatic joints times
+#: `kinematics.RACK` [m]
+BEYOND = 0.02
+STOPPING = 0.3  # time in which a cancelled motion comes to rest [s]
+SAMPLES = 200  # approximate number of moments at which a whole trajectory is evaluated
+WITHIN = 5  # smallest number of moments at which each piece is evaluated
+AT_ONCE = 0.01  # time that replaces a requested time of 0 [s]
+#: smallest distance between two successive times, relative to the later one; in a shorter piece of
+#: the curve, rounding errors of the time would matter
+RESOLUTION = 1e-11
+# Matrices that give the coefficients c of u(τ) = Σ c_k τ^k, τ in [0, 1], from position, velocity
+# and acceleration at both ends.
+LINEAR = np.array([[1, 0, 0, 0, 0, 0], [-1, 0, 0, 1, 0, 0], *np.zeros((4, 6))])
+CUBIC = np.array(
+    [[1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0], [-3, -2, 0, 3, -1, 0], [2, 1, 0, -2, 1, 0],
+     *np.zeros((2, 6))]
+)  # fmt: skip
+QUINTIC = np.array(
+    [[1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0], [0, 0, 0.5, 0, 0, 0],
+     [-10, -6, -1.5, 10, -4, 0.5], [15, 8, 1.5, -15, 7, -1], [-6, -3, -0.5, 6, -3, 0.5]]
+)  # fmt: skip
+
+
+class Setpoint(NamedTuple):
+    """Desired motion at one moment or at N moments; each array is (D,) or (N, D)."""
+
+    theta: Array  # joint angles [rad]
+    velocity: Array  # joint velocities [rad/s]
+    acceleration: Array  # joint accelerations [rad/s²]
+
+    @classmethod
+    def resting(cls, theta: Array) -> Setpoint:
+        """Return the setpoint of an arm that rests at the posture θ [rad], (D,)."""
+        return cls(theta, np.zeros_like(theta), np.zeros_like(theta))
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A piecewise polynomial curve from `start` through points."""
+
+    start: Setpoint
+    points: TrajectoryPoints  # the remaining points
+    time: Array  # times of the knots [s], (K,); the first time is 0
+    coefficients: Array  # coefficients of each piece, (K−1, 6, D)
+    end: Array  # posture that is held after the last point [rad], (D,)
+    slowed: float = 1.0  # factor by which the trajectory was slowed
+
+    @classmethod
+    def through(cls, start: Setpoint, points: TrajectoryPoints, passed: float = 0.0) -> Trajectory:
+        """Return the trajectory from `start` through the points that are still ahead.
+
+        A single point at time 0 is reached as fast as possible.
+
+        Args:
+            start: Setpoint at which the trajectory begins.
+            points: The points, with times relative to the same time 0.
+            passed: Time elapsed since time 0 of the points [s]; points up to then are dropped.
+
+        Raises:
+            MessageError: If no point remains, or two points are too close in time.
+        """
+        kept = points.time > passed + 1e-9
+        # If all points are at time 0, they are requested after AT_ONCE instead. The planner then
+        # slows the trajectory as far as necessary.
+        if not kept.any() and passed == 0.0:
+            points = points._replace(time=points.time + AT_ONCE)
+            kept = points.time >= AT_ONCE
+        if not kept.any():
+            detail = f'the trajectory started {passed:.3g} s ago; send a later header.stamp, or 0'
+            raise MessageError('all points have passed', detail)
+        velocity, acceleration = (None if part is None else part[kept] for part in points[3:])
+        time, position = points.time[kept] - passed, points.position[kept]
+        if ((apart := np.diff(time, prepend=0.0)) < RESOLUTION * time).any():
+            raise MessageError(
+                'points too close in time',
+                f'two points are only {apart.min():.3g} s apart; send one of them only',
+            )
+        left = TrajectoryPoints(points.joints, time, position, velocity, acceleration)
+        return cls._joined(start, left)
+
+    @classmethod
+    def _joined(cls, start: Setpoint, points: TrajectoryPoints, slowed: float = 1.0) -> Trajectory:
+        time = np.concatenate([[0.0], points.time])
+        degrees = [points.velocity, points.acceleration]
+        every = np.zeros((3, len(time), len(start.theta)))
+        every[0] = start.theta
+        every[:, 0] = start
+        every[0, 1:, points.joints] = points.position.T
+        for order, values in enumerate(degrees, 1):
+            if values is not None:
+                every[order, 1:, points.joints] = values.T
+        shape = LINEAR if degrees[0] is None else CUBIC if degrees[1] is None else QUINTIC
+        span = np.diff(time)[:, None]
+        first, last = every[:, :-1], every[:, 1:]
+        scales = np.stack([np.ones_like(span), span, span**2])
+        ends = np.concatenate([scales * first, scales * last])
+        pieces = np.einsum('cp,pkd->kcd', shape, ends)
+        return cls(start, points, time, pieces, every[0, -1], slowed)
+
+    @classmethod
+    def to(cls, start: Setpoint, theta: Array, duration: float) -> Trajectory:
+        """Return a trajectory of quintics that comes to rest at each of one or more postures.
+
+        A motion that starts at rest is a minimum-jerk motion.
+
+        Args:
+            start: Setpoint at which the trajectory begins.
+            theta: One posture θ [rad], (D,), or K postures, (K, D).
+            duration: Time from each posture to the next [s].
+        """
+        path = np.atleast_2d(theta)
+        (count, joints), still = path.shape, np.zeros(path.shape)
+        time = duration * np.arange(1.0, count + 1.0)
+        return cls.through(start, TrajectoryPoints(np.arange(joints), time, path, still, still))
+
+    @classmethod
+    def stopping(cls, start: Setpoint, robot: Robot) -> Trajectory:
+        """Return a trajectory that comes to rest within STOPPING seconds."""
+        return cls.to(start, _halt(start, robot), STOPPING)
+
+    def after_rest(self, robot: Robot) -> Trajectory:
+        """Return a trajectory that first comes to rest and then passes through the points.
+
+        The points have to name all joints. A slowed curve that starts in motion overshoots more if
+        it lasts longer; coming to rest first avoids that.
+        """
+        points, still = self.points, np.zeros((1, len(self.end)))
+        time = np.append(STOPPING, STOPPING + points.time)
+        where = np.vstack([_halt(self.start, robot), points.position])
+        rates = (None if part is None else np.vstack([still, part]) for part in points[3:])
+        return self.through(self.start, TrajectoryPoints(points.joints, time, where, *rates))
+
+    def check(self, robot: Robot) -> None:
+        """Check that the curve stays within the joint limits between its points.
+
+        Raises:
+            MessageError: If the curve exceeds the limits by more than `BEYOND`.
+        """
+        _, theta = self.path
+        out = np.maximum(robot.lower - theta, theta - robot.upper).max(axis=0)
+        if not np.isfinite(out).all():
+            raise MessageError(
+                'leaves the joint limits',
+                'between the points, the curve is not finite; send smaller velocities and '
+                'accelerations',
+            )
+        beyond = out / robot.kinematics.radian
+        if (beyond > BEYOND).any():
+            j = int(beyond.argmax())
+            excess, legal = distinct(out[j], BEYOND * robot.kinematics.radian[j])
+            joint, unit = robot.joints[j], robot.units[j].theta
+            raise MessageError(
+                'leaves the joint limits',
+                f'between the points, joint {joint} exceeds its limits by {excess} {unit}; legal: '
+                f'at most {legal} {unit}; send more points or smaller velocities',
+            )
+
+    @property
+    def path(self) -> tuple[Array, Array]:
+        """The curve at N moments, several in each piece: times [s], (N,), and θ [rad], (N, D)."""
+        share = np.linspace(0.0, 1.0, max(WITHIN, SAMPLES // (len(self.time) - 1)), endpoint=False)
+        inner = self.time[:-1, None] + np.diff(self.time)[:, None] * share
+        theta = share[:, None] ** np.arange(6.0) @ self.coefficients  # (K−1, n, D)
+        joints = len(self.end)
+        return np.append(inner, self.time[-1]), np.append(theta, self.end).reshape(-1, joints)
+
+    @property
+    def duration(self) -> float:
+        """Duration of the trajectory [s]."""
+        return float(self.time[-1])
+
+    def sample(self, time: Array | float) -> Setpoint:
+        """Return the setpoint at one time or at times (N,) [s].
+
+        Before the start and after the end of the trajectory, the setpoint is at rest.
+        """
+        inner = np.clip(np.asarray(time), 0.0, self.time[-1])
+        piece = np.clip(np.searchsorted(self.time, inner, side='right') - 1, 0, len(self.time) - 2)
+        span = np.diff(self.time)[piece]
+        tau = ((inner - self.time[piece]) / span)[..., None]
+        c, k = np.moveaxis(self.coefficients[piece], -2, 0), np.arange(6.0)
+        powers = tau**k  # (..., 6)
+        theta = np.einsum('k...d,...k->...d', c, powers)
+        velocity = np.einsum('k...d,...k->...d', c[1:], k[1:] * powers[..., :-1])
+        acceleration = np.einsum('k...d,...k->...d', c[2:], k[2:] * k[1:-1] * powers[..., :-2])
+        rate = (1.0 / span)[..., None]
+        moving = ((np.asarray(time) >= 0.0) & (np.asarray(time) < self.duration))[..., None]
+        return Setpoint(theta, moving * velocity * rate, moving * acceleration * rate**2)
+
+    def scaled(self, slower: float) -> Trajectory:
+        """Return the trajectory slowed by the factor `slower`."""
+        return self._joined(self.start, self.points.later(slower), self.slowed * slower)
+
+
+def _halt(start: Setpoint, robot: Robot) -> Array:
+    """Return the posture [rad], (D,), at which a motion comes to rest STOPPING seconds later."""
+    return np.clip(start.theta + 0.5 * STOPPING * start.velocity, robot.lower, robot.upper)

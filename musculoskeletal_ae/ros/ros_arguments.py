@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS arguments on the command line: the names of parameters in them, and rclpy's errors."""
+
+import os
+from itertools import pairwise
+
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+
+from musculoskeletal_ae.ros.executor import RCLInvalidROSArgsError, UnknownROSArgsError
+
+NO_REASON = 'error not set'  # the message of rcl for an error without a reason
+#: exceptions of rclpy for a wrong ROS argument: an unknown argument, or a parameter value of the
+#: wrong type or out of range
+PARAMETER_ERRORS = (
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    UnknownROSArgsError,
+    RCLInvalidROSArgsError,
+)
+
+
+def reason(error: Exception) -> str:
+    """Return the message of an rcl error, without the location in its source code."""
+    text = ' '.join(str(error).split(', at /')[0].split())
+    is_secured = os.environ.get('ROS_SECURITY_ENABLE') == 'true'
+    if is_secured and not os.environ.get('ROS_SECURITY_KEYSTORE') and NO_REASON in text:
+        return (
+            f'{text.replace(NO_REASON, "security is switched on without keys")}; set '
+            'ROS_SECURITY_KEYSTORE to a keystore, or unset ROS_SECURITY_ENABLE'
+        )
+    return text
+
+
+def parameters_given(arguments: list[str]) -> list[str]:
+    """Return the names of the parameters set by `-p NAME:=VALUE` or `-p NODE:NAME:=VALUE`."""
+    values = [value for flag, value in pairwise(arguments) if flag in ('-p', '--param')]
+    return [value.partition(':=')[0].rpartition(':')[2] for value in values]
