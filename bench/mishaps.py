@@ -78,7 +78,7 @@ BETWEEN = 0.5  # time between two steps of a remedy [s]
 SETTLING = 4.0  # time after the steps of a remedy until the operator reads the statements again [s]
 QUIET = 3.0  # the arm is well when it has explored without a condition for this time [s]
 CALIBRATION = 60.0  # longest time for which an operator waits for a length calibration [s]
-COOLING = 1500.0  # longest time for which an operator waits for motors to cool [s]
+COOLING = 240.0  # time for which an operator waits for motors to cool, in all [s]
 AFTER = 20.0  # time in which the true error is measured [s]
 WELL, WELL_RAD = 1.5, 0.02  # a larger error than this multiple or this much more is not well
 HOLDABLE = 4  # number of postures from which the one to hold is chosen
@@ -262,11 +262,11 @@ class Course:
             advised = list(
                 dict.fromkeys((step, each) for each in self.present for step in each.steps)
             )
+            cooled_before = self._cooled_for
             for step in dict.fromkeys(step for step, _ in advised):
                 self._take(step, [each for other, each in advised if other is step])
                 self.run(BETWEEN)
-            end += self._cooled_for
-            self._cooled_for = 0.0
+            end += self._cooled_for - cooled_before
             if not self.present and not self._explores and self.mended_at is not None:
                 lab.controller.explore(True)  # the operator goes on with the work
             elif not advised and not self.present and self.mended_at is None:
@@ -311,12 +311,11 @@ class Course:
 
     def _wait_until_cool(self) -> None:
         """Wait while a statement advises it; the patience does not count this."""
-        start = self.lab.now
-        while self.lab.now - start < COOLING:
+        while self._cooled_for < COOLING:
             if not any(Step.WAIT_UNTIL_COOL in each.steps for each in self.present):
                 break
             self.run(1.0)
-        self._cooled_for += self.lab.now - start
+            self._cooled_for += 1.0
 
     def _reset_estimator(self) -> None:
         lab = self.lab
