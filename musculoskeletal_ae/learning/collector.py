@@ -166,7 +166,7 @@ class SampleCollector:
             sample = replace(
                 sample,
                 length=np.where(used, sample.length, 0.0),
-                tension_read=np.where(used, sample.learned_tension, 0.0),
+                tension_read=np.where(used, sample.tension_read, 0.0),
                 sliding=np.where(used, sample.sliding, 0.0),
             )
         return self._pairing.muscles(time, sample)
@@ -188,7 +188,7 @@ class SampleCollector:
         message = paired.message
         reading = Sample(
             theta,
-            message.learned_tension,
+            message.tension_read,
             message.length,
             message.sliding,
             self._spread,

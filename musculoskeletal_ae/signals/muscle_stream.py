@@ -64,7 +64,8 @@ class MuscleSample:
         length: l, with the length offset removed [m].
         length_read: l as the sensor measured it [m].
         tension_read: T_read [N], the reading of the tension sensor, or the motor current converted
-            to newtons; NaN where tension is not known.
+            to newtons. Where tension is not known, it is the tension that models assume
+            (`Actuation.assumed_tension`).
         motor_tension: Motor-side tension T [N]; NaN where it is not known. It equals T_read for
             tension sensors. For motor currents, it is max(0, T_read) until the friction of the
             drives has been learned.
@@ -109,16 +110,6 @@ class MuscleSample:
         tension: Array = np.where(
             np.isnan(self.motor_tension), self.bone_tension, self.motor_tension
         )
-        return tension
-
-    @property
-    def learned_tension(self) -> Array:
-        """Tensions with which the network is learned [N], (M,).
-
-        They are the readings `tension_read`; where these are not known, the tensions that models
-        assume.
-        """
-        tension: Array = np.where(np.isnan(self.tension_read), self.bone_tension, self.tension_read)
         return tension
 
     def shifted(self, offset: Array) -> MuscleSample:
@@ -296,7 +287,7 @@ class MuscleStream:
             time=time,
             length=length,
             length_read=read[Row.LENGTH],
-            tension_read=tension,
+            tension_read=self._robot.actuation.known_tension(tension),
             motor_tension=self._transmission.motor(tension, sliding),
             bone_tension=self._robot.actuation.known_tension(end),
             sliding=sliding,
