@@ -409,7 +409,7 @@ class ConditionKind(Enum):
         'warn',
         'a muscle is isolated, and is not being verified',
         'a muscle is isolated and not used',
-        (Step.RESTORE_MUSCLES,),
+        (Step.REPAIR_MUSCLE, Step.RESTORE_MUSCLES),
     )
     LENGTH_OFFSETS_UNKNOWN = Declaration(
         'length_offsets_unknown',

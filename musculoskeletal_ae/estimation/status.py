@@ -85,7 +85,9 @@ def _isolated(core: Estimator) -> Iterator[Condition]:
             continue
         name, fault = core.robot.muscles[muscle], core.suspects.faults.get(muscle)
         detail = name if fault is None else f'{name} ({fault})'
-        yield ConditionKind.MUSCLE_ISOLATED.condition(detail, [name])
+        # A muscle that a user has isolated need not be faulty.
+        steps = None if fault is not None else (Step.RESTORE_MUSCLES,)
+        yield ConditionKind.MUSCLE_ISOLATED.condition(detail, [name], steps=steps)
 
 
 def _unknown_offsets(core: Estimator) -> Iterator[Condition]:
