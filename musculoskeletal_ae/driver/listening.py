@@ -107,7 +107,7 @@ class Listening:
         self._read: list[tuple[Array, Array]] = []  # states (3, M) and θ (D,) at that time, or NaN
         self._rejected: dict[tuple[str, str], list[MessageError]] = {}  # by topic and reason
         #: lowest and highest possible values of each quantity, (Q, M)
-        self._low, self._high = possible_readings(robot)
+        self._low, self._high = (each[: len(Row)] for each in possible_readings(robot))
         (low, high), beyond = length_range(robot), BEYOND[not zeroed]
         self._low[Row.LENGTH], self._high[Row.LENGTH] = low - beyond, high + beyond
         self._low[Row.TEMPERATURE], self._high[Row.TEMPERATURE] = TEMPERATURES
@@ -141,7 +141,7 @@ class Listening:
             states = read_muscle_states(
                 reading, self._robot.muscle_count, source=self._robot.tension_source
             )
-            self._read.append((states, self._theta))
+            self._read.append((states[: len(Row)], self._theta))  # the check ignores other rows
 
     def joints(self, message: object) -> None:
         """Record a message of joint_states."""
@@ -233,7 +233,7 @@ class Listening:
         """
         for what, texts, meant in _readings(states):
             possible = (meant >= self._low) & (meant <= self._high)
-            for row, quantity in enumerate(QUANTITIES):
+            for row, quantity in enumerate(QUANTITIES[: len(Row)]):
                 if quantity.presence is not Presence.REQUIRED:
                     possible[row] |= np.isnan(meant[row])
             possible[Row.TENSION] |= not self._robot.tension_source.is_known

@@ -19,6 +19,7 @@ from musculoskeletal_ae.driver.order import JOINTS_BETTER, judge_order, wrong_si
 from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.report import is_overloaded
 from musculoskeletal_ae.signals.joint_sensors import corrected, judge, sign_notes
+from musculoskeletal_ae.signals.muscle_readings import Row
 from musculoskeletal_ae.signals.wiring import Judgement
 
 RELEASE = 0.6  # wait after a release [s]
@@ -97,11 +98,11 @@ class MotionTest(ABC):
         The command is l_target [m], (M,), or None if nothing is to be published.
 
         Args:
-            states: l [m], T [N] and temperature [°C], (3, M).
+            states: Readings, (Q, M); only l [m], T [N] and temperature [°C] are used.
             now: Time [s].
             theta: θ of the joint sensors [rad], (D,), with NaN if unknown; None without sensors.
         """
-        self._now = now
+        self._now, states = now, states[: len(Row)]
         if theta is not None:
             segment = -1 if self._tested is None else self._tested
             self._history.append((theta, states, segment))

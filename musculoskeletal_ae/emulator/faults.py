@@ -83,13 +83,12 @@ class Readings(NamedTuple):
 
     def message(self, robot: Robot) -> MuscleReading:
         """Return the readings of the muscle modules as a message of `muscle_states`."""
-        return muscle_reading(
-            robot, length=self.length, tension=self.tension, temperature=self.temperature
-        )
+        reported = {each.name for each in QUANTITIES} & set(self._fields)
+        return muscle_reading(robot, **{name: getattr(self, name) for name in reported})
 
 
 #: quantities of the muscle modules that have sensor faults
-SENSED = tuple(quantity.name for quantity in QUANTITIES if quantity.name in Readings._fields)
+SENSED = tuple(quantity.name for quantity in QUANTITIES if quantity.name in SIZES)
 
 
 class Fault(NamedTuple):
