@@ -961,7 +961,7 @@ MISHAPS: tuple[Mishap, ...] = (
     Mishap('driver restarts, lengths counted from 0', driver_zeroes,
            SEVERAL_LENGTHS | REVOKED, says='jumped',
            allowed=STALE | _CONSEQUENCES | REJECTED),
-    Mishap('driver restarts in mm', driver_in_mm, frozenset({'implausible_muscle_states'}),
+    Mishap('driver restarts in mm', driver_in_mm, REJECTED,
            says=ORDER, allowed=_LENGTHS | STALE | _CONSEQUENCES),
     Mishap('driver restarts at half rate', half_rate, is_harmless=True, allowed=STALE),
     Mishap('messages pause for 0.3 s', pause(0.3), STALE),

@@ -31,7 +31,7 @@ EVERY = 1.0  # time between two updates [s]
 LONGEST = 10.0  # longest time that one update may cover [s]
 #: largest change of a housing's temperature between two updates that the motor can cause [°C]; a
 #: larger change is due to the sensor or to another source of heat
-JUMP = 5.0
+JUMP = 2.0
 NOISE = 0.1  # standard deviation of the mean of c₂ over EVERY [°C]
 RATIO = 0.4  # assumed ratio r: typical of small motors, which vary widely
 #: initial estimate of how much warmer than the air the housing becomes while T_limit is held [°C]
