@@ -262,8 +262,10 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         assert detected[-1].data
         # The page must refuse this as long as the muscle is ruptured, because the arm would stop
         # again.
-        page.press('Reset after a stop')
-        see('press "Repair" first')
+        graph.wait(
+            lambda: page.press('Reset after a stop') or 'press "Repair" first' in page.text,
+            'the refusal, which the page shows for some seconds',
+        )
         assert 'controller/reset' not in page.text
         page.close_notifications()
         page.screenshot(SCREENSHOTS / 'rupture.png')
