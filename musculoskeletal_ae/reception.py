@@ -16,7 +16,7 @@ SHOWN = 10.0  # report refusals and internal errors for this time [s]
 
 
 class Reception:
-    """Counts rejected messages and ignored parts of messages, and has the arrival of each topic.
+    """Counts rejected messages and ignored parts of messages, and knows when messages arrived.
 
     Attributes:
         arrivals: When the messages of each topic arrived, by topic.

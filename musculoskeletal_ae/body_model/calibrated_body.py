@@ -191,7 +191,7 @@ class CalibratedBody:
 
     @classmethod
     def of_straight_lines(cls, robot: Robot) -> CalibratedBody:
-        """Return the body without a residual model, which a robot description can represent."""
+        """Return the body without its residual model, as a robot description can represent it."""
         shapes = (0, robot.joint_count), 0, (0, 0)
         none = ResidualModel(*(np.zeros(shape, np.float32) for shape in shapes))
         return cls(robot, smooth=[none] * robot.muscle_count)

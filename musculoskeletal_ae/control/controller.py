@@ -297,7 +297,8 @@ class Controller:
         try:
             sample = self.stream.take(message, now, delay=delay)
         except RejectionError as error:
-            # Limiter and watchdog still react to a tension that is too high.
+            # The tensions of a rejected message may be right. If one is too high, limiter and
+            # watchdog have to react.
             if error.pull is not None:
                 self.rejected_pull = error.pull
                 self.watchdog.take_rejected(error.pull[1], self.stream.body.used, now, delay)

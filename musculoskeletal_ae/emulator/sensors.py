@@ -30,7 +30,7 @@ def read_sensors(lines: Iterable[str], robot: Robot) -> Sensors:
     Raises:
         MusculoskeletalError: If a line is not legal; the message lists the legal forms.
     """
-    sensors, seen = Sensors(), set[str]()
+    sensors, kinds = Sensors(), set[str]()
     for line in lines:
         kind, _, detail = (word.strip() for word in line.partition(':'))
         if kind == 'joints' and not detail:
@@ -45,9 +45,9 @@ def read_sensors(lines: Iterable[str], robot: Robot) -> Sensors:
             sensors = sensors._replace(imu_link=detail)
         else:
             raise MusculoskeletalError(f'{line[:80]!r}; legal: {LEGAL}')
-        if kind in seen:
+        if kind in kinds:
             raise MusculoskeletalError(f'{line[:80]!r} is the second sensor of its kind; {LEGAL}')
-        seen.add(kind)
+        kinds.add(kind)
     return sensors
 
 

@@ -10,7 +10,7 @@ STOP, ISOLATE = ON_ANOMALY = ('stop', 'isolate')
 
 @dataclass(frozen=True)
 class Settings(CheckedSettings):
-    """The reaction to an anomaly; `Estimator.configure` applies changed settings."""
+    """How the estimator reacts to an anomaly. `Estimator.configure` takes changed settings."""
 
     on_anomaly: str = settable(
         STOP,

@@ -2,9 +2,14 @@
 """Parts of a run in files: values with arrays as npz, without pickle, which could contain code.
 
 A value consists of None, numbers, texts, arrays, and of dictionaries, lists and named tuples of
-values. The file has the arrays, and the text `document`, which is JSON. Each array, dictionary or
-named tuple is there an object with one key: {"array": N} for the array with the name N,
-{"dictionary": {…}} or {"record": {…}}. Read values differ from written ones in their types only:
+values. Every array is a member of the npz file. A further member, `document`, contains the rest of
+the value as JSON, in which an object with a single key stands for
+
+    {"array": N}           the array in the member N
+    {"dictionary": {…}}    a dictionary
+    {"record": {…}}        a named tuple
+
+Read values differ from written ones in their types only:
 tuples have become lists, and named tuples have become objects with the same attributes.
 """
 

@@ -23,7 +23,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.samples import NOTHING, Sample
 
 REST_TIME = 0.3  # count the arm as resting after it has been still for this long [s]
-#: count a joint as moving above this speed [rad/s]; for prismatic joints times 0.06 m
+#: count a joint as moving above this speed [rad/s]; for prismatic joints times
+#: `kinematics.RACK` [m/s]
 JOINT_RATE = 0.02
 LENGTH_RATE = 0.002  # count a muscle as moving above this speed [m/s]
 LONGEST_PART = 1.0  # longest part of a rest that one sample averages [s]

@@ -29,7 +29,8 @@ CREEP_SHARE = 0.5
 NOTHING: Array = np.zeros(0)  # stands for a quantity that was not measured
 #: typical moment arm, which converts lengths to angles where not all joint angles were measured [m]
 MOMENT_ARM = 0.04
-#: count two samples as different if an angle differs by more [rad]; prismatic joints: times 0.06 m
+#: count two samples as different if an angle differs by more [rad]; for prismatic joints times
+#: `kinematics.RACK` [m]
 JOINT_DISTANCE = 0.05
 TENSION_DISTANCE = 10.0  # count two samples as different if a tension differs by more [N]
 

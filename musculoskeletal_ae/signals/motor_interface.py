@@ -87,7 +87,8 @@ class MotorInterface:
         if stamp == 0:
             raise MessageError('no stamp', 'header.stamp is 0; expected the time of measurement')
         if not is_later(stamp, self._stamp):
-            detail = f'{1e-9 * stamp:.9f} s is not later than the previous stamp'
+            seconds, rest = divmod(stamp, 1_000_000_000)
+            detail = f'{seconds}.{rest:09d} s is not later than the previous stamp'
             raise MessageError('repeated stamp', detail)
         self._stamp = stamp
         position = np.array(message.position, dtype=float)[self._places]

@@ -2,8 +2,9 @@
 """What a muscle module reports: one row for each quantity, in the order of `QUANTITIES`.
 
 A message of `muscle_states` has these rows, with one column for each muscle. To add a quantity, add
-its entry to `QUANTITIES`. Messages, recordings and the emulator then have one more row; its values
-are checked, and `MuscleSample.newest` contains them.
+its entry to `QUANTITIES`. Messages may then have its row; its values are checked, and
+`MuscleSample.newest` contains them. What else a quantity needs if the emulator reports it, or if a
+part of the package uses it, is in doc/explanation/architecture.md ("How to add …").
 """
 
 from __future__ import annotations

@@ -61,9 +61,8 @@ def test_an_optional_quantity_is_one_entry_of_the_layout(monkeypatch):
     voltage = Quantity(
         'voltage', 'V', 'impossible voltage', lambda _: (5.0, 60.0), Presence.OPTIONAL
     )
-    for module in (muscle_readings, message_reading):
+    for module in (muscle_readings, message_reading, plausibility):
         monkeypatch.setattr(module, 'QUANTITIES', (*QUANTITIES, voltage))
-    monkeypatch.setattr(plausibility, 'QUANTITIES', (*QUANTITIES, voltage))
     stream, volts = MuscleStream(ROBOT), np.full(M, 24.0)
     sample = stream.take(message([*resting(), volts]), 0.0)
     np.testing.assert_array_equal(sample.newest[-1], volts)

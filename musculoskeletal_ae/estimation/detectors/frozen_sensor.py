@@ -61,7 +61,8 @@ class FrozenSensor(Detector):
             is_same[1] = 0.0
         slack = LIMITS.slack_share * robot.tension.bias
         is_near_bias = np.abs(tension - robot.tension.bias) <= slack
-        # What the reading does now counts only once it has changed again.
+        # Messages with the present value are counted only when the reading changes again. Otherwise
+        # a frozen sensor would look like one that never had noise.
         same, changed, now = self._near_bias
         has_changed = is_same[1] == 0.0
         same, changed = same + now * has_changed, changed + (has_changed & is_near_bias)

@@ -113,9 +113,12 @@ class ModuleFollowing(Detector):
         """Return T − T_ref [N], (M,); None without a command."""
         if observation.demand is None:
             return None
-        demand = np.minimum(observation.demand, self._complete_robot.tension.max)
-        difference: Array = observation.sample.motor_tension - demand
+        difference: Array = observation.sample.motor_tension - self._reference(observation.demand)
         return difference
+
+    def _reference(self, demand: Array) -> Array:
+        """Return T_ref [N], (M,): what a command demands, but at most T_max."""
+        return np.minimum(demand, self._complete_robot.tension.max)
 
     def _growth(self, observation: Observation, away: Array, correcting: Array) -> Array:
         """Return how fast the evidence grows, not limited to ±1, (M,).
@@ -126,8 +129,7 @@ class ModuleFollowing(Detector):
             correcting: Speed of each winch in the direction that reduces the difference [m/s].
         """
         assert observation.demand is not None
-        limit = self._complete_robot.tension.limit
-        demand = np.minimum(observation.demand, self._complete_robot.tension.max)
+        limit, demand = self._complete_robot.tension.limit, self._reference(observation.demand)
         excess = away - limit * correcting / CORRECTING
         allowed = ALLOWED * limit + ALLOWED_SHARE * demand
         spread = np.fmax(observation.sample.tension_spread, 0.0)

@@ -26,6 +26,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import anomaly, residuals
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.muscle_readings import Row
 from musculoskeletal_ae.signals.wiring import Judgement, Wiring, decide, single_faults
 
 SPACING = 0.25  # time between two messages that are kept [s]
@@ -84,10 +85,10 @@ class ExchangeCheck:
         """Note the raw l of a message, accepted or not, and whether a silence has ended with it.
 
         Args:
-            states: Raw l [m], T [N] and temperature [°C], (3, M).
+            states: The raw readings, (Q, M).
             now: Time of the message on a steady clock [s].
         """
-        length = states[0]
+        length = states[Row.LENGTH]
         if not np.isfinite(length).all():
             return
         if self._newest is not None and now - self._newest[0] > SILENT:
