@@ -225,7 +225,8 @@ class Course:
         self.stated.clear()
         self.peak = 0.0
         self.begun_at = self.started_at = self.lab.now
-        self.advised_at = None
+        self.advised_at = self.true_at = None
+        self.first_true = ''
         self.case = self.mishap.begin(self.lab, rng)
         self._wait_for_advice()
         self._follow_advice(self.lab.now + self.mishap.patience)

@@ -353,7 +353,7 @@ class ConditionKind(Enum):
         'a joint that had readings in `joint_states` has had none for 1 s, or only NaN, although '
         '`muscle_states` are received',
         'no readings of joint sensors',
-        (Step.CHECK_JOINT_DRIVER,),
+        (Step.CHECK_JOINT_DRIVER, Step.CONFIRM_REMOVED_SENSORS),
     )
     READINGS_REJECTED = Declaration(
         'readings_rejected',

@@ -33,7 +33,7 @@ from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.joint_check import JointCheck
 from musculoskeletal_ae.estimation.lengths.checked_calibration import CheckedCalibration
-from musculoskeletal_ae.estimation.lengths.length_trust import EVIDENCE_OF, Evidence, LengthTrust
+from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthTrust
 from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
 from musculoskeletal_ae.estimation.mounting import MountingCheck
@@ -279,11 +279,12 @@ class Estimator:
         return self.joint_check.trust
 
     def confirm_joint_sensors(self) -> tuple[int, ...]:
-        """Trust all joint sensors again, as the user wants; return the joints that were in doubt.
+        """Take the joint sensors as they are, as the user wants; return the joints concerned.
 
-        The readings of the doubtful time then count as well.
+        Sensors in doubt are trusted again, and the readings of the doubtful time count as well.
+        Sensors without readings count as removed until they report again.
         """
-        return self.joint_check.confirm()
+        return (*self.joint_check.confirm(), *self.joint_stream.do_without_missing())
 
     def restore(self, muscles: Iterable[int]) -> None:
         """Use isolated muscles (indices) again; muscles that are not isolated are ignored.
@@ -464,7 +465,7 @@ class Estimator:
 
     def _note(
         self,
-        evidence: Evidence,
+        evidence: Evidence | ConditionKind,
         muscles: Iterable[int] | None = None,
         found: LengthOffsets | None = None,
     ) -> None:
@@ -553,9 +554,8 @@ class Estimator:
             self._note(Evidence.MOVED, [finding.muscle])
             self.health.reset()  # evidence from before the repair is no longer valid
             return False
-        evidence = EVIDENCE_OF.get(finding.kind)
-        if evidence is not None and finding.muscle not in self.body.isolated:
-            self._note(evidence, [finding.muscle] if finding.is_of_one_length else None)
+        if finding.kind.revokes is not None and finding.muscle not in self.body.isolated:
+            self._note(finding.kind, [finding.muscle] if finding.is_of_one_length else None)
         is_latched = before is None and self.suspects.finding is not None
         if is_latched:
             self._follows_network = False

@@ -98,9 +98,9 @@ def _unknown_offsets(core: Estimator) -> Iterator[Condition]:
         steps = ()
     elif finding is not None and finding.kind.steps == REPAIR:
         steps = ()  # the lengths are calibrated after the repair
-    for evidence, muscles in core.trust.doubts.items():
+    for reason, muscles in core.trust.doubts.items():
         names = [core.robot.muscles[muscle] for muscle in muscles]
-        detail = f'{", ".join(names)}: {evidence.value}'
+        detail = f'{", ".join(names)}: {reason}'
         if calibration is not None:
             detail = f'{detail}; calibrating: {calibration.progress}'
         yield kind.LENGTH_OFFSETS_UNKNOWN.condition(detail, names, steps=steps)

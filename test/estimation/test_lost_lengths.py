@@ -325,6 +325,20 @@ def test_a_joint_sensor_that_is_unplugged_is_named_until_it_is_plugged_in_again(
     assert conditions_of_joints(moved) == {}
 
 
+def test_a_joint_sensor_that_was_removed_is_not_expected_until_it_reports_again(moved):
+    elbow = moved.robot.joints[1]
+    moved.joint_off = np.array([0.0, np.nan])
+    moved.go(5.0)
+    assert moved.core.confirm_joint_sensors() == (1,)
+    moved.go(5.0)
+    assert conditions_of_joints(moved) == {}
+    moved.joint_off[:] = 0.0
+    moved.go(1.0)
+    moved.joint_off = np.array([0.0, np.nan])
+    moved.go(5.0)
+    assert conditions_of_joints(moved) == {'joint_readings_missing': (elbow,)}
+
+
 def test_all_joints_are_named_if_their_driver_ends(moved):
     moved.go(5.0, sensors=False)
     assert conditions_of_joints(moved) == {'joint_readings_missing': moved.robot.joints}
