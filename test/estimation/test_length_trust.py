@@ -48,7 +48,7 @@ def test_only_a_calibration_or_joint_sensors_end_a_revocation(events):
     for evidence, muscles in events:
         concerns = muscles is None or 2 in muscles
         trust.take(evidence, muscles)
-        is_calibration = TRANSITIONS[evidence].after is Trust.UNKNOWN
+        is_calibration = evidence in CALIBRATIONS
         revoked &= not (concerns and (is_calibration or evidence is Evidence.AGREES))
         if revoked:
             assert trust.offsets.trust[2] == Trust.REVOKED

@@ -162,6 +162,19 @@ def test_a_driver_that_returns_with_another_order_or_sign_is_named(robot, mae, i
     assert Step.CORRECT_WIRING in arm.core.remedy
 
 
+def test_a_wrong_sign_after_a_restart_is_named_even_if_the_length_was_near_zero(robot, calibrated):
+    arm = MovingArm(robot, calibrated)
+    arm.go(10.0, sensors=False)
+    muscle = 1
+    while not 0.004 < abs(arm.core.sample.length_read[muscle]) < 0.009:
+        arm.go(DT, sensors=False)
+    arm.time += 0.4  # the driver restarts
+    arm.sign[muscle] = -1.0
+    arm.go(4.0, sensors=False)
+    assert arm.kind is ConditionKind.MUSCLES_EXCHANGED, arm.core.cause
+    assert f'the length of {robot.muscles[muscle]} has the wrong sign' in arm.core.cause
+
+
 def test_a_jump_of_two_lengths_that_no_exchange_explains_is_one_of_lost_offsets(robot, calibrated):
     arm = MovingArm(robot, calibrated)
     arm.go(10.0, sensors=False)

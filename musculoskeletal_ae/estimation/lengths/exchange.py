@@ -12,6 +12,9 @@ putting the columns back makes their lengths continue those before the silence.
 Anomaly score. If muscles are exchanged, putting the two columns back restores the usual A in all
 recent messages (`signals/wiring.py`). A network that has learned the arm is exact enough for this.
 With any other network, the length calibration judges the order, because the arm moves meanwhile.
+Shortly after a silence, wrong signs are judged in this way as well: a length near 0 changes by
+little when its sign is reversed. Without a silence, no driver has restarted, and a length offset
+that has been lost could look like a wrong sign.
 """
 
 import math
@@ -117,7 +120,9 @@ class ExchangeCheck:
             return finding
         if not observation.lengths_known:
             return finding
-        judgement, reason = self._judge_silence(), 'the lengths then continue those before a pause'
+        judgement, reason = None, 'the lengths then continue those before a pause'
+        if self._may_have_restarted:
+            judgement = self._judge_silence()
         is_explained = judgement is not None and judgement.is_faulty
         if not is_explained and finding.kind in EXPLAINED:
             judgement, reason = self._judge(observation), 'the lengths then fit the arm again'
@@ -127,13 +132,18 @@ class ExchangeCheck:
         first, *others = judgement.faulty
         return Finding(first, ConditionKind.MUSCLES_EXCHANGED, text, tuple(others))
 
+    @property
+    def _may_have_restarted(self) -> bool:
+        """Whether a silence has ended recently, in which the driver may have restarted."""
+        if self._silence is None or self._newest is None:
+            return False
+        return self._newest[0] - self._silence[0] <= RESTARTED
+
     def _judge_silence(self) -> Judgement | None:
-        """Return which wiring makes lengths continue over a recent silence; None without one."""
-        if self._silence is None or self._newest is None or self._mae is None:
+        """Return which wiring makes lengths continue over the last silence; None if unknown."""
+        if self._silence is None or self._mae is None:
             return None
-        resumed_at, before, after = self._silence
-        if self._newest[0] - resumed_at > RESTARTED:
-            return None
+        _, before, after = self._silence
         used = ~np.isin(np.arange(self._robot.muscle_count), self._mae.isolated)
         straight = Wiring.straight(self._robot.muscle_count)
 
@@ -156,11 +166,7 @@ class ExchangeCheck:
         return Judgement(best, tuple(wiring for _, wiring in explaining), (), least)
 
     def _judge(self, observation: Observation) -> Judgement | None:
-        """Return which exchange restores the usual A; None if that cannot be judged.
-
-        Wrong signs are not considered, because in few postures a lost length offset of one muscle
-        can look like one.
-        """
+        """Return which wiring restores the usual A; None if that cannot be judged."""
         mae, sample = self._mae, observation.sample
         if mae is None or mae.anomaly is None or not mae.anomaly.calibrated:
             return None
@@ -194,7 +200,8 @@ class ExchangeCheck:
 
         # An exchange makes both lengths jump, if they differ by enough.
         columns = sample.jumped or np.flatnonzero(used).tolist()
-        others = [(other, cost(other)) for other in single_faults(straight, columns, signs=False)]
+        faults = single_faults(straight, columns, signs=self._may_have_restarted)
+        others = [(other, cost(other)) for other in faults]
         return decide(straight, float(np.median(present[is_anomalous])), others, BETTER)
 
 

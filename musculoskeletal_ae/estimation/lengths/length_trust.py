@@ -103,9 +103,8 @@ class LengthTrust:
             muscles: Indices of the muscles that it concerns; None for all muscles.
             found: Offsets and standard deviations that replace the present ones; None to keep them.
         """
-        is_finding = isinstance(evidence, ConditionKind)
-        transition = REVOCATION if is_finding else TRANSITIONS[evidence]
         previous = self.offsets
+        transition = REVOCATION if isinstance(evidence, ConditionKind) else TRANSITIONS[evidence]
         candidates = range(len(self.evidence)) if muscles is None else muscles
         concerned = [m for m in candidates if previous.trust[m] in transition.before]
         for muscle in concerned:
