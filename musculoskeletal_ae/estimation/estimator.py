@@ -163,12 +163,12 @@ class Estimator:
         finding = self.suspects.finding
         if finding is None or self.suspects.verification is not None:
             return ()
-        muscle, check = finding.muscle, self._repair_check
-        is_moved = self.trust.evidence[muscle] is Evidence.MOVED
+        muscles, check = finding.muscles, self._repair_check
+        is_moved = any(self.trust.evidence[muscle] is Evidence.MOVED for muscle in muscles)
         is_repaired = finding.kind is ConditionKind.SLACK_TENDON or is_moved
         if finding.kind.steps != REPAIR or not is_repaired or check is None:
             return finding.kind.steps
-        is_wrong = check.is_taut_with_wrong_length(muscle)
+        is_wrong = any(map(check.is_taut_with_wrong_length, muscles))
         return (Step.CALIBRATE_LENGTHS,) if is_wrong else finding.kind.steps
 
     @property
@@ -455,7 +455,7 @@ class Estimator:
             pull = sample.bone_tension * self.body.used
             contact = self.contact.step(estimate.state.theta, pull, sent_apart)
             if self.suspects.finding is None:
-                self.mounting.step(estimate.state.theta, pull, contact.torque)
+                self.mounting.step(estimate.state.theta, pull, contact.torque, dt)
         self.output = Output(
             sample, estimate.state, estimate.covariance, estimate.anomaly, detected, contact
         )
@@ -500,9 +500,9 @@ class Estimator:
             self._handle(finding_of(jumped), now)
 
     def _check_suspect(self, isolating: Iterable[int]) -> None:
-        """Check that the suspect may be used again, unless it is among the muscles `isolating`.
+        """Check that the suspects may be used again, unless they are among the muscles `isolating`.
 
-        If its length has jumped since the finding, its length offset is then confirmed.
+        If the length of one has jumped since the finding, its length offset is then confirmed.
 
         Raises:
             MusculoskeletalError: If the suspect may not be used yet.
@@ -510,9 +510,10 @@ class Estimator:
         suspected = self.suspects.finding
         if suspected is None or suspected.kind.steps != REPAIR or suspected.muscle in isolating:
             return
-        if problem := self._repair_problem(suspected.muscle):
-            raise MusculoskeletalError(f'{problem}; then call estimator/reset again')
-        self._confirm([suspected.muscle])
+        used = [muscle for muscle in suspected.muscles if muscle not in isolating]
+        if problems := list(filter(None, map(self._repair_problem, used))):
+            raise MusculoskeletalError(f'{"; ".join(problems)}; then call estimator/reset again')
+        self._confirm(used)
 
     def _confirm(self, muscles: Iterable[int]) -> None:
         """Confirm the offsets of repaired muscles, if their lengths have changed in the repair."""
