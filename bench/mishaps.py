@@ -57,6 +57,7 @@ from bench.lab import SAMPLE_TIME, Lab
 from bench.learned_arm import initial
 from bench.mishap_kinds import MISHAPS, NAMES, SELF, SOFTWARE, Case, Mishap
 from bench.statements import Statement, statements, troubles
+from musculoskeletal_ae.control.holding import AWAY
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
@@ -104,7 +105,13 @@ explores again without any condition, or when the patience of the operator ends.
 
 - **true**: cases with a true statement within {goal} s of the first effect, of those that need a
   statement. A case needs none if the mishap is harmless, or had no effect within {longest} s.
-- **after**: median time from the first effect to the first true statement.
+- **after**: median time from the first effect to the first true statement. Most mishaps have an
+  effect at once. Wrong readings have one from {angle} rad, {length} mm or {tension} N on. A joint
+  sensor that drifts and a tendon that creeps have one from {sigmas} times the individual's own
+  model error (root mean square) on, if that is more. A module has one when its tension has differed
+  from the demanded one by {tension} N for {demanded} s; on healthy arms, 99 % of such differences
+  end earlier. A turned base has one when the arm rests further from the posture that it holds than
+  `holding` permits ({away} rad), by more than {sigmas} times its model error.
 - **false**: different false statements, over all cases. Statements about other muscles and joints
   are false, too.
 - **well**: cases in which the advice alone brought the arm back: it explores without any condition,
@@ -326,7 +333,7 @@ class Course:
         finding = lab.estimator.suspects.finding
         lab.estimator.reset()
         if finding is not None:
-            lab.validator.declare_repaired([finding.muscle], lab.now)
+            lab.validator.declare_repaired(finding.muscles, lab.now)
         lab.publish()
 
     def _mend_named(self, by: list[Statement]) -> str:
@@ -480,8 +487,7 @@ def run_seed(
     mishap_kinds.OTHER_NETWORK[:] = [other_network(robot, first, reality, folder)]
     begun = time.process_time()
     lab = learned_lab(robot, first, seed, reality, LEARNING)
-    watch = Course(lab, NAMES[to_do[0]])
-    before = watch.mean_error(AFTER)
+    before = lab.measure_model_errors(AFTER)
     took = time.process_time() - begun
     is_calibrated = lab.estimator.health.residual.is_calibrated
     print(
@@ -672,6 +678,12 @@ def page(of: Sequence[dict[str, Any]], realities: Sequence[str]) -> str:
         goal=f'{GOAL:g}',
         longest=f'{LONGEST_WAIT:g}',
         after=f'{AFTER:g}',
+        angle=f'{mishap_kinds.SHOWN_ANGLE:g}',
+        length=f'{1e3 * mishap_kinds.SHOWN_LENGTH:g}',
+        tension=f'{mishap_kinds.SHOWN_TENSION:g}',
+        demanded=f'{mishap_kinds.DEMANDED_FOR:g}',
+        sigmas=f'{mishap_kinds.SIGMAS:g}',
+        away=f'{AWAY:g}',
         ratio=f'{WELL:g}',
         more=f'{WELL_RAD:g}',
     )

@@ -240,9 +240,9 @@ class ConditionKind(Enum):
         'slack_tendon',
         'estimator',
         'error',
-        'a muscle has no tension although its command demands some: its tendon has ruptured or is '
-        'slack, or its winch is jammed',
-        'a muscle has no tension',
+        'a muscle shows no tension although its command demands some: its tendon has ruptured or '
+        'is slack, its winch is jammed, or its sensor reads too little',
+        'a muscle shows no tension',
         REPAIR,
         reaction=Reaction.ISOLATE,
     )

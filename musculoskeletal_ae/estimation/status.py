@@ -64,7 +64,7 @@ def _finding(core: Estimator) -> Iterator[Condition]:
     finding = core.suspects.finding
     if finding is None:
         return
-    names = [core.robot.muscles[muscle] for muscle in (finding.muscle, *finding.others)]
+    names = [core.robot.muscles[muscle] for muscle in finding.muscles]
     detail = f'{", ".join(names)}: {finding.evidence}'
     if core.suspects.verification is not None:
         detail += f' (it is being verified, which ends by itself within {LONGEST:g} s)'

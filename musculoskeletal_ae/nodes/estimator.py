@@ -185,7 +185,7 @@ class Estimator(Shell):
         finding = self.core.suspects.finding
         self.core.reset()
         if finding is not None:
-            self.candidates.validator.declare_repaired([finding.muscle], time.monotonic())
+            self.candidates.validator.declare_repaired(finding.muscles, time.monotonic())
         self._publish_offsets()
         self.published_anomaly = False
         self.candidates.on_anomaly(False)
