@@ -775,7 +775,11 @@ def mounted(least: float, most: float) -> Callable[[Lab, Rng], Case]:
             lab.arm.faults.mount = np.eye(3)
 
         lab.before_step.append(turn)
-        return Case(f'{math.degrees(angle):.0f}°', mend, is_visible=_is_away)
+        is_turned = _since(start + took)
+        return Case(
+            f'{math.degrees(angle):.0f}°', mend,
+            is_visible=lambda lab: is_turned(lab) and _is_away(lab),
+        )  # fmt: skip
 
     return begin
 

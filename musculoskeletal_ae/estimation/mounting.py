@@ -53,7 +53,7 @@ SPACING = 0.5
 AT_STOP = 0.12
 MEMORY = 100  # largest number of the newest postures by which the direction is judged
 ENOUGH = 30  # smallest number of postures by which the direction is judged
-CERTAIN = 25.0  # report another direction of gravity from this evidence on
+CERTAIN = 50.0  # report another direction of gravity from this evidence on
 #: end the report, and discard earlier postures, when the newest ENOUGH postures show the direction
 #: of `robot.urdf` with this evidence
 CLEARED = 8.0
