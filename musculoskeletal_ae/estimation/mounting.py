@@ -53,8 +53,8 @@ SPACING = 0.5
 AT_STOP = 0.12
 MEMORY = 100  # largest number of the newest postures by which the direction is judged
 ENOUGH = 30  # smallest number of postures by which the direction is judged
-#: Report another direction of gravity from this evidence on. In 150 s of exploration of learned arms,
-#: it was at most 33 on healthy ones (foreign, individuals 0 and 1) and reached 74 and 86 within 70 s
+#: Report another direction of gravity from this evidence on. On learned arms that explored
+#: (foreign, individuals 0 and 1), it was at most 33 in 150 s. It reached 78 and 86 in the 70 s
 #: after the base had been turned by 176°.
 CERTAIN = 60.0
 #: end the report, and discard earlier postures, when the newest ENOUGH postures show the direction
