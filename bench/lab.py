@@ -181,9 +181,6 @@ class Lab:
         now: The steady clock [s].
         clock_shift: The ROS clock minus the steady clock [s].
         before_step: Functions of this object that are called before each step.
-        theta_error: Error of the healthy arm's estimate, root mean square [rad], (D,); 0 until
-            `measure_model_errors`.
-        length_error: The same of the lengths that the network computes [m], (M,).
     """
 
     def __init__(self, arm: Arm, initial: Mae, seed: int, load: float = 0.0) -> None:
@@ -191,8 +188,6 @@ class Lab:
         self.arm, self.now, self.clock_shift = arm, 0.0, 0.0
         self.wire = Wire()
         self.before_step: list[Callable[[Lab], object]] = []
-        self.theta_error: Array = np.zeros(arm.robot.joint_count)
-        self.length_error: Array = np.zeros(arm.robot.muscle_count)
         self.driver, self._estimating, self.controlling, self._learning = (
             Process(load, [seed, n]) for n in range(4)
         )
@@ -223,25 +218,6 @@ class Lab:
         """Let a time pass [s]."""
         for _ in range(round(seconds / SAMPLE_TIME)):
             self.step()
-
-    def measure_model_errors(self, seconds: float) -> float:
-        """Let a time pass [s], and measure the errors of the network on the healthy arm.
-
-        Returns:
-            The mean distance of the estimate from the true posture [rad].
-        """
-        theta, length = list[Array](), list[Array]()
-        for _ in range(round(seconds / SAMPLE_TIME)):
-            self.step()
-            output, mae = self.estimator.output, self.estimator.mae
-            if output is None or mae is None:
-                continue
-            theta.append(output.state.theta - self.arm.theta)
-            computed = mae.lengths(self.arm.theta, output.sample.bone_tension)
-            length.append(output.sample.length - computed)
-        self.theta_error = np.sqrt(np.square(theta).mean(axis=0))
-        self.length_error = np.sqrt(np.square(length).mean(axis=0))
-        return float(np.linalg.norm(theta, axis=1).mean())
 
     def step(self) -> None:
         """Simulate the arm, the driver and the nodes for one sample period."""

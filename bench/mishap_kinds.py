@@ -21,7 +21,6 @@ import pinocchio as pin
 from bench.lab import CONTROLLER, ESTIMATOR, LEARNER, CommandFault, Lab, Packet, ReadingFault
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.control.holding import AWAY
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.remedy import Step
 
@@ -75,13 +74,6 @@ SOFTWARE = frozenset({
 SHOWN_ANGLE = 0.1  # a wrong joint angle can be seen from this error on [rad]
 SHOWN_LENGTH = 0.02  # a wrong length can be seen from this error on [m]
 SHOWN_TENSION = 20.0  # a wrong tension can be seen from this error on [N]
-#: A tension that differs by this error from the demanded one can be seen after this time [s]. On
-#: healthy arms that explored for 40 s, 99 % of such differences lasted for at most 0.7 s (kin,
-#: individual 0), 2.3 s and 1.3 s (foreign, individuals 0 and 1).
-DEMANDED_FOR = 2.3
-#: an error that grows slowly can be seen once it exceeds the model error of the healthy arm, root
-#: mean square, by this factor
-SIGMAS = 3.0
 
 
 def _at_once(_: Lab) -> bool:
@@ -200,19 +192,16 @@ def _loaded(lab: Lab, rng: Rng) -> int:
 
 
 def _is_demanded(muscle: int) -> Callable[[Lab], bool]:
-    """Return whether the module has lastingly been pulling with another tension than demanded."""
-    since = [math.inf]
+    """Return whether the module should now pull with another tension than it does."""
 
     def shown(lab: Lab) -> bool:
         sample, command = lab.controller.sample, lab.controller.limiter.command
         if sample is None or command is None:
             return False
         demand = lab.arm.robot.actuation.demanded(sample.length, command.value)
-        if demand is None or abs(demand[muscle] - lab.arm.tension[muscle]) <= SHOWN_TENSION:
-            since[0] = math.inf
-            return False
-        since[0] = min(since[0], lab.now)
-        return lab.now - since[0] > DEMANDED_FOR
+        return demand is not None and bool(
+            abs(demand[muscle] - lab.arm.tension[muscle]) > SHOWN_TENSION
+        )
 
     return shown
 
@@ -243,7 +232,7 @@ def _slackening(largest: float, speed: float) -> Callable[[Lab, Rng], Case]:
     """Return a mishap by which a tendon becomes longer, up to `largest` [m], by `speed` [m/s]."""
 
     def begin(lab: Lab, rng: Rng) -> Case:
-        muscle, name = _any(rng, lab.arm.robot.muscles)
+        _, name = _any(rng, lab.arm.robot.muscles)
         start, fast = lab.now, speed * rng.uniform(0.5, 1.5)
         size = largest * rng.uniform(0.7, 1.3)
         excess = [0.0]
@@ -262,9 +251,7 @@ def _slackening(largest: float, speed: float) -> Callable[[Lab, Rng], Case]:
         lab.before_step.append(creep)
         return Case(
             f'{name}, {1e3 * size:.0f} mm at {1e3 * fast:.1f} mm/s', mend, (name,),
-            is_visible=lambda lab: excess[0] > max(
-                min(SHOWN_LENGTH, 0.5 * size), SIGMAS * lab.length_error[muscle]
-            ),
+            is_visible=lambda _: excess[0] > min(SHOWN_LENGTH, 0.5 * size),
             settled_by=(Step.CALIBRATE_LENGTHS,),
         )  # fmt: skip
 
@@ -507,7 +494,7 @@ def joint_drifts(lab: Lab, rng: Rng) -> Case:
     lab.wire.reading_faults.append(on_theta(drift))
     return Case(
         f'{name}, {rate:.3f} rad/s', _clear, (name,),
-        is_visible=lambda lab: abs(error[0]) > max(SHOWN_ANGLE, SIGMAS * lab.theta_error[j]),
+        is_visible=lambda _: abs(error[0]) > SHOWN_ANGLE,
     )  # fmt: skip
 
 
@@ -775,21 +762,9 @@ def mounted(least: float, most: float) -> Callable[[Lab, Rng], Case]:
             lab.arm.faults.mount = np.eye(3)
 
         lab.before_step.append(turn)
-        is_turned = _since(start + took)
-        return Case(
-            f'{math.degrees(angle):.0f}°', mend,
-            is_visible=lambda lab: is_turned(lab) and _is_away(lab),
-        )  # fmt: skip
+        return Case(f'{math.degrees(angle):.0f}°', mend, is_visible=_since(start + took))
 
     return begin
-
-
-def _is_away(lab: Lab) -> bool:
-    """Return whether a joint surely rests further from its target than "holding" permits."""
-    target = lab.controller.target_state.theta
-    if target is None or lab.controller.holding.distance is None:
-        return False
-    return bool((np.abs(lab.arm.theta - target) > AWAY + SIGMAS * lab.theta_error).any())
 
 
 def _target_is_missed(lab: Lab) -> bool:
