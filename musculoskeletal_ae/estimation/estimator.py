@@ -400,7 +400,7 @@ class Estimator:
             sent_apart = max(sample.sent_at - before.sent_at, 0.0)
         self.joint_stream.pass_time(min(elapsed, LONGEST_STEP))
         temperature = np.where(self.body.used, sample.temperature, np.nan)
-        self.heat.step(sample.model_tension, temperature, elapsed)
+        self.heat.step(sample.motor_tension, temperature, elapsed)
         if self.mae is None:
             return None
         self.stepped_at = now
@@ -568,8 +568,9 @@ class Estimator:
         assert mae is not None
         muscle, command = verification.muscle, self._commands.length(now)
         pull = np.clip(sample.bone_tension, 0.0, self.robot.tension.limit)
+        tension = self.robot.tension_source.known(sample.motor_tension)
         verdict = verification.step(
-            tension=float(sample.motor_tension[muscle]),
+            tension=float(tension[muscle]),
             length=float(sample.length[muscle]),
             command=None if command is None else float(command[muscle]),
             likely=float(mae.lengths(estimate.state.theta, pull)[muscle]),

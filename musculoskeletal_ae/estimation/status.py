@@ -181,7 +181,7 @@ def _residuals(core: Estimator) -> dict[str, str]:
         'suspect muscle': core.robot.muscles[suspect],
     }
     if residual.is_calibrated:
-        limit = residual.limit(output.state.theta, output.sample.model_tension)
+        limit = residual.limit(output.state.theta, output.sample.motor_tension)
         values[f'{residual.symbol} limit'] = f'{limit:.3g}'
     return values
 

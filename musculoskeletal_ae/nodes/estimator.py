@@ -272,7 +272,7 @@ class Estimator(Shell):
     def _publish_mirror(self, sample: MuscleSample, stamp: Any) -> None:
         assert self.mirror is not None
         message = joint_message(self.robot.muscles, sample.length, stamp)
-        message.effort = sample.motor_tension.tolist()
+        message.effort = self.robot.tension_source.known(sample.motor_tension).tolist()
         self.mirror.publish(message)
 
     def _publish_anomaly(self) -> None:

@@ -118,7 +118,7 @@ class ResidualDistance(Detector):
         The result is None if there is nothing to report.
         """
         sample, error = observation.sample, observation.estimate.residual
-        tension, muscle_count = sample.model_tension, len(sample.motor_tension)
+        tension, muscle_count = sample.motor_tension, len(sample.motor_tension)
         distance, share = math.nan, error
         if self._statistics is not None:
             centred = error - self._statistics.mean
@@ -203,7 +203,7 @@ class ResidualDistance(Detector):
         limit, where = self.threshold, ''
         value = self.statistic(observation, distance)
         if value > limit and not has_slack:
-            theta, tension = observation.estimate.state.theta, observation.sample.model_tension
+            theta, tension = observation.estimate.state.theta, observation.sample.motor_tension
             wider = self.limit(theta, tension)
             if wider > limit:
                 limit = wider
