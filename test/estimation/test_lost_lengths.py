@@ -183,6 +183,19 @@ def test_a_jump_of_two_lengths_that_no_exchange_explains_is_one_of_lost_offsets(
     assert arm.kind is ConditionKind.LENGTHS_JUMPED
 
 
+def test_lengths_that_a_restarted_driver_counts_from_zero_have_lost_their_offsets(
+    robot, calibrated
+):
+    arm = MovingArm(robot, calibrated)
+    arm.posture = robot.lower + 0.3 * (robot.upper - robot.lower)
+    arm.go(10.0, sensors=False)
+    arm.time += 1.0  # the driver restarts
+    arm.off = arm.off - arm.core.sample.length_read
+    arm.go(4.0, sensors=False)
+    assert arm.kind is ConditionKind.LENGTHS_JUMPED, arm.core.cause
+    assert arm.offsets.revoked
+
+
 def test_a_jump_without_a_network_is_not_forgotten(robot, mae):
     arm = MovingArm(robot, mae)
     arm.core = Estimator(robot)
