@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check a recording: contents, completeness and fit to a robot (`replay --check`)."""
 
+from __future__ import annotations
+
 from array import array
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,7 +15,9 @@ import numpy as np
 
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.storage import LONGEST_PAUSE
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
+from musculoskeletal_ae.bags.timed_messages import find_pauses
 from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError, printable
 from musculoskeletal_ae.learning.calibration import Reservoir
@@ -59,8 +63,15 @@ def check_bag(path: Path, robot: str | None = None, namespace: str | None = None
         with ProgressBar(f'reading {path}') as bar:
             bar.announce()
             bag = Bag.open(path)
-            check.faults += [f'unfinished: {reason}; {_RECOVER}' for reason in bag.unfinished]
-            check.lines += _contents(bag, bar.add)
+            recover = f'; {_RECOVER}' if bag.message_count else ''
+            check.faults += [f'unfinished: {reason}{recover}' for reason in bag.unfinished]
+            times = _read_times(bag, bar.add)
+        check.lines += _contents(bag, times)
+        check.faults += [
+            f'{pause.text(bag.start)}: the recorder was paused, or its clock was set; '
+            '`replay --skip-pauses` does not wait there'
+            for pause in find_pauses(times.values())
+        ]
         interface_topics(bag, namespace, motor_topics(robot) if robot else NO_MOTORS)
     except MusculoskeletalError as error:
         check.faults.append(str(error))
@@ -133,13 +144,18 @@ def recorded_wiring(pairs: Pairs, robot: Robot) -> Wiring:
     return judge(robot.muscle_lengths, theta, pairs.length, pairs.tension, used=used).wiring
 
 
-def _contents(bag: Bag, progress: Callable[[float], None]) -> list[str]:
+def _read_times(bag: Bag, progress: Callable[[float], None]) -> dict[str, array[int]]:
+    """Return the log times [ns] of each topic, after decoding all messages that can be used."""
     times = {name: array('q') for name in bag.topics}
     for message in bag.messages():
         times[message.topic].append(message.log_time)
         if not bag.topics[message.topic].problem:
             bag.decode(message)
         progress(1.0 / bag.message_count)
+    return times
+
+
+def _contents(bag: Bag, times: dict[str, array[int]]) -> list[str]:
     begin = datetime.fromtimestamp(bag.start / 1e9, timezone.utc)
     length = f'{(bag.end - bag.start) / 1e9:.3f} s from {begin:%Y-%m-%d %H:%M:%S} UTC'
     has_checksums = all(file.has_checksums for file in bag.files)
@@ -151,7 +167,8 @@ def _contents(bag: Bag, progress: Callable[[float], None]) -> list[str]:
     ]
     for name, topic in sorted(bag.topics.items()):
         gaps = np.diff(times[name]) / 1e9
-        rate = f'{1 / gaps.mean():.2f}' if gaps.any() else ''
+        usual = gaps[gaps <= LONGEST_PAUSE / 1e9]  # a pause says nothing about the rate
+        rate = f'{1 / usual.mean():.2f}' if usual.any() else ''
         line = f'{name:<44} {len(times[name]):>9} {rate:>9} {gaps.max(initial=0.0):8.3f}'
         ignored = f'; ignored: {topic.problem}' if topic.problem else ''
         lines.append(f'{line}  {topic.type}{ignored}')
@@ -179,9 +196,13 @@ def _fit(bag: Bag, name: str, namespace: str | None) -> _Fit:
     left_out += [
         f'{n} messages were used only in part: {why}' for why, n in streams.ignored.items()
     ]
+    joint_text = streams.judged_joints.advice
+    joint_faults = [joint_text] if streams.judged_joints.is_fault else []
+    if streams.judged_joints.text and not joint_faults:
+        left_out.append(joint_text)
     if not len(streams.muscles.time) and not len(streams.joints.time):
         problem = f'the bag has neither joint_states nor muscle_states that fit {name}'
-        return _Fit([problem], left_out)
+        return _Fit([problem, *joint_faults], left_out)
     pairs = streams.pairs()
     wiring = recorded_wiring(pairs, robot)
     if wiring.faulty:
@@ -189,4 +210,5 @@ def _fit(bag: Bag, name: str, namespace: str | None) -> _Fit:
         faults = [f'muscles are not {what} of {name}: {wiring.text(robot.muscles)}']
     else:
         faults = wrong_joint_sensors(robot, pairs)
+    faults = joint_faults + faults
     return _Fit(faults, left_out, '' if faults else motion_text(robot, pairs))

@@ -28,6 +28,7 @@ from musculoskeletal_ae.message_reading import (
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
+from musculoskeletal_ae.signals.joint_series import JointSeries, judge_series
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream
 from musculoskeletal_ae.signals.pairing import Pairing
@@ -58,7 +59,7 @@ class Pairs(NamedTuple):
 class Streams(NamedTuple):
     """Sensor data and commands of one arm; missing topics are empty series."""
 
-    joints: Series  # θ [rad], (N, D); NaN for joints without a sensor
+    joints: Series  # usable θ [rad], (N, D); NaN where a joint has no usable reading
     muscles: Series  # length [m], tension [N], temperature [°C], (N, 3, M)
     length_commands: Series  # l_target [m], (N, M)
     tension_commands: Series  # T_target [N], (N, M)
@@ -66,6 +67,7 @@ class Streams(NamedTuple):
     rejected: Counter[str]  # rejected messages by topic and reason
     ignored: Counter[str]  # unused parts of messages by topic and part
     notes: tuple[str, ...]  # further remarks for the user
+    judged_joints: JointSeries  # which readings of all messages of joint_states are usable
 
     def pairs(self) -> Pairs:
         """Pair each muscle message with the joint angles at the same time.
@@ -197,6 +199,8 @@ def read_streams(
     `muscle_length_zeros`. If the first offsets on this topic are known, they also correct earlier
     lengths. Muscle states that were received while offsets were unknown are rejected.
 
+    False readings of joint sensors are left out (`signals/joint_series.py`).
+
     An isolated muscle may have any readings. Lengths and tensions of an isolated muscle that are
     not finite or exceed the legal range become 0, and such temperatures become NaN.
 
@@ -237,8 +241,11 @@ def read_streams(
         reason = f'{labels["muscle_states"]}: length offsets unknown'
         reception.rejected[reason] += int((~is_known).sum())
         states = Series(states.time[is_known], states.values[is_known])
+    judged = judge_series(robot, joints.time, joints.values)
+    is_usable = np.isfinite(judged.theta).any(axis=1)
+    joints = Series(joints.time[is_usable], judged.theta[is_usable])
     series = joints, states, lengths, tensions, isolated
-    return Streams(*series, reception.rejected, reception.ignored, notes)
+    return Streams(*series, reception.rejected, reception.ignored, notes, judged)
 
 
 def _labels(recorded: Mapping[str, str]) -> dict[str, str]:

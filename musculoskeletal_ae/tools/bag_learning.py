@@ -275,6 +275,8 @@ def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
         print(f'warning: {path}: {count} messages were rejected: {reason}', file=sys.stderr)
     for note in streams.notes:
         print(f'warning: {path}: {note}', file=sys.stderr)
+    if streams.judged_joints.text:
+        print(f'warning: {path}: {streams.judged_joints.advice}', file=sys.stderr)
     for part, count in streams.ignored.items():
         print(f'warning: {path}: {count} messages were used only in part: {part}', file=sys.stderr)
     pairs = streams.pairs()

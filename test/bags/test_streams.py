@@ -251,3 +251,41 @@ def test_a_recorder_that_wrote_in_bunches_costs_no_pairs(robot, tmp_path, period
     pairs = result.pairs()
     assert len(pairs.time) >= len(regular.time) - 1
     assert_allclose(np.diff(pairs.time), 0.01, atol=1e-6)
+
+
+def with_false_angles(robot, kind):
+    """Return a recording of 10 s in which some joint angles are false."""
+    arm = Arm(robot, count=1000)
+    for n in range(1000):
+        zeros = joints(robot.joints, np.zeros(robot.joint_count))
+        if kind == 'second publisher':
+            arm.add('/joint_states', JOINTS, n * 0.01 + 0.006, zeros)
+    for n in (100, 500, 900) if kind == 'failed reads' else ():
+        failed = joints(robot.joints, np.full(robot.joint_count, -np.pi))
+        arm.add('/joint_states', JOINTS, n * 0.01 + 0.004, failed)
+    return arm
+
+
+@pytest.mark.parametrize(
+    ('kind', 'share', 'is_fault'),
+    [('second publisher', '50 %', True), ('failed reads', '0.299 %', False)],
+)
+def test_false_joint_angles_are_found_with_their_share_and_not_used(
+    kind, share, is_fault, robot, tmp_path
+):
+    arm = with_false_angles(robot, kind)
+    result = streams(arm, robot, tmp_path)
+    assert_array_equal(result.joints.values, arm.theta)
+    check = check_bag(tmp_path / 'bag', robot.description.directory.name)
+    found = [text for text in (check.faults if is_fault else check.lines) if share in text]
+    assert len(found) == 1 and 'stop a second program that publishes joint_states' in found[0]
+    assert bool(check.faults) == is_fault, check.faults
+
+
+@pytest.mark.parametrize('first', [0, samples.START - 3600 * 10**9])
+def test_a_forward_jump_of_the_log_times_is_a_fault(first, content, tmp_path):
+    early = [sample._replace(log_time=first) for sample in content[:5]]
+    samples.write_ours(tmp_path / 'bag', [*early, *content[5:]])
+    (fault,) = [text for text in check_bag(tmp_path / 'bag').faults if 'jump forward' in text]
+    assert ('57.0 years' if first == 0 else '60.0 min') in fault
+    assert '--skip-pauses' in fault
