@@ -32,6 +32,7 @@ from musculoskeletal_ae.signals.muscle_readings import muscle_reading
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.signals.wiring import Wiring, judge
 
+READINGS = 'joint_states', 'muscle_states'  # topics of sensors, which do not pause
 _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 
 
@@ -72,10 +73,11 @@ def check_bag(path: Path, robot: str | None = None, namespace: str | None = None
             '`replay --skip-pauses` does not wait there'
             for pause in find_pauses(times.values())
         ]
-        interface_topics(bag, namespace, motor_topics(robot) if robot else NO_MOTORS)
+        topics = interface_topics(bag, namespace, motor_topics(robot) if robot else NO_MOTORS)
     except MusculoskeletalError as error:
         check.faults.append(str(error))
         return check
+    check.faults += _silences(bag, topics, times)
     results = {
         name: _fit(bag, name, namespace) for name in ([robot] if robot else shipped_robots())
     }
@@ -153,6 +155,32 @@ def _read_times(bag: Bag, progress: Callable[[float], None]) -> dict[str, array[
             bag.decode(message)
         progress(1.0 / bag.message_count)
     return times
+
+
+def _silences(bag: Bag, topics: dict[str, str], times: dict[str, array[int]]) -> list[str]:
+    """Return a fault for each topic of readings that is silent while others are recorded.
+
+    A recorder may lose a topic in the middle of a recording. Times in which nothing was recorded
+    are not counted here.
+
+    Args:
+        bag: The recording.
+        topics: Recorded names of the topics, by name in the interface.
+        times: Log times [ns] of each topic, by recorded name.
+    """
+    paused = {pause.begin for pause in find_pauses(times.values())}
+    faults = []
+    for name in dict.fromkeys(topics[each] for each in READINGS if each in topics):
+        marks = np.unique([bag.start, *times[name], bag.end])
+        for begin, end in zip(marks[:-1].tolist(), marks[1:].tolist()):
+            if end - begin > LONGEST_PAUSE and begin not in paused:
+                since, until = ((mark - bag.start) / 1e9 for mark in (begin, end))
+                faults.append(
+                    f'no message of {name} was recorded from {since:.1f} s to {until:.1f} s after '
+                    'the start, while other topics went on: see whether its publisher had ended, '
+                    'and record again'
+                )
+    return faults
 
 
 def _contents(bag: Bag, times: dict[str, array[int]]) -> list[str]:

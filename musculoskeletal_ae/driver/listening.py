@@ -28,7 +28,7 @@ from musculoskeletal_ae.message_reading import (
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals import joint_sensors, wiring
-from musculoskeletal_ae.signals.joint_series import REMEDY, judge_series
+from musculoskeletal_ae.signals.joint_series import judge_series
 from musculoskeletal_ae.signals.limits import length_range
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Presence, Row, possible_readings
@@ -227,7 +227,7 @@ class Listening:
         time, theta = map(np.array, zip(*self._angles_read))
         judged = judge_series(self._robot, time, theta)
         if judged.is_fault:
-            verdict.failed('false joint angles', detail=judged.text, remedy=REMEDY)
+            verdict.failed('false joint angles', detail=judged.text, remedy=judged.remedy)
         elif judged.text:
             verdict.notes.append(judged.advice)
         # Row 0 stands for the time before the first message. Each angle holds until the next one.

@@ -13,6 +13,9 @@ and further than the step from it. Not only these readings are then left out, bu
 with the same value, so that none is left where the arm happens to be close to it. The remaining
 readings pass through a `JointStream`.
 
+Encoders count whole turns, or wrap around at 0 or π. Readings that are within the joint limits, and
+continuous, after whole turns have been subtracted are used in this form.
+
 If a sensor has impossible readings again and again even then, none of its readings during that time
 is usable, as on a running arm (`estimation/joint_check.py`).
 """
@@ -46,6 +49,9 @@ RETURNING, NOISY = 0.5, 0.1
 #: without a jump more often than this, its unit, sign or zero is wrong, and no single reading is to
 #: blame. `joint_sensors.py` judges these.
 WRONG_SCALE = 0.5
+#: Whole turns are subtracted from the readings of a joint if at least this share of those readings
+#: is then within the limits and continuous with the reading before
+CONTINUOUS = 0.95
 #: report a smaller share of messages with false readings as a remark instead of a fault
 TOLERATED = 0.01
 MOST_NAMED = 6  # largest number of kinds of false readings in a text
@@ -53,20 +59,26 @@ REMEDY = (
     'stop a second program that publishes joint_states, and let the driver leave out readings that '
     'failed'
 )
+TURN_REMEDY = (
+    'let the driver subtract the whole turns that the encoder counts, so that θ is within the '
+    'limits of robot.urdf'
+)
 
 
 class JointSeries(NamedTuple):
     """The usable readings of joint sensors in a series of N messages.
 
     Attributes:
-        theta: θ [rad], (N, D); NaN where a reading is unknown or not usable.
-        share: Share of the messages that have readings which are not usable.
+        theta: θ [rad], (N, D), without whole turns; NaN where a reading is unknown or not usable.
+        share: Share of the messages that have readings which are false.
         text: What these readings are, for users; '' if there are none.
+        remedy: What to do about them.
     """
 
     theta: Array
     share: float
     text: str
+    remedy: str
 
     @property
     def is_fault(self) -> bool:
@@ -76,7 +88,7 @@ class JointSeries(NamedTuple):
     @property
     def advice(self) -> str:
         """The text with the remedy."""
-        return f'joint_states: {self.text}; {REMEDY}'
+        return f'joint_states: {self.text}; {self.remedy}'
 
 
 def judge_series(robot: Robot, time: Array, theta: Array) -> JointSeries:
@@ -88,6 +100,7 @@ def judge_series(robot: Robot, time: Array, theta: Array) -> JointSeries:
         theta: Measured θ [rad], (N, D), with NaN for joints that a message does not name.
     """
     usable = theta.copy()
+    turned = _subtract_turns(robot, time, usable)
     found = _drop_constants(robot, time, usable)
     stream = JointStream(robot)
     impossible = defaultdict[tuple[int, JointReading], list[float]](list)  # readings [rad]
@@ -102,7 +115,7 @@ def judge_series(robot: Robot, time: Array, theta: Array) -> JointSeries:
         for j, series in stream.impossible(now).items():
             lasting[j, series.since] = series.until
     if _has_wrong_scale(robot, time, theta, is_outside):
-        return JointSeries(theta, 0.0, '')
+        return JointSeries(theta, 0.0, '', '')
     for (j, since), until in lasting.items():
         usable[(since <= time) & (time <= until), j] = np.nan
     for (j, kind), readings in impossible.items():
@@ -110,9 +123,55 @@ def judge_series(robot: Robot, time: Array, theta: Array) -> JointSeries:
             name, unit = robot.joints[j], robot.units[j].theta
             example = f'such as {readings[0]:.3g} {unit}'
             found.append((len(readings), f'{name}: {kind.value}, {example}'))
-    is_affected = (np.isfinite(theta) & np.isnan(usable)).any(axis=1)
-    share = float(is_affected.mean()) if len(is_affected) else 0.0
-    return JointSeries(usable, share, _text(share, len(theta), found) if found else '')
+    is_unused = (np.isfinite(theta) & np.isnan(usable)).any(axis=1)
+    is_turned = (np.abs(usable - theta) > np.pi).any(axis=1)
+    texts = [_text(is_unused, found, ', which are not used')] if found else []
+    texts += [_text(is_turned, turned, '')] if turned else []
+    remedies = [REMEDY] if found else []
+    remedies += [TURN_REMEDY] if turned else []
+    share = float((is_unused | is_turned).mean()) if len(theta) else 0.0
+    return JointSeries(usable, share, '; '.join(texts), '; '.join(remedies))
+
+
+def _subtract_turns(robot: Robot, time: Array, theta: Array) -> list[tuple[int, str]]:
+    """Subtract whole turns from readings of revolute joints that are then within the limits.
+
+    Readings in degrees may look like whole turns as well, but then most joints seem to be turned by
+    different numbers of turns.
+
+    Args:
+        robot: The robot.
+        time: Times of the messages [s], (N,).
+        theta: Measured θ [rad], (N, D), which is changed in place.
+
+    Returns:
+        The number of changed readings of each joint, with a text about it.
+    """
+    margin = LIMITS.joint_outside * (robot.upper - robot.lower)
+    middle = 0.5 * (robot.lower + robot.upper)
+    turns = np.round((theta - middle) / (2.0 * np.pi))
+    turns[:, np.asarray(robot.kinematics.slides)] = 0.0
+    is_turned = np.nan_to_num(turns) != 0.0
+    joints = np.flatnonzero(is_turned.any(axis=0)).tolist()
+    is_positive = not (theta[:, joints] < 0.0).any() and np.nanmax(theta, initial=0.0) < 2.0 * np.pi
+    if len(joints) > max(1.0, 0.5 * robot.joint_count) and not is_positive:
+        return []
+    found = []
+    for j in joints:
+        rows = np.flatnonzero(np.isfinite(theta[:, j]))
+        shifted = theta[rows, j] - 2.0 * np.pi * turns[rows, j]
+        is_inside = np.abs(shifted - middle[j]) <= middle[j] - robot.lower[j] + margin[j]
+        is_smooth = np.abs(np.diff(shifted, prepend=shifted[0])) <= np.concatenate(
+            [[np.inf], _largest_changes(time[rows])]
+        )
+        which = is_turned[rows, j]
+        if (is_inside & is_smooth)[which].mean() < CONTINUOUS:
+            continue
+        example = theta[rows[which][0], j]
+        theta[rows, j] = shifted
+        text = f'{robot.joints[j]} is whole turns off, such as {example:.3g} rad'
+        found.append((int(which.sum()), text))
+    return found
 
 
 def _drop_constants(robot: Robot, time: Array, theta: Array) -> list[tuple[int, str]]:
@@ -215,13 +274,19 @@ def _interrupting(which: Ints, readings: Array, largest: Array) -> list[int]:
     return np.flatnonzero(is_false).tolist()
 
 
-def _text(share: float, count: int, found: list[tuple[int, str]]) -> str:
-    """Return a text on false readings in a share of `count` messages."""
+def _text(is_affected: Bools, found: list[tuple[int, str]], consequence: str) -> str:
+    """Return a text on false readings.
+
+    Args:
+        is_affected: Which messages have them, (N,).
+        found: The number of readings of each kind, with a text about it.
+        consequence: What is done with the readings.
+    """
     named = [f'{number} × {text}' for number, text in sorted(found, reverse=True)[:MOST_NAMED]]
     if len(found) > MOST_NAMED:
         named.append(f'{len(found) - MOST_NAMED} more kinds')
-    percent = distinct(100.0 * share, 0.0)[0]
+    percent = distinct(100.0 * float(is_affected.mean()), 0.0)[0]
     return (
-        f'{percent} % of the {count} messages have false joint angles, which are not used '
+        f'{percent} % of the {len(is_affected)} messages have false joint angles{consequence} '
         f'({"; ".join(named)})'
     )

@@ -289,3 +289,26 @@ def test_a_forward_jump_of_the_log_times_is_a_fault(first, content, tmp_path):
     (fault,) = [text for text in check_bag(tmp_path / 'bag').faults if 'jump forward' in text]
     assert ('57.0 years' if first == 0 else '60.0 min') in fault
     assert '--skip-pauses' in fault
+
+
+@pytest.mark.parametrize('topic', ['/joint_states', '/muscle_states'])
+def test_a_topic_that_was_lost_during_the_recording_is_a_fault(topic, robot, tmp_path):
+    arm = Arm(robot, count=1500)
+    lost_at = samples.START + 4 * 10**9
+    arm.content = [each for each in arm.content if each.topic != topic or each.log_time < lost_at]
+    arm.write(tmp_path / 'bag')
+    (fault,) = check_bag(tmp_path / 'bag', 'arm26').faults
+    assert f'no message of {topic} was recorded from 4.0 s to 15.0 s' in fault
+
+
+def test_an_encoder_that_wraps_around_is_named_and_no_muscle_is_blamed(robot, tmp_path):
+    arm = Arm(robot, count=400)
+    theta = iter(np.mod(arm.theta, 2.0 * np.pi))
+    arm.content = [
+        each._replace(data=joints(robot.joints, next(theta))) if each.type == JOINTS else each
+        for each in arm.content
+    ]
+    result = streams(arm, robot, tmp_path)
+    assert_allclose(result.joints.values, arm.theta, atol=1e-12)
+    (fault,) = check_bag(tmp_path / 'bag', 'arm26').faults
+    assert 'whole turns' in fault and 'subtract the whole turns' in fault

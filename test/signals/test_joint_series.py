@@ -109,3 +109,21 @@ def test_a_wrong_unit_or_sign_is_left_to_the_comparison_with_the_lengths(factor,
     judged = judge_series(robot, time, factor * theta)
     np.testing.assert_array_equal(judged.theta, factor * theta)
     assert not judged.text
+
+
+@pytest.mark.parametrize('turns', [-1, 1, 2])
+def test_whole_turns_of_an_encoder_are_subtracted_and_named(turns, robot):
+    time, theta = motion(robot)
+    read = theta.copy()
+    read[:, 3] += 2.0 * np.pi * turns
+    judged = judge_series(robot, time, read)
+    np.testing.assert_allclose(judged.theta, theta, atol=1e-12)
+    assert judged.is_fault and robot.joints[3] in judged.text
+    assert 'subtract the whole turns' in judged.advice and 'second program' not in judged.advice
+
+
+def test_encoders_that_wrap_around_at_zero_are_used_without_the_jumps(robot):
+    time, theta = motion(robot)
+    judged = judge_series(robot, time, np.mod(theta, 2.0 * np.pi))
+    np.testing.assert_allclose(judged.theta, theta, atol=1e-12)
+    assert judged.is_fault and 'subtract the whole turns' in judged.advice
