@@ -16,7 +16,7 @@ import numpy as np
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LONGEST_PAUSE
-from musculoskeletal_ae.bags.streams import Pairs, read_streams
+from musculoskeletal_ae.bags.streams import Pairs, Streams, read_streams
 from musculoskeletal_ae.bags.timed_messages import find_pauses
 from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError, printable
@@ -32,6 +32,10 @@ from musculoskeletal_ae.signals.muscle_readings import muscle_reading
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.signals.wiring import Wiring, judge
 
+MOST_REJECTED = 0.1  # largest share of rejected messages of a topic that is no fault
+#: reasons for which messages of a sound recording may be rejected: lengths were being calibrated, or
+#: another program publishes its own joints on the topic
+USUAL_REJECTIONS = 'length offsets unknown', 'missing joint', 'missing motor'
 READINGS = 'joint_states', 'muscle_states'  # topics of sensors, which do not pause
 _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 
@@ -157,6 +161,20 @@ def _read_times(bag: Bag, progress: Callable[[float], None]) -> dict[str, array[
     return times
 
 
+def _rejected(bag: Bag, streams: Streams) -> list[str]:
+    """Return a fault for each reason for which a large share of a topic's messages was rejected."""
+    faults = []
+    for why, count in streams.rejected.items():
+        label, _, reason = why.partition(': ')
+        total = bag.topics[label.partition(' as ')[0]].message_count
+        if count > MOST_REJECTED * total and reason not in USUAL_REJECTIONS:
+            faults.append(
+                f'{count / total:.0%} of the messages of {label} were rejected: {reason}. See '
+                'check_driver, mend the driver, and record again'
+            )
+    return faults
+
+
 def _silences(bag: Bag, topics: dict[str, str], times: dict[str, array[int]]) -> list[str]:
     """Return a fault for each topic of readings that is silent while others are recorded.
 
@@ -228,6 +246,7 @@ def _fit(bag: Bag, name: str, namespace: str | None) -> _Fit:
     joint_faults = [joint_text] if streams.judged_joints.is_fault else []
     if streams.judged_joints.text and not joint_faults:
         left_out.append(joint_text)
+    rejected_faults = _rejected(bag, streams)
     if not len(streams.muscles.time) and not len(streams.joints.time):
         problem = f'the bag has neither joint_states nor muscle_states that fit {name}'
         return _Fit([problem, *joint_faults], left_out)
@@ -238,5 +257,5 @@ def _fit(bag: Bag, name: str, namespace: str | None) -> _Fit:
         faults = [f'muscles are not {what} of {name}: {wiring.text(robot.muscles)}']
     else:
         faults = wrong_joint_sensors(robot, pairs)
-    faults = joint_faults + faults
+    faults = rejected_faults + joint_faults + faults
     return _Fit(faults, left_out, '' if faults else motion_text(robot, pairs))
