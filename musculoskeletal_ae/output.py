@@ -7,11 +7,17 @@ its work: text that cannot be written is discarded. A tool reports the loss by i
 (`options.exit_status`).
 """
 
+from __future__ import annotations
+
 import errno
 import io
 import os
 import select
 import sys
+from typing import TYPE_CHECKING, TextIO
+
+if TYPE_CHECKING:
+    from typing_extensions import Buffer
 
 #: standard input, output and error
 _DESCRIPTORS = range(3)
@@ -28,7 +34,7 @@ class _Output(io.FileIO):
 
     problem: OSError | None = None
 
-    def write(self, data: 'memoryview | bytes', /) -> int:  # type: ignore[override]
+    def write(self, data: Buffer, /) -> int:
         try:
             written = super().write(data)
             if written is None:  # another program has set the terminal to non-blocking mode
@@ -37,7 +43,7 @@ class _Output(io.FileIO):
         except OSError as error:
             self.problem = error
             written = None
-        return len(data) if written is None else written
+        return memoryview(data).nbytes if written is None else written
 
 
 def secure_output() -> None:
@@ -56,14 +62,15 @@ def secure_output() -> None:
     sys.stderr = _secured(sys.stderr, 2)
 
 
-def _secured(stream: io.TextIOBase | None, number: int) -> io.TextIOBase:
+def _secured(stream: TextIO | None, number: int) -> TextIO:
     """Return a stream that replaces `stream`, which Python has opened for a descriptor."""
     if stream is not None and not isinstance(stream, io.TextIOWrapper):
         return stream  # not Python's own one
     if stream is not None:
         stream.flush()
+    file: io.RawIOBase = _Output(number, 'w', closefd=False)
     return io.TextIOWrapper(
-        io.BufferedWriter(_Output(number, 'w', closefd=False)),
+        io.BufferedWriter(file),
         encoding=stream.encoding if stream else 'utf-8',
         errors='replace',
         line_buffering=stream.line_buffering if stream else False,

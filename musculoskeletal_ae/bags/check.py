@@ -33,8 +33,8 @@ from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.signals.wiring import Wiring, judge
 
 MOST_REJECTED = 0.1  # largest share of rejected messages of a topic that is no fault
-#: reasons for which messages of a sound recording may be rejected: lengths were being calibrated, or
-#: another program publishes its own joints on the topic
+#: reasons for which messages of a sound recording may be rejected: lengths were being calibrated,
+#: or another program publishes its own joints on the topic
 USUAL_REJECTIONS = 'length offsets unknown', 'missing joint', 'missing motor'
 READINGS = 'joint_states', 'muscle_states'  # topics of sensors, which do not pause
 _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'

@@ -49,7 +49,7 @@ class Pause(NamedTuple):
         return f'the log times jump forward by {length}, {begin} after the start of the bag'
 
 
-def find_pauses(times: Iterable[Sequence[int]]) -> list[Pause]:
+def find_pauses(times: Iterable[Sequence[int] | Ints]) -> list[Pause]:
     """Return the pauses of more than `LONGEST_PAUSE` between messages.
 
     Args:

@@ -123,8 +123,8 @@ def judge_series(robot: Robot, time: Array, theta: Array) -> JointSeries:
             name, unit = robot.joints[j], robot.units[j].theta
             example = f'such as {readings[0]:.3g} {unit}'
             found.append((len(readings), f'{name}: {kind.value}, {example}'))
-    is_unused = (np.isfinite(theta) & np.isnan(usable)).any(axis=1)
-    is_turned = (np.abs(usable - theta) > np.pi).any(axis=1)
+    is_unused = np.asarray((np.isfinite(theta) & np.isnan(usable)).any(axis=1))
+    is_turned = np.asarray((np.abs(usable - theta) > np.pi).any(axis=1))
     texts = [_text(is_unused, found, ', which are not used')] if found else []
     texts += [_text(is_turned, turned, '')] if turned else []
     remedies = [REMEDY] if found else []

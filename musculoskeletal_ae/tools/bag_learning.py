@@ -387,14 +387,14 @@ def _finding(
 def error(mae: Mae, recording: Pairs) -> float:
     """Return the mean of ‖θ_est − θ‖₂ [rad] over all messages with θ, for joints with sensors."""
     is_known = np.isfinite(recording.theta).any(axis=1)
-    recording = Pairs(*(column[is_known] for column in recording))
     tension = mae.transmission.end(recording.tension, directions(recording.length))
     estimate = np.empty_like(recording.theta)
     for isolated in np.unique(recording.isolated, axis=0):
         rows = (recording.isolated == isolated).all(axis=1)
         without = mae.without(_isolated(isolated, mae.isolated))
         estimate[rows] = without.estimate(tension[rows], recording.length[rows]).theta
-    return float(np.linalg.norm(np.nan_to_num(estimate - recording.theta), axis=1).mean())
+    errors = np.linalg.norm(np.nan_to_num(estimate - recording.theta), axis=1)
+    return float(errors[is_known].mean())
 
 
 def _isolated(row: Ints, default: tuple[int, ...]) -> tuple[int, ...]:
