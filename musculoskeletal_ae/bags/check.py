@@ -86,8 +86,11 @@ def check_bag(path: Path, robot: str | None = None, namespace: str | None = None
         name: _fit(bag, name, namespace) for name in ([robot] if robot else shipped_robots())
     }
     fits = [name for name, fit in results.items() if not fit.faults]
+    recorded = [name for name, fit in results.items() if fit.has_its_messages]
     if robot:
         check.faults += results[robot].faults
+    elif not fits and len(recorded) == 1:  # the faults say what is wrong with the recording
+        check.faults += [f'as {recorded[0]}: {fault}' for fault in results[recorded[0]].faults]
     if fits:
         check.lines += results[fits[0]].notes
         check.lines.append(results[fits[0]].motion)
@@ -225,6 +228,7 @@ class _Fit(NamedTuple):
     faults: list[str]  # reasons why the bag does not fit the robot
     notes: list[str]  # on unused messages
     motion: str = ''  # text on the motion that can be learned from
+    has_its_messages: bool = False  # whether the messages have the joints and muscles of the robot
 
 
 def _fit(bag: Bag, name: str, namespace: str | None) -> _Fit:
@@ -258,4 +262,4 @@ def _fit(bag: Bag, name: str, namespace: str | None) -> _Fit:
     else:
         faults = wrong_joint_sensors(robot, pairs)
     faults = rejected_faults + joint_faults + faults
-    return _Fit(faults, left_out, '' if faults else motion_text(robot, pairs))
+    return _Fit(faults, left_out, '' if faults else motion_text(robot, pairs), True)

@@ -280,6 +280,23 @@ def test_false_joint_angles_are_found_with_their_share_and_not_used(
     found = [text for text in (check.faults if is_fault else check.lines) if share in text]
     assert len(found) == 1 and 'stop a second program that publishes joint_states' in found[0]
     assert bool(check.faults) == is_fault, check.faults
+    # Without the robot, the fault is that of the only robot whose messages these are.
+    assert any(share in text for text in check_bag(tmp_path / 'bag').faults) == is_fault
+
+
+def test_muscle_messages_beside_false_joint_angles_are_kept_without_them(robot, tmp_path):
+    arm, zeros = Arm(robot, count=1000), np.zeros(robot.joint_count)
+    is_false = [400 <= n < 700 for n in range(1000)]
+    messages = iter(is_false)
+    arm.content = [
+        each._replace(data=joints(robot.joints, zeros))
+        if each.type == JOINTS and next(messages)
+        else each
+        for each in arm.content
+    ]
+    pairs = streams(arm, robot, tmp_path).pairs()
+    assert_array_equal(pairs.length, arm.length)
+    assert_array_equal(np.isnan(pairs.theta).all(axis=1), is_false)
 
 
 @pytest.mark.parametrize('first', [0, samples.START - 3600 * 10**9])
