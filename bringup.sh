@@ -4,6 +4,9 @@
 # Runs the whole system on an emulated arm or on your own. This is the launch file: the section
 # "The system" at the end starts the nodes with their parameters.
 set -u
+# Without stdout or stderr, the next file that is opened would be taken for it.
+{ : >&1; } 2>/dev/null || exec >/dev/null
+{ : >&2; } 2>/dev/null || exec 2>/dev/null
 unset CDPATH # otherwise cd may print the directory
 here=$(cd "$(dirname "$(readlink -f "${BASH_SOURCE[0]}")")" && pwd -P) || exit 1
 if [ -e "$here/setup.py" ]; then
@@ -36,6 +39,7 @@ doc/howto/your_robot.md is the guide for your own robot.
   --combined                 estimator and controller in one process
   --bag DIR                  a recording instead of the emulator: no controller, no emulator. It has
                              to be one of the robot that --robot names
+  --from-namespace NS        with --bag: namespace of the arm to play, if the recording has several
   --explore | --no-explore   random exploration, so that learning has data (default: on; with
                              --hardware off: a real arm moves only on request)
   --no-learner               no online learning
@@ -68,7 +72,8 @@ doc/howto/your_robot.md is the guide for your own robot.
   -h, --help                 this text
 
 Exit status: 0 at the end of --duration or of a recording, 130 on Ctrl-C, 1 if a process failed or a
-recording brought no estimate, 2 for a wrong option or a recording of another robot.
+recording brought no estimate, 2 for a wrong option or a recording of another robot, 141 if a reader
+of the output has closed it, as "| head" does: everything is then stopped.
 EOF
 }
 
@@ -88,6 +93,7 @@ hardware=false
 controller=true
 combined=false
 bag=
+from=() # namespace of the recorded arm
 explore= # empty: on, except with --hardware
 learner=true
 preset=default
@@ -109,7 +115,7 @@ nodes='controller|estimator|hardware_emulator|learner|sim'
 sorted=$(getopt --name bringup.sh --options hp: --longoptions robot:,checkpoint:,hardware \
   --longoptions no-controller,combined,bag:,explore,no-explore,no-learner,preset:,seed:,reality: \
   --longoptions joint-source:,params-file:,namespace:,network,duration:,record:,view,port: \
-  --longoptions read-only,mujoco:,joints:,muscles:,without:,base:,end:,help -- "$@") || refuse 'see ./bringup.sh --help for the legal options'
+  --longoptions read-only,mujoco:,joints:,muscles:,without:,base:,end:,from-namespace:,help -- "$@") || refuse 'see ./bringup.sh --help for the legal options'
 eval set -- "$sorted"
 passed=$sorted
 while [ $# -gt 0 ]; do
@@ -122,6 +128,7 @@ while [ $# -gt 0 ]; do
     --no-controller) controller=false ;;
     --combined) combined=true ;;
     --bag) bag=$2 && shift ;;
+    --from-namespace) from=("$2") && shift ;;
     --explore) explore=true ;;
     --no-explore) explore=false ;;
     --no-learner) learner=false ;;
@@ -163,6 +170,7 @@ exclude() { # OPTION OTHER_OPTION…
     ! is_given "$other" || refuse "$1 and $other cannot be used together; remove one of them"
   done
 }
+[ -n "$bag" ] || [ ${#from[@]} = 0 ] || refuse '--from-namespace requires --bag'
 exclude --bag --hardware --combined --explore --reality
 exclude --hardware --reality
 exclude --no-controller --combined --explore
@@ -215,7 +223,7 @@ use_udp
 [ ${#parameters[@]} = 0 ] || "$python" -m musculoskeletal_ae.nodes.parameters "${parameters[@]}" || exit
 if [ -n "$bag" ]; then
   say "reading $bag"
-  "$python" -m musculoskeletal_ae.tools.recorded_robot "$bag" "$robot" || exit 2
+  "$python" -m musculoskeletal_ae.tools.recorded_robot "$bag" "$robot" "${from[@]}" || exit 2
 fi
 
 # A namespace contains one arm. The lock is held until the last process has ended, which takes a
@@ -331,7 +339,7 @@ train_once() {
   fi
   say "training the initial network of $robot (once; it takes a minute or two)"
   launch train --robot "$robot" --preset "$preset" --out "$checkpoint" \
-    > >(tee "$logs/train.log" | sed -un -e '/^training: /p' -e '/^warning: /p' \
+    > >(tee -p "$logs/train.log" | sed -un -e '/^training: /p' -e '/^warning: /p' \
       -e 's/^error on the geometric model: \([^(]*[^ (]\).*/-- initial network: \1 on the geometric model/p') 2>&1
   wait_for train || died train $?
 }
@@ -347,7 +355,7 @@ import_mujoco() {
   mujoco=$(realpath "$mujoco")
   robot=$logs/${name//[^A-Za-z0-9_.-]/_} && robot_directory=$robot
   say "importing $mujoco"
-  launch import_robot "$mujoco" --out "$robot" --play "${chain[@]}" > >(tee "$logs/import.log") 2>&1
+  launch import_robot "$mujoco" --out "$robot" --play "${chain[@]}" > >(tee -p "$logs/import.log") 2>&1
   wait_for import_robot
   status=$?
   case $status in
@@ -424,7 +432,8 @@ if [ -n "$bag" ]; then
   # message, however slow this computer is.
   receivers=estimator
   [ $learner = false ] || receivers+=,learner
-  start replay "$bag" --robot "$robot" --clock --wait-for "$receivers" --ros-args "${under[@]}"
+  start replay "$bag" --robot "$robot" "${from[@]/#/--from-namespace=}" --clock --skip-pauses \
+    --wait-for "$receivers" --ros-args "${under[@]}"
 elif [ $controller = true ]; then
   [ -n "$explore" ] || explore=$([ $hardware = true ] && echo false || echo true)
   kept_in controller
@@ -451,5 +460,9 @@ if [ -n "$duration" ]; then
 fi
 [ -z "$bag" ] || limits+=(-p end_with_replay:=true)
 launch bringup_status "${common[@]}" "${limits[@]}" 2>"$logs/bringup_status.log"
-wait_for bringup_status || died bringup_status $?
-exit 0
+wait_for bringup_status
+status=$?
+case $status in
+  0 | 141) exit $status ;; # 141: the reader of the output has closed it
+  *) died bringup_status $status ;;
+esac

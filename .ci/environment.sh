@@ -19,7 +19,7 @@ python=$venv/bin/python
 executables=$repository/install/musculoskeletal_ae/lib/musculoskeletal_ae
 setup_log=$repository/log/setup.log
 
-say() { printf '%s\n' "-- $*"; }
+say() { printf '%s\n' "-- $*" 2>/dev/null; } # even if the output is full
 
 fail() {
   printf '%s\n' "$@" >&2

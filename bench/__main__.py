@@ -10,8 +10,8 @@ import importlib
 import sys
 from pathlib import Path
 
-from musculoskeletal_ae.exceptions import replace_unprintable
 from musculoskeletal_ae.options import exit_status
+from musculoskeletal_ae.output import secure_output
 from musculoskeletal_ae.process_signals import STOP, Reaction
 
 
@@ -43,6 +43,6 @@ def main(argv: list[str]) -> int:
 
 
 if __name__ == '__main__':
-    replace_unprintable()
+    secure_output()
     STOP.install(Reaction.RAISE)  # SIGTERM then ends a bench and its child processes as Ctrl-C does
     sys.exit(main(sys.argv[1:]))

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The errors of this package, with a common base class."""
 
-import io
-import sys
 from pathlib import Path
 
 LONGEST_TEXT = 4000
@@ -15,13 +13,6 @@ def printable(text: object) -> str:
     """
     shown = str(text)[:LONGEST_TEXT]
     return ''.join(c if c.isprintable() else repr(c)[1:-1] for c in shown)
-
-
-def replace_unprintable() -> None:
-    """Make stdout and stderr show "?" for characters that the encoding of the terminal lacks."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors='replace')
 
 
 class MusculoskeletalError(Exception):

@@ -16,7 +16,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 
-from musculoskeletal_ae.exceptions import replace_unprintable
+from musculoskeletal_ae.output import secure_output
 from musculoskeletal_ae.process_signals import INTERRUPTED, STOP, Reaction
 
 
@@ -26,9 +26,9 @@ def _prepare_process() -> None:
     A native crash prints the stacks of all threads. An environment variable stops MuJoCo from
     loading a graphics library; otherwise the import could start processes that look for a display.
     """
-    replace_unprintable()
+    secure_output()
     os.environ.setdefault('MUJOCO_GL', 'disable')
-    with suppress(AttributeError, ValueError, RuntimeError, OSError):  # stderr may be closed
+    with suppress(AttributeError, ValueError, RuntimeError, OSError):  # stderr may be no file
         faulthandler.enable()
 
 

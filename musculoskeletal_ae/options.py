@@ -8,8 +8,8 @@ prints one line and ends with status 1.
 """
 
 import argparse
+import errno
 import math
-import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.output import output_problem
 from musculoskeletal_ae.presets.names import DEFAULT, PRESET_NAMES
 from musculoskeletal_ae.process_signals import INTERRUPTED
 from musculoskeletal_ae.robot.directories import shipped_robots
@@ -178,20 +179,16 @@ def exit_status(
 
     For MusculoskeletalError, OSError and the exceptions in `also`, print one line and return 1.
     After Ctrl-C, print one line and return INTERRUPTED. The line is the text of the
-    KeyboardInterrupt, or says whether `out`, the file or directory of results, was written. If the
-    reader of the output has closed it, as `head` does, print nothing and return CLOSED.
+    KeyboardInterrupt, or says whether `out`, the file or directory of results, was written.
+
+    A tool does its work whatever happens to its output (`output.py`). If the reader of stdout has
+    closed it, as `head` does, print nothing and return CLOSED; if stdout could not be written for
+    another reason, print one line and return 1. A status other than 0 of the work comes first.
     """
     refused: tuple[type[Exception], ...] = (MusculoskeletalError, OSError, *also)
     before = _versions(out)
     try:
-        status = work() or 0
-        sys.stdout.flush()
-        return status
-    except BrokenPipeError as error:
-        if _is_stdout_closed():
-            return CLOSED
-        print(f'error: {error}', file=sys.stderr)
-        return 1
+        return work() or _output_status()
     except refused as error:
         print(f'error: {error}', file=sys.stderr)
         return 1
@@ -206,14 +203,15 @@ def exit_status(
         return INTERRUPTED
 
 
-def _is_stdout_closed() -> bool:
-    """Return whether the reader of stdout has closed it; if so, discard the rest of the output."""
-    try:
-        print(flush=True)  # fails even if the text that could not be written was discarded
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return True
-    return False
+def _output_status() -> int:
+    """Return the exit status of a tool whose work is done: whether its output was written."""
+    problem = output_problem()
+    if problem is None:
+        return 0
+    if problem.errno == errno.EPIPE:
+        return CLOSED
+    print(f'error: the output was not written: {problem.strerror}', file=sys.stderr)
+    return 1
 
 
 def _versions(out: Path | None) -> dict[Path, int]:

@@ -12,6 +12,7 @@ from musculoskeletal_ae.conditions import Condition, Level, ordered, remedy_of, 
 from musculoskeletal_ae.remedy import Step
 
 MOST_DIGITS = 17  # significant digits that identify a double
+_UNITS_OF_TIME = {'years': 365.25 * 86400.0, 'days': 86400.0, 'h': 3600.0, 'min': 60.0}
 #: values of `state` in the reports of a replay
 WAITING, PLAYING, PAUSED, END_OF_RECORDING = 'waiting', 'playing', 'paused', 'end_of_recording'
 #: key in the last report of a replay: names of nodes that may have missed messages
@@ -84,6 +85,14 @@ def with_load(text: str) -> str:
 def whole(value: float, unit: str = '') -> str:
     """Return a value, rounded to a whole number, with its unit; "–" for NaN (unknown)."""
     return '–' if math.isnan(value) else f'{value:.0f} {unit}'.rstrip()
+
+
+def duration(seconds: float) -> str:
+    """Return a duration in the unit in which it is easiest to read, such as "1.5 h"."""
+    for unit, length in _UNITS_OF_TIME.items():
+        if seconds >= 2.0 * length:
+            return f'{seconds / length:.1f} {unit}'
+    return f'{seconds:.3f} s' if seconds < 1.0 else f'{seconds:.1f} s'
 
 
 def distinct(value: float, *limits: float, digits: int = 3) -> tuple[str, ...]:

@@ -141,6 +141,16 @@ def test_ctrl_c_ends_a_tool_without_a_traceback(name, tmp_path):
     assert done.returncode in (0, 1, 130), output
 
 
+def test_a_home_that_cannot_be_written_is_named_and_the_advice_helps(tmp_path):
+    arguments = 'record', '-o', str(tmp_path / 'bag'), '--duration', '0.1'
+    refused = run(*arguments, HOME='/dev/null', ROS_HOME='', ROS_LOG_DIR='')
+    assert refused.returncode == 1
+    assert "'/dev/null/.ros/log'" in refused.stderr and '--ros-args' not in refused.stderr
+    assert 'set ROS_LOG_DIR to a folder that can be written' in refused.stderr
+    mended = run(*arguments, HOME='/dev/null', ROS_HOME='', ROS_LOG_DIR=str(tmp_path / 'log'))
+    assert 'nothing was recorded' in mended.stderr and 'error' not in mended.stderr
+
+
 def test_an_option_that_no_node_has_is_an_error():
     done = run('estimator', '-p', 'robot:=arm26')
     assert done.returncode == 2

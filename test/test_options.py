@@ -2,9 +2,6 @@
 """Properties that the command lines of all tools and benches have."""
 
 import argparse
-import os
-import subprocess
-import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -12,7 +9,7 @@ import pytest
 
 from musculoskeletal_ae import options
 from musculoskeletal_ae.exceptions import RobotDescriptionError
-from musculoskeletal_ae.options import CLOSED, Parser, exit_status
+from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.process_signals import INTERRUPTED
 
 
@@ -140,18 +137,3 @@ def test_ctrl_c_ends_with_one_line_that_says_whether_the_result_was_written(
     assert exit_status(work, out=out) == INTERRUPTED
     result = 'was written' if writes else 'was not written'
     assert capsys.readouterr().err == f'interrupted; {out} {result}\n'
-
-
-def test_output_that_its_reader_has_closed_ends_a_tool_quietly():
-    code = (
-        'from musculoskeletal_ae.options import exit_status\n'
-        'raise SystemExit(exit_status(lambda: print("x" * 100_000)))'
-    )
-    reader, writer = os.pipe()
-    os.close(reader)
-    ended = subprocess.run(
-        [sys.executable, '-c', code], stdout=writer, stderr=subprocess.PIPE, check=False
-    )
-    os.close(writer)
-    assert ended.returncode == CLOSED
-    assert ended.stderr == b''

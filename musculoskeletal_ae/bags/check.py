@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check a recording: contents, completeness and fit to a robot (`replay --check`)."""
 
+from __future__ import annotations
+
 from array import array
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,7 +15,9 @@ import numpy as np
 
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.streams import Pairs, read_streams
+from musculoskeletal_ae.bags.storage import LONGEST_PAUSE
+from musculoskeletal_ae.bags.streams import Pairs, Streams, read_streams
+from musculoskeletal_ae.bags.timed_messages import find_pauses
 from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError, printable
 from musculoskeletal_ae.learning.calibration import Reservoir
@@ -28,6 +32,11 @@ from musculoskeletal_ae.signals.muscle_readings import muscle_reading
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.signals.wiring import Wiring, judge
 
+MOST_REJECTED = 0.1  # largest share of rejected messages of a topic that is no fault
+#: reasons for which messages of a sound recording may be rejected: lengths were being calibrated,
+#: or another program publishes its own joints on the topic
+USUAL_REJECTIONS = 'length offsets unknown', 'missing joint', 'missing motor'
+READINGS = 'joint_states', 'muscle_states'  # topics of sensors, which do not pause
 _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 
 
@@ -59,18 +68,29 @@ def check_bag(path: Path, robot: str | None = None, namespace: str | None = None
         with ProgressBar(f'reading {path}') as bar:
             bar.announce()
             bag = Bag.open(path)
-            check.faults += [f'unfinished: {reason}; {_RECOVER}' for reason in bag.unfinished]
-            check.lines += _contents(bag, bar.add)
-        interface_topics(bag, namespace, motor_topics(robot) if robot else NO_MOTORS)
+            recover = f'; {_RECOVER}' if bag.message_count else ''
+            check.faults += [f'unfinished: {reason}{recover}' for reason in bag.unfinished]
+            times = _read_times(bag, bar.add)
+        check.lines += _contents(bag, times)
+        check.faults += [
+            f'{pause.text(bag.start)}: the recorder was paused, or its clock was set; '
+            '`replay --skip-pauses` does not wait there'
+            for pause in find_pauses(times.values())
+        ]
+        topics = interface_topics(bag, namespace, motor_topics(robot) if robot else NO_MOTORS)
     except MusculoskeletalError as error:
         check.faults.append(str(error))
         return check
+    check.faults += _silences(bag, topics, times)
     results = {
         name: _fit(bag, name, namespace) for name in ([robot] if robot else shipped_robots())
     }
     fits = [name for name, fit in results.items() if not fit.faults]
+    recorded = [name for name, fit in results.items() if fit.has_its_messages]
     if robot:
         check.faults += results[robot].faults
+    elif not fits and len(recorded) == 1:  # the faults say what is wrong with the recording
+        check.faults += [f'as {recorded[0]}: {fault}' for fault in results[recorded[0]].faults]
     if fits:
         check.lines += results[fits[0]].notes
         check.lines.append(results[fits[0]].motion)
@@ -133,13 +153,58 @@ def recorded_wiring(pairs: Pairs, robot: Robot) -> Wiring:
     return judge(robot.muscle_lengths, theta, pairs.length, pairs.tension, used=used).wiring
 
 
-def _contents(bag: Bag, progress: Callable[[float], None]) -> list[str]:
+def _read_times(bag: Bag, progress: Callable[[float], None]) -> dict[str, array[int]]:
+    """Return the log times [ns] of each topic, after decoding all messages that can be used."""
     times = {name: array('q') for name in bag.topics}
     for message in bag.messages():
         times[message.topic].append(message.log_time)
         if not bag.topics[message.topic].problem:
             bag.decode(message)
         progress(1.0 / bag.message_count)
+    return times
+
+
+def _rejected(bag: Bag, streams: Streams) -> list[str]:
+    """Return a fault for each reason for which a large share of a topic's messages was rejected."""
+    faults = []
+    for why, count in streams.rejected.items():
+        label, _, reason = why.partition(': ')
+        total = bag.topics[label.partition(' as ')[0]].message_count
+        if count > MOST_REJECTED * total and reason not in USUAL_REJECTIONS:
+            faults.append(
+                f'{count / total:.0%} of the messages of {label} were rejected: {reason}. See '
+                'check_driver, mend the driver, and record again'
+            )
+    return faults
+
+
+def _silences(bag: Bag, topics: dict[str, str], times: dict[str, array[int]]) -> list[str]:
+    """Return a fault for each topic of readings that is silent while others are recorded.
+
+    A recorder may lose a topic in the middle of a recording. Times in which nothing was recorded
+    are not counted here.
+
+    Args:
+        bag: The recording.
+        topics: Recorded names of the topics, by name in the interface.
+        times: Log times [ns] of each topic, by recorded name.
+    """
+    paused = {pause.begin for pause in find_pauses(times.values())}
+    faults = []
+    for name in dict.fromkeys(topics[each] for each in READINGS if each in topics):
+        marks = np.unique([bag.start, *times[name], bag.end])
+        for begin, end in zip(marks[:-1].tolist(), marks[1:].tolist()):
+            if end - begin > LONGEST_PAUSE and begin not in paused:
+                since, until = ((mark - bag.start) / 1e9 for mark in (begin, end))
+                faults.append(
+                    f'no message of {name} was recorded from {since:.1f} s to {until:.1f} s after '
+                    'the start, while other topics went on: see whether its publisher had ended, '
+                    'and record again'
+                )
+    return faults
+
+
+def _contents(bag: Bag, times: dict[str, array[int]]) -> list[str]:
     begin = datetime.fromtimestamp(bag.start / 1e9, timezone.utc)
     length = f'{(bag.end - bag.start) / 1e9:.3f} s from {begin:%Y-%m-%d %H:%M:%S} UTC'
     has_checksums = all(file.has_checksums for file in bag.files)
@@ -151,7 +216,8 @@ def _contents(bag: Bag, progress: Callable[[float], None]) -> list[str]:
     ]
     for name, topic in sorted(bag.topics.items()):
         gaps = np.diff(times[name]) / 1e9
-        rate = f'{1 / gaps.mean():.2f}' if gaps.any() else ''
+        usual = gaps[gaps <= LONGEST_PAUSE / 1e9]  # a pause says nothing about the rate
+        rate = f'{1 / usual.mean():.2f}' if usual.any() else ''
         line = f'{name:<44} {len(times[name]):>9} {rate:>9} {gaps.max(initial=0.0):8.3f}'
         ignored = f'; ignored: {topic.problem}' if topic.problem else ''
         lines.append(f'{line}  {topic.type}{ignored}')
@@ -162,6 +228,7 @@ class _Fit(NamedTuple):
     faults: list[str]  # reasons why the bag does not fit the robot
     notes: list[str]  # on unused messages
     motion: str = ''  # text on the motion that can be learned from
+    has_its_messages: bool = False  # whether the messages have the joints and muscles of the robot
 
 
 def _fit(bag: Bag, name: str, namespace: str | None) -> _Fit:
@@ -179,9 +246,14 @@ def _fit(bag: Bag, name: str, namespace: str | None) -> _Fit:
     left_out += [
         f'{n} messages were used only in part: {why}' for why, n in streams.ignored.items()
     ]
+    joint_text = streams.judged_joints.advice
+    joint_faults = [joint_text] if streams.judged_joints.is_fault else []
+    if streams.judged_joints.text and not joint_faults:
+        left_out.append(joint_text)
+    rejected_faults = _rejected(bag, streams)
     if not len(streams.muscles.time) and not len(streams.joints.time):
         problem = f'the bag has neither joint_states nor muscle_states that fit {name}'
-        return _Fit([problem], left_out)
+        return _Fit([problem, *joint_faults], left_out)
     pairs = streams.pairs()
     wiring = recorded_wiring(pairs, robot)
     if wiring.faulty:
@@ -189,4 +261,5 @@ def _fit(bag: Bag, name: str, namespace: str | None) -> _Fit:
         faults = [f'muscles are not {what} of {name}: {wiring.text(robot.muscles)}']
     else:
         faults = wrong_joint_sensors(robot, pairs)
-    return _Fit(faults, left_out, '' if faults else motion_text(robot, pairs))
+    faults = rejected_faults + joint_faults + faults
+    return _Fit(faults, left_out, '' if faults else motion_text(robot, pairs), True)

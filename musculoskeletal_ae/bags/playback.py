@@ -21,7 +21,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.arrival import SILENCE
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.storage import BagMessage
+from musculoskeletal_ae.bags.storage import LONGEST_PAUSE, BagMessage
 from musculoskeletal_ae.bags.timed_messages import TimedMessages
 from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
@@ -29,6 +29,7 @@ from musculoskeletal_ae.message_reading import MOST_ENTRIES, read_target
 
 # After a longer interruption, playback resumes instead of catching up.
 LONGEST_LAG = 1.0  # [s]
+SKIP_LEAD = 500_000_000  # recorded time between a skipped pause and the next message [ns]
 
 TAUGHT_TOPIC = 'estimated_joint_states'
 # Standard deviation of the Gaussian weights that smooth a motion [s]. They keep the motion of a
@@ -125,6 +126,17 @@ class Timeline:
         """
         self.jump(self.recorded(now), now)
         self.paused = paused
+
+    def skip_pause(self, before: int, recorded: int, now: float) -> None:
+        """Jump to shortly before a message if nothing was recorded for a long time before it.
+
+        Args:
+            before: Recorded time of the message before [ns].
+            recorded: Recorded time of the message [ns].
+            now: Reading of the steady clock [s].
+        """
+        if recorded - before > LONGEST_PAUSE:
+            self.jump(recorded - SKIP_LEAD, now)
 
     def catch_up(self, recorded: int, now: float, longest: float) -> None:
         """Set recorded time to `recorded` [ns] if that time was due more than `longest` [s] ago.

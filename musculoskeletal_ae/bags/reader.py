@@ -16,6 +16,7 @@ from typing import Any
 from musculoskeletal_ae.bags import mcap_file, message_types, sqlite3_file
 from musculoskeletal_ae.bags.metadata import FILE, Contents, read_metadata
 from musculoskeletal_ae.bags.storage import (
+    CONVERT_ROS1,
     LATEST,
     LONGEST_PAUSE,
     NAME_A_BAG,
@@ -28,6 +29,7 @@ from musculoskeletal_ae.bags.storage import (
 )
 from musculoskeletal_ae.exceptions import BagError
 
+ROS1_MAGIC = b'#ROSBAG V'  # first bytes of a bag file of ROS 1
 MOST_HELD = 64 << 20  # largest size of the messages held in memory to sort them [bytes]
 _OVERHEAD = 100  # size counted for a message in addition to its data [bytes]
 
@@ -117,13 +119,15 @@ class Bag:
 def _open_file(path: Path) -> StorageFile:
     """Open an mcap or sqlite3 file, or raise a BagError."""
     with open_file(path) as stream:
-        head = stream.read(max(len(mcap_file.MAGIC), len(sqlite3_file.MAGIC)))
+        head = stream.read(len(sqlite3_file.MAGIC))  # the longest of them
     if not head:
         raise BagError(path, 'the file is empty', 'record again')
     if head.startswith(sqlite3_file.MAGIC):
         return sqlite3_file.Sqlite3File(path)
     if head.startswith(mcap_file.MAGIC):
         return mcap_file.McapFile(path)
+    if head.startswith(ROS1_MAGIC):
+        raise BagError(path, 'is a bag file of ROS 1', CONVERT_ROS1)
     raise BagError(path, 'is neither an mcap nor a sqlite3 file', NAME_A_BAG)
 
 

@@ -28,9 +28,17 @@ LONGEST_DISORDER = 1_000_000_000  # [ns]
 LONGEST_PAUSE = 10_000_000_000  # [ns]
 LATEST = (1 << 63) - 1  # [ns]; the largest ROS time
 
+ROS1 = 'ros1'  # the message encoding of ROS 1
 DAMAGED = 'use a copy or another recording'
 #: remedy if a path is not a recording
 NAME_A_BAG = 'name a bag directory, or one mcap or sqlite3 file'
+#: remedy for messages of ROS 1; their definitions have to become those of ROS 2
+CONVERT_ROS1 = (
+    'convert the bag file of ROS 1 with `rosbags-convert --src FILE.bag --dst DIR '
+    '--dst-typestore ros2_jazzy` (of the Python package rosbags)'
+)
+#: problem and remedy of a recording of which nothing can be read
+EMPTY = 'contains no complete message', 'record again, or use another recording'
 CONVERT = 'convert it with `rosbags-convert` (of the Python package rosbags) or `ros2 bag convert`'
 
 _TOPIC_NAME = re.compile(r'(/[A-Za-z_]\w*)+', re.ASCII)
@@ -65,6 +73,11 @@ class BagTopic:
     schema: Schema | None = None  # the recorded definition of the type
     problem: str = ''  # why its messages cannot be used; '' if they can
     message_count: int = 0
+
+    @property
+    def is_of_ros1(self) -> bool:
+        """Whether its messages were recorded with ROS 1."""
+        return self.encoding.lower() == ROS1
 
     @property
     def is_latched(self) -> bool:

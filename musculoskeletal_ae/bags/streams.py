@@ -28,6 +28,7 @@ from musculoskeletal_ae.message_reading import (
 from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
+from musculoskeletal_ae.signals.joint_series import JointSeries, judge_series
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream
 from musculoskeletal_ae.signals.pairing import Pairing
@@ -44,7 +45,7 @@ class Pairs(NamedTuple):
     """P pairs, each of joint angles and of the muscle lengths and tensions at the same time."""
 
     time: Array  # time since the bag's start [s], (P,)
-    theta: Array  # θ [rad], (P, D); NaN for joints without a sensor
+    theta: Array  # θ [rad], (P, D); NaN for joints without a sensor or with a false reading
     length: Array  # l [m], (P, M)
     tension: Array  # T [N], (P, M)
     isolated: Ints  # 1 for isolated muscles, 0 for others, -1 if not recorded, (P, M)
@@ -58,7 +59,7 @@ class Pairs(NamedTuple):
 class Streams(NamedTuple):
     """Sensor data and commands of one arm; missing topics are empty series."""
 
-    joints: Series  # θ [rad], (N, D); NaN for joints without a sensor
+    joints: Series  # usable θ [rad], (N, D); NaN where a joint has no usable reading
     muscles: Series  # length [m], tension [N], temperature [°C], (N, 3, M)
     length_commands: Series  # l_target [m], (N, M)
     tension_commands: Series  # T_target [N], (N, M)
@@ -66,15 +67,27 @@ class Streams(NamedTuple):
     rejected: Counter[str]  # rejected messages by topic and reason
     ignored: Counter[str]  # unused parts of messages by topic and part
     notes: tuple[str, ...]  # further remarks for the user
+    judged_joints: JointSeries  # which readings of all messages of joint_states are usable
+    false_joints: (
+        Array  # times of the messages of joint_states without any usable reading [s], (F,)
+    )
 
     def pairs(self) -> Pairs:
         """Pair each muscle message with the joint angles at the same time.
 
         Online learning on the robot pairs messages in the same way (`signals/pairing.py`). Muscle
-        messages without matching joint angles are left out.
+        messages without matching joint angles are left out, but not those beside a false reading,
+        because their lengths and tensions are right.
         """
         time = self.muscles.time
-        pairing = Pairing[int](float(np.median(np.diff(time))) if len(time) > 1 else 0.0)
+        period = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+        is_beside = np.zeros(len(time), dtype=bool)
+        if len(self.false_joints):
+            after = np.searchsorted(self.false_joints, time).clip(1, len(self.false_joints) - 1)
+            nearest = np.abs(self.false_joints[np.stack([after - 1, after])] - time).min(axis=0)
+            is_beside = nearest <= 0.5 * period
+        unknown = np.full(self.joints.values.shape[1], np.nan)
+        pairing = Pairing[int](period)
         joints = ((came, 0, row) for row, came in enumerate(self.joints.time))
         # A muscle message at time ∞ makes `Pairing` return the last pair.
         muscles = ((came, 1, row) for row, came in enumerate([*time, math.inf]))
@@ -84,9 +97,10 @@ class Streams(NamedTuple):
                 pairing.joints(came, self.joints.values[row])
                 continue
             paired = pairing.muscles(came, row if came < math.inf else None)
-            if paired is not None and paired.theta is not None:
-                theta.append(paired.theta)
-                muscle.append(paired.message)
+            if paired is None or (paired.theta is None and not is_beside[paired.message]):
+                continue
+            theta.append(unknown if paired.theta is None else paired.theta)
+            muscle.append(paired.message)
         values, time = self.muscles.values[muscle], time[muscle]
         isolated = np.full(values[:, 0].shape, -1)
         if len(self.isolated.time):
@@ -178,6 +192,13 @@ class _ArmStreams:
         return np.isin(np.arange(self._robot.muscle_count), indices).astype(float)
 
 
+#: reasons of rejection that another number or names of muscles or joints explain
+OTHER_ROBOT = 'wrong length', 'missing joint', 'missing motor', 'wrong layout'
+CHOOSE_ROBOT = 'choose the robot that was recorded'
+CHECK_DRIVER = (
+    'if this robot was recorded, correct what the driver publishes (check_driver names the fault), '
+    'and record again; otherwise choose the robot that was recorded'
+)
 #: topics of the body state; they are read before all others, because the recorder may have received
 #: a body state only after the first readings to which it applies
 BODY_TOPICS = 'isolated_muscles', 'muscle_length_zeros'
@@ -196,6 +217,8 @@ def read_streams(
     implausible messages. Each length is corrected by the newest length offsets on the topic
     `muscle_length_zeros`. If the first offsets on this topic are known, they also correct earlier
     lengths. Muscle states that were received while offsets were unknown are rejected.
+
+    False readings of joint sensors are left out (`signals/joint_series.py`).
 
     An isolated muscle may have any readings. Lengths and tensions of an isolated muscle that are
     not finite or exceed the legal range become 0, and such temperatures become NaN.
@@ -237,8 +260,12 @@ def read_streams(
         reason = f'{labels["muscle_states"]}: length offsets unknown'
         reception.rejected[reason] += int((~is_known).sum())
         states = Series(states.time[is_known], states.values[is_known])
+    judged = judge_series(robot, joints.time, joints.values)
+    is_usable, times_read = np.isfinite(judged.theta).any(axis=1), joints.time
+    joints = Series(joints.time[is_usable], judged.theta[is_usable])
     series = joints, states, lengths, tensions, isolated
-    return Streams(*series, reception.rejected, reception.ignored, notes)
+    false = times_read[~is_usable]
+    return Streams(*series, reception.rejected, reception.ignored, notes, judged, false)
 
 
 def _labels(recorded: Mapping[str, str]) -> dict[str, str]:
@@ -310,7 +337,8 @@ def _check_fit(bag: Bag, used: Mapping[str, _Stream], warnings: Sequence[str]) -
         reasons = [text.partition(f' {label}: ')[2] for text in warnings if f' {label}: ' in text]
         if reasons and not stream.values:
             problem = f'no message of {label} fits the robot ({reasons[-1]})'
-            raise BagError(bag.path, problem, 'choose the robot that was recorded')
+            is_of_shape = reasons[-1].startswith(OTHER_ROBOT)
+            raise BagError(bag.path, problem, CHOOSE_ROBOT if is_of_shape else CHECK_DRIVER)
 
 
 def _latched(times: ArrayLike, when: ArrayLike) -> Any:

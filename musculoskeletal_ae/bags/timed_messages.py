@@ -11,24 +11,53 @@ of each message, the best time is
 The minimum is over all messages of the topic. Topics without bunches keep their log times, because
 publish times have errors of their own: the clock of another computer drifts, and the clock of a
 recorder with `use_sim_time` passes at another rate.
+
+Log times may also jump forward, because the recorder was paused, or because its clock was set.
+Jumps of more than `LONGEST_PAUSE` count as pauses. Backward jumps are refused when a bag is opened.
 """
 
 from __future__ import annotations
 
 import heapq
 from array import array
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from musculoskeletal_ae.arrays import Ints
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.storage import LATEST, BagMessage
+from musculoskeletal_ae.bags.storage import LATEST, LONGEST_PAUSE, BagMessage
+from musculoskeletal_ae.report import duration
 
 # The log times of a topic count as bunched if all of these conditions hold.
 FEW = 20  # it has at least this number of messages
 BUNCHED = 50_000_000  # the delays of its messages differ by more than this [ns]
 MANY = 0.1  # more than this fraction of its messages was written together with the message before
+
+
+class Pause(NamedTuple):
+    """A time in which nothing was recorded."""
+
+    begin: int  # log time of the last message before it [ns]
+    end: int  # log time of the first message after it [ns]
+
+    def text(self, start: int) -> str:
+        """Return a sentence about the pause in a bag that begins at the log time `start` [ns]."""
+        begin = duration((self.begin - start) / 1e9)
+        length = duration((self.end - self.begin) / 1e9)
+        return f'the log times jump forward by {length}, {begin} after the start of the bag'
+
+
+def find_pauses(times: Iterable[Sequence[int] | Ints]) -> list[Pause]:
+    """Return the pauses of more than `LONGEST_PAUSE` between messages.
+
+    Args:
+        times: The log times [ns] of each topic.
+    """
+    ordered = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *times]))
+    before = np.flatnonzero(np.diff(ordered) > LONGEST_PAUSE).tolist()
+    return [Pause(int(ordered[n]), int(ordered[n + 1])) for n in before]
 
 
 class _Bunched(NamedTuple):
@@ -44,11 +73,12 @@ class TimedMessages:
     Attributes:
         bag: The recording.
         topics: Recorded names of the topics.
+        pauses: The pauses of the recording, in order.
         note: A text that names the topics with corrected times; '' if there are none.
     """
 
     def __init__(self, bag: Bag, topics: Iterable[str], stop: int = LATEST) -> None:
-        """Find the topics with bunched log times.
+        """Find the pauses of the recording, and the topics with bunched log times.
 
         Args:
             bag: The recording.
@@ -56,7 +86,9 @@ class TimedMessages:
             stop: Latest log time of the messages to check [ns].
         """
         self.bag, self.topics = bag, frozenset(topics)
-        self._bunched = _find_bunched(bag, self.topics, stop)
+        times = _read_times(bag, self.topics, stop)
+        self.pauses = find_pauses(log_time for log_time, _ in times.values())
+        self._bunched = _find_bunched(times)
         self.note = ''
         if self._bunched:
             problem = 'the recorder wrote messages late and in bunches'
@@ -92,15 +124,23 @@ class TimedMessages:
             yield heapq.heappop(waiting)[2]
 
 
-def _find_bunched(bag: Bag, topics: Collection[str], stop: int) -> dict[str, _Bunched]:
+def _read_times(bag: Bag, topics: Collection[str], stop: int) -> dict[str, tuple[Ints, Ints]]:
+    """Return the log times and the publish times [ns] of the messages of each topic."""
     times = {topic: (array('q'), array('q')) for topic in topics}
     for message in bag.messages(topics, stop=stop):
         log, sent = times[message.topic]
         log.append(message.log_time)
         sent.append(message.publish_time)
+    return {
+        topic: (np.array(log, dtype=np.int64), np.array(sent, dtype=np.int64))
+        for topic, (log, sent) in times.items()
+    }
+
+
+def _find_bunched(times: dict[str, tuple[Ints, Ints]]) -> dict[str, _Bunched]:
     bunched = {}
     for topic in sorted(times):
-        log_time, publish_time = (np.array(part, dtype=np.int64) for part in times[topic])
+        log_time, publish_time = times[topic]
         if len(log_time) < FEW or not (publish_time > 0).all():
             continue
         if (np.diff(publish_time) < 0).any():

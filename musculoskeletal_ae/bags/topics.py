@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.storage import CONVERT_ROS1, EMPTY
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.files import read_table
 from musculoskeletal_ae.robot.motors import ARRAY, FILE, JOINT_STATE, NO_MOTORS, MotorTopics
@@ -196,8 +197,11 @@ def _relative_names(
         motors: Topics of the motors of a ros2_control robot.
 
     Raises:
-        BagError: If the namespace is not in the bag, or if it is None and the bag has several.
+        BagError: If the bag is empty, if the namespace is not in the bag, or if it is None and the
+            bag has several.
     """
+    if not bag.message_count:
+        raise BagError(bag.path, *EMPTY)
     motor_topics = _motor_topics(bag, motors)
     placed = [name for name in bag.topics if name not in motor_topics]
     if namespace is None:
@@ -260,6 +264,8 @@ def _compare_type(bag: Bag, name: str, expected: str, leave_out: str = '') -> No
         leave_out: Text that is appended to the remedy in the error message.
     """
     topic = bag.topics[name]
+    if topic.is_of_ros1:
+        raise BagError(bag.path, f'topic {name} has messages of ROS 1', CONVERT_ROS1)
     if topic.type != expected:
         problem = (
             f'topic {name} has the type {topic.type[:80]!r}; legal for this name: {expected!r}'

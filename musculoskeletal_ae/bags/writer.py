@@ -13,7 +13,7 @@ from rosbags.interfaces import Qos
 
 from musculoskeletal_ae.bags import message_types, metadata
 from musculoskeletal_ae.bags.reader import Bag
-from musculoskeletal_ae.bags.storage import BagTopic
+from musculoskeletal_ae.bags.storage import EMPTY, BagTopic
 from musculoskeletal_ae.exceptions import BagError
 
 COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
@@ -168,8 +168,13 @@ def recover(path: Path, target: Path, compression: str = 'zstd') -> tuple[int, l
     Returns:
         The number of messages in the new bag, and the names of the topics that were left out
         because their messages are not encoded in CDR.
+
+    Raises:
+        BagError: If no message can be read, or a bag cannot be read or written.
     """
     bag = Bag.open(path)
+    if not bag.message_count:
+        raise BagError(path, *EMPTY)
     with BagWriter(target, compression) as writer:
         for name, topic in bag.topics.items():
             if topic.encoding == message_types.CDR:

@@ -28,6 +28,7 @@ from musculoskeletal_ae.message_reading import (
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals import joint_sensors, wiring
+from musculoskeletal_ae.signals.joint_series import judge_series
 from musculoskeletal_ae.signals.limits import length_range
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Presence, Row, possible_readings
@@ -39,6 +40,7 @@ TEMPERATURES = -20.0, 130.0  # range of possible temperatures [°C]
 #: distance by which l may exceed its range, with and without length calibration [m]
 BEYOND = 0.1, 1.0
 BEYOND_JOINT = 0.3  # distance by which θ may exceed the joint limits [rad]
+BEYOND_SHARE = 0.95  # share of the messages of which θ must not exceed them by more
 #: tolerance of |T − T_bias| while nothing is commanded, [N] and relative to T_bias, for errors of
 #: the sensor and of its zero; the smaller tolerance applies
 RESTING_TENSION, RESTING_SHARE = 15.0, 0.5
@@ -104,7 +106,11 @@ class Listening:
         self._stated = posture is not None
         self._theta = np.full(robot.joint_count, math.nan) if posture is None else np.array(posture)
         self._not_finite: Counter[str] = Counter()  # positions that are not finite, by joint
-        self._read: list[tuple[Array, Array]] = []  # states (3, M) and θ (D,) at that time, or NaN
+        #: states (3, M) of each message of the muscles, and the number of joint messages before it
+        self._read: list[tuple[Array, int]] = []
+        #: times [s] of the joint messages, which are those of the muscles before them, and θ (D,)
+        self._angles_read: list[tuple[float, Array]] = []
+        self._now = 0.0  # time of the newest message of the muscles [s]
         self._rejected: dict[tuple[str, str], list[MessageError]] = {}  # by topic and reason
         #: lowest and highest possible values of each quantity, (Q, M)
         self._low, self._high = (each[: len(Row)] for each in possible_readings(robot))
@@ -135,13 +141,15 @@ class Listening:
             number: Sequence number; 0 if unknown.
         """
         self._pace.message(now, sent, number)
+        self._now = now
         topic = 'motors' if self._motors.is_ros2_control else 'muscle_states'
         with self._rejecting(topic):
             reading = self._motors.reading(message)
             states = read_muscle_states(
                 reading, self._robot.muscle_count, source=self._robot.tension_source
             )
-            self._read.append((states[: len(Row)], self._theta))  # the check ignores other rows
+            # The check ignores other rows.
+            self._read.append((states[: len(Row)], len(self._angles_read)))
 
     def joints(self, message: object) -> None:
         """Record a message of joint_states."""
@@ -150,6 +158,7 @@ class Listening:
             theta = read_posture(message, self._robot.joints, some=True)
             if not self._stated:  # joints may come in several messages
                 self._theta = np.where(np.isnan(theta), self._theta, theta)
+                self._angles_read.append((self._now, theta))
 
     @contextmanager
     def _rejecting(self, topic: str) -> Iterator[None]:
@@ -175,7 +184,8 @@ class Listening:
         if not self.count:
             verdict.failed('silent', topic=self._motors.state_topic)
             return verdict
-        states, theta = map(np.array, zip(*self._read)) if self._read else (np.zeros(0),) * 2
+        states = np.array([each for each, _ in self._read])
+        theta = self._angles_at_readings(verdict)
         self._pace.judge(verdict, now)
         if self._motors.is_ros2_control:
             verdict.notes.append(MOTOR_NOTE)
@@ -202,6 +212,31 @@ class Listening:
                     '--posture of check_driver',
                 )
         return verdict
+
+    def _angles_at_readings(self, verdict: Verdict) -> Array:
+        """Return θ [rad] at each message of the muscles, (N, D), with NaN where it is unknown.
+
+        False angles are left out, and recorded.
+
+        Args:
+            verdict: Receives the results.
+        """
+        unknown = np.full((1, self._robot.joint_count), math.nan)
+        if self._stated or not self._angles_read:
+            return np.repeat(self._theta[None], len(self._read), axis=0)
+        time, theta = map(np.array, zip(*self._angles_read))
+        judged = judge_series(self._robot, time, theta)
+        if judged.is_fault:
+            verdict.failed('false joint angles', detail=judged.text, remedy=judged.remedy)
+        elif judged.text:
+            verdict.notes.append(judged.advice)
+        # Row 0 stands for the time before the first message. Each angle holds until the next one.
+        known = np.concatenate([unknown, judged.theta])
+        rows = np.where(np.isfinite(known), np.arange(len(known))[:, None], 0)
+        newest = np.maximum.accumulate(rows, axis=0)
+        angles = np.take_along_axis(known, newest, axis=0)
+        at: Array = angles[[count for _, count in self._read]].reshape(-1, unknown.shape[1])
+        return at
 
     def _judge_repetition(self, verdict: Verdict, states: Array) -> None:
         if len(states) > 10:
@@ -454,10 +489,14 @@ class Listening:
             joint limits.
         """
         robot = self._robot
-        beyond = np.maximum(theta - robot.upper, robot.lower - theta).max(axis=0)
+        # Judge the message that few others exceed, not a single extreme.
+        excess = np.maximum(theta - robot.upper, robot.lower - theta)
+        judged = np.argsort(excess, axis=0)[int(BEYOND_SHARE * (len(theta) - 1))]
+        beyond = np.take_along_axis(excess, judged[None], axis=0)[0]
         j = int((beyond / robot.kinematics.radian).argmax())
         if beyond[j] > BEYOND_JOINT * robot.kinematics.radian[j]:
-            values = {'theta': theta[0, j], 'beyond': beyond[j], 'unit': robot.units[j].theta}
+            reading = theta[judged[j], j]
+            values = {'theta': reading, 'beyond': beyond[j], 'unit': robot.units[j].theta}
             verdict.failed('joint', name=robot.joints[j], **values)
             return math.inf
         model = robot.muscle_lengths(theta, tension)

@@ -22,6 +22,8 @@ from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.situation import Situation, figures, nodes_in_graph
+from musculoskeletal_ae.options import CLOSED
+from musculoskeletal_ae.output import is_reader_gone
 from musculoskeletal_ae.report import (
     END_OF_RECORDING,
     NOT_WAITED_FOR,
@@ -98,6 +100,8 @@ class BringupStatus(Shell):
         return Report('' if self.situation.trouble() else 'all nodes are OK', {})
 
     def _print(self) -> None:
+        if is_reader_gone():  # end it all, because the arm would otherwise go on unseen
+            sys.exit(CLOSED)
         now = time.monotonic()
         self.situation.forget_ended()
         if self.started is None and not self.anomalies:
@@ -207,5 +211,5 @@ class BringupStatus(Shell):
         """Print the hint of the situation in a line of its own, once."""
         hint = self.situation.hint()
         if hint and hint != self.printed_hint:
-            print(f'-- {printable(hint)}')
+            print(f'-- {printable(hint)}', flush=True)
             self.printed_hint = hint

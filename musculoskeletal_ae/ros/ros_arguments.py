@@ -9,19 +9,26 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from musculoskeletal_ae.ros.executor import RCLInvalidROSArgsError, UnknownROSArgsError
 
 NO_REASON = 'error not set'  # the message of rcl for an error without a reason
-#: exceptions of rclpy for a wrong ROS argument: an unknown argument, or a parameter value of the
-#: wrong type or out of range
+NO_LOG_FOLDER = 'log directory'  # in the message of rcl if it cannot create the folder of its logs
+#: exceptions of rclpy for an argument that cannot be parsed
+ARGUMENT_ERRORS = UnknownROSArgsError, RCLInvalidROSArgsError
+#: exceptions of rclpy for a wrong ROS argument: also a parameter value of the wrong type or out of
+#: range
 PARAMETER_ERRORS = (
     InvalidParameterTypeException,
     InvalidParameterValueException,
-    UnknownROSArgsError,
-    RCLInvalidROSArgsError,
+    *ARGUMENT_ERRORS,
 )
 
 
 def reason(error: Exception) -> str:
-    """Return the message of an rcl error, without the location in its source code."""
+    """Return the message of an rcl error, without the location in its source code.
+
+    If it is known how to mend the cause, the text also says how.
+    """
     text = ' '.join(str(error).split(', at /')[0].split())
+    if NO_LOG_FOLDER in text:
+        return f'{text}; set ROS_LOG_DIR to a folder that can be written'
     is_secured = os.environ.get('ROS_SECURITY_ENABLE') == 'true'
     if is_secured and not os.environ.get('ROS_SECURITY_KEYSTORE') and NO_REASON in text:
         return (

@@ -30,6 +30,7 @@ from musculoskeletal_ae.bags.playback import (
     window,
 )
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.storage import LONGEST_PAUSE
 from musculoskeletal_ae.bags.timed_messages import TimedMessages
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, DIAGNOSTICS, latched_topics, select
 from musculoskeletal_ae.conditions import ConditionKind
@@ -106,7 +107,7 @@ class Replay(Node):
         # Times of the next /clock message, service round and report on the steady clock [s].
         self._next_tick = self._next_service = self._next_report = 0.0
         self._sought: int | None = None  # recorded time to seek to [ns]
-        self._rate = options.rate
+        self._rate, self._skips_pauses = options.rate, options.skip_pauses
         self._printed = ''  # the nodes that it waits for, as last printed
         # Steady time and recorded time of the last report, and steady time of the last seek [s].
         self._reported, self._seek_time = (math.inf, 0.0), math.inf
@@ -170,7 +171,11 @@ class Replay(Node):
             self._seek_time = time.monotonic()
             # Jump to just before the first message, so that it is not due while playback is paused.
             self._timeline.jump(start - 1, time.monotonic())
+            before = start
             for message in lap(self._messages, start, self._stop):
+                if self._skips_pauses:
+                    self._timeline.skip_pause(before, message.log_time, time.monotonic())
+                before = message.log_time
                 if not self._wait(message.log_time, progress):
                     break
                 self._wait_for_nodes(message.log_time)
@@ -325,6 +330,17 @@ def _await_subscribers(spinner: Spinner, publishers: list[Publisher], longest: f
     time.sleep(SETTLE_TIME if longest else 0.0)
 
 
+def _warn_of_pauses(messages: TimedMessages, played: tuple[int, int]) -> None:
+    """Warn of the pauses for which playback will wait, in the part to play [ns]."""
+    pauses = [each for each in messages.pauses if each.end > played[0] and each.begin < played[1]]
+    if not pauses:
+        return
+    longest = max(pauses, key=lambda pause: pause.end - pause.begin)
+    others = f' ({len(pauses) - 1} more such jumps)' if len(pauses) > 1 else ''
+    problem = f'{longest.text(messages.bag.start)}{others}, and playback waits as long'
+    print(f'warning: {problem}; --skip-pauses goes on at once', file=sys.stderr, flush=True)
+
+
 def _replay(options: Namespace, arguments: list[str]) -> int:
     bag = Bag.open(options.bag)
     for reason in bag.unfinished:
@@ -342,6 +358,8 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
     messages = TimedMessages(bag, names)
     if messages.note:
         print(f'note: {messages.note}', file=sys.stderr)
+    if not options.skip_pauses:
+        _warn_of_pauses(messages, window(bag, options.start, options.duration))
     with STOP.reacting(Reaction.REMEMBER):
         start_ros(arguments)
         node = Replay(messages, names, options)
@@ -386,6 +404,11 @@ def parse(arguments: list[str]) -> Namespace:
     add('--rate', type=number(1e-3, 1e3), default=1.0, help=rate)
     add('--clock', action='store_true', help='publish the recorded time on /clock')
     add('--loop', action='store_true', help='start again after the end of the recording')
+    text = (
+        f'go on at once where nothing was recorded for more than {LONGEST_PAUSE / 1e9:g} s; the '
+        'recorded time on /clock then jumps'
+    )
+    add('--skip-pauses', action='store_true', help=text)
     start = 'start this far into the bag [s]'
     add('--start', type=not_negative, default=0.0, metavar='S', help=start)
     add('--duration', type=positive, metavar='S', help='duration of the part to play [s]')
@@ -425,8 +448,11 @@ def _check_combination(parser: Parser, options: Namespace) -> None:
         }
         if ignored := sorted(changed - {'bag', 'check', 'robot', 'from_namespace'}):
             parser.error(f'--check plays nothing: remove --{ignored[0].replace("_", "-")}')
-    if options.as_trajectory and (options.loop or options.clock or options.paused):
-        parser.error('--as-trajectory sends one message: remove --loop, --clock and --paused')
+    plays = options.loop, options.clock, options.paused, options.skip_pauses
+    if options.as_trajectory and any(plays):
+        parser.error(
+            '--as-trajectory sends one message: remove --loop, --clock, --paused and --skip-pauses'
+        )
     if options.as_trajectory and options.topics != [DEFAULT]:
         listed = ','.join(options.topics)
         parser.error(

@@ -21,7 +21,12 @@ from musculoskeletal_ae.nodes.parameters import OF_RCLPY
 from musculoskeletal_ae.options import exit_status
 from musculoskeletal_ae.process_signals import STOP, Reaction
 from musculoskeletal_ae.ros.executor import RCLError, make_executor
-from musculoskeletal_ae.ros.ros_arguments import PARAMETER_ERRORS, parameters_given, reason
+from musculoskeletal_ae.ros.ros_arguments import (
+    ARGUMENT_ERRORS,
+    PARAMETER_ERRORS,
+    parameters_given,
+    reason,
+)
 
 ROS_HELP = (
     'Options of ROS follow --ros-args, such as  --ros-args -r __ns:=/left_arm -r TOPIC:=OTHER.'
@@ -130,8 +135,12 @@ def _interruptible(
 
 @contextmanager
 def _clear_ros_arguments(arguments: list[str]) -> Iterator[None]:
+    """End the tool with one line if ROS cannot use its arguments, or cannot start."""
     try:
         yield
-    except RuntimeError as error:
+    except ARGUMENT_ERRORS as error:
         print(f'{arguments[0]}: error: --ros-args: {reason(error)}', file=sys.stderr)
         sys.exit(2)
+    except RuntimeError as error:
+        print(f'error: {reason(error)}', file=sys.stderr)
+        sys.exit(1)

@@ -154,6 +154,7 @@ class JointStream:
 
     Attributes:
         rejected: Number of impossible readings by joint and kind, such as ('elbow', JUMPED).
+        newest: Whether the reading of each joint in the newest message is usable.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -164,7 +165,8 @@ class JointStream:
         self._joints = robot.joints
         self._channels = [JointChannel(*each) for each in zip(*(part.tolist() for part in limits))]
         self.rejected: Counter[tuple[str, JointReading]] = Counter()
-        self._newest = -math.inf  # time of the newest message [s]
+        self.newest: list[JointReading] = [JointReading.MISSING] * robot.joint_count
+        self._newest_at = -math.inf  # time of the newest message [s]
         self._impossible_at = -math.inf  # time of the newest impossible reading of any joint [s]
         self._passed = 0.0  # sum of the times of `pass_time` [s]
 
@@ -180,14 +182,15 @@ class JointStream:
         Returns:
             θ [rad], (D,); NaN where the reading is not usable.
         """
-        if time < self._newest:  # the clock has gone back
+        if time < self._newest_at:  # the clock has gone back
             self.reset()
-        self._newest = time
+        self._newest_at = time
         values, channels = theta.tolist(), self._channels
         kinds = [each.judge(time, value) for each, value in zip(channels, values, strict=True)]
         usable, foreign = JointReading.USABLE, JointReading.FOREIGN
         if self._is_foreign(kinds):
             kinds = [foreign if kind is usable else kind for kind in kinds]
+        self.newest = kinds
         for j, kind in enumerate(kinds):
             if kind is JointReading.MISSING:
                 values[j] = math.nan

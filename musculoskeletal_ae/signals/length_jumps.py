@@ -11,6 +11,10 @@ receives every message and decides:
     waiting ── the lengths have returned ───────────────────► no jump
     waiting ── no length has jumped for `LIMITS.settled` ───► no jump: the new level is accepted
 
+A failed read may be so close to the lengths before it that only the way back is a jump. Changes of
+more than half the legal one are therefore counted as well, if they come shortly before a jump or
+while its new level is not accepted yet.
+
 The muscles whose new level is accepted are displaced until the next length calibration
 (`DisplacedMuscles`), unless a rupture explains the jump (`PresumedRupture`).
 """
@@ -45,16 +49,40 @@ class JumpVerdict(NamedTuple):
     is_unseen: bool = False
 
 
+#: smallest change of a length that may be a part of a jump, as a fraction of the legal change
+LARGE = 0.5
+
+
+class LargeChange(NamedTuple):
+    """A message in which lengths have changed by much.
+
+    Attributes:
+        at: Time of reception by a steady clock [s].
+        which: Muscles whose lengths have changed by more than `LARGE` of the legal change, (M,).
+        change: Changes of all lengths since the previous message [m], (M,).
+        allowed: Largest change that was legal [m].
+        pause: Time since the previous message [s].
+        is_jump: Whether any of the changes was too large.
+    """
+
+    at: float
+    which: Bools
+    change: Array
+    allowed: float
+    pause: float
+    is_jump: bool
+
+
 @dataclass
 class Jump:
     """A jump whose new level is not accepted yet; arrays have the shape (M,).
 
-    The changes that were too large are added up for each muscle. The sum shows whether the length
-    is still at another level. The length itself does not show this: a module whose length jumped
-    winds in or pays out, which can bring the length back to the previous value.
+    The changes that were too large, or nearly so, are added up for each muscle. The sum shows
+    whether the length is still at another level. The length itself does not show this: a module
+    whose length jumped winds in or pays out, which can bring the length back to the previous value.
 
     Attributes:
-        change: Sum of the changes that were too large [m].
+        change: Sum of these changes [m].
         allowed: The largest change that was legal at any of these changes [m].
         winding: Length that the motors can have wound in during these changes [m].
         is_unseen: Whether the first change followed a pause of the messages.
@@ -73,20 +101,14 @@ class Jump:
         nothing = np.zeros(muscle_count)
         return cls(nothing, nothing.copy(), nothing.copy(), pause > LIMITS.pause)
 
-    def add(self, jumps: Bools, change: Array, allowed: float, pause: float, now: float) -> None:
-        """Add the changes of the muscles whose lengths have changed by too much in one message.
-
-        Args:
-            jumps: Which muscles have changed by too much, (M,).
-            change: Changes of all lengths since the previous message [m], (M,).
-            allowed: Largest change that was legal [m].
-            pause: Time since the previous message [s].
-            now: Time of reception by a steady clock [s].
-        """
-        self.last_at = now
-        self.change[jumps] += change[jumps]
-        self.allowed[jumps] = np.maximum(self.allowed[jumps], allowed)
-        self.winding[jumps] += LIMITS.step + LIMITS.speed * pause
+    def add(self, large: LargeChange) -> None:
+        """Add the changes of the muscles whose lengths have changed by much in one message."""
+        which = large.which
+        if large.is_jump:
+            self.last_at = large.at
+        self.change[which] += large.change[which]
+        self.allowed[which] = np.maximum(self.allowed[which], large.allowed)
+        self.winding[which] += LIMITS.step + LIMITS.speed * large.pause
 
     def remaining(self, used: Bools) -> Bools:
         """Return which muscles in `used` (M,) have not returned to their level before the jump."""
@@ -161,6 +183,8 @@ class LengthJumps:
         self._last_at = math.inf  # time of reception of the last message [s]
         self._last_delay = 0.0  # delay of the last message [s]
         self._jump: Jump | None = None  # the jump whose new level is not accepted yet
+        #: large changes within the last `LIMITS.glitch` that belong to no jump
+        self._large: list[LargeChange] = []
         self._was_unseen = False  # `Jump.is_unseen` of the last accepted jump
         self._rupture = PresumedRupture(robot)
 
@@ -182,11 +206,10 @@ class LengthJumps:
             return JumpVerdict()
         allowed = LIMITS.step + LIMITS.speed * min(pause, LIMITS.longest_step)
         change = length - last
-        jumps = (np.abs(change) > allowed) & used
-        if jumps.any():
-            if self._jump is None:
-                self._jump = Jump.begin(len(length), pause)
-            self._jump.add(jumps, change, allowed, pause, now)
+        is_large: Bools = (np.abs(change) > LARGE * allowed) & used
+        if is_large.any():
+            is_jump = bool((np.abs(change[is_large]) > allowed).any())
+            self._note(LargeChange(now, is_large, change, allowed, pause, is_jump))
         jump = self._jump
         if jump is None or not jump.remaining(used).any():
             self._jump = None
@@ -199,6 +222,19 @@ class LengthJumps:
             return JumpVerdict()
         muscles = np.flatnonzero(jump.remaining(used)).tolist()
         return JumpVerdict(None, tuple(muscles), jump.is_unseen)
+
+    def _note(self, large: LargeChange) -> None:
+        """Add a large change to the present jump, or begin one if the change is too large."""
+        self._large = [each for each in self._large if large.at - each.at <= LIMITS.glitch]
+        if self._jump is None and not large.is_jump:
+            self._large.append(large)
+            return
+        if self._jump is None:
+            self._jump = Jump.begin(len(large.change), large.pause)
+            for each in self._large:
+                self._jump.add(each)
+            self._large = []
+        self._jump.add(large)
 
     def jumping(self, used: Bools) -> tuple[int, ...]:
         """Return the muscles in `used` (M,) whose new level has not been accepted yet."""

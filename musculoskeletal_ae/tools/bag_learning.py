@@ -8,12 +8,14 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.arrival import LONGEST_STEP
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.storage import LONGEST_PAUSE
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.estimation.finding import Finding, observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
@@ -136,7 +138,7 @@ def _initial_network(robot: Robot, args: Namespace) -> Mae:
 
 def _learn_and_show(learner: Learner, path: Path, recording: Pairs) -> str:
     """Learn from a recording and show the progress; return a warning, or ''."""
-    total = float(recording.time[-1] - recording.time[0])
+    total = float(_without_pauses(np.diff(recording.time)).sum())
 
     def learned() -> str:
         return f'{len(learner.samples)} samples, {learner.updates} updates'
@@ -144,6 +146,11 @@ def _learn_and_show(learner: Learner, path: Path, recording: Pairs) -> str:
     with ProgressBar(f'learning from {path}', total, learned) as bar:
         bar.announce(f', a recording of {total:.0f} s')
         return learn(learner, recording, bar.add)
+
+
+def _without_pauses(steps: ArrayLike) -> Array:
+    """Return the times between messages [s], in which a pause of the recording counts little."""
+    return np.minimum(steps, LONGEST_PAUSE / 1e9)
 
 
 def _nothing_learned(learner: Learner) -> str:
@@ -275,6 +282,8 @@ def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
         print(f'warning: {path}: {count} messages were rejected: {reason}', file=sys.stderr)
     for note in streams.notes:
         print(f'warning: {path}: {note}', file=sys.stderr)
+    if streams.judged_joints.text:
+        print(f'warning: {path}: {streams.judged_joints.advice}', file=sys.stderr)
     for part, count in streams.ignored.items():
         print(f'warning: {path}: {count} messages were used only in part: {part}', file=sys.stderr)
     pairs = streams.pairs()
@@ -336,7 +345,7 @@ def learn(
             learner.take(reading, at)
         learner.poll(at)
         if progress is not None:
-            progress(dt)
+            progress(float(_without_pauses(dt)))
     if learner.mae is not newest:
         _network_in_use(validator, learner, at)
     return stop
@@ -376,14 +385,16 @@ def _finding(
 
 
 def error(mae: Mae, recording: Pairs) -> float:
-    """Return the mean of ‖θ_est − θ‖₂ [rad] over all messages, for joints with sensors."""
+    """Return the mean of ‖θ_est − θ‖₂ [rad] over all messages with θ, for joints with sensors."""
+    is_known = np.isfinite(recording.theta).any(axis=1)
     tension = mae.transmission.end(recording.tension, directions(recording.length))
     estimate = np.empty_like(recording.theta)
     for isolated in np.unique(recording.isolated, axis=0):
         rows = (recording.isolated == isolated).all(axis=1)
         without = mae.without(_isolated(isolated, mae.isolated))
         estimate[rows] = without.estimate(tension[rows], recording.length[rows]).theta
-    return float(np.linalg.norm(np.nan_to_num(estimate - recording.theta), axis=1).mean())
+    errors = np.linalg.norm(np.nan_to_num(estimate - recording.theta), axis=1)
+    return float(errors[is_known].mean())
 
 
 def _isolated(row: Ints, default: tuple[int, ...]) -> tuple[int, ...]:

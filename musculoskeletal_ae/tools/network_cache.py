@@ -82,7 +82,9 @@ def main(arguments: list[str]) -> int:
         file = network_file(robot, preset)
         file.parent.mkdir(parents=True, exist_ok=True)
     except (MusculoskeletalError, OSError) as error:
-        print(f'cache of initial networks: {error}', file=sys.stderr)
+        remedy = '; set XDG_CACHE_HOME to a folder that can be written'
+        advice = remedy if isinstance(error, OSError) else ''
+        print(f'cache of initial networks: {error}{advice}', file=sys.stderr)
         return 1
     print(file)
     return 0

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tell whether a recording is one of a given robot, and otherwise of which.
 
-    python -m musculoskeletal_ae.tools.recorded_robot BAG ROBOT
+    python -m musculoskeletal_ae.tools.recorded_robot BAG ROBOT [NAMESPACE]
 
 ends with status 1 and one line if the nodes of the robot could not use the recording. `bringup.sh`
 calls it before it starts anything. It only reads the beginning of a recording that fits;
@@ -23,35 +23,35 @@ from musculoskeletal_ae.robot.urdf import parse_xml
 BEGINNING = 2_000_000_000  # first part of a recording, in which most wrong robots are noticed [ns]
 
 
-def misfit(bag: Bag, name: str) -> str:
+def misfit(bag: Bag, name: str, namespace: str | None = None) -> str:
     """Return why a recording is not one of a robot, and what to pass instead; '' if it is one.
 
     Args:
         bag: The recording.
         name: A shipped robot or a robot directory.
+        namespace: The namespace of the arm; required only if the bag has several.
 
     Raises:
         MusculoskeletalError: If the robot or the recording is unusable.
     """
     robot = Robot.load(name)
-    interface_topics(
-        bag, motors=robot.description.motor_topics
-    )  # raises errors that have nothing to do with the robot
+    # raises errors that have nothing to do with the robot
+    interface_topics(bag, namespace, robot.description.motor_topics)
     # The first messages may be bad ones, so the whole recording is read before it is refused.
     for stop in bag.start + BEGINNING, LATEST:
-        problem = _problem(bag, robot, stop)
+        problem = _problem(bag, robot, namespace, stop)
         if not problem:
             return ''
     fits = [
         other
         for other in shipped_robots()
-        if not _problem(bag, Robot.load(other), bag.start + BEGINNING)
+        if not _problem(bag, Robot.load(other), namespace, bag.start + BEGINNING)
     ]
     if fits:
         remedy = f'it fits {", ".join(fits)}; pass --robot {fits[0]}'
     else:
         remedy = 'pass --robot with the directory of the robot that was recorded'
-        recorded, joints = _described(bag, robot)
+        recorded, joints = _described(bag, robot, namespace)
         if joints:
             stated = f'its robot_description is that of {recorded!r}, with the joints '
             remedy = f'{stated}{", ".join(joints)}; {remedy}'
@@ -59,24 +59,25 @@ def misfit(bag: Bag, name: str) -> str:
     return f'{bag.path} is not a recording of {robot_name}: {problem}; {remedy}'
 
 
-def _problem(bag: Bag, robot: Robot, stop: int) -> str:
+def _problem(bag: Bag, robot: Robot, namespace: str | None, stop: int) -> str:
     """Return why the messages up to a log time [ns] do not fit a robot; '' if they do."""
     try:
-        streams = read_streams(bag, robot, stop=stop)
+        streams = read_streams(bag, robot, namespace, stop=stop)
     except BagError as error:
         return error.problem
     if len(streams.joints.time):
         return ''
     # Without joint sensors, only the number of muscles is known to fit.
-    _, described = _described(bag, robot)
+    _, described = _described(bag, robot, namespace)
     if described and not set(robot.joints) <= set(described):
         return f'its robot_description has the joints {", ".join(described)}'
     return ''
 
 
-def _described(bag: Bag, robot: Robot) -> tuple[str, list[str]]:
+def _described(bag: Bag, robot: Robot, namespace: str | None) -> tuple[str, list[str]]:
     """Return the name and the movable joints of the recorded URDF; '' and [] without one."""
-    topic = interface_topics(bag, motors=robot.description.motor_topics).get('robot_description')
+    topics = interface_topics(bag, namespace, robot.description.motor_topics)
+    topic = topics.get('robot_description')
     for message in bag.messages([topic] if topic else []):
         try:
             root = parse_xml(bag.path, bag.decode(message).data)
@@ -93,9 +94,9 @@ def _described(bag: Bag, robot: Robot) -> tuple[str, list[str]]:
 
 def main(arguments: list[str]) -> int:
     """Print why a recording does not fit a robot; return the exit status."""
-    path, robot = arguments
+    path, robot, *namespace = arguments
     try:
-        problem = misfit(Bag.open(Path(path)), robot)
+        problem = misfit(Bag.open(Path(path)), robot, *namespace)
     except (MusculoskeletalError, OSError) as error:
         problem = str(error)
     if problem:

@@ -126,3 +126,29 @@ def test_a_replay_publishes_what_the_motors_measured_and_never_what_moves_them(t
         assert set(chosen) == {topic, '/muscle_length_command'}
     named = select(Bag.open(tmp_path / 'bag'), ['/tendons/commands'], None, True, motors)
     assert set(named) == {'/tendons/commands'}
+
+
+def test_motors_whose_positions_wrap_around_do_not_pass_the_check(robot, tmp_path):
+    arm = Arm(ROBOT, count=COUNT)
+    arm.content.clear()
+    for i in range(COUNT):
+        position = np.mod(-arm.length[i] / RADIUS + np.pi, 2.0 * np.pi) - np.pi
+        names, values = [*MOTORS, *ROBOT.joints], [*position, *arm.theta[i]]
+        effort = [*arm.tension[i], *[np.nan] * ROBOT.joint_count]
+        arm.add('/joint_states', JOINTS, i * PERIOD, joint_state(names, values, effort, i + 1))
+    arm.write(tmp_path / 'bag')
+    with_motors = str(robot().description.directory)
+    faults = check_bag(tmp_path / 'bag', with_motors).faults
+    assert any('were rejected: length jumped. See check_driver' in fault for fault in faults)
+
+
+@pytest.mark.parametrize('factor', [-1.0, 1000.0, np.nan])
+def test_a_false_sign_or_unit_of_efforts_is_not_taken_for_another_robot(factor, robot, tmp_path):
+    arm = Arm(ROBOT, count=COUNT)
+    arm.content.clear()
+    for i in range(COUNT):
+        position, effort = -arm.length[i] / RADIUS, factor * arm.tension[i]
+        arm.add('/joint_states', JOINTS, i * PERIOD, joint_state(MOTORS, position, effort, i + 1))
+    arm.write(tmp_path / 'bag')
+    with pytest.raises(BagError, match='correct what the driver publishes'):
+        read_streams(Bag.open(tmp_path / 'bag'), robot())

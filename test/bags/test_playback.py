@@ -60,6 +60,25 @@ def test_after_a_long_stop_of_the_process_it_goes_on_instead_of_catching_up():
     assert timeline.wait(2 * SECOND, 100.0) == 1.0
 
 
+@pytest.mark.parametrize('paused', [False, True])
+def test_a_pause_of_the_recording_can_be_skipped(paused):
+    timeline = Timeline(0, 1.0, now=0.0)
+    timeline.hold(paused, 0.0)
+    timeline.skip_pause(SECOND, 6 * SECOND, now=1.0)  # this is no pause
+    assert timeline.recorded(1.0) == (0 if paused else SECOND)
+    timeline.skip_pause(SECOND, 3601 * SECOND, now=1.0)
+    assert timeline.wait(3601 * SECOND, 1.0) == (np.inf if paused else 0.5)
+
+
+def test_pauses_are_found_in_the_messages_to_play(tmp_path, content):
+    late = [each._replace(log_time=each.log_time + 3600 * SECOND) for each in content[40:]]
+    samples.write_ours(tmp_path / 'paused', [*content[:40], *late])
+    bag = Bag.open(tmp_path / 'paused')
+    (pause,) = TimedMessages(bag, bag.topics).pauses
+    assert (pause.begin, pause.end) == (content[39].log_time, late[0].log_time)
+    assert 'jump forward by 60.0 min, 0.390 s after the start' in pause.text(bag.start)
+
+
 def test_a_lap_is_everything_from_start_to_stop_in_order(bag, content):
     opened = Bag.open(bag)
     played = list(lap(TimedMessages(opened, opened.topics), opened.start, opened.end))

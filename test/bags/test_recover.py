@@ -1,7 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The recording of a killed recorder can be read, and be converted into a finished bag."""
 
+import shutil
+import sqlite3
+from contextlib import closing
+
 import pytest
+from rosbags.rosbag2 import StoragePlugin
 
 from bags import bag_samples as samples
 from musculoskeletal_ae.bags.check import check_bag
@@ -59,6 +64,45 @@ def test_recovery_writes_a_finished_bag_and_leaves_the_original_alone(
     assert not bag.unfinished
     assert bag.topics['/left_arm/robot_description'].is_latched
     assert (killed / 'bag_0.mcap').read_bytes() == before
+
+
+def test_messages_in_the_log_of_sqlite_are_recovered(tmp_path, content, capsys):
+    """A killed recorder may leave its last messages in the write-ahead log only."""
+    samples.write_rosbags(tmp_path / 'closed', content, StoragePlugin.SQLITE3)
+    (file,) = (tmp_path / 'closed').glob('*.db3')
+    with closing(sqlite3.connect(file)) as connection:
+        connection.execute('PRAGMA journal_mode=wal')
+        connection.execute('PRAGMA wal_autocheckpoint=0')
+        rows = connection.execute('SELECT * FROM messages WHERE id > 20').fetchall()
+        connection.execute('DELETE FROM messages WHERE id > 20')
+        connection.commit()
+        connection.execute('PRAGMA wal_checkpoint(TRUNCATE)')
+        connection.executemany(
+            f'INSERT INTO messages VALUES ({", ".join("?" * len(rows[0]))})', rows
+        )
+        connection.commit()
+        shutil.copytree(tmp_path / 'closed', tmp_path / 'killed')
+    before = {each.name: each.read_bytes() for each in (tmp_path / 'killed').iterdir()}
+    assert recover(tmp_path / 'killed') == 0
+    assert f'{len(content)} messages recovered' in capsys.readouterr().out
+    bag = Bag.open(tmp_path / 'killed_recovered')
+    assert [message.data for message in bag.messages()] == [sample.data for sample in content]
+    assert {each.name: each.read_bytes() for each in (tmp_path / 'killed').iterdir()} == before
+
+
+@pytest.mark.parametrize('namespace', [None, '/left_arm'])
+def test_of_a_recording_without_a_complete_message_nothing_is_promised(
+    namespace, tmp_path, content
+):
+    samples.write_ours(tmp_path / 'bag', content[:5], finish=False)
+    file = tmp_path / 'bag' / 'bag_0.mcap'
+    file.write_bytes(file.read_bytes()[:200])
+    faults = '\n'.join(check_bag(tmp_path / 'bag', None, namespace).faults)
+    assert 'contains no complete message; record again' in faults
+    assert '--recover' not in faults and '--from-namespace' not in faults
+    with pytest.raises(BagError, match='contains no complete message; record again'):
+        recover(tmp_path / 'bag')
+    assert not (tmp_path / 'bag_recovered').exists()
 
 
 @pytest.mark.parametrize('text', ['', 'rosbag2_bagfile_information: {}'])

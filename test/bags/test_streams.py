@@ -251,3 +251,81 @@ def test_a_recorder_that_wrote_in_bunches_costs_no_pairs(robot, tmp_path, period
     pairs = result.pairs()
     assert len(pairs.time) >= len(regular.time) - 1
     assert_allclose(np.diff(pairs.time), 0.01, atol=1e-6)
+
+
+def with_false_angles(robot, kind):
+    """Return a recording of 10 s in which some joint angles are false."""
+    arm = Arm(robot, count=1000)
+    for n in range(1000):
+        zeros = joints(robot.joints, np.zeros(robot.joint_count))
+        if kind == 'second publisher':
+            arm.add('/joint_states', JOINTS, n * 0.01 + 0.006, zeros)
+    for n in (100, 500, 900) if kind == 'failed reads' else ():
+        failed = joints(robot.joints, np.full(robot.joint_count, -np.pi))
+        arm.add('/joint_states', JOINTS, n * 0.01 + 0.004, failed)
+    return arm
+
+
+@pytest.mark.parametrize(
+    ('kind', 'share', 'is_fault'),
+    [('second publisher', '50 %', True), ('failed reads', '0.299 %', False)],
+)
+def test_false_joint_angles_are_found_with_their_share_and_not_used(
+    kind, share, is_fault, robot, tmp_path
+):
+    arm = with_false_angles(robot, kind)
+    result = streams(arm, robot, tmp_path)
+    assert_array_equal(result.joints.values, arm.theta)
+    check = check_bag(tmp_path / 'bag', robot.description.directory.name)
+    found = [text for text in (check.faults if is_fault else check.lines) if share in text]
+    assert len(found) == 1 and 'stop a second program that publishes joint_states' in found[0]
+    assert bool(check.faults) == is_fault, check.faults
+    # Without the robot, the fault is that of the only robot whose messages these are.
+    assert any(share in text for text in check_bag(tmp_path / 'bag').faults) == is_fault
+
+
+def test_muscle_messages_beside_false_joint_angles_are_kept_without_them(robot, tmp_path):
+    arm, zeros = Arm(robot, count=1000), np.zeros(robot.joint_count)
+    is_false = [400 <= n < 700 for n in range(1000)]
+    messages = iter(is_false)
+    arm.content = [
+        each._replace(data=joints(robot.joints, zeros))
+        if each.type == JOINTS and next(messages)
+        else each
+        for each in arm.content
+    ]
+    pairs = streams(arm, robot, tmp_path).pairs()
+    assert_array_equal(pairs.length, arm.length)
+    assert_array_equal(np.isnan(pairs.theta).all(axis=1), is_false)
+
+
+@pytest.mark.parametrize('first', [0, samples.START - 3600 * 10**9])
+def test_a_forward_jump_of_the_log_times_is_a_fault(first, content, tmp_path):
+    early = [sample._replace(log_time=first) for sample in content[:5]]
+    samples.write_ours(tmp_path / 'bag', [*early, *content[5:]])
+    (fault,) = [text for text in check_bag(tmp_path / 'bag').faults if 'jump forward' in text]
+    assert ('57.0 years' if first == 0 else '60.0 min') in fault
+    assert '--skip-pauses' in fault
+
+
+@pytest.mark.parametrize('topic', ['/joint_states', '/muscle_states'])
+def test_a_topic_that_was_lost_during_the_recording_is_a_fault(topic, robot, tmp_path):
+    arm = Arm(robot, count=1500)
+    lost_at = samples.START + 4 * 10**9
+    arm.content = [each for each in arm.content if each.topic != topic or each.log_time < lost_at]
+    arm.write(tmp_path / 'bag')
+    (fault,) = check_bag(tmp_path / 'bag', 'arm26').faults
+    assert f'no message of {topic} was recorded from 4.0 s to 15.0 s' in fault
+
+
+def test_an_encoder_that_wraps_around_is_named_and_no_muscle_is_blamed(robot, tmp_path):
+    arm = Arm(robot, count=400)
+    theta = iter(np.mod(arm.theta, 2.0 * np.pi))
+    arm.content = [
+        each._replace(data=joints(robot.joints, next(theta))) if each.type == JOINTS else each
+        for each in arm.content
+    ]
+    result = streams(arm, robot, tmp_path)
+    assert_allclose(result.joints.values, arm.theta, atol=1e-12)
+    (fault,) = check_bag(tmp_path / 'bag', 'arm26').faults
+    assert 'whole turns' in fault and 'subtract the whole turns' in fault

@@ -286,6 +286,30 @@ def test_a_wrong_option_is_refused_before_anything_starts(bringup, arguments, ex
     assert expected in output
 
 
+@pytest.mark.parametrize(
+    ('options', 'shell', 'status'),
+    [
+        pytest.param(['--duration', '1'], 'exec "$@" >/dev/full', 0, marks=pytest.mark.thorough),
+        pytest.param(['--duration', '1'], 'exec "$@" >&- 2>&-', 0, marks=pytest.mark.thorough),
+        # The first status line is the last one that anybody reads.
+        ([], '"$@" | sed "/ A /q"; exit "${PIPESTATUS[0]}"', 141),
+    ],
+    ids=['on a full disk', 'without output', 'reader gone'],
+)
+def test_bringup_ends_with_all_its_processes_whatever_happens_to_its_output(
+    options, shell, status, trained_file, environment, join
+):
+    arguments = ['--robot', 'arm26', '--checkpoint', trained_file, '--no-learner', *options]
+    arguments += ['--namespace', 'unseen']
+    command = ['bash', '-c', shell, 'bash', str(REPOSITORY / 'bringup.sh'), *arguments]
+    run = Process('bringup.sh', command, env=environment, start_new_session=True)
+    graph = join('/unseen')
+    graph.processes.append(run)
+    ended, output = run.ended()
+    assert ended == status, output
+    assert 'Traceback' not in output and left_behind(run) == ''
+
+
 def driver(namespace):
     """Run the driver template for arm26."""
     command = [sys.executable, str(REPOSITORY / 'examples' / 'driver.py')]

@@ -355,6 +355,44 @@ def test_a_reversed_joint_sensor_of_a_symmetric_arm_is_not_taken_for_several_exc
     assert not verdict.allows_motion or not faults
 
 
+def listened(robot, spoil):
+    """Return the verdict on a driver of a moved arm; `spoil` returns θ of the joint messages."""
+    listening, noise = Listening(robot, 100.0), np.random.default_rng(0)
+    for k in range(400):
+        share = 0.1 + 0.8 * (0.5 - 0.5 * np.cos(0.02 * k * np.array([1.0, 1.3])))
+        theta = robot.lower + share * (robot.upper - robot.lower)
+        length = robot.muscle_lengths(theta, robot.tension.bias)
+        rows = np.stack([length, robot.tension.bias, np.full(4, 30.0)])
+        rows += 1e-4 * noise.normal(size=rows.shape)
+        for angles in spoil(k, theta):
+            listening.joints(joint_state(dict(zip(robot.joints, angles))))
+        listening.muscles(array(rows), 0.01 * k)
+    return listening.verdict(4.0)
+
+
+def test_zeros_of_a_second_publisher_are_named_and_no_length_is_blamed(neck):
+    verdict = listened(neck, lambda _, theta: [theta, 0.0 * theta])
+    (fault,) = verdict.faults
+    assert fault.name == 'false joint angles'
+    assert '50 % of the 800 messages' in fault.observation and 'roll 0 rad' in fault.observation
+    assert 'stop a second program' in fault.change
+
+
+def test_a_single_false_angle_is_a_remark_with_its_value(neck):
+    verdict = listened(neck, lambda k, theta: [theta - np.pi * (k == 200)])
+    assert not verdict.faults, str(verdict)
+    (note,) = [note for note in verdict.notes if 'false joint angles' in note]
+    assert '0.25 % of the 400 messages' in note
+
+
+def test_the_angle_that_is_beyond_the_limits_is_quoted(neck):
+    far = neck.upper + 0.5
+    verdict = listened(neck, lambda k, theta: [theta if k < 100 else far])
+    (fault,) = verdict.faults
+    assert fault.name == 'joint'
+    assert f'{far[0]:.3g} rad, 0.5 rad beyond its limits' in fault.observation
+
+
 def test_advice_on_a_rejected_message_is_that_of_its_topic():
     listening = Listening(ROBOT, 100.0)
     velocities = joint_state({})

@@ -11,7 +11,10 @@ import pytest
 
 from musculoskeletal_ae import progress_bar
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
+from musculoskeletal_ae.bags.message_types import TYPESTORE
+from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs
+from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Finding
 from musculoskeletal_ae.estimation.health import HealthMonitor
@@ -54,6 +57,44 @@ def test_learning_from_one_recording_improves_the_estimate_of_another(robot, tea
     assert sum(reported) == pytest.approx(exploration.time[-1] - exploration.time[0])
     assert learner.updates > 0
     assert error(learner.mae, other) < 0.6 * error(mae, other)
+
+
+def spoiled(path, kind, seconds=60.0):
+    """Write the begin of a recording with false joint angles; return the bag."""
+    bag = Bag.open(BAGS / 'exploration')
+    changed, end = bag.topics['/joint_states'], bag.start + seconds * 1e9
+    with BagWriter(path) as writer:
+        for name, topic in bag.topics.items():
+            writer.add_topic(name, topic.type, topic.qos)
+        count = 0
+        for message in bag.messages(stop=int(end)):
+            data, at = message.data, (message.log_time - bag.start) / 1e9
+            if message.topic == changed.name:
+                count += 1
+                zeros = bag.decode(message)
+                zeros.position = np.zeros(len(zeros.position))
+                false = bytes(TYPESTORE.serialize_cdr(zeros, changed.type))
+                if kind == 'every second message' and count % 2:
+                    data = false
+                if kind == 'bursts' and at % 20.0 > 18.0:
+                    data = false
+                if kind == 'second publisher':
+                    other = message.log_time + 20_000_000, message.publish_time + 20_000_000
+                    writer.write(message.topic, *other, false)
+            writer.write(message.topic, message.log_time, message.publish_time, data)
+    return path
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize('kind', ['every second message', 'bursts', 'second publisher'])
+def test_false_joint_angles_hardly_change_what_is_learned(kind, robot, teaching, tmp_path):
+    errors = []
+    for each in ('none', kind):
+        recording = read(spoiled(tmp_path / each, each), robot)
+        learner = Learner(robot, initial_mae(robot, steps=150).mae, steps=20)
+        learn(learner, recording)
+        errors.append(error(learner.mae, part(teaching, 0.0, 15.0)))
+    assert errors[1] <= 1.1 * errors[0]
 
 
 def test_isolated_muscles_of_a_recording_are_neither_learned_nor_used(arm26, initial):

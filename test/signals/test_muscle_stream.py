@@ -349,3 +349,23 @@ def test_a_body_state_counts_its_changes(first, second):
     after = body.with_isolated(second)
     assert after.version - body.version == (first != second)
     assert np.flatnonzero(~after.used).tolist() == sorted(second)
+
+
+@pytest.mark.parametrize('count', [1, 5])
+@pytest.mark.parametrize('failed', [0.0, 0.0314, 0.05])
+def test_failed_reads_of_all_motors_of_a_moving_arm_do_not_reject_what_follows(failed, count):
+    """The value of a failed read may be so close to some lengths that only the way back jumps."""
+    stream, used = MuscleStream(ROBOT), []
+    time = PERIOD * np.arange(600)
+    middle, half = 0.5 * (ROBOT.lower + ROBOT.upper), 0.5 * (ROBOT.upper - ROBOT.lower)
+    theta = middle + 0.8 * half * np.sin(3.0 * time[:, None] + np.arange(ROBOT.joint_count))
+    lengths = ROBOT.muscle_lengths(theta, np.tile(ROBOT.tension.bias, (len(time), 1)))
+    for n, (now, length) in enumerate(zip(time, lengths)):
+        states = resting()
+        states[0] = failed if n % 90 in range(50, 50 + count) else length
+        with suppress(RejectionError):
+            stream.take(message(states), now)
+            used.append(n)
+    right = [n for n in range(len(time)) if n % 90 not in range(50, 50 + count)]
+    assert set(right) <= set(used)
+    assert not stream.displaced.muscles
