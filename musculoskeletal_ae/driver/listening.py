@@ -93,7 +93,8 @@ class Listening:
         Args:
             robot: The geometric model.
             rate: Expected rate of muscle_states [Hz].
-            posture: θ [rad] (D,) in which the arm is held, or None to use joint_states.
+            posture: Positions of the joints [rad or m], (D,), in which the arm is held, or None to
+                use joint_states.
             zeroed: Whether the lengths are calibrated; if not, each may have any constant offset.
             motors: How the motors of a ros2_control robot are connected, or None for muscle_states.
             clock: Shows the pauses of this process; None for a process without pauses.
@@ -102,7 +103,9 @@ class Listening:
         self._pace = Pace(rate, clock or AwakeClock())
         self._motors = motors or MotorInterface(None)
         self._stated = posture is not None
-        self._theta = np.full(robot.joint_count, math.nan) if posture is None else np.array(posture)
+        self._theta = np.full(robot.joint_count, math.nan)
+        if posture is not None:
+            self._theta = robot.units.to_theta(np.array(posture))
         self._not_finite: Counter[str] = Counter()  # positions that are not finite, by joint
         self._read: list[tuple[Array, Array]] = []  # states (3, M) and θ (D,) at that time, or NaN
         self._rejected: dict[tuple[str, str], list[MessageError]] = {}  # by topic and reason
@@ -147,7 +150,7 @@ class Listening:
         """Record a message of joint_states."""
         with self._rejecting('joint_states'):
             self._not_finite.update(joints_not_finite(message, self._robot.joints))
-            theta = read_posture(message, self._robot.joints, some=True)
+            theta = read_posture(message, self._robot.units, some=True)
             if not self._stated:  # joints may come in several messages
                 self._theta = np.where(np.isnan(theta), self._theta, theta)
 
@@ -364,7 +367,7 @@ class Listening:
 
     def _moved(self, theta: Array) -> Bools:
         """Return which joints moved enough to check the signs of their angles, (D,)."""
-        moved: Bools = np.ptp(theta, axis=0) > MOVED_JOINT * self._robot.kinematics.radian
+        moved: Bools = np.ptp(theta, axis=0) > MOVED_JOINT
         return moved
 
     def _judge_joint_signs(
@@ -401,7 +404,7 @@ class Listening:
         """
         robot = self._robot
         joints = range(robot.joint_count)
-        turning = [j for j in joints if not robot.kinematics.slides[j]]
+        turning = [j for j in joints if not robot.units.slides[j]]
         if np.abs(theta[:, turning]).max(initial=0.0) > math.pi:
             degrees = theta.copy()
             degrees[:, turning] = np.radians(degrees[:, turning])
@@ -414,8 +417,9 @@ class Listening:
         if moved.sum() > 1:
             yield 'joint sign', [robot.joints[j] for j in joints], -theta
         for j, k in combinations(np.flatnonzero(moved).tolist(), 2):
-            exchanged = theta.copy()
-            exchanged[:, [j, k]] = theta[:, [k, j]]
+            exchanged = joint_sensors.corrected(
+                theta, [joint_sensors.JointFault(joint_sensors.ORDER, (j, k))], robot.units
+            )
             yield 'joint order', [robot.joints[j], robot.joints[k]], exchanged
 
     def _are_turned(self, length: Array, model: Array, moved: Bools) -> bool:
@@ -455,9 +459,10 @@ class Listening:
         """
         robot = self._robot
         beyond = np.maximum(theta - robot.upper, robot.lower - theta).max(axis=0)
-        j = int((beyond / robot.kinematics.radian).argmax())
-        if beyond[j] > BEYOND_JOINT * robot.kinematics.radian[j]:
-            values = {'theta': theta[0, j], 'beyond': beyond[j], 'unit': robot.units[j].theta}
+        j = int(beyond.argmax())
+        if beyond[j] > BEYOND_JOINT:
+            at, off = robot.units.to_position(np.array([theta[0, j], beyond[j]]), j)
+            values = {'theta': at, 'beyond': off, 'unit': robot.units[j].theta}
             verdict.failed('joint', name=robot.joints[j], **values)
             return math.inf
         model = robot.muscle_lengths(theta, tension)

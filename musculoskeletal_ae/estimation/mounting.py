@@ -38,12 +38,8 @@ UPRIGHT = 25.0  # angle up to which a direction counts as that of `robot.urdf` [
 NOISE = 0.08, 0.16, 0.32
 LEAST_NOISE = 0.1  # smallest σ_j [N·m]
 FREEDOM = 4.0  # ν: with larger residuals, a posture counts less
-#: motion of a joint after which a posture counts again [rad]; for prismatic joints times
-#: `kinematics.RACK` [m]
-MOVED = 0.2
-#: distance from a limit below which a joint may rest at its stop [rad]; for prismatic joints times
-#: `kinematics.RACK` [m]
-AT_STOP = 0.12
+MOVED = 0.2  # motion of a joint after which a posture counts again [rad]
+AT_STOP = 0.12  # distance from a limit below which a joint may rest at its stop [rad]
 MEMORY = 100.0  # number of postures after which the weight of a posture has decreased to 1/e
 ENOUGH = 30  # number of postures from which the evidence is judged
 CERTAIN = 25.0  # report another direction of gravity from this evidence on
@@ -129,14 +125,12 @@ class MountingCheck:
             tension: Bone-side tensions [N], (M,).
             torque: External torque τ_ext [N·m], (D,); 0 where a stop may be the only cause.
         """
-        robot = self._robot
-        radian = robot.kinematics.radian
-        moved = np.abs(theta - self._counted_at) / radian
+        moved = np.abs(theta - self._counted_at)
         if not self._is_learned or not moved.max() > MOVED or not np.isfinite(torque).all():
             return
         self._counted_at = theta
         load = tension @ np.abs(self._mae.muscle_jacobian(theta, tension))
-        noise = np.maximum(load, LEAST_NOISE / radian)
+        noise = np.maximum(load, LEAST_NOISE)
         of_arm, of_hand = self._regressors(theta)
         weight = of_arm @ self._gravity - torque  # torque that the muscles hold
         u = self._strength * self._directions.T
@@ -172,8 +166,7 @@ class MountingCheck:
     def _at_stop(self, theta: Array) -> tuple[Bools, Bools]:
         """Return which joints are near their lower limit, (D,), and which near the upper, (D,)."""
         robot = self._robot
-        near = AT_STOP * robot.kinematics.radian
-        return theta < robot.lower + near, theta > robot.upper - near
+        return theta < robot.lower + AT_STOP, theta > robot.upper - AT_STOP
 
     def _regressors(self, theta: Array) -> tuple[Array, Array]:
         """Return Y of the arm and of a mass of 1 kg in the hand, (D, 3) each."""

@@ -40,7 +40,7 @@ def test_the_elbows_of_two_arms_are_found_by_name():
 
 def test_without_known_names_the_first_and_last_revolute_joints_are_shoulder_and_elbow(tmp_path):
     robot = Robot.load(write_robot(tmp_path / 'other', slider=True))
-    assert robot.kinematics.slides.tolist() == [False, False, False, True]
+    assert robot.units.slides.tolist() == [False, False, False, True]
     assert shoulder(robot) == 0
     assert elbow(robot) == robot.joint_count - 2
     assert np.flatnonzero(elbows(robot)).tolist() == [elbow(robot)]
