@@ -14,7 +14,7 @@ What reads a position converts it to θ, and what publishes or prints θ convert
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple, overload
+from typing import TYPE_CHECKING, NamedTuple, SupportsIndex
 
 import numpy as np
 
@@ -58,7 +58,7 @@ class JointUnit(NamedTuple):
 TURN, SLIDE = JointUnit(1.0, 'rad', 'N·m', 'N·m/rad'), JointUnit(RACK, 'm', 'N', 'N/m')
 
 
-class JointUnits(Sequence[JointUnit]):
+class JointUnits:
     """Names and units of D joints, and conversions between θ and the positions outside."""
 
     def __init__(self, names: Sequence[str], slides: Sequence[bool]) -> None:
@@ -76,13 +76,7 @@ class JointUnits(Sequence[JointUnit]):
         kinds = [model.joints[model.getJointId(name)].shortname() for name in joints]
         return cls(joints, [kind in PRISMATIC for kind in kinds])
 
-    @overload
-    def __getitem__(self, joint: int) -> JointUnit: ...
-
-    @overload
-    def __getitem__(self, joint: slice) -> tuple[JointUnit, ...]: ...
-
-    def __getitem__(self, joint: int | slice) -> JointUnit | tuple[JointUnit, ...]:
+    def __getitem__(self, joint: SupportsIndex) -> JointUnit:
         return self._units[joint]
 
     def __len__(self) -> int:
@@ -91,17 +85,18 @@ class JointUnits(Sequence[JointUnit]):
     def __iter__(self) -> Iterator[JointUnit]:
         return iter(self._units)
 
-    def to_theta(self, position: Array, joints: Ints | slice = slice(None)) -> Array:
+    def to_theta(self, position: Array, joints: Ints | slice | int = slice(None)) -> Array:
         """Return θ [rad], (..., D), for positions, velocities or accelerations of the joints.
 
         Args:
             position: Values in [rad] or [m], (..., D).
-            joints: Indices of the joints in the last axis; by default all.
+            joints: Indices of the joints in the last axis, or the index of the only joint; by
+                default all.
         """
         theta: Array = position / self.radian[joints]
         return theta
 
-    def to_position(self, theta: Array, joints: Ints | slice = slice(None)) -> Array:
+    def to_position(self, theta: Array, joints: Ints | slice | int = slice(None)) -> Array:
         """Return positions, velocities or accelerations in [rad] or [m]: inverse of `to_theta`."""
         position: Array = theta * self.radian[joints]
         return position

@@ -172,7 +172,7 @@ class MomentFit:
     def __init__(self, model: LengthModel, moments: Moments, theta: Array) -> None:
         """Prepare the fit; the first postures `theta` (K, D) show how the joints turn."""
         self._model, self._moments = model, moments
-        self._turning = _turning(theta, STICKING)
+        self._turning = _turning(theta)
         self._largest_step = np.full(model.robot.joint_count, LARGEST_STEP)
         self._precision = model.prior_spread**-2
         self.usual = self._largest_step**-2, self._precision
@@ -229,17 +229,16 @@ class MomentFit:
         return self.point(point.constants + step.common, point.theta + turned)
 
 
-def _turning(theta: Array, sticking: Array) -> Array:
+def _turning(theta: Array) -> Array:
     """Return the direction in which each joint moved last, in [−1, 1], (K, D).
 
-    Args:
-        theta: K consecutive postures [rad], (K, D).
-        sticking: Motion after a reversal over which the direction changes its sign [rad], (D,).
+    After a reversal, the direction changes its sign over a motion of STICKING. `theta` are K
+    consecutive postures [rad], (K, D).
     """
     result, reference = np.zeros_like(theta), theta[0].copy()
     for k, posture in enumerate(theta):
-        reference = np.clip(reference, posture - sticking, posture + sticking)
-        result[k] = (posture - reference) / sticking
+        reference = np.clip(reference, posture - STICKING, posture + STICKING)
+        result[k] = (posture - reference) / STICKING
     return result
 
 
