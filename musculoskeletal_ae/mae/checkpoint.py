@@ -25,7 +25,7 @@ from musculoskeletal_ae.files import read_bytes, write_whole
 from musculoskeletal_ae.mae.mae import Layer, Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
 from musculoskeletal_ae.mae.units import UNITS, ActivationName
-from musculoskeletal_ae.presets.names import PAPER_PRESET, PRESET_NAMES
+from musculoskeletal_ae.presets.names import PRESET_NAMES
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
@@ -48,7 +48,7 @@ SMALLEST_EIGENVALUE = 1e-12  # smallest eigenvalue of a covariance, relative to 
 SMALLEST_SPRING_EIGENVALUE = -1e-6
 #: reject a network if its postures of a prismatic joint span less than this share of the joint's
 #: range; networks from before θ of such joints was in rad have a 17 times smaller span.
-#: Preset `paper` does not standardise, so its networks do not tell their span.
+#: A network whose inputs are not standardised does not tell its span.
 LEAST_SPAN = 0.25
 #: largest absolute values in the estimate of the middle posture: θ [rad], T [N], l [m], G [m/rad]
 LARGEST_ESTIMATES = (100.0, 1e5, 100.0, 1e5)
@@ -403,7 +403,8 @@ def _check_fit(mae: Mae, robot: Robot) -> None:
         )
     _, spread = mae.usual_posture
     narrow = math.sqrt(12.0) * spread < LEAST_SPAN * (robot.upper - robot.lower)
-    if mae.preset != PAPER_PRESET and (narrow & robot.units.slides).any():
+    is_standardised = bool((mae.std != 1.0).any())
+    if is_standardised and (narrow & robot.units.slides).any():
         names = ', '.join(np.array(robot.joints)[narrow & robot.units.slides])
         raise CheckpointError(
             f'its postures of {names} span less than {LEAST_SPAN:.0%} of the joint range; an early '
