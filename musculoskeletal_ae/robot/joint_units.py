@@ -106,13 +106,8 @@ class JointUnits:
         result: Array = self.radian[:, None] * covariance * self.radian
         return result
 
-    def to_torque(self, effort: Array) -> Array:
-        """Return joint torques [N·m], (..., D), for torques and forces [N·m or N], (..., D)."""
-        torque: Array = effort * self.radian
-        return torque
-
     def to_effort(self, torque: Array) -> Array:
-        """Return torques and forces of the joints [N·m or N]: inverse of `to_torque`."""
+        """Return torques and forces [N·m or N], (..., D), for joint torques [N·m], (..., D)."""
         effort: Array = torque / self.radian
         return effort
 
