@@ -42,6 +42,7 @@ MODULES = {
     'robot/actuation.py': ['Actuation'],
     'robot/tension_source.py': ['TensionSource'],
     'robot/series_elastic.py': ['SeriesElastic'],
+    'robot/joint_units.py': ['JointUnits', 'JointUnit'],
     'robot/kinematics.py': ['Kinematics'],
     'robot/routes.py': ['Routes'],
     'design/checks.py': ['check_robot', 'RobotCheck', 'Finding', 'Setting'],
@@ -139,8 +140,9 @@ def api() -> str:
         '',
         'This page lists the classes and functions that a program may use; `python doc/make.py`',
         'writes it from the code. Arrays are arrays of numpy, and units are SI units. θ has the',
-        'order of `joints` in `muscles.yaml`, and T and l have the order of its muscles. `help()`',
-        'shows the docstrings, which describe arguments and results.',
+        'order of `joints` in `muscles.yaml`, and T and l have the order of its muscles. θ is in',
+        'rad for prismatic joints, too: 60 mm count as 1 rad. `robot.units` converts from and to',
+        'metres. `help()` shows the docstrings, which describe arguments and results.',
         '',
     ]
     for file, names in MODULES.items():

@@ -19,6 +19,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
+from musculoskeletal_ae.robot.joint_units import JointUnits
 from musculoskeletal_ae.robot.tension_source import TENSION_SENSOR, TensionSource
 from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Presence, Row
 
@@ -32,7 +33,7 @@ MOST_TWIST = np.array([5.0] * 3 + [20.0] * 3)
 #: range of plausible accelerometer readings on an arm [m/s²]
 LEAST_GRAVITY, MOST_GRAVITY = 3.0, 30.0
 LAST_VELOCITY = 1e-6  # highest velocity at the end of a trajectory [rad/s]
-MOST_EFFORT = 1000.0  # highest torque that may be requested of one joint [N·m]
+MOST_EFFORT = 1000.0  # highest torque or force that may be requested of one joint [N·m or N]
 #: largest value of an isolated muscle that is kept; much larger values could overflow when squared
 MOST_ISOLATED = 1e6
 UNIT_TOLERANCE = 0.01  # largest deviation of a quaternion's norm from 1
@@ -130,15 +131,15 @@ def _values(message: Any, rows: int, columns: int, owner: str = 'muscle') -> Arr
     return np.array(message.data, dtype=float).reshape(rows, columns)
 
 
-def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Array:
+def read_posture(message: Any, units: JointUnits, some: bool = False) -> Array:
     """Return θ [rad], (D,), from a measured JointState.
 
-    Joints are matched by name, and joints of the message that are not in `joints` are ignored.
-    Every joint in `joints` must have a finite position. With `some`, one finite position is enough,
+    Joints are matched by name, and joints of the message that are not in `units` are ignored.
+    Every joint in `units` must have a finite position. With `some`, one finite position is enough,
     and θ of all other joints is NaN. Velocities and efforts are not checked, because drivers
     publish NaN for quantities that they do not measure.
     """
-    names = joint_names(message)
+    names, joints = joint_names(message), units.names
     index = {name: i for i, name in enumerate(names)}
     known = [name for name in joints if name in index]
     if len(index) < len(names):
@@ -154,7 +155,7 @@ def read_posture(message: Any, joints: Sequence[str], some: bool = False) -> Arr
     if np.count_nonzero(finite) < (1 if some else len(known)):
         raise MessageError('not finite', _positions_of(joints_not_finite(message, joints)))
     theta[~finite] = np.nan
-    return theta
+    return units.to_theta(theta)
 
 
 def joints_not_finite(message: Any, joints: Sequence[str]) -> list[str]:
@@ -170,10 +171,23 @@ def _positions_of(names: Sequence[str]) -> str:
     return f'position of {", ".join(names)}'
 
 
-def read_target(message: Any, joints: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Return position [rad] and effort [N·m], by joint name, of a JointState that is a command.
+def read_target(message: Any, units: JointUnits) -> dict[str, tuple[float, float]]:
+    """Return θ [rad] and torque [N·m], by joint name, of a JointState that is a command.
 
-    The message need not contain all joints. Without efforts in the message, efforts are 0.
+    The rules are those of `target_values`.
+    """
+    of = dict(zip(units.names, units, strict=True))
+    return {
+        name: (position / of[name].radian, effort * of[name].radian)
+        for name, (position, effort) in target_values(message, units.names).items()
+    }
+
+
+def target_values(message: Any, joints: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Return position and effort, by joint name, of a JointState that is a command.
+
+    The values are in the units of the message, which need not contain all joints. Without efforts
+    in the message, efforts are 0.
     """
     names = joint_names(message)
     listed = set(joints)
@@ -193,8 +207,8 @@ def read_target(message: Any, joints: Sequence[str]) -> dict[str, tuple[float, f
     for name, effort in zip(names, efforts.tolist()):
         if abs(effort) > MOST_EFFORT:
             value, most = distinct(effort, math.copysign(MOST_EFFORT, effort))
-            legal = f'at most ±{most.lstrip("-")} N·m'
-            raise MessageError('oversized', f'effort of {name} is {value} N·m; legal: {legal}')
+            legal = f'at most ±{most.lstrip("-")} N·m or N'
+            raise MessageError('oversized', f'effort of {name} is {value}; legal: {legal}')
     return dict(zip(names, zip(message.position, efforts.tolist())))
 
 
@@ -287,12 +301,12 @@ class TrajectoryPoints(NamedTuple):
         )
 
 
-def read_trajectory(message: Any, joints: Sequence[str]) -> TrajectoryPoints | None:
+def read_trajectory(message: Any, units: JointUnits) -> TrajectoryPoints | None:
     """Return the points of a JointTrajectory; None if it is empty, which commands the arm to stop.
 
     Velocities and accelerations must be present at all points or at none.
     """
-    names, points = list(message.joint_names), list(message.points)
+    names, points, joints = list(message.joint_names), list(message.points), units.names
     if len(names) * max(len(points), 1) > MOST_ENTRIES:
         problem = (
             f'{len(points)} points of {len(names)} joints; legal: at most {MOST_ENTRIES} values'
@@ -328,8 +342,11 @@ def read_trajectory(message: Any, joints: Sequence[str]) -> TrajectoryPoints | N
         raise MessageError(
             'moves at its end', f'the last velocities are {velocity[-1].tolist()}; expected 0'
         )
-    places = np.array([list(joints).index(name) for name in names])
-    return TrajectoryPoints(places, time, position, velocity, acceleration)
+    places = np.array([joints.index(name) for name in names])
+    values = (
+        None if each is None else units.to_theta(each, places) for each in (velocity, acceleration)
+    )
+    return TrajectoryPoints(places, time, units.to_theta(position, places), *values)
 
 
 def _check_names(names: Sequence[str], joints: Sequence[str]) -> None:

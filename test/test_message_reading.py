@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, TwistStamped, WrenchStamped
 from hypothesis import given
 from hypothesis import strategies as st
@@ -27,9 +28,10 @@ from musculoskeletal_ae.message_reading import (
     read_wrench,
     without_orientation,
 )
-from musculoskeletal_ae.ros.messages import array_message
+from musculoskeletal_ae.robot.joint_units import JointUnits
+from musculoskeletal_ae.ros.messages import array_message, posture_message
 
-JOINTS = ('a', 'b')
+UNITS = JointUnits(('a', 'b'), [False, False])
 
 
 def muscle_array(data, sizes=None, strides=None, offset=0):
@@ -106,31 +108,31 @@ def test_measured_joints_are_matched_by_name_and_foreign_ones_ignored():
     message = JointState(name=['b', 'x', 'a'], position=[2.0, math.nan, 1.0])
     # The sensors measure neither velocity nor effort.
     message.velocity, message.effort = [math.nan] * 3, [math.nan] * 3
-    assert read_posture(message, JOINTS).tolist() == [1.0, 2.0]
+    assert read_posture(message, UNITS).tolist() == [1.0, 2.0]
 
 
 def test_a_measurement_of_some_joints_leaves_the_others_open():
     message = JointState(name=['x', 'b'], position=[1.0, 2.0])
-    np.testing.assert_array_equal(read_posture(message, JOINTS, some=True), [np.nan, 2.0])
+    np.testing.assert_array_equal(read_posture(message, UNITS, some=True), [np.nan, 2.0])
     with pytest.raises(MessageError, match='a, b'):
-        read_posture(JointState(name=['x'], position=[1.0]), JOINTS, some=True)
+        read_posture(JointState(name=['x'], position=[1.0]), UNITS, some=True)
 
 
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf])
 def test_a_sensor_without_a_number_costs_its_joint_only_and_is_named(value):
     message = JointState(name=['x', 'b', 'a'], position=[value, 2.0, value])
-    np.testing.assert_array_equal(read_posture(message, JOINTS, some=True), [np.nan, 2.0])
-    assert joints_not_finite(message, JOINTS) == ['a']
+    np.testing.assert_array_equal(read_posture(message, UNITS, some=True), [np.nan, 2.0])
+    assert joints_not_finite(message, UNITS.names) == ['a']
     message = JointState(name=['b', 'a'], position=[value, value])
     with pytest.raises(MessageError, match='not finite: position of b, a'):
-        read_posture(message, JOINTS, some=True)
+        read_posture(message, UNITS, some=True)
 
 
 @pytest.mark.parametrize('field', ['position', 'velocity', 'effort'])
 def test_a_target_without_a_number_is_refused_and_names_the_joint(field):
     values = {'position': [0.1, 0.2], field: [0.1, math.nan]}
     with pytest.raises(MessageError, match=f'{field} of b'):
-        read_target(JointState(name=['a', 'b'], **values), JOINTS)
+        read_target(JointState(name=['a', 'b'], **values), UNITS)
 
 
 @pytest.mark.parametrize('field', ['positions', 'velocities', 'accelerations'])
@@ -138,7 +140,7 @@ def test_a_trajectory_without_a_number_is_refused_and_names_joint_and_point(fiel
     rows = {'velocities': [(0.0, 0.0)] * 2, 'accelerations': [(0.0, 0.0)] * 2}
     rows[field] = [(0.0, 0.0), (math.nan, 0.0)]
     with pytest.raises(MessageError, match='of b at point 2'):
-        read_trajectory(trajectory(**rows), JOINTS)
+        read_trajectory(trajectory(**rows), UNITS)
 
 
 @pytest.mark.parametrize(
@@ -157,14 +159,14 @@ def test_a_trajectory_without_a_number_is_refused_and_names_joint_and_point(fiel
 )
 def test_a_wrong_measurement_is_rejected_by_reason(message, reason):
     with pytest.raises(MessageError) as error:
-        read_posture(message, JOINTS)
+        read_posture(message, UNITS)
     assert error.value.reason == reason
 
 
 def test_a_target_may_name_a_subset_and_effort():
     message = JointState(name=['b'], position=[2.0], effort=[3.0])
-    assert read_target(message, JOINTS) == {'b': (2.0, 3.0)}
-    assert read_target(JointState(name=['b'], position=[2.0]), JOINTS) == {'b': (2.0, 0.0)}
+    assert read_target(message, UNITS) == {'b': (2.0, 3.0)}
+    assert read_target(JointState(name=['b'], position=[2.0]), UNITS) == {'b': (2.0, 0.0)}
 
 
 @pytest.mark.parametrize(
@@ -181,7 +183,7 @@ def test_a_target_may_name_a_subset_and_effort():
 )
 def test_a_wrong_target_is_rejected_by_reason(message, reason):
     with pytest.raises(MessageError) as error:
-        read_target(message, JOINTS)
+        read_target(message, UNITS)
     assert error.value.reason == reason
 
 
@@ -205,7 +207,7 @@ def test_messages_are_known_by_their_fields_whatever_library_made_them():
     recorded = decode(bag_array(values), ARRAY)
     np.testing.assert_array_equal(read_muscle_states(recorded, 2), values)
     recorded = decode(bag_joints(['b', 'a'], [2.0, 1.0]), JOINT_STATE)
-    assert read_posture(recorded, JOINTS).tolist() == [1.0, 2.0]
+    assert read_posture(recorded, UNITS).tolist() == [1.0, 2.0]
 
 
 def trajectory(names=('b', 'a'), times=(1.0, 2.5), rows=((1.0, 2.0), (3.0, 4.0)), **others):
@@ -221,13 +223,13 @@ def trajectory(names=('b', 'a'), times=(1.0, 2.5), rows=((1.0, 2.0), (3.0, 4.0))
 
 def test_a_trajectory_is_matched_by_name_and_an_empty_one_is_none():
     still = ((0.5, 0.0), (0.0, 0.0))
-    points = read_trajectory(trajectory(velocities=still, accelerations=still), JOINTS)
+    points = read_trajectory(trajectory(velocities=still, accelerations=still), UNITS)
     assert points.joints.tolist() == [1, 0]
     assert points.time.tolist() == [1.0, 2.5]
     assert points.position.tolist() == [[1.0, 2.0], [3.0, 4.0]]
     assert points.velocity.tolist() == [[0.5, 0.0], [0.0, 0.0]]
-    assert read_trajectory(trajectory(['a'], rows=[[1.0]]), JOINTS).velocity is None
-    assert read_trajectory(JointTrajectory(), JOINTS) is None
+    assert read_trajectory(trajectory(['a'], rows=[[1.0]]), UNITS).velocity is None
+    assert read_trajectory(JointTrajectory(), UNITS) is None
 
 
 @pytest.mark.parametrize(
@@ -250,7 +252,7 @@ def test_a_trajectory_is_matched_by_name_and_an_empty_one_is_none():
 )
 def test_what_is_no_trajectory_is_refused(message, reason):
     with pytest.raises(MessageError, match=reason):
-        read_trajectory(message, JOINTS)
+        read_trajectory(message, UNITS)
 
 
 def test_a_pose_may_contain_a_position_only_and_needs_the_right_frame():
@@ -294,3 +296,21 @@ def test_an_acceleration_that_is_no_gravity_is_refused_with_the_reason(accelerat
     with pytest.raises(MessageError) as refused:
         read_imu(message, ['hand'])
     assert refused.value.reason == reason
+
+
+def test_60_mm_of_a_prismatic_joint_are_one_radian_inside_and_metres_in_messages():
+    units = JointUnits(('a', 'b'), [False, True])
+    message = posture_message(units, np.array([0.5, 0.5]), Time())
+    assert list(message.position) == [0.5, pytest.approx(0.03)]
+    np.testing.assert_allclose(read_posture(message, units), [0.5, 0.5])
+    command = JointState(name=['b'], position=[0.03], effort=[10.0])
+    assert read_target(command, units)['b'] == (pytest.approx(0.5), pytest.approx(0.6))
+    still = [[0.0, 0.0], [0.0, 0.0]]
+    rows = [[0.1, 0.003], [0.2, 0.006]]
+    speeds = [[0.1, 0.003], [0.0, 0.0]]
+    message = trajectory(['a', 'b'], rows=rows, velocities=speeds, accelerations=still)
+    points = read_trajectory(message, units)
+    np.testing.assert_allclose(points.position, [[0.1, 0.05], [0.2, 0.1]])
+    np.testing.assert_allclose(points.velocity, [[0.1, 0.05], [0.0, 0.0]])
+    reversed_names = trajectory(['b', 'a'], rows=[[0.003, 0.1]])
+    np.testing.assert_allclose(read_trajectory(reversed_names, units).position, [[0.05, 0.1]])

@@ -117,10 +117,7 @@ def motion_text(robot: Robot, recording: Pairs) -> str:
 
 
 def _resting_postures(robot: Robot, recording: Pairs) -> int:
-    radian = robot.kinematics.radian
-    samples = SampleStore(radian=radian)
-    healthy = Reservoir(robot.muscle_count, 0, radian=radian)
-    collector = SampleCollector(robot, samples, healthy)
+    collector = SampleCollector(robot, samples := SampleStore(), Reservoir(robot.muscle_count, 0))
     isolated: tuple[int, ...] = ()
     with ProgressBar('counting resting postures', len(recording.time)) as bar:
         for time, theta, length, tension, row in zip(*recording, strict=True):

@@ -25,7 +25,7 @@ from musculoskeletal_ae.bags.storage import LONGEST_PAUSE, BagMessage
 from musculoskeletal_ae.bags.timed_messages import TimedMessages
 from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
-from musculoskeletal_ae.message_reading import MOST_ENTRIES, read_target
+from musculoskeletal_ae.message_reading import MOST_ENTRIES, target_values
 
 # After a longer interruption, playback resumes instead of catching up.
 LONGEST_LAG = 1.0  # [s]
@@ -153,8 +153,8 @@ class TaughtMotion(NamedTuple):
 
     joints: tuple[str, ...]
     time: Array  # including LEAD_TIME to reach the first posture [s], (N,)
-    theta: Array  # [rad], (N, D)
-    velocity: Array  # [rad/s], zero at both ends, (N, D)
+    position: Array  # [rad or m], (N, D)
+    velocity: Array  # [rad/s or m/s], zero at both ends, (N, D)
 
 
 def taught_motion(bag: Bag, topic: str, start: int, stop: int) -> TaughtMotion:
@@ -171,7 +171,7 @@ def taught_motion(bag: Bag, topic: str, start: int, stop: int) -> TaughtMotion:
         joint_state = bag.decode(message)
         with suppress(MessageError):  # skip invalid messages, as a node does
             names = sorted(joint_state.name)
-            values = read_target(joint_state, names)
+            values = target_values(joint_state, names)
             theta = np.array([values[name][0] for name in names])
             postures[tuple(names)].append(((message.log_time - start) / 1e9, theta))
     if not postures:

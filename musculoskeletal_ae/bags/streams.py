@@ -162,9 +162,8 @@ class _ArmStreams:
         }
 
     def _posture(self, message: Any, _: Arrival) -> Array:
-        joints = self._robot.joints
-        theta = read_posture(message, joints, some=True)
-        for name in joints_not_finite(message, joints):
+        theta = read_posture(message, self._robot.units, some=True)
+        for name in joints_not_finite(message, self._robot.joints):
             self._ignore(f'position of {name} is not finite')
         return theta
 

@@ -28,8 +28,6 @@ from musculoskeletal_ae.arrays import Array, Bools
 if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.posture_model import PostureModel
 
-# The following angles [rad] apply to revolute joints; for prismatic joints they are multiplied by
-# `kinematics.RACK` [m].
 ROUGH_OFFSET = np.deg2rad(2.0)  # σ of z of a roughly calibrated sensor [rad]
 ACCURATE_OFFSET = 0.003  # σ of z of an accurately calibrated sensor [rad]
 #: refuse an update that finds a larger |z|: ten times σ of a roughly calibrated sensor [rad]
@@ -52,22 +50,20 @@ OTHER_DIFFERENCE = 0.1  # smallest difference of another joint [rad]
 OWN_DIFFERENCE = 0.01  # smallest difference of the reading [rad]
 
 
-def sensor_zeros(read: Array, lower: Array, upper: Array, radian: Array) -> tuple[Array, Array]:
-    """Return the joint-sensor offsets and their standard deviations, both [rad or m] (D,).
+def sensor_zeros(read: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
+    """Return the joint-sensor offsets and their standard deviations, both [rad] (D,).
 
     Args:
         read: Sensor readings at rest, (N, D); NaN where nothing was measured.
         lower: Lower limits, (D,).
         upper: Upper limits, (D,).
-        radian: 1 rad for a revolute joint, and for a prismatic joint the displacement [m] that
-            counts as 1 rad, (D,).
     """
-    theta, lower, upper = (read / radian).T, lower / radian, upper / radian
+    theta = read.T
     apart = np.abs(theta[:, None] - theta[:, :, None])  # (D, N, N)
     elsewhere: Bools = np.logical_or.reduce(apart > OTHER_DIFFERENCE)
     estimates = [_zero(*each, elsewhere) for each in zip(theta, lower.tolist(), upper.tolist())]
     zero, spread = np.reshape(estimates, (-1, 2)).T
-    return zero * radian, np.hypot(spread, STOP_SPREAD) * radian
+    return zero, np.hypot(spread, STOP_SPREAD)
 
 
 def _zero(own: Array, lower: float, upper: float, elsewhere: Bools) -> tuple[float, float]:
@@ -142,9 +138,8 @@ class Stops:
         """Start with no joint at a stop."""
         robot, observed = model.body.robot, model.observed
         self._lower, self._upper = robot.lower, robot.upper
-        self._radian = robot.kinematics.radian
         self._by_sensor = model.by_sensor
-        self._near = self._radian * np.where(model.by_sensor, 2.0 * ROUGH_OFFSET, NEAR_STOP)
+        self._near = np.where(model.by_sensor, 2.0 * ROUGH_OFFSET, NEAR_STOP)
         # Samples from before the change of a muscle give no torque balance, because the earlier
         # torque of the muscle cannot be computed from its new parameters. A tension of 0 N,
         # however, means that the muscle was only isolated.
@@ -190,10 +185,9 @@ class Stops:
         """
         goal = np.where(np.isnan(self._at), np.clip(own, self._lower, self._upper), self._at)
         is_pulled = ~np.isnan(self._at) | (goal != own)
-        return goal - own, is_pulled / (STOP_SPREAD * self._radian) ** 2 / repeated
+        return goal - own, is_pulled / STOP_SPREAD**2 / repeated
 
     @property
     def least_weight(self) -> Array:
         """A small weight for each joint angle, which keeps the normal equations regular, (D,)."""
-        weight: Array = SMALL / (STOP_SPREAD * self._radian) ** 2
-        return weight
+        return np.full(len(self._lower), SMALL / STOP_SPREAD**2)

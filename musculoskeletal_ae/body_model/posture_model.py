@@ -26,9 +26,8 @@ from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 
-DIFFERENCE = 1e-6  # step of the finite differences [rad] or [m]
-#: motion of a joint up to which Σ T ∂²l/∂θ² of the geometric model is reused [rad]; for prismatic
-#: joints times `kinematics.RACK` [m]
+DIFFERENCE = 1e-6  # step of the finite differences [rad]
+#: motion of a joint up to which Σ T ∂²l/∂θ² of the geometric model is reused [rad]
 REUSED_MOTION = 0.05
 SMALL = 1e-6  # smallest divisor
 
@@ -99,9 +98,8 @@ class PostureModel:
         ends = np.cumsum([0, *(layout.size for layout in self.body.layouts)])
         #: positions of each muscle's parameters in w
         self.columns = [slice(*pair) for pair in pairwise(ends.tolist())]
-        nominal, radian = self._kinematics.elasticity, self._kinematics.radian
         #: prior spread of α and β of the joints in `sprung`, (2, S)
-        self.spring_spread = springs.prior_spread(nominal, radian)[:, self.sprung]
+        self.spring_spread = springs.prior_spread(self._kinematics.elasticity)[:, self.sprung]
         self._crossed = self.body.robot.routes.crossed
         of_muscle = np.repeat(self._crossed, np.diff(ends), axis=0).T
         #: the parameters of the muscles that cross each joint
@@ -211,9 +209,9 @@ class PostureModel:
 
         It is that of the geometric model at θ (N, D), or from the cache at a posture near θ.
         """
-        joints, radian = self.joints, self.body.robot.kinematics.radian
+        joints = self.joints
         at = self._bent.theta[:, joints]
-        moved = np.flatnonzero(~(np.abs(own - at) < REUSED_MOTION * radian).all(axis=1))
+        moved = np.flatnonzero(~(np.abs(own - at) < REUSED_MOTION).all(axis=1))
         hessian = muscle_hessian(self.body.robot.routes.muscle_jacobian, own[moved])
         self._bent.theta[np.ix_(moved, joints)] = own[moved]
         read, direction = self.observed.tension[moved], self.observed.direction[moved]

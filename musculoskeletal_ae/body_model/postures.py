@@ -51,8 +51,6 @@ from musculoskeletal_ae.learning.samples import Observations
 if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 
-# The following angles [rad] apply to revolute joints; for prismatic joints they are multiplied by
-# `kinematics.RACK` [m].
 GRAVITY_NOISE = 0.02  # σ_u, from the noise and the mounting of the accelerometer [rad]
 FIRST_NOISE = 0.002  # initial σ of a length [m]
 LEAST_NOISE = 0.0008  # smallest σ of a length in the weights, for errors of the body model [m]
@@ -124,9 +122,8 @@ class GroupFit:
         self._determined = np.zeros(len(mean))
         self._weights: Weights
         self._stiffness: Array  # −∂τ/∂θ in the last normal equations [N·m/rad], (N, D, D)
-        radian = model.body.robot.kinematics.radian
         self.usual = (
-            1.0 / (TYPICAL_STEP * radian) ** 2,
+            1.0 / np.full(model.body.robot.joint_count, TYPICAL_STEP) ** 2,
             np.concatenate(
                 [self.prior.precision, self.prior.zero_precision, self.prior.spring_precision]
             ),

@@ -20,8 +20,6 @@ from musculoskeletal_ae.signals.friction import DRIVE_FRICTION_MEAN, DRIVE_SPREA
 #: the constants of motor currents, and for the posterior uncertainty from the torque and the stops
 #: of joints without a sensor.
 INDEPENDENT_SAMPLES = 10.0
-# The following angles [rad] apply to revolute joints; for prismatic joints they are multiplied by
-# `kinematics.RACK` [m].
 SENSOR_NOISE = 0.002  # σ_y of a joint sensor [rad]
 LEAST_ANGLE_NOISE = 1e-6  # smallest σ_y [rad]
 
@@ -104,11 +102,10 @@ class GroupPrior:
     def of(cls, model: PostureModel, mean: list[Array], spread: list[Array]) -> GroupPrior:
         """Return the prior of a group from the `mean` and `spread` of each of its muscles."""
         observed, robot, by_sensor = model.observed, model.body.robot, model.by_sensor
-        radian = robot.kinematics.radian
-        angle_spread = np.where(by_sensor, SENSOR_NOISE * radian, observed.spread)
+        angle_spread = np.where(by_sensor, SENSOR_NOISE, observed.spread)
         repeated = np.maximum(1.0, by_sensor.sum(axis=0) / INDEPENDENT_SAMPLES)
         readings = np.where(by_sensor, observed.theta, np.nan)
-        zero, zero_spread = sensor_zeros(readings, robot.lower, robot.upper, radian)
+        zero, zero_spread = sensor_zeros(readings, robot.lower, robot.upper)
         repeated_samples = max(1.0, len(readings) / INDEPENDENT_SAMPLES)
         return cls(
             mean=np.concatenate(mean),

@@ -17,8 +17,7 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 
 STIFFNESS_SPREAD = 0.5  # prior standard deviation of α
-#: prior standard deviation of the angle at which a spring exerts no torque [rad]; for prismatic
-#: joints, this value times `kinematics.RACK` is the standard deviation of the position [m]
+#: prior standard deviation of the angle at which a spring exerts no torque [rad]
 REST_SPREAD = 0.2
 LARGEST_LOG = 2.0  # largest |α|
 
@@ -28,16 +27,10 @@ def none_learned(joint_count: int) -> Array:
     return np.zeros((2, joint_count))
 
 
-def prior_spread(nominal: JointElasticity, radian: Array) -> Array:
-    """Return the prior spread of α and of β [N·m], (2, D).
-
-    Args:
-        nominal: The springs that muscles.yaml states.
-        radian: 1 rad for a revolute joint, and for a prismatic joint the displacement [m] that
-            counts as 1 rad, (D,).
-    """
+def prior_spread(nominal: JointElasticity) -> Array:
+    """Return the prior spread of α and of β [N·m], (2, D); `nominal` are those of muscles.yaml."""
     stiffness = np.diag(nominal.stiffness)
-    return np.stack([np.full(len(stiffness), STIFFNESS_SPREAD), stiffness * REST_SPREAD * radian])
+    return np.stack([np.full(len(stiffness), STIFFNESS_SPREAD), stiffness * REST_SPREAD])
 
 
 def learned(nominal: JointElasticity, springs: Array) -> JointElasticity:

@@ -259,8 +259,8 @@ class Controller:
             ParameterError: If the joint stiffness or the method does not fit the robot.
         """
         check_settings(self.robot, settings)
-        before, radian = self.settings, self.robot.kinematics.radian
-        stiffness = settings.desired_stiffness(radian)
+        before, units = self.settings, self.robot.units
+        is_stiffer = settings.desired_stiffness(units) != before.desired_stiffness(units)
         self.settings = settings
         self._use_parts()
         is_other = (settings.method, settings.preset) != (before.method, before.preset)
@@ -268,7 +268,7 @@ class Controller:
             self._request(Activity.GRAVITY_COMPENSATION)
         elif is_other and not self.supervisor.explores:
             self._hold()
-        if settings.method == 'stiffness' and stiffness != before.desired_stiffness(radian):
+        if settings.method == 'stiffness' and is_stiffer.any():
             self.activities.follower.plan_anew()
 
     def use(self, mae: Mae) -> None:

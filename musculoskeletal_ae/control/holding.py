@@ -23,9 +23,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion import reach
 from musculoskeletal_ae.robot.robot import Robot
 
-#: report a joint that rests further than this away from its target [rad]; for prismatic joints
-#: times `kinematics.RACK` [m]
-AWAY = 0.5
+AWAY = 0.5  # report a joint that rests further than this away from its target [rad]
 LASTING = 5.0  # report it after this time [s]
 #: what may be the cause where nothing more is known
 POSSIBLE_CAUSES = (
@@ -58,13 +56,10 @@ class HoldingCheck:
 
     @property
     def largest(self) -> float:
-        """Largest distance of a joint from its target [rad]; NaN while `distance` is None.
-
-        Distances of prismatic joints are divided by `kinematics.RACK`.
-        """
+        """Largest distance of a joint from its target [rad]; NaN while `distance` is None."""
         if self.distance is None:
             return math.nan
-        return float(np.abs(self.distance / self._robot.kinematics.radian).max())
+        return float(np.abs(self.distance).max())
 
     @property
     def is_away(self) -> bool:
@@ -76,7 +71,7 @@ class HoldingCheck:
         """Index of the joint with the largest distance; None while `distance` is None."""
         if self.distance is None:
             return None
-        return int(np.abs(self.distance / self._robot.kinematics.radian).argmax())
+        return int(np.abs(self.distance).argmax())
 
     @property
     def text(self) -> str:
@@ -84,8 +79,8 @@ class HoldingCheck:
         joint = self.farthest
         if self.distance is None or joint is None:
             return ''
-        unit = self._robot.units[joint].theta
-        return f'{self._robot.joints[joint]} {abs(self.distance[joint]):.2f} {unit}'
+        distance = self._robot.units[joint].position_text(abs(self.distance[joint]))
+        return f'{self._robot.joints[joint]} {distance}'
 
 
 def away_text(check: HoldingCheck, robot: Robot, mae: Mae, theta: Array) -> str:

@@ -18,7 +18,7 @@ def check_settings(robot: Robot, settings: Settings) -> None:
         ParameterError: If they do not; the text names the reason and the legal values.
     """
     with naming_parameter('joint_stiffness'):
-        settings.desired_stiffness(robot.kinematics.radian)
+        settings.desired_stiffness(robot.units)
     with naming_parameter('method'):
         _check_method(robot, settings)
 

@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Settings of control, from which the parameters of the controller node are generated, too."""
 
-from collections.abc import Iterable
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.arrival import INTERRUPTION
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.parameters import PRESET, CheckedSettings, settable
+from musculoskeletal_ae.robot.joint_units import SLIDE, JointUnits
 
 UNREACHABLE = ('refuse', 'nearest')  # legal values of the setting `unreachable`
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness', 'float')
 BY_TENSION = ('tension', 'float')  # methods that command tensions; all others command lengths
-MOST_STIFFNESS = 1000.0  # largest desired stiffness of a revolute joint [N·m/rad]
+MOST_STIFFNESS = 1000.0  # largest desired stiffness of a joint [N·m/rad]
 
 
 @dataclass(frozen=True)
@@ -28,9 +33,7 @@ class Settings(CheckedSettings):
         'joints (0 or []: unconstrained)',
         'N·m/rad or N/m',
         0.0,
-        # Largest value for prismatic joints. 0.06 is `kinematics.RACK`; importing it would also
-        # import pinocchio, which is slow.
-        MOST_STIFFNESS / 0.06**2,
+        MOST_STIFFNESS / SLIDE.radian**2,  # the largest value for prismatic joints [N/m]
     )
     first_duration: float = settable(
         5.0,
@@ -84,21 +87,20 @@ class Settings(CheckedSettings):
     #: `default`; extended if muscle modules or muscles are too weak; 0 for first_duration [s]
     target_duration: float = 1.2
 
-    def desired_stiffness(self, radian: Iterable[float]) -> tuple[float, ...]:
-        """Return the desired stiffness of each joint [N·m/rad or N/m]; 0 for unconstrained joints.
+    def desired_stiffness(self, units: JointUnits) -> Array:
+        """Return the desired stiffness of each joint [N·m/rad], (D,); 0 for unconstrained joints.
 
         Args:
-            radian: Displacement of each joint that counts as one radian, as in `Kinematics`
-                [rad or m].
+            units: Units of the joints, in which the setting `joint_stiffness` states the values.
 
         Raises:
             MusculoskeletalError: If `joint_stiffness` has the wrong size or a value out of range.
         """
-        values, most = self.joint_stiffness, [MOST_STIFFNESS / each**2 for each in radian]
+        values, most = self.joint_stiffness, [MOST_STIFFNESS / each.radian**2 for each in units]
         if values in ((), (0.0,)):
-            return (0.0,) * len(most)
+            return np.zeros(len(most))
         if len(values) != len(most) or not all(0.0 <= v <= high for v, high in zip(values, most)):
             ends = ', '.join(f'{high:g}' for high in most)
             legal = f'{len(most)} numbers of at least 0, at most {ends} [N·m/rad or N/m], or []'
             raise MusculoskeletalError(f'{list(values)}; legal: {legal}')
-        return values
+        return units.to_stiffness(np.array(values))

@@ -131,7 +131,7 @@ def _target(core: Controller) -> Iterator[Condition]:
     if core.is_following and follower.progress.is_moving and (slow := slowed(follower)):
         yield kind.TRAJECTORY_SLOWED.condition(f'trajectory {slow}')
     missing = _missing_torque(core)
-    if missing is not None and np.abs(robot.kinematics.radian * missing).max() > reach.NOTABLE:
+    if missing is not None and np.abs(missing).max() > reach.NOTABLE:
         yield kind.TORQUE_MISSING.condition()
     if target.unreachable_reason:
         yield kind.OUT_OF_REACH.condition(target.unreachable_reason)
@@ -176,9 +176,9 @@ def _add_motion(core: Controller, values: dict[str, str]) -> None:
         lag = core.activities.follower.winches.lag
         values['lag of the winches'] = f'{1000.0 * lag:.0f} ms'
     missing = _missing_torque(core)
-    if missing is not None and np.abs(robot.kinematics.radian * missing).max() > reach.NOTABLE:
+    if missing is not None and np.abs(missing).max() > reach.NOTABLE:
         each = zip(robot.joints, missing, robot.units)
-        values['missing torque'] = ', '.join(f'{n} {m:.2f} {unit.torque}' for n, m, unit in each)
+        values['missing torque'] = ', '.join(f'{n} {unit.torque_text(m)}' for n, m, unit in each)
     if distance := core.holding.text:
         values['distance from the target'] = distance
 
@@ -226,12 +226,14 @@ def _add_stiffness(core: Controller, values: dict[str, str]) -> None:
         return
     expected, *reachable = solution.stiffness
     robot = core.robot
-    desired = core.settings.desired_stiffness(robot.kinematics.radian)
+    desired = core.settings.desired_stiffness(robot.units)
     rows = zip(robot.joints, robot.units, desired, expected.diagonal(), *reachable)
     for name, unit, wanted, planned, low, high in rows:
-        text = f'{planned:.2f} {unit.stiffness}, reachable {low:.2f} to {high:.2f}'
+        one = unit.radian**2
+        reachable_text = f'{low / one:.2f} to {high / one:.2f}'
+        text = f'{unit.stiffness_text(planned)}, reachable {reachable_text}'
         if wanted > 0.0 and not low <= wanted <= high:
-            text += f', desired {wanted:.2f} clamped'
+            text += f', desired {wanted / one:.2f} clamped'
         values[f'joint stiffness {name}'] = text
 
 

@@ -8,8 +8,7 @@ For postures drawn uniformly within the joint limits, the check computes
 - the moment arms r(θ) = −∂l/∂θ [m], the joint torque for one newton of tension. A muscle with
   r > 0 moves the joint in its positive direction.
 
-To give all joints the same unit, the check assumes that a pinion of radius RACK moves each
-prismatic joint. A tendon parallel to the axis of the joint then has r = RACK.
+A tendon parallel to the axis of a prismatic joint has r = RACK (`robot/joint_units.py`).
 
 doc/explanation/method.md ("An arm must be holdable") defines a sound arm. A joint with a spring of
 its own may have muscles on one side only, if these muscles can hold the joint. The report also
@@ -33,7 +32,7 @@ from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_csv, read_table
 from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
 from musculoskeletal_ae.robot.description import RobotDescription, Wrap, refusal, shown
-from musculoskeletal_ae.robot.kinematics import RACK
+from musculoskeletal_ae.robot.joint_units import SLIDE
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.robot.tension import least_tension
@@ -93,14 +92,10 @@ class Finding(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """A robot in N postures, with the quantities that determine holding and stiffness.
-
-    For a prismatic joint, all quantities except `theta` are those of a pinion of radius RACK that
-    moves the joint.
-    """
+    """A robot in N postures, with the quantities that determine holding and stiffness."""
 
     robot: Robot
-    theta: Array  # [rad] or [m], (N, D)
+    theta: Array  # [rad], (N, D)
     jacobian: Array  # G [m/rad], (N, M, D)
     hessian: Array  # ∂²l/∂θ² [m/rad²], (N, M, D, D)
     torque: Array  # g + K θ − b, which holds the arm against weight and springs [N·m], (N, D)
@@ -109,13 +104,12 @@ class Setting(NamedTuple):
 
     @classmethod
     def of(cls, robot: Robot, theta: Array) -> Setting:
-        """Return a robot in postures θ [rad] or [m], (N, D), with all quantities computed."""
-        radian = robot.kinematics.radian
-        weight = radian * robot.kinematics.weight_torque(theta)
+        """Return a robot in postures θ [rad], (N, D), with all quantities computed."""
+        weight = robot.kinematics.weight_torque(theta)
         elasticity = robot.kinematics.elasticity
-        torque = weight + radian * elasticity.holding_torque(theta)
-        springs = radian[:, None] * elasticity.stiffness * radian
-        return cls(robot, theta, *_slopes(robot, theta), torque, weight, springs)
+        torque = weight + elasticity.holding_torque(theta)
+        slopes = _slopes(robot, theta)
+        return cls(robot, theta, *slopes, torque, weight, elasticity.stiffness)
 
     def rerouted(self, robot: Robot) -> Setting:
         """Return the quantities of a robot that differs from this one only in its routes."""
@@ -125,9 +119,8 @@ class Setting(NamedTuple):
 
 def _slopes(robot: Robot, theta: Array) -> tuple[Array, Array]:
     """Return `jacobian` and `hessian` of a `Setting`."""
-    jacobian, radian = robot.routes.muscle_jacobian, robot.kinematics.radian
-    hessian = radian[:, None] * muscle_hessian(jacobian, theta) * radian
-    return radian * jacobian(theta), hessian
+    jacobian = robot.routes.muscle_jacobian
+    return jacobian(theta), muscle_hessian(jacobian, theta)
 
 
 @dataclass(frozen=True)
@@ -257,9 +250,9 @@ class ArmTerms(NamedTuple):
 
 def arm_terms(robot: Robot, joint: int) -> ArmTerms:
     """Return unit and wording for moment arms at a joint."""
-    if robot.kinematics.slides[joint]:
-        towards_other_end = 'towards the other end of'
-        return ArmTerms(100.0 / RACK, '%', 'force share', towards_other_end, 'more parallel to', '')
+    if robot.units.slides[joint]:
+        scale, other, better = 100.0 / SLIDE.radian, 'towards the other end of', 'more parallel to'
+        return ArmTerms(scale, '%', 'force share', other, better, '')
     guided = ', or keep it on one side of the axis by `wrap: cylinder` around the axis'
     return ArmTerms(1e3, 'mm', 'moment arm', 'to the other side of', 'further from', guided)
 
@@ -274,8 +267,8 @@ def required_stiffness(robot: Robot, required: float) -> str:
         required: Smallest permitted eigenvalue of the joint stiffness [N·m/rad].
     """
     text = f'{required:.2g} N·m/rad'
-    if robot.kinematics.slides.any():
-        text += f' ({required / RACK**2:.0f} N/m for prismatic joints)'
+    if robot.units.slides.any():
+        text += f' ({SLIDE.stiffness_text(required, ".0f")} for prismatic joints)'
     return text
 
 
@@ -386,7 +379,7 @@ def _one_way_joints(robot: Robot, moment_arms: Array, matters: Array) -> Iterato
 
 def _useless_muscles(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[Finding]:
     """Yield a fault for each muscle that has no effective moment arm at any joint."""
-    along = ', or parallel to that of a prismatic joint' * bool(robot.kinematics.slides.any())
+    along = ', or parallel to that of a prismatic joint' * bool(robot.units.slides.any())
     for muscle, arms in zip(robot.muscles, np.abs(moment_arms).max(axis=0), strict=True):
         if (arms < matters).all():
             terms, least = arm_terms(robot, int(arms.argmax())), 1e3 * matters.max()
@@ -431,14 +424,15 @@ def _millimetres(moment_arms: Array) -> Iterator[Finding]:
 
 def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
     """Yield a warning for each moment arm or joint limit that looks like millimetres or degrees."""
-    longest, slides = np.abs(moment_arms).max(axis=0), robot.kinematics.slides
+    longest, units = np.abs(moment_arms).max(axis=0), robot.units
+    slides, ends = units.slides, (units.to_position(robot.lower), units.to_position(robot.upper))
     for m, j in np.argwhere((longest > LONGEST_ARM) & ~slides).tolist():
         names = {'muscle': robot.muscles[m], 'joint': robot.joints[j]}
         yield _finding('other_units, arm', **names, arm=longest[m, j])
-    for j, (low, high) in enumerate(zip(robot.lower, robot.upper)):
+    for j, (low, high) in enumerate(zip(*ends)):
         if high - low > WIDEST_RANGES[int(slides[j])]:
             wrong = 'metres, not millimetres' if slides[j] else 'radians, not degrees'
-            limits = {'low': low, 'high': high, 'unit': robot.units[j].theta}
+            limits = {'low': low, 'high': high, 'unit': units[j].theta}
             yield _finding('other_units, limits', joint=robot.joints[j], wrong=wrong, **limits)
 
 
@@ -455,8 +449,8 @@ def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
 def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
     """Yield a warning for each muscle whose length jumps where its tendon slips over an object."""
     for m, size, theta in jumping_muscles(robot):
-        crossed = np.flatnonzero(robot.routes.crossed[m])
-        place = ', '.join(f'{robot.joints[j]} {theta[j]:.2f}' for j in crossed)
+        crossed, position = np.flatnonzero(robot.routes.crossed[m]), robot.units.to_position(theta)
+        place = ', '.join(f'{robot.joints[j]} {position[j]:.2f}' for j in crossed)
         yield _finding('jumping_muscle', muscle=robot.muscles[m], size=1e3 * size, place=place)
 
 
@@ -478,8 +472,10 @@ def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
     """Yield a fault for each joint that moves almost no mass."""
     kin = robot.kinematics
     least = np.min([kin.joint_inertia(posture) for posture in theta], axis=0)
-    for j in np.flatnonzero(kin.radian**2 * least < LEAST_INERTIA):
-        moved = f'{least[j]:.2g} kg' if kin.slides[j] else f'inertia {least[j]:.2g} kg·m²'
+    for j in np.flatnonzero(least < LEAST_INERTIA):
+        moved = f'inertia {least[j]:.2g} kg·m²'
+        if robot.units.slides[j]:
+            moved = f'{least[j] / robot.units[j].radian ** 2:.2g} kg'
         yield _finding('no_inertia', joint=robot.joints[j], moved=moved)
 
 
@@ -492,7 +488,7 @@ def _holding_faults(check: RobotCheck) -> Iterator[Finding]:
         lack = np.abs(check.missing_torque[~held])
         most = lack.argmax(axis=1)
         counts = Counter(sorted(most.tolist())).most_common()
-        own, units = lack / robot.kinematics.radian, robot.units
+        own, units = robot.units.to_effort(lack), robot.units
         each = {k: rounded_text(own[most == k, k].max(), 2) for k, _ in counts}
         where = ', '.join(
             f'{robot.joints[k]} (in {count}, up to {each[k]} {units[k].torque})'
@@ -502,7 +498,7 @@ def _holding_faults(check: RobotCheck) -> Iterator[Finding]:
         yield _finding(
             'not_held', held=100 * held.mean(), bias=shown(robot.tension.bias),
             limit=shown(robot.tension.limit), required=required, others=len(lack),
-            force='torque' + ' or force' * bool(robot.kinematics.slides.any()), where=where,
+            force='torque' + ' or force' * bool(robot.units.slides.any()), where=where,
         )._replace(joint=worst)  # fmt: skip
     if stiff.mean() < REQUIRED_SHARE:
         counts = Counter(sorted(check.softest.tolist())).most_common()

@@ -120,14 +120,18 @@ def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Set
         return setting._replace(jacobian=setting.jacobian * scale, hessian=hessian), text
     if what == 'limits':  # the postures are scaled with the limits
         theta, middle = setting.theta.copy(), 0.5 * (robot.lower + robot.upper)[joint]
-        slides = robot.kinematics.slides[joint]
+        # Round as the user would write the limits into the file.
+        unit, digits = robot.units[joint], 4 if robot.units.slides[joint] else 2
         low, high = (
-            round(float(middle + factor * (end[joint] - middle)), 4 if slides else 2)
+            round(float(middle + factor * (end[joint] - middle)) * unit.radian, digits)
             for end in (robot.lower, robot.upper)
         )
+        text = f'[{low:.{digits}f}, {high:.{digits}f}]'
+        if robot.units.slides[joint]:
+            text += f' {unit.theta}'
+        low, high = low / unit.radian, high / unit.radian
         share = (theta[:, joint] - robot.lower[joint]) / (robot.upper - robot.lower)[joint]
         theta[:, joint] = low + share * (high - low)
-        text = f'[{low:.4f}, {high:.4f}] m' if slides else f'[{low:.2f}, {high:.2f}]'
         return Setting.of(robot, theta), f'limits of {robot.joints[joint]} {text}'
     owner, _, part = what.rpartition('.')
     of: Any = getattr(robot, owner) if owner else robot

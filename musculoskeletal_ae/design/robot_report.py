@@ -20,7 +20,7 @@ from musculoskeletal_ae.design.suggestion import suggest, write
 from musculoskeletal_ae.figures import save_plot
 from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
 from musculoskeletal_ae.robot.description import shown
-from musculoskeletal_ae.robot.kinematics import RACK
+from musculoskeletal_ae.robot.joint_units import SLIDE
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -130,7 +130,7 @@ def moment_arm_table(robot: Robot, result: RobotCheck) -> str:
     longest = np.abs(result.moment_arms).max(axis=(0, 1))
     decimals = [arm_terms(robot, j).decimals(arm) for j, arm in enumerate(longest.tolist())]
     spread = np.stack([arms.min(axis=0), np.median(arms, axis=0), arms.max(axis=0)], axis=-1)
-    sliders = ', '.join(np.array(robot.joints)[robot.kinematics.slides])
+    sliders = ', '.join(np.array(robot.joints)[robot.units.slides])
     has_short_arms = bool((matters < COUNTED_ARM).any())
     tenth = ', and below a tenth of the longest at that joint,' * has_short_arms
     lines = [
@@ -139,7 +139,7 @@ def moment_arm_table(robot: Robot, result: RobotCheck) -> str:
         f'"." = below {1e3 * COUNTED_ARM:g} mm{tenth} in every posture',
     ]
     if sliders:
-        least = f'"." = below {100 * COUNTED_ARM / RACK:g} %'
+        least = f'"." = below {100 * COUNTED_ARM / SLIDE.radian:g} %'
         lines.append(
             f'prismatic joints ({sliders}): share of the tension along the axis [%], {least}'
         )
@@ -163,8 +163,10 @@ def plot(robot: Robot, result: RobotCheck) -> Any:
     axes = np.atleast_1d(figure.subplots(rows, columns)).ravel()
     dots = {'s': 5, 'alpha': 0.6, 'linewidths': 0}
     for j, (panel, name) in enumerate(zip(axes, robot.joints)):
-        slides, terms = robot.kinematics.slides[j], arm_terms(robot, j)
-        label, shown_as = ('position [mm]', 1e3) if slides else ('joint angle [deg]', 180.0 / np.pi)
+        terms = arm_terms(robot, j)
+        label, shown_as = 'joint angle [deg]', 180.0 / np.pi
+        if robot.units.slides[j]:
+            label, shown_as = 'position [mm]', 1e3 * robot.units[j].radian
         for m, muscle in enumerate(robot.muscles):
             arm = result.moment_arms[:, m, j]
             if np.abs(arm).max() >= result.matters[j]:

@@ -117,8 +117,8 @@ def jump_choices(robot: Robot) -> list[str]:
         there = theta[bends[:, m] > JUMP]
         crossed = np.flatnonzero(robot.routes.crossed[m])
         place = ', '.join(
-            f'{robot.joints[j]} in [{there[:, j].min():.2f}, {there[:, j].max():.2f}] '
-            f'{robot.units[j].theta}'
+            f'{robot.joints[j]} in '
+            f'{robot.units[j].range_text(there[:, j].min(), there[:, j].max())}'
             for j in crossed
         )
         size, name = 1e3 * bends[:, m].max(), robot.muscles[m]
@@ -161,5 +161,5 @@ def _limit_without_jumps(robot: Robot, there: Array, crossed: Ints) -> str:
             share = (kept[1] - kept[0]) / (high - low)
             if share > best:
                 best = share
-                text = f'{robot.joints[j]} to [{kept[0]:.2f}, {kept[1]:.2f}] {robot.units[j].theta}'
+                text = f'{robot.joints[j]} to {robot.units[j].range_text(*kept)}'
     return text

@@ -95,7 +95,8 @@ class Listening:
         Args:
             robot: The geometric model.
             rate: Expected rate of muscle_states [Hz].
-            posture: θ [rad] (D,) in which the arm is held, or None to use joint_states.
+            posture: Positions of the joints [rad or m], (D,), in which the arm is held, or None to
+                use joint_states.
             zeroed: Whether the lengths are calibrated; if not, each may have any constant offset.
             motors: How the motors of a ros2_control robot are connected, or None for muscle_states.
             clock: Shows the pauses of this process; None for a process without pauses.
@@ -104,7 +105,9 @@ class Listening:
         self._pace = Pace(rate, clock or AwakeClock())
         self._motors = motors or MotorInterface(None)
         self._stated = posture is not None
-        self._theta = np.full(robot.joint_count, math.nan) if posture is None else np.array(posture)
+        self._theta = np.full(robot.joint_count, math.nan)
+        if posture is not None:
+            self._theta = robot.units.to_theta(np.array(posture))
         self._not_finite: Counter[str] = Counter()  # positions that are not finite, by joint
         #: states (3, M) of each message of the muscles, and the number of joint messages before it
         self._read: list[tuple[Array, int]] = []
@@ -155,7 +158,7 @@ class Listening:
         """Record a message of joint_states."""
         with self._rejecting('joint_states'):
             self._not_finite.update(joints_not_finite(message, self._robot.joints))
-            theta = read_posture(message, self._robot.joints, some=True)
+            theta = read_posture(message, self._robot.units, some=True)
             if not self._stated:  # joints may come in several messages
                 self._theta = np.where(np.isnan(theta), self._theta, theta)
                 self._angles_read.append((self._now, theta))
@@ -399,7 +402,7 @@ class Listening:
 
     def _moved(self, theta: Array) -> Bools:
         """Return which joints moved enough to check the signs of their angles, (D,)."""
-        moved: Bools = np.ptp(theta, axis=0) > MOVED_JOINT * self._robot.kinematics.radian
+        moved: Bools = np.ptp(theta, axis=0) > MOVED_JOINT
         return moved
 
     def _judge_joint_signs(
@@ -436,7 +439,7 @@ class Listening:
         """
         robot = self._robot
         joints = range(robot.joint_count)
-        turning = [j for j in joints if not robot.kinematics.slides[j]]
+        turning = [j for j in joints if not robot.units.slides[j]]
         if np.abs(theta[:, turning]).max(initial=0.0) > math.pi:
             degrees = theta.copy()
             degrees[:, turning] = np.radians(degrees[:, turning])
@@ -449,8 +452,9 @@ class Listening:
         if moved.sum() > 1:
             yield 'joint sign', [robot.joints[j] for j in joints], -theta
         for j, k in combinations(np.flatnonzero(moved).tolist(), 2):
-            exchanged = theta.copy()
-            exchanged[:, [j, k]] = theta[:, [k, j]]
+            exchanged = joint_sensors.corrected(
+                theta, [joint_sensors.JointFault(joint_sensors.ORDER, (j, k))], robot.units
+            )
             yield 'joint order', [robot.joints[j], robot.joints[k]], exchanged
 
     def _are_turned(self, length: Array, model: Array, moved: Bools) -> bool:
@@ -493,10 +497,10 @@ class Listening:
         excess = np.maximum(theta - robot.upper, robot.lower - theta)
         judged = np.argsort(excess, axis=0)[int(BEYOND_SHARE * (len(theta) - 1))]
         beyond = np.take_along_axis(excess, judged[None], axis=0)[0]
-        j = int((beyond / robot.kinematics.radian).argmax())
-        if beyond[j] > BEYOND_JOINT * robot.kinematics.radian[j]:
-            reading = theta[judged[j], j]
-            values = {'theta': reading, 'beyond': beyond[j], 'unit': robot.units[j].theta}
+        j = int(beyond.argmax())
+        if beyond[j] > BEYOND_JOINT:
+            at, off = robot.units.to_position(np.array([theta[judged[j], j], beyond[j]]), j)
+            values = {'theta': at, 'beyond': off, 'unit': robot.units[j].theta}
             verdict.failed('joint', name=robot.joints[j], **values)
             return math.inf
         model = robot.muscle_lengths(theta, tension)

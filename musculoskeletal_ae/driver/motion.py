@@ -214,7 +214,7 @@ class MotionTest(ABC):
             return
         judgement = judge(robot, theta, states[:, 0], states[:, 1], segments=tested)
         order = judge_order(robot, theta, states[:, 0], states[:, 1], tested)
-        meant = corrected(theta, judgement.faults)
+        meant = corrected(theta, judgement.faults, robot.units)
         of_joints = judge_order(robot, meant, states[:, 0], states[:, 1], tested)
         # A fault of the joint sensors is preferred, because it can look like exchanged antagonists.
         if order.is_faulty and (

@@ -76,5 +76,5 @@ def wrong_side(
         return 'commands'
     if BETTER * of_readings > of_commands:
         return None
-    of_joints = misfit(corrected(theta, joint_faults), own)
+    of_joints = misfit(corrected(theta, joint_faults, robot.units), own)
     return 'readings' if of_readings < JOINTS_BETTER * of_joints else None

@@ -34,8 +34,7 @@ from musculoskeletal_ae.robot.robot import Robot
 SLIDING_DISTANCE = 0.0005  # sliding distance over which tendon friction builds up [m]
 # Joints.
 ARMATURE = 0.004  # rotor and bearing inertia of a joint module [kg·m²]; chosen by hand
-#: angle over which joint friction builds up [rad]; at a prismatic joint, angle of its pinion
-STICKING_ANGLE = 0.003
+STICKING_ANGLE = 0.003  # angle over which joint friction builds up [rad]
 VISCOUS = 0.5  # viscous friction of a joint [N·m·s/rad]
 STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0  # of the joint limits [N·m/rad], [N·m·s/rad]
 STOP_LOAD = 40.0  # load by weight and muscles at T_bias above which stops are stiffer [N·m]
@@ -215,13 +214,15 @@ class EmulatedArm(modules.Arm):
 
     def _constants(self) -> Body:
         robot, true, elastic = self.robot, self.individual, self.individual.elastic
-        springs = true.joint_elasticity
+        units = robot.units
+        springs = units.elasticity_outside(true.joint_elasticity)
         # Coupled joints have neither friction nor stops of their own.
         friction, lower, upper = (np.full(self._model.nv, end) for end in (0.0, -np.inf, np.inf))
-        friction[self._order] = true.joint_friction
-        lower[self._order], upper[self._order] = robot.lower, robot.upper
+        friction[self._order] = units.to_effort(true.joint_friction)
+        lower[self._order] = units.to_position(robot.lower)
+        upper[self._order] = units.to_position(robot.upper)
         firmness = self._gear.copy()
-        load = true.joint_load / STOP_LOAD
+        load = units.to_effort(true.joint_load) / STOP_LOAD
         firmness[self._order] = np.maximum(firmness[self._order], load)
         joint, hand = robot.kinematics.placement(robot.description.end_effector)
         return Body(
@@ -257,14 +258,14 @@ class EmulatedArm(modules.Arm):
 
     def _step(self) -> None:
         model, data, joint = self._model, self._data, self._joint
-        if not self.robot.kinematics.tree.is_coupled:
+        if not self.robot.kinematics.tree.is_geared:
             acceleration = pin.aba(model, data, joint.q, joint.velocity, joint.torque)
         else:
             acceleration = self._coupled_acceleration()
         muscle_step(self._handle, self._kind, acceleration)
 
     def _coupled_acceleration(self) -> Array:
-        """Return the acceleration of each joint of the tree, (J−1,), if some joints are coupled.
+        """Return the acceleration of each joint, (J−1,), if some are coupled or prismatic.
 
             q̈ = A θ̈ + Ȧ θ̇,   θ̈ = (Aᵀ M A)⁻¹ Aᵀ (τ − h − M Ȧ θ̇)
 

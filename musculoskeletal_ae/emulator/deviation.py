@@ -52,7 +52,7 @@ def effects(robot: Robot) -> Effects:
 def typical_arms(robot: Robot) -> Array:
     """Return the root mean square moment arm of each muscle over the workspace [m], (M,)."""
     theta = robot.random_postures(POSTURES, np.random.default_rng(0))
-    arms = robot.routes.muscle_jacobian(theta) * robot.kinematics.radian
+    arms = robot.routes.muscle_jacobian(theta)
     crossed = np.maximum(robot.routes.crossed.sum(axis=1), 1)
     result: Array = np.sqrt((arms**2).sum(axis=2).mean(axis=0) / crossed)
     return result

@@ -35,7 +35,7 @@ class Effects:
     #: factor of these σ: link lengths 5 mm, axes 2°, masses 15 %, centres of mass 20 mm
     links: float = 0.0
     springs: float = 0.25  # σ of the logarithm of the stiffness of each joint's spring
-    #: σ of the rest angle of each spring [rad]; prismatic joints: times RACK [m]
+    #: σ of the rest angle of each spring [rad]
     spring_rest: float = 0.08
     # Series elastic elements, made of rubber
     stiffness: float = 0.4  # largest relative deviation from the data sheet
@@ -59,10 +59,9 @@ class Effects:
     eccentricity: float = 0.0008  # eccentricity of the spool [m]
     spool_slip: float = 0.0011  # slip of a tendon on its spool, on average once in five hours [m]
     length_drift: float = 0.001  # σ of the drift of the offset [m/h]
-    joint_zero: float = np.radians(2.0)  # σ of the offset [rad]; prismatic joints: times RACK [m]
+    joint_zero: float = np.radians(2.0)  # σ of the offset [rad]
     joint_bend: float = 0.01  # non-linearity, relative to the joint's range
-    #: backlash of the joint sensor [rad]; prismatic joints: times RACK [m]
-    backlash: float = np.radians(1.0)
+    backlash: float = np.radians(1.0)  # backlash of the joint sensor [rad]
     # Messages
     delay: float = 0.02  # delay of joint angles, and of lengths and tensions [s]
     jitter: float = 0.005  # range over which the delay varies from one reading to the next [s]

@@ -250,14 +250,18 @@ class Faults:
             is_in_burst = fault.kind == 'burst' and self._is_in_burst(fault)
             for name in fault.quantities:
                 value, which = values[name], fault.which
+                size = np.full(len(which), fault.size)
+                if name == 'theta':  # the size is stated in the units of the joints
+                    size = self._robot.units.to_theta(size, which)
                 if fault.kind == 'bias':
-                    value[which] += fault.size
+                    value[which] += size
                 elif fault.kind == 'exchange':
-                    value[which] = value[which[::-1]]
+                    units = self._robot.units  # the sensors publish positions
+                    value[which] = units.to_theta(units.to_position(value)[which[::-1]], which)
                 elif fault.kind == 'drift':
-                    value[which] += fault.size * (self._time - self._begins[fault.key])
+                    value[which] += size * (self._time - self._begins[fault.key])
                 elif fault.kind == 'burst':
-                    value[which] = np.where(is_in_burst, fault.size, value[which])
+                    value[which] = np.where(is_in_burst, size, value[which])
                 elif fault.kind == 'dead_sensor':
                     value[which] = 0.0
                 elif fault.kind == 'nan_sensor':
@@ -267,7 +271,8 @@ class Faults:
                         self._frozen.setdefault((name, m), float(value[m])) for m in which
                     ]
                 elif self._rng.random() < SPIKE_SHARE:
-                    value[self._rng.choice(which)] += fault.size
+                    hit = which == self._rng.choice(which)
+                    value[which[hit]] += size[hit]
         return readings._replace(**values)
 
     def _delay(self) -> float:

@@ -181,7 +181,8 @@ def _limit_warnings(robot: Robot, file: Path, model: Any) -> Iterator[str]:
 
     Differences of up to 2 % of the joint's range are tolerated.
     """
-    for name, lower, upper in zip(robot.joints, robot.lower, robot.upper):
+    ends = robot.units.to_position(robot.lower), robot.units.to_position(robot.upper)
+    for name, lower, upper in zip(robot.joints, *ends):
         joint = model.joint(name).id
         unlimited = np.array([-np.inf, np.inf])
         actual = model.jnt_range[joint] if model.jnt_limited[joint] else unlimited
@@ -198,11 +199,11 @@ class LateSensors:
     """Errors of the joint sensors (offset, non-linearity, backlash), and delays of all messages."""
 
     def __init__(self, robot: Robot, draw: Draw) -> None:
-        joints, radian = robot.joint_count, robot.kinematics.radian
+        joints = robot.joint_count
         self._joint_count, self._span = joints, robot.upper - robot.lower
-        self._zero = radian * draw.normal('joint_zero', joints)
+        self._zero = draw.normal('joint_zero', joints)
         self._bend = draw.about('joint_bend', joints, signed=True)
-        self._backlash = radian * draw.about('backlash', joints)
+        self._backlash = draw.about('backlash', joints)
         self._delays = draw.about('delay', 2)  # delay of joint sensors, and of muscle modules [s]
         self._history = np.zeros((HISTORY, joints + 3 * robot.muscle_count))
         self._steps = 0
@@ -357,7 +358,7 @@ class ForeignArm(Arm):
         robot, draw, body = self.robot, self._draw, self.individual
         theta = robot.random_postures(200, draw.rng('load'))
         torque = robot.kinematics.holding_torque(theta)
-        load = robot.joint_load(torque, body.muscle_jacobian(theta))
+        load = robot.units.to_effort(robot.joint_load(torque, body.muscle_jacobian(theta)))
         joints = [self._model.joint(name).dofadr[0] for name in robot.joints]
         self._model.dof_frictionloss[joints] += load * draw.about('joint_friction', len(joints))
 

@@ -37,7 +37,7 @@ class Spread:
     tension_bias: float = 1.0  # standard deviation of each tension sensor's offset [N]
     tension_gain: float = 0.01  # standard deviation of each tension sensor's relative gain error
     springs: float = 0.2  # standard deviation of the logarithm of each joint's spring stiffness
-    #: standard deviation of the angle at which each spring is at rest [rad]; prismatic: times RACK
+    #: standard deviation of the angle at which each spring is at rest [rad]
     spring_rest: float = 0.05
 
 
@@ -104,7 +104,7 @@ class Individual:
         drawn = np.random.default_rng([seed, 0x5B]).normal(size=(2, robot.joint_count))
         #: springs and dampers of the joints
         self.joint_elasticity = kin.elasticity.deviating(
-            np.exp(spread.springs * drawn[0]), spread.spring_rest * kin.radian * drawn[1]
+            np.exp(spread.springs * drawn[0]), spread.spring_rest * drawn[1]
         )
 
     def _redraw_jumping_routes(

@@ -25,7 +25,8 @@ from numba import njit
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT, Faults, Readings
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.robot.kinematics import RACK, Kinematics
+from musculoskeletal_ae.robot.joint_units import SLIDE
+from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
 STEP = 0.001  # [s]
@@ -48,7 +49,7 @@ HEAT_SPREAD = 0.15  # standard deviation of the logarithm of LOSS, the capacitie
 
 # Sensors. The values are chosen by hand. Noise is one standard deviation. Readings are rounded to
 # the resolution, which is a power of two as for an A/D converter.
-ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # [rad]; prismatic joints: times RACK [m]
+ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # [rad]
 LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # [m]
 TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # [N]
 TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3  # [°C]
@@ -63,10 +64,10 @@ MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # of the position [m] and the ori
 def joint_gear(kinematics: Kinematics) -> Array:
     """Return the factor of damping, stop stiffness and motor inertia for each joint, (J,).
 
-    The factor is 1 for revolute joints. A prismatic joint is driven by a pinion of radius RACK, so
+    The factor is 1 for revolute joints. A prismatic joint is driven by a pinion (`JointUnits`), so
     its factor is 1/RACK² [1/m²].
     """
-    gear: Array = np.where(kinematics.tree.prismatic, RACK**-2, 1.0)
+    gear: Array = np.where(kinematics.tree.prismatic, SLIDE.radian**-2, 1.0)
     return gear
 
 
@@ -310,13 +311,13 @@ class Arm(ABC):
     @property
     def theta(self) -> Array:
         """True joint angles [rad], shape (D,), the reference for all errors."""
-        angles: Array = self._angles[self._order]
+        angles: Array = self.robot.units.to_theta(self._angles[self._order])
         return angles
 
     @property
     def velocity(self) -> Array:
         """True joint velocities [rad/s], shape (D,)."""
-        rates: Array = self._rates[self._order]
+        rates: Array = self.robot.units.to_theta(self._rates[self._order])
         return rates
 
     @property
@@ -468,11 +469,10 @@ class Arm(ABC):
         """Read all sensors once, with noise, bias, resolution and faults."""
         theta, length, tension, housing = self._raw_readings()
         ruptured, rng = self._muscle.ruptured > 0.0, self._rng
-        radian = self.robot.kinematics.radian
         # A ruptured tendon does not load the sensor, and a tension sensor does not read below zero.
         measured = noisy(np.where(ruptured, 0.0, tension), TENSION_NOISE, TENSION_RESOLUTION, rng)
         readings = Readings(
-            noisy(theta, ANGLE_NOISE * radian, ANGLE_RESOLUTION * radian, rng),
+            noisy(theta, ANGLE_NOISE, ANGLE_RESOLUTION, rng),
             noisy(length, LENGTH_NOISE, LENGTH_RESOLUTION, rng),
             np.where(ruptured, 0.0, np.maximum(measured, 0.0)),
             noisy(housing, TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION, rng),

@@ -75,7 +75,8 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
     spec.compiler.boundmass = 1e-6  # for links without mass
     off = links * draw.rng('links').normal(size=(model.njoints, 4, 3))
     bodies, gear = [spec.worldbody], joint_gear(kin)
-    springs = _drawn_springs(robot, draw)
+    springs, units = robot.units.elasticity_outside(_drawn_springs(robot, draw)), robot.units
+    limits = [*zip(units.to_position(robot.lower), units.to_position(robot.upper))]
     for i in range(1, model.njoints):
         at, inertia, name = model.jointPlacements[i], model.inertias[i], names[i]
         # A joint that is hardly apart from its parent belongs to a joint module with several axes
@@ -96,7 +97,7 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
         joint = body.add_joint(name=name, type=kind, axis=axis, **module)
         if name in robot.joints:
             k = robot.joints.index(name)
-            joint.limited, joint.range = True, [robot.lower[k], robot.upper[k]]
+            joint.limited, joint.range = True, limits[k]
             damping = float(gear[i] * DAMPING + springs.damping[k])
             joint.damping = [damping, 0.0, 0.0]
         else:
@@ -120,7 +121,7 @@ def _drawn_springs(robot: Robot, draw: Draw) -> JointElasticity:
     """Return the springs of an individual's joints."""
     kin, drawn = robot.kinematics, draw.rng('springs').normal(size=(2, robot.joint_count))
     factor = np.exp(draw.sizes.springs * drawn[0])
-    return kin.elasticity.deviating(factor, draw.sizes.spring_rest * kin.radian * drawn[1])
+    return kin.elasticity.deviating(factor, draw.sizes.spring_rest * drawn[1])
 
 
 def _add_springs(robot: Robot, springs: JointElasticity, spec: Any) -> None:
@@ -128,7 +129,12 @@ def _add_springs(robot: Robot, springs: JointElasticity, spec: Any) -> None:
 
     MuJoCo has no springs between joints. The stiffness matrix of joints that springs couple is
     therefore represented by fixed tendons with stiffness, one for each eigenvector v of the matrix.
-    Each of them acts along the coordinate v · θ of the joint angles θ.
+    Each of them acts along the coordinate v · q of the joint positions q.
+
+    Args:
+        robot: The robot.
+        springs: The springs in the units of the joints.
+        spec: The MjSpec, to which the springs are added.
     """
     off = springs.stiffness - np.diag(np.diag(springs.stiffness))
     for k in np.flatnonzero(~off.any(axis=1)).tolist():

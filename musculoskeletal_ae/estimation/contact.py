@@ -37,12 +37,10 @@ from musculoskeletal_ae.robot.robot import Robot
 BANDWIDTH = 25.0
 LARGEST_USUAL = 20.0  # F₀: largest usual force at the hand [N]
 REGULARISATION = np.eye(3) / LARGEST_USUAL**2
-#: Distance from a limit below which a joint counts as at its stop [rad]; for prismatic joints times
-#: `kinematics.RACK` [m]. It is about as large as the error of the estimate.
+#: distance from a limit below which a joint counts as at its stop [rad]; about as large as the
+#: error of the estimate
 AT_STOP = 0.06
-#: motion of a joint after which G is evaluated again [rad]; for prismatic joints times
-#: `kinematics.RACK` [m]
-TURNED = 0.02
+TURNED = 0.02  # motion of a joint after which G is evaluated again [rad]
 #: threshold of d; for five healthy arms that explored for ten minutes each, d was at most 8.6
 CONTACT = 10.0
 IN_A_ROW = 2  # number of consecutive messages with d > CONTACT that count as a contact
@@ -116,8 +114,7 @@ class ContactEstimator:
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._middle = 0.5 * (robot.lower + robot.upper)
-        self._reach = 0.5 * (robot.upper - robot.lower) - AT_STOP * robot.kinematics.radian
-        self._near = TURNED * robot.kinematics.radian
+        self._reach = 0.5 * (robot.upper - robot.lower) - AT_STOP
         self._filter = LowPass(BANDWIDTH)
         self.is_calibrated = False
         self.count = 0
@@ -149,7 +146,7 @@ class ContactEstimator:
             dt: Time since the previous message [s].
         """
         kinematics, joint_count = self._robot.kinematics, len(theta)
-        near = np.abs(theta - self._evaluated_at) <= self._near
+        near = np.abs(theta - self._evaluated_at) <= TURNED
         if np.count_nonzero(near) < joint_count:  # also true if θ is NaN
             self._jacobian = self._mae.muscle_jacobian(theta, end_tension)
             self._evaluated_at = theta

@@ -241,7 +241,8 @@ class Estimator:
         """Start a length calibration, while the arm stands in a posture or moves gently.
 
         Args:
-            posture: θ in which the arm stands [rad], (D,); () if it moves gently.
+            posture: Positions of the joints at which the arm stands [rad or m], (D,); () if it
+                moves gently.
 
         Raises:
             MusculoskeletalError: If there is no network, if the posture is not valid, or if no

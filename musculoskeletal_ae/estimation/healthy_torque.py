@@ -20,9 +20,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
 MEMORY = 180.0  # largest time constant of the average; only time in motion counts [s]
-#: norm of the joint velocities above which an arm moves [rad/s]; speeds of prismatic joints are
-#: divided by `kinematics.RACK`
-MOVING = 0.05
+MOVING = 0.05  # norm of the joint velocities above which an arm moves [rad/s]
 #: multiple of σ to which torques are clipped, because larger torques indicate contact
 OUTLIER = 5.0
 LEAST_SPREAD = 1e-3  # smallest σ [N·m]
@@ -36,12 +34,12 @@ class HealthyTorque:
 
     def __init__(self, robot: Robot) -> None:
         self._contact, self._direction = ContactEstimator(robot), FrictionDirection()
-        self._radian = robot.kinematics.radian
+        self._joint_count = robot.joint_count
         self.start()
 
     def start(self) -> None:
         """Restart the measurement, for example for another arm."""
-        self._square, self._time = np.zeros_like(self._radian), 0.0
+        self._square, self._time = np.zeros(self._joint_count), 0.0
 
     def use(self, mae: Mae) -> Mae:
         """Use another network, and return a copy that contains the residual torque σ measured here.
@@ -75,7 +73,7 @@ class HealthyTorque:
         end = self._direction.end_tension(self._mae.transmission, tension, length)
         theta = self._mae.estimate(end, length).theta
         torque = self._contact.step(theta, end, dt).torque
-        if np.linalg.norm(self._contact.velocity / self._radian) < MOVING:
+        if np.linalg.norm(self._contact.velocity) < MOVING:
             return
         square = torque**2
         if self._time > LEAST_MOTION:

@@ -45,21 +45,21 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.joint_trust import NOT_USED, JointTrust, Trust
 
 SPACING = 0.5  # shortest time between two messages that count [s]
-#: A message counts if the estimate of a joint has moved by this much since the last one that
-#: counted [rad]; for prismatic joints times `kinematics.radian`.
+#: a message counts if the estimate of a joint has moved by this much since the last one that
+#: counted [rad]
 MOVED = 0.03
 EARLIER = 600  # largest number of earlier messages, at least 5 min of motion
 ENOUGH = 80  # judge a sensor by this many earlier messages at least
 NEWEST = 48  # number of newest messages, which are judged by all messages before them
 #: Windows in which a sensor is judged: number of messages, smallest limit of the median of |x|
-#: [rad] (for prismatic joints times `kinematics.radian`), and limit in healthy spreads of x.
-#: The short window finds large errors fast; the long one averages over more postures.
+#: [rad], and limit in healthy spreads of x. The short window finds large errors fast; the long one
+#: averages over more postures.
 WINDOWS = ((6, 0.12, 7.0), (24, 0.07, 3.0), (NEWEST, 0.06, 2.2))
 #: Multiply the limits by 1 + FEW/n if there are n earlier messages
 FEW = 20.0
-#: Trust a sensor again once the median of |x| is below AGREEING_LIMIT [rad] (for prismatic joints
-#: times `kinematics.radian`), or below AGREEING_SPREADS healthy spreads of x. It has to be so over
-#: the newest AGREEING messages and over the newer half of them.
+#: Trust a sensor again once the median of |x| is below AGREEING_LIMIT [rad], or below
+#: AGREEING_SPREADS healthy spreads of x. It has to be so over the newest AGREEING messages and over
+#: the newer half of them.
 AGREEING, AGREEING_LIMIT, AGREEING_SPREADS = 12, 0.035, 1.0
 #: Smallest healthy spread of r [m], which bounds the precision of any length sensor
 LEAST_SPREAD = 0.0005
@@ -68,8 +68,8 @@ LEAST_SPREAD = 0.0005
 BETTER = 0.7
 USES = 10  # compute the medians of the earlier messages again after this many messages
 TO_SIGMA = 1.48  # standard deviation of a normal distribution, in medians of absolute deviations
-#: Doubt a sensor with fewer earlier messages if its reading differs from the estimate by this much
-#: [rad]; for prismatic joints times `kinematics.radian`
+#: doubt a sensor with fewer earlier messages if its reading differs from the estimate by this much
+#: [rad]
 GROSS = 0.8
 
 
@@ -102,7 +102,6 @@ class JointCheck:
     def __init__(self, robot: Robot) -> None:
         """Start without a network."""
         self._has_tensions = robot.tension_source.is_known
-        self._radian = robot.kinematics.radian * np.ones(robot.joint_count)
         self._mae: Mae | None = None
         self.trust = JointTrust.full(robot.joint_count)
         #: messages in order of time; the last NEWEST of them are judged by the earlier ones
@@ -187,10 +186,10 @@ class JointCheck:
         estimate, sample = observation.estimate.state.theta, observation.sample
         if self._mae is None or self._since < SPACING - 1e-9 or np.isnan(theta).all():
             return
-        has_moved = (np.abs(estimate - self._counted_at) > MOVED * self._radian).any()
+        has_moved = (np.abs(estimate - self._counted_at) > MOVED).any()
         # A sensor that is far off is also found while the arm stands still.
         usual = 0.0 if self._usual is None else self._usual.deviation
-        is_far = np.abs(theta - estimate - usual) > GROSS * self._radian
+        is_far = np.abs(theta - estimate - usual) > GROSS
         if not (has_moved or (is_far & ~self.trust.is_doubted).any()):
             return
         self._since, self._counted_at = 0.0, estimate
@@ -257,14 +256,14 @@ class JointCheck:
     def _limits(self, usual: _Usual) -> Iterator[tuple[int, Array]]:
         """Yield the length of each window and the limits of the median of |x| [rad], (D,)."""
         for count, smallest, spreads in WINDOWS:
-            limit = np.fmax(smallest * self._radian, spreads * usual.deviation_spread)
+            limit = np.fmax(smallest, spreads * usual.deviation_spread)
             limit = limit * (1.0 + FEW / np.maximum(usual.known_count, 1))
             is_gross = np.isnan(usual.deviation_spread) | (not self._is_precise())
-            yield count, np.where(is_gross, GROSS * self._radian, limit)
+            yield count, np.where(is_gross, GROSS, limit)
 
     def _agrees(self, excess: Array, usual: _Usual) -> Bools:
         """Return which joints agree with the lengths again, (D,)."""
-        limit = np.fmax(AGREEING_LIMIT * self._radian, AGREEING_SPREADS * usual.deviation_spread)
+        limit = np.fmax(AGREEING_LIMIT, AGREEING_SPREADS * usual.deviation_spread)
         agrees = np.ones(len(limit), dtype=bool)
         for count in (AGREEING // 2, AGREEING):
             agrees &= _median(np.abs(excess[-count:])) < limit
@@ -335,9 +334,8 @@ class JointCheck:
         deviation = np.array([deviation[joint] for deviation, _ in self._compared])
         usual = np.nanmedian(deviation[:-NEWEST]) if len(deviation) > NEWEST else 0.0
         excess = np.abs(deviation - usual)
-        limit = AGREEING_LIMIT * self._radian[joint]
         for end in range(len(excess) - 1, count, -1):
-            if np.median(excess[end - count : end]) < limit:  # NaN never agrees
+            if np.median(excess[end - count : end]) < AGREEING_LIMIT:  # NaN never agrees
                 return self._messages[end - count // 2].time
         return self._messages[0].time
 

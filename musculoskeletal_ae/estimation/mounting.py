@@ -43,14 +43,10 @@ UPRIGHT = 25.0  # angle up to which a direction counts as that of `robot.urdf` [
 NOISE = 0.08, 0.16, 0.32
 LEAST_NOISE = 0.1  # smallest σ_j [N·m]
 FREEDOM = 4.0  # ν: with larger residuals, a posture counts less
-#: motion of a joint after which a posture counts again [rad]; for prismatic joints times
-#: `kinematics.RACK` [m]
-MOVED = 0.2
+MOVED = 0.2  # motion of a joint after which a posture counts again [rad]
 #: shortest time between two postures that count [s]: noise of the readings makes the estimate jump
 SPACING = 0.5
-#: distance from a limit below which a joint may rest at its stop [rad]; for prismatic joints times
-#: `kinematics.RACK` [m]
-AT_STOP = 0.12
+AT_STOP = 0.12  # distance from a limit below which a joint may rest at its stop [rad]
 MEMORY = 100  # largest number of the newest postures by which the direction is judged
 ENOUGH = 30  # smallest number of postures by which the direction is judged
 #: Report another direction of gravity from this evidence on. On learned arms that explored
@@ -142,16 +138,14 @@ class MountingCheck:
             torque: External torque τ_ext [N·m], (D,); 0 where a stop may be the only cause.
             dt: Time since the previous message [s].
         """
-        robot = self._robot
         self._since += dt
-        radian = robot.kinematics.radian
-        moved = np.abs(theta - self._counted_at) / radian
+        moved = np.abs(theta - self._counted_at)
         has_moved = self._since >= SPACING - 1e-9 and moved.max() > MOVED
         if not self._is_learned or not has_moved or not np.isfinite(torque).all():
             return
         self._counted_at, self._since = theta, 0.0
         load = tension @ np.abs(self._mae.muscle_jacobian(theta, tension))
-        noise = np.maximum(load, LEAST_NOISE / radian)
+        noise = np.maximum(load, LEAST_NOISE)
         of_arm, of_hand = self._regressors(theta)
         weight = of_arm @ self._gravity - torque  # torque that the muscles hold
         u = self._strength * self._directions.T
@@ -193,8 +187,7 @@ class MountingCheck:
     def _at_stop(self, theta: Array) -> tuple[Bools, Bools]:
         """Return which joints are near their lower limit, (D,), and which near the upper, (D,)."""
         robot = self._robot
-        near = AT_STOP * robot.kinematics.radian
-        return theta < robot.lower + near, theta > robot.upper - near
+        return theta < robot.lower + AT_STOP, theta > robot.upper - AT_STOP
 
     def _regressors(self, theta: Array) -> tuple[Array, Array]:
         """Return Y of the arm and of a mass of 1 kg in the hand, (D, 3) each."""

@@ -116,7 +116,7 @@ def _doubted_joints(core: Estimator) -> Iterator[Condition]:
     trust, robot = core.joint_trust, core.robot
     if trust.doubted:
         detail = ', '.join(
-            f'{robot.joints[j]} by {trust.deviation[j]:+.2f} {robot.units[j].theta}'
+            f'{robot.joints[j]} by {robot.units[j].position_text(trust.deviation[j], "+.2f")}'
             for j in trust.doubted
         )
         names = [robot.joints[j] for j in trust.doubted]

@@ -41,7 +41,7 @@ def shoulder(robot: Robot) -> int:
 
 
 def _named(robot: Robot, names: tuple[str, ...], otherwise: int) -> int:
-    revolute = np.flatnonzero(~robot.kinematics.slides).tolist()
+    revolute = np.flatnonzero(~robot.units.slides).tolist()
     for name in names:
         for index in revolute:
             if name in robot.joints[index]:
@@ -51,7 +51,9 @@ def _named(robot: Robot, names: tuple[str, ...], otherwise: int) -> int:
 
 def plot_unit(robot: Robot, joint: int) -> tuple[float, str]:
     """Return the factor that converts θ of a joint to the unit of plots, and that unit."""
-    return (1000.0, 'mm') if robot.kinematics.slides[joint] else (math.degrees(1.0), 'deg')
+    if robot.units.slides[joint]:
+        return 1000.0 * robot.units[joint].radian, 'mm'
+    return math.degrees(1.0), 'deg'
 
 
 def within(robot: Robot, joint: int, degrees: float) -> float:

@@ -82,7 +82,7 @@ class Report(NamedTuple):
             numbers = f'{1e3 * length:>10.2f}{1e3 * arm:>12.2f}{1e3 * size:>8.1f}'
             lines.append(f'{name:<28}{numbers}{1e3 * stretch:>9.2f}{offset:>11.5f}')
         torques = ', '.join(
-            f'{name} {value:.2g} {unit.torque}'
+            f'{name} {unit.torque_text(value, ".2g")}'
             for name, value, unit in zip(robot.joints, self.torque, robot.units)
         )
         warned = '; '.join(self.warnings) or 'none'
@@ -196,11 +196,12 @@ def _spec(robot: Robot, mae: Mae, springs: Springs) -> Any:
     spec.option.timestep = TIMESTEP
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     kin, gear = robot.kinematics, joint_gear(robot.kinematics)
+    dampers = robot.units.elasticity_outside(kin.elasticity).damping
     for i in range(1, kin.model.njoints):
         joint = spec.joint(kin.model.names[i])
         name, damping = kin.model.names[i], float(gear[i]) * DAMPING
         if name in robot.joints:
-            damping += float(kin.elasticity.damping[robot.joints.index(name)])
+            damping += float(dampers[robot.joints.index(name)])
         joint.damping, joint.armature = [damping, 0.0, 0.0], 0.0
         bodies[i].name = f'{kin.model.names[i]} link'
         reach = kin.tree.placement_translation[kin.tree.parent == i]

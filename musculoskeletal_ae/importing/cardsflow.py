@@ -140,12 +140,13 @@ def _measure(source: Source) -> None:
     joints = [n for n, j in zip(source.model.names, source.model.joints) if j.shortname() in KINDS]
     if not straight or not joints:
         return
-    routes = Routes(Kinematics(source.model, joints, source.links[0]), list(straight.values()))
+    kinematics = Kinematics(source.model, joints, source.links[0])
+    routes = Routes(kinematics, list(straight.values()))
 
     def lengths(values: dict[str, Array]) -> dict[str, Array]:
         still = np.zeros(len(next(iter(values.values()))))
         q = np.stack([values.get(name, still) for name in joints], axis=-1)
-        return dict(zip(straight, routes.absolute_lengths(q).T))
+        return dict(zip(straight, routes.absolute_lengths(kinematics.units.to_theta(q)).T))
 
     source.lengths = lengths
 

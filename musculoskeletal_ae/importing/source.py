@@ -16,14 +16,15 @@ import yaml
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.robot.description import Route, RoutePoint, written
-from musculoskeletal_ae.robot.joint_tree import PRISMATIC, REVOLUTE, Coupling, joint_axis
+from musculoskeletal_ae.robot.joint_tree import REVOLUTE, Coupling, joint_axis
+from musculoskeletal_ae.robot.joint_units import PRISMATIC
 from musculoskeletal_ae.robot.kinematics import link_placement, reduced
 from musculoskeletal_ae.robot.robot import Robot
 
 KINDS = REVOLUTE + PRISMATIC
 POSTURES = 1000  # number of postures in which lengths are compared
 ARM_POSTURES = 200  # number of postures in which moment arms are compared
-TURN = 1e-5  # step of the numerical derivatives that give moment arms [rad] or [m]
+TURN = 1e-5  # step of the numerical derivatives that give moment arms [rad]
 SHORT_ARM = 1e-3  # length of a moment arm below which its sign is not compared [m]
 LISTED = 12  # largest number of names in a message
 STRENGTH = (
@@ -524,7 +525,7 @@ class Comparison(NamedTuple):
     """Differences between the lengths of an imported robot and those of its source, by muscle."""
 
     lengths: dict[str, float]  # largest error [m]
-    arms: dict[str, float]  # largest error of a moment arm [m]; at prismatic joints, [m/m]
+    arms: dict[str, float]  # largest error of a moment arm [m]
     #: share of postures with a moment arm of the wrong sign, at the joint where it is largest
     flips: dict[str, float]
 

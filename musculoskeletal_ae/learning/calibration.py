@@ -72,7 +72,6 @@ class Reservoir:
         muscles: int,
         seed: int = 0,
         capacity: int = CAPACITY,
-        radian: Array | float = 1.0,
     ) -> None:
         """Create an empty reservoir.
 
@@ -80,8 +79,6 @@ class Reservoir:
             muscles: Number of muscles.
             seed: Seed of the random selection.
             capacity: Largest number of messages.
-            radian: 1 rad for a revolute joint, and for a prismatic joint the displacement [m] that
-                counts as 1 rad, (D,).
         """
         self._rng = np.random.default_rng([seed, 0x4E])
         self._muscles, self._capacity = muscles, capacity
@@ -89,7 +86,7 @@ class Reservoir:
         self._offered, self._since = 0, 0.0
         self.time = 0.0  # healthy time [s]
         self._missing: frozenset[int] = frozenset()  # muscles that were isolated in some messages
-        self._rests = SampleStore(radian=radian)
+        self._rests = SampleStore()
 
     def step(self, reading: Sample, dt: float) -> None:
         """Add a message to the selection with a probability that keeps the selection uniform.

@@ -34,9 +34,7 @@ from musculoskeletal_ae.signals.pairing import Paired, Pairing
 SENSOR, MARKER, NONE = 'sensor', 'marker', 'none'
 NO_MESSAGES = 'no muscle_states are received'
 NO_JOINTS = 'muscle_states are received without usable joint angles'
-#: standard deviation of θ measured by a camera [rad]; for prismatic joints times `kinematics.RACK`
-#: [m]
-SPREAD = 0.02
+SPREAD = 0.02  # standard deviation of θ measured by a camera [rad]
 
 
 class SampleCollector:
@@ -69,7 +67,6 @@ class SampleCollector:
             period: Period of the muscle modules' messages [s].
             joint_source: Source of θ: `SENSOR`, `MARKER` or `NONE`.
         """
-        radian = robot.kinematics.radian
         self.samples, self.healthy = samples, healthy
         self.rejected: Counter[str] = Counter()
         self.usable, self.obstacle = Arrival(), NO_MESSAGES
@@ -79,9 +76,9 @@ class SampleCollector:
         self._joint_stream = JointStream(robot)
         self.joint_trust = JointTrust.full(robot.joint_count)
         self._pairing = Pairing[MuscleSample](period)
-        self._detector = RestDetector(joint_source != SENSOR, radian)
+        self._detector = RestDetector(joint_source != SENSOR)
         self._margin = AnomalyMargin()
-        self._spread = SPREAD * radian if joint_source == MARKER else NOTHING
+        self._spread = np.full(robot.joint_count, SPREAD) if joint_source == MARKER else NOTHING
         # θ and the directions of gravity (see `Sample`) are paired as one array.
         self._unmeasured = np.full(
             robot.joint_count + 3 * len(robot.kinematics.tree.parent), np.nan

@@ -106,9 +106,7 @@ class Learner:
         self.enabled = True
         self._polled_at = math.inf  # time of the last poll [s]
         self.trainer = trainer(robot, preset, seed)
-        radian = robot.kinematics.radian
-        samples = SampleStore(radian=radian)
-        healthy = Reservoir(robot.muscle_count, seed, radian=radian)
+        samples, healthy = SampleStore(), Reservoir(robot.muscle_count, seed)
         self.collector = SampleCollector(robot, samples, healthy, period, joint_source)
         least = self.trainer.preset.least_samples
         self.scheduler = UpdateScheduler(
@@ -462,13 +460,13 @@ class Learner:
         """
         if self.last_update is None or self.last_update.sensor_offset.size == 0:
             return {}
-        offset, radian = self.last_update.sensor_offset, self.robot.kinematics.radian
+        offset, units = self.last_update.sensor_offset, self.robot.units
         return {
             self.robot.joints[j]: (
-                f'{offset[j]:.2f} {self.robot.units[j].theta}, largest '
-                f'{LARGEST_OFFSET * radian[j]:.2f}'
+                f'{units[j].position_text(offset[j])}, largest '
+                f'{LARGEST_OFFSET * units[j].radian:.2f}'
             )
-            for j in np.flatnonzero(np.abs(offset) > LARGEST_OFFSET * radian)
+            for j in np.flatnonzero(np.abs(offset) > LARGEST_OFFSET)
         }
 
     @property

@@ -23,9 +23,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.samples import NOTHING, Sample
 
 REST_TIME = 0.3  # count the arm as resting after it has been still for this long [s]
-#: count a joint as moving above this speed [rad/s]; for prismatic joints times
-#: `kinematics.RACK` [m/s]
-JOINT_RATE = 0.02
+JOINT_RATE = 0.02  # count a joint as moving above this speed [rad/s]
 LENGTH_RATE = 0.002  # count a muscle as moving above this speed [m/s]
 LONGEST_PART = 1.0  # longest part of a rest that one sample averages [s]
 #: largest number of readings in a rest, which bounds the memory if the clock stands still
@@ -118,15 +116,9 @@ class OpenRest:
 class RestDetector:
     """Turns a stream of readings into one mean for each rest."""
 
-    def __init__(self, blind: bool = False, radian: Array | float = 1.0) -> None:
-        """Start with an empty window.
-
-        Args:
-            blind: Whether the arm has no joint sensors.
-            radian: 1 rad for a revolute joint, and for a prismatic joint the displacement [m] that
-                counts as 1 rad, (D,).
-        """
-        self.blind, self._radian = blind, radian
+    def __init__(self, blind: bool = False) -> None:
+        """Start with an empty window; `blind` states that the arm has no joint sensors."""
+        self.blind = blind
         self._window = ReadingWindow()
         self.reset()
 
@@ -194,7 +186,7 @@ class RestDetector:
         enough = np.minimum(*(part.sum(axis=0) for part in known)) >= LEAST_READINGS
         if not enough.any():
             return self.blind
-        rate = JOINT_RATE * half * self._radian
+        rate = JOINT_RATE * half
         allowed, whole = np.broadcast_to(rate, enough.shape), known[0].all(0) & known[1].all(0)
         # Only some messages may contain a joint, for example if two nodes publish joints. Compare
         # the means of such a joint separately.

@@ -29,9 +29,7 @@ CREEP_SHARE = 0.5
 NOTHING: Array = np.zeros(0)  # stands for a quantity that was not measured
 #: typical moment arm, which converts lengths to angles where not all joint angles were measured [m]
 MOMENT_ARM = 0.04
-#: count two samples as different if an angle differs by more [rad]; for prismatic joints times
-#: `kinematics.RACK` [m]
-JOINT_DISTANCE = 0.05
+JOINT_DISTANCE = 0.05  # count two samples as different if an angle differs by more [rad]
 TENSION_DISTANCE = 10.0  # count two samples as different if a tension differs by more [N]
 
 
@@ -121,15 +119,8 @@ class Observations:
 class SampleStore:
     """Keeps up to `capacity` samples in the order in which they were accepted."""
 
-    def __init__(self, capacity: int = CAPACITY, radian: Array | float = 1.0) -> None:
-        """Create an empty store.
-
-        Args:
-            capacity: Largest number of samples.
-            radian: 1 rad for a revolute joint, and for a prismatic joint the displacement [m] that
-                counts as 1 rad, (D,).
-        """
-        self._radian = radian
+    def __init__(self, capacity: int = CAPACITY) -> None:
+        """Create an empty store for at most `capacity` samples."""
         self.capacity = capacity
         self.accepted = 0  # number of samples ever accepted
         #: samples that are held back because their length offsets are in doubt, and these offsets
@@ -277,7 +268,7 @@ class SampleStore:
         unread = np.isnan(theta).any(axis=1, keepdims=True)
         # Where not all joint angles were measured, compare the muscle lengths as well.
         by_length = np.where(unread, length / (MOMENT_ARM * JOINT_DISTANCE), np.nan)
-        by_angle, by_tension = theta / (JOINT_DISTANCE * self._radian), tension / TENSION_DISTANCE
+        by_angle, by_tension = theta / JOINT_DISTANCE, tension / TENSION_DISTANCE
         return np.concatenate([by_angle, by_tension, by_length], axis=1)
 
     def _dispensable(self) -> int:

@@ -88,7 +88,7 @@ def _values(learner: Learner) -> dict[str, str]:
 
 def _update_values(robot: Robot, update: Update) -> dict[str, str]:
     values = {
-        'error at newest samples': f'{update.error:.4f} {robot.kinematics.distance_unit}',
+        'error at newest samples': f'{update.error:.4f} {robot.units.distance_unit}',
         'loss': f'{update.loss:.4f}',
         'update': f'{update.seconds:.2f} s on {update.device}',
         'anomaly calibrated': str(is_calibrated(update.mae)),

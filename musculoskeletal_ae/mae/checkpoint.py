@@ -7,6 +7,7 @@ unpickling can run arbitrary code.
 """
 
 import json
+import math
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -45,6 +46,10 @@ SMALLEST_EIGENVALUE = 1e-12  # smallest eigenvalue of a covariance, relative to 
 #: smallest eigenvalue of the springs' stiffness, relative to the largest one; springs have no
 #: negative eigenvalue, except for rounding errors
 SMALLEST_SPRING_EIGENVALUE = -1e-6
+#: reject a network if its postures of a prismatic joint span less than this share of the joint's
+#: range; networks from before θ of such joints was in rad have a 17 times smaller span.
+#: A network whose inputs are not standardised does not tell its span.
+LEAST_SPAN = 0.25
 #: largest absolute values in the estimate of the middle posture: θ [rad], T [N], l [m], G [m/rad]
 LARGEST_ESTIMATES = (100.0, 1e5, 100.0, 1e5)
 
@@ -395,6 +400,15 @@ def _check_fit(mae: Mae, robot: Robot) -> None:
         raise CheckpointError(
             'learned with motor currents (tension_source: current); '
             f'this robot has tension_source: {robot.tension_source.kind}'
+        )
+    _, spread = mae.usual_posture
+    narrow = math.sqrt(12.0) * spread < LEAST_SPAN * (robot.upper - robot.lower)
+    is_standardised = bool((mae.std != 1.0).any())
+    if is_standardised and (narrow & robot.units.slides).any():
+        names = ', '.join(np.array(robot.joints)[narrow & robot.units.slides])
+        raise CheckpointError(
+            f'its postures of {names} span less than {LEAST_SPAN:.0%} of the joint range; an early '
+            'version took the positions of prismatic joints in m'
         )
     theta = 0.5 * (robot.lower + robot.upper)
     tension = np.full(robot.muscle_count, robot.tension.bias)

@@ -13,7 +13,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 
-THETA_SCALE = 1.0  # scaled units per [rad] (or [m] of a prismatic joint)
+THETA_SCALE = 1.0  # scaled units per [rad]
 TENSION_SCALE = 1.0 / 200.0  # scaled units per [N]
 LENGTH_SCALE = 10.0  # scaled units per [m]; mm/100 = 10 · l[m]
 

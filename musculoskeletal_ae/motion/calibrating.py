@@ -17,8 +17,7 @@ from musculoskeletal_ae.robot.tension import TensionProgramme
 SPEED = 0.05  # fastest change of a length command [m/s]
 DURATION = 1.5  # duration of a step, which takes longer if SPEED requires it [s]
 REST = 0.25  # duration of the rest after a step [s]
-#: largest change of each joint in a step [rad]; for prismatic joints times `kinematics.RACK` [m]
-REACH = 0.7
+REACH = 0.7  # largest change of each joint in a step [rad]
 INSIDE = 0.1  # smallest distance of goals from the joint limits, as a fraction of the joint range
 GOALS = 20  # number of random goals among which a holdable goal is sought
 SHARE = 0.6  # highest tension, as a fraction of the range from T_bias to T_limit
@@ -85,9 +84,8 @@ class Calibrating(ActivityControl):
         tension = inputs.pull.motor
         limits = robot.tension.bias, gentle_limit(robot)
         best, best_tension, least_missing = theta, tension, np.inf
-        radian = robot.kinematics.radian
         for goal in robot.random_postures(GOALS, self._rng, -INSIDE):
-            near = theta + np.clip(goal - theta, -REACH * radian, REACH * radian)
+            near = theta + np.clip(goal - theta, -REACH, REACH)
             jacobian = mae.muscle_jacobian(near, tension)
             programme = TensionProgramme(jacobian, robot.kinematics.holding_torque(near), *limits)
             try:
@@ -97,7 +95,7 @@ class Calibrating(ActivityControl):
                 break
             except InfeasibleError:
                 exertion = programme.compromise()
-                missing = float(np.abs(radian * exertion.missing_torque).max())
+                missing = float(np.abs(exertion.missing_torque).max())
                 if missing < least_missing:
                     best, best_tension, least_missing = near, exertion.tension, missing
         offset = inputs.sample.length - mae.lengths(theta, tension)

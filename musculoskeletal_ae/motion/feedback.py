@@ -16,10 +16,9 @@ from musculoskeletal_ae.robot.tension import least_tension
 #: A change of a tension limit by more than this requires a new plan, if the planned tension is also
 #: nearer to the limit than this [N].
 REPLAN = 5.0
-CORRECTION = 0.3  # largest correction [rad]; for prismatic joints times `kinematics.RACK` [m]
-#: Largest estimated error that is not corrected [rad]; for prismatic joints times `kinematics.RACK`
-#: [m]. It is about as large as the error of the estimate. Without this dead band, an arm with
-#: friction would never rest.
+CORRECTION = 0.3  # largest correction of a joint [rad]
+#: Largest estimated error that is not corrected [rad]. It is about as large as the error of the
+#: estimate. Without this dead band, an arm with friction would never rest.
 DEADBAND = 0.03
 RELIEF_INTERVAL = 0.1  # shortest time between two computations of the needless tension [s]
 PROPORTIONAL = 0.7  # proportional gain k_p in motion
@@ -72,13 +71,10 @@ class RestFeedback:
     Attributes:
         correction: c [rad], (D,).
         relief: r [m], (M,).
-        largest: Bound on |c| [rad], (D,).
     """
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self._deadband: Array = DEADBAND * robot.kinematics.radian
-        self.largest: Array = CORRECTION * robot.kinematics.radian
         self.reset()
         self.moving()
 
@@ -114,9 +110,9 @@ class RestFeedback:
         self._rested += dt
         if self._rested <= SETTLING or gain == 0.0:
             return False
-        beyond = np.where(np.abs(error) < self._deadband, 0.0, error)
+        beyond = np.where(np.abs(error) < DEADBAND, 0.0, error)
         correction = self.correction + gain * dt * beyond
-        self.correction = np.clip(correction, -self.largest, self.largest)
+        self.correction = np.clip(correction, -CORRECTION, CORRECTION)
         self._unsolved += dt
         if self._unsolved >= RELIEF_INTERVAL and self._robot.tension_source.is_known:
             actuation, bias = self._robot.actuation, self._robot.tension.bias
@@ -164,11 +160,11 @@ class MotionFeedback:
         change = INTEGRAL * dt * error
         if is_held_back:
             change = np.where(change * rest.correction >= 0.0, 0.0, change)
-        rest.correction = np.clip(rest.correction + change, -rest.largest, rest.largest)
+        rest.correction = np.clip(rest.correction + change, -CORRECTION, CORRECTION)
         rest.moving()
         # Bound the shift as well, so that a suddenly wrong estimate cannot move the arm far.
         shift = rest.correction + PROPORTIONAL * error
-        self._shift = np.clip(shift, -rest.largest, rest.largest)
+        self._shift = np.clip(shift, -CORRECTION, CORRECTION)
         return self._shift
 
     def continue_at_rest(self) -> None:

@@ -9,12 +9,13 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.robot.joint_units import JointUnits
 
 # Error codes of control_msgs/action/FollowJointTrajectory.
 SUCCESSFUL, INVALID, BEYOND_PATH, BEYOND_GOAL = 0, -1, -4, -5
 
 
-def read_tolerances(tolerances: Iterable[Any], joints: Sequence[str]) -> Array:
+def read_tolerances(tolerances: Iterable[Any], units: JointUnits) -> Array:
     """Return the position tolerance [rad] of each joint, (D,), from control_msgs/JointTolerance.
 
     A position of 0 (the default) or a negative position means that the joint has no tolerance.
@@ -23,7 +24,7 @@ def read_tolerances(tolerances: Iterable[Any], joints: Sequence[str]) -> Array:
     Raises:
         MessageError: If a joint is unknown or a tolerance is not finite.
     """
-    bounds = np.full(len(joints), np.inf)
+    joints, bounds = units.names, np.full(len(units), np.inf)
     for one in tolerances:
         if one.name not in joints:
             raise MessageError('unknown joint', f'{one.name!r}; legal: {", ".join(joints)}')
@@ -32,7 +33,7 @@ def read_tolerances(tolerances: Iterable[Any], joints: Sequence[str]) -> Array:
             raise MessageError('not finite', detail)
         if one.position > 0.0:
             bounds[joints.index(one.name)] = one.position
-    return bounds
+    return units.to_theta(bounds)
 
 
 class FollowedGoal:
@@ -80,6 +81,7 @@ class FollowedGoal:
         m = int((off - bounds).argmax())
         if off[m] <= bounds[m]:
             return None
-        unit = self._core.robot.units[m].theta
-        error = f'deviates by {off[m]:.3f} {unit}; its tolerance is {bounds[m]:.3g} {unit}'
+        unit = self._core.robot.units[m]
+        error, legal = unit.position_text(off[m], '.3f'), unit.position_text(bounds[m], '.3g')
+        error = f'deviates by {error}; its tolerance is {legal}'
         return code, f'{self._joints[m]} {error}'

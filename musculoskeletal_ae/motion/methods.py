@@ -164,8 +164,7 @@ class StiffnessModel(NamedTuple):
             levels = np.linspace(low, max(high, low + 1.0), LEVELS)
             cubic[:, own] = np.polyfit(levels, -lengths[:, own], 3)
         slope = mae.muscle_jacobian(theta, tension)
-        step = STEP * robot.kinematics.radian
-        bend = robot_stiffness.muscle_hessian(jacobian, theta, step)
+        bend = robot_stiffness.muscle_hessian(jacobian, theta, STEP)
         slope[list(robot.isolated)] = bend[list(robot.isolated)] = 0.0
         return cls(
             jacobian=slope,

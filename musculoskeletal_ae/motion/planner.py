@@ -28,9 +28,9 @@ from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 
-#: Distance by which a point may exceed a joint limit [rad]; for prismatic joints times
-#: `kinematics.RACK` [m]. The points of a replayed motion are estimated postures. The estimate of an
-#: arm that is held against a joint stop exceeds the limit by less than this.
+#: Distance by which a point may exceed a joint limit [rad]. The points of a replayed motion are
+#: estimated postures. The estimate of an arm that is held against a joint stop exceeds the limit by
+#: less than this.
 TOLERANCE = 0.01
 SAME = 1e-6  # relative difference below which two poses count as equal
 
@@ -187,13 +187,14 @@ class Planner:
         """
         robot = self._robot
         low, high = robot.lower[points.joints], robot.upper[points.joints]
-        tolerance = TOLERANCE * robot.kinematics.radian[points.joints]
-        beyond = (points.position < low - tolerance) | (points.position > high + tolerance)
+        beyond = (points.position < low - TOLERANCE) | (points.position > high + TOLERANCE)
         if not beyond.any():
             return points._replace(position=np.clip(points.position, low, high))
         k, j = np.argwhere(beyond)[0]
         unit = robot.units[points.joints[j]].theta
-        value, least, most = distinct(points.position[k, j], low[j], high[j], digits=4)
+        values = np.array([points.position[k, j], low[j], high[j]])
+        values = robot.units.to_position(values, points.joints[j])
+        value, least, most = distinct(*values, digits=4)
         raise MessageError(
             'beyond the joint limits',
             f'{robot.joints[points.joints[j]]} is {value} {unit}; legal: {least} to {most} {unit}',

@@ -9,14 +9,12 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.robot import Robot
 
-#: error above which an arm with isolated muscles has fallen [rad]; for prismatic joints, the error
-#: divided by `kinematics.RACK` counts
-FALLEN = 0.2
+FALLEN = 0.2  # error above which an arm with isolated muscles has fallen [rad]
 #: time for which a trajectory must have ended before the arm can count as fallen, and for which the
 #: error must exceed LOST before the arm counts as having lost its trajectory [s]
 FALLING = 2.0
 #: An arm with isolated muscles has lost its trajectory if the error exceeds this for the time
-#: FALLING [rad]. For prismatic joints, the error divided by `kinematics.RACK` counts.
+#: FALLING [rad].
 LOST = 0.4
 
 
@@ -91,7 +89,7 @@ class Progress:
     @property
     def _largest_error(self) -> float:
         """The largest error of a joint [rad]."""
-        return float(np.abs(self.error / self._robot.kinematics.radian).max())
+        return float(np.abs(self.error).max())
 
     @property
     def is_moving(self) -> bool:

@@ -8,11 +8,10 @@ the cheapest path through a roadmap of random postures, with
 
     cost of an edge = ∫ 1 + PRICE m(θ) ds,   m = max_j |τ_missing,j|
 
-where τ_missing,j is the torque of joint j that muscles and joint stops do not provide. Prismatic
-joints count as if a pinion of radius `kinematics.RACK` turned them. Tensions are limited to
-T_bias + USED (T_limit − T_bias), so that the path keeps a reserve of tension. If no path can keep
-the reserve, the cost favours postures in which little torque is missing. On an edge, tendon
-friction opposes the motion (`Limits`).
+where τ_missing,j is the torque of joint j that muscles and joint stops do not provide. Tensions
+are limited to T_bias + USED (T_limit − T_bias), so that the path keeps a reserve of tension. If no
+path can keep the reserve, the cost favours postures in which little torque is missing. On an edge,
+tendon friction opposes the motion (`Limits`).
 
 A joint that is at a stop at the start is also at this stop in some postures of the roadmap. An edge
 is evaluated only if the cheapest path contains it (lazy roadmap, Bohlin and Kavraki 2000). Until
@@ -32,8 +31,6 @@ from musculoskeletal_ae.motion.trajectory import Setpoint
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-# Constants in rad and N·m are for revolute joints. For a prismatic joint, angles are multiplied by
-# `kinematics.RACK` and become [m], and torques are divided by it and become [N].
 NOTABLE = 0.05  # missing torque above which a posture is not holdable [N·m]
 HALVINGS = 6  # bisection steps in the search for the last holdable posture of a path
 
@@ -51,15 +48,13 @@ STOP = 100.0  # largest torque with which a stop supports a joint [N·m]
 
 def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
     """Return a text on the largest missing torque at θ [rad], (D,), or '' if θ is holdable."""
-    limits, radian = robot.tension, robot.kinematics.radian
-    torque = radian * robot.kinematics.holding_torque(theta)
-    jacobian = radian * mae.muscle_jacobian(theta, limits.bias)
+    limits, torque = robot.tension, robot.kinematics.holding_torque(theta)
+    jacobian = mae.muscle_jacobian(theta, limits.bias)
     lacks = np.abs(least_tension(jacobian, torque, limits.bias, limits.limit).missing_torque)
     joint = int(lacks.argmax())
     if lacks[joint] <= NOTABLE:
         return ''
-    torque_text = f'{lacks[joint] / radian[joint]:.2f} {robot.units[joint].torque}'
-    return f'{torque_text} at joint {robot.joints[joint]}'
+    return f'{robot.units[joint].torque_text(lacks[joint])} at joint {robot.joints[joint]}'
 
 
 def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Array, str]:
@@ -95,7 +90,7 @@ def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
         return theta[None]
     cost = PathCost(robot, mae)
     direct = cost.of_edge(start, theta)
-    if direct <= np.linalg.norm((theta - start) / robot.kinematics.radian):
+    if direct <= np.linalg.norm(theta - start):
         return theta[None]
     path = Roadmap(robot, cost, start, theta, direct).cheapest_path()
     return _shortened(path, cost)[1:]
@@ -114,7 +109,7 @@ class Limits:
     def __init__(self, robot: Robot, mae: Mae, used: float = USED) -> None:
         """Describe the limits; `used` is the usable fraction of the tension range above T_bias."""
         limits = robot.tension
-        self._robot, self._radian = robot, robot.kinematics.radian
+        self._robot = robot
         self._low = limits.bias
         self._high = limits.bias + used * (limits.limit - limits.bias)
         self._friction = tendon_friction(robot, mae)
@@ -130,7 +125,7 @@ class Limits:
                 vector has no effect.
             resistance: Tension by which the lowest tension is raised [N], (M,).
         """
-        length = max(float(np.linalg.norm(direction / self._radian)), 1e-9)
+        length = max(float(np.linalg.norm(direction)), 1e-9)
         loss = np.exp(-self._friction * np.tanh(jacobian @ direction / (length * CERTAIN)))
         return np.minimum(self._low + resistance, self._high) / loss, self._high / loss
 
@@ -143,12 +138,12 @@ class Limits:
             lag: Time λ by which the muscle modules lag behind their commands [s].
             slower: Factor by which the motion is slowed; ∞ for a very slow motion.
         """
-        robot, radian = self._robot, self._radian
+        robot = self._robot
         velocity, acceleration = at.velocity / slower, at.acceleration / slower**2
         paid_out = np.maximum(jacobian @ velocity, 0.0)
         ends = self.of(jacobian, at.velocity, robot.actuation.tension_of_lag(lag, paid_out))
-        torque = radian * robot.kinematics.inverse_dynamics(at.theta, velocity, acceleration)
-        return float(np.abs(least_tension(radian * jacobian, torque, *ends).missing_torque).max())
+        torque = robot.kinematics.inverse_dynamics(at.theta, velocity, acceleration)
+        return float(np.abs(least_tension(jacobian, torque, *ends).missing_torque).max())
 
 
 class PathCost:
@@ -160,7 +155,6 @@ class PathCost:
 
     def __init__(self, robot: Robot, mae: Mae) -> None:
         self._robot, self._mae = robot, mae
-        self._radian = robot.kinematics.radian
         self._limits = Limits(robot, mae)
 
     def missing(self, postures: Array, direction: Array | None = None) -> Array:
@@ -183,8 +177,8 @@ class PathCost:
             none = np.zeros(len(stops))
             low, high = self._limits.of(jacobian, moved)
             ends = np.concatenate([low, none]), np.concatenate([high, none + STOP])
-            torque = self._radian * robot.kinematics.holding_torque(theta)
-            exertion = least_tension(np.vstack([self._radian * jacobian, stops]), torque, *ends)
+            torque = robot.kinematics.holding_torque(theta)
+            exertion = least_tension(np.vstack([jacobian, stops]), torque, *ends)
             torques.append(exertion.missing_torque)
         m = np.abs(torques).max(axis=1)
         return np.where(m > NOTABLE, m, 0.0)
@@ -195,13 +189,12 @@ class PathCost:
         A stop is modelled as a muscle that pulls the joint away from the stop.
         """
         robot, joints = self._robot, np.eye(self._robot.joint_count)
-        at_stop = AT_STOP * self._radian
-        is_low, is_high = theta < robot.lower + at_stop, theta > robot.upper - at_stop
+        is_low, is_high = theta < robot.lower + AT_STOP, theta > robot.upper - AT_STOP
         return np.vstack([-joints[is_low], joints[is_high]])
 
     def of_edge(self, one: Array, other: Array) -> float:
         """Return the cost of the straight path between two postures θ [rad], (D,) each."""
-        length = float(np.linalg.norm((other - one) / self._radian))
+        length = float(np.linalg.norm(other - one))
         shares = np.linspace(0.0, 1.0, int(length / SPACING) + 2)[:, None]
         m = self.missing(one + shares * (other - one), other - one)
         return length * (1.0 + PRICE * float(m.mean()))
@@ -212,7 +205,7 @@ class PathCost:
         The cost is approximated from the missing torque at both ends of an edge. It is 0 for
         postures between which the roadmap has no edge.
         """
-        apart = np.linalg.norm((postures[:, None] - postures) / self._radian, axis=2)
+        apart = np.linalg.norm(postures[:, None] - postures, axis=2)
         m = self.missing(postures)
         near = apart <= np.sort(apart, axis=1)[:, NEIGHBOURS, None]
         cost = apart * (1.0 + PRICE * 0.5 * (m[:, None] + m))
@@ -277,11 +270,10 @@ def _random_postures(robot: Robot, start: Array) -> Array:
     A joint that is at a stop in `start` is placed at that stop in 30 % of the postures.
     """
     rng = np.random.default_rng(0)
-    at_stop = AT_STOP * robot.kinematics.radian
     postures = robot.random_postures(POSTURES, rng)
     for joint in range(robot.joint_count):
         for stop in (robot.lower[joint], robot.upper[joint]):
-            if abs(start[joint] - stop) < at_stop[joint]:
+            if abs(start[joint] - stop) < AT_STOP:
                 postures[rng.random(POSTURES) < 0.3, joint] = stop
     return postures
 

@@ -62,7 +62,7 @@ class Stiffening:
         if solution is None or self._solved >= AHEAD:
             at, self._solved = trajectory.sample(time + AHEAD), 0.0
             torque = robot.kinematics.inverse_dynamics(*at) + effort
-            desired = np.array(settings.desired_stiffness(robot.kinematics.radian))
+            desired = settings.desired_stiffness(robot.units)
             near = None if solution is None else self._near
             solution = stiffness_command(robot, mae, at.theta, torque, desired, limit, near)
             self._near = solution.tension if near is None else near

@@ -12,14 +12,12 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-# Gains of the method `tension`. For prismatic joints, they apply to a pinion of radius
-# `kinematics.RACK`.
+# Gains of the method `tension`.
 POSITION_GAIN = 10.0  # K_p [N·m/rad]
 VELOCITY_GAIN = 0.5  # K_d [N·m·s/rad]
 SMOOTHING = 0.05  # time constant of the low-pass filter on the noisy estimate [s]
 
-# Constants of gravity compensation. For prismatic joints, they apply to a pinion of radius
-# `kinematics.RACK`.
+# Constants of gravity compensation.
 HOLD = 15.0  # stiffness of the spring that holds the arm at θ_held [N·m/rad]
 BAND = 0.05  # largest distance of the arm from θ_held [rad]
 DAMPING = 1.0  # damping of each joint [N·m·s/rad]
@@ -106,8 +104,7 @@ class TorqueControl(ActivityControl):
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
         """Return the feedback torque [N·m], (D,), from posture and velocity."""
-        torque = POSITION_GAIN * (target - theta) - VELOCITY_GAIN * velocity
-        return torque / self._robot.kinematics.radian**2
+        return POSITION_GAIN * (target - theta) - VELOCITY_GAIN * velocity
 
 
 class GravityCompensation(TorqueControl):
@@ -146,9 +143,8 @@ class GravityCompensation(TorqueControl):
         return self._theta
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
-        low, high, radian = self._robot.lower, self._robot.upper, self._robot.kinematics.radian
-        band, edge = BAND * radian, WALL_AT * radian
-        held = target if self.held is None else np.clip(self.held, theta - band, theta + band)
+        low, high = self._robot.lower, self._robot.upper
+        held = target if self.held is None else np.clip(self.held, theta - BAND, theta + BAND)
         self.held = np.clip(held, low, high)
-        wall = np.clip(theta, low + edge, high - edge) - theta
-        return (HOLD * (self.held - theta) - DAMPING * velocity + WALL * wall) / radian**2
+        wall = np.clip(theta, low + WALL_AT, high - WALL_AT) - theta
+        return HOLD * (self.held - theta) - DAMPING * velocity + WALL * wall

@@ -28,9 +28,7 @@ from musculoskeletal_ae.message_reading import TrajectoryPoints
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 
-#: largest allowed excess over the joint limits between points [rad]; for prismatic joints times
-#: `kinematics.RACK` [m]
-BEYOND = 0.02
+BEYOND = 0.02  # largest allowed excess over the joint limits between points [rad]
 STOPPING = 0.3  # time in which a cancelled motion comes to rest [s]
 SAMPLES = 200  # approximate number of moments at which a whole trajectory is evaluated
 WITHIN = 5  # smallest number of moments at which each piece is evaluated
@@ -174,10 +172,9 @@ class Trajectory:
                 'between the points, the curve is not finite; send smaller velocities and '
                 'accelerations',
             )
-        beyond = out / robot.kinematics.radian
-        if (beyond > BEYOND).any():
-            j = int(beyond.argmax())
-            excess, legal = distinct(out[j], BEYOND * robot.kinematics.radian[j])
+        if (out > BEYOND).any():
+            j = int(out.argmax())
+            excess, legal = distinct(*robot.units.to_position(np.array([out[j], BEYOND]), j))
             joint, unit = robot.joints[j], robot.units[j].theta
             raise MessageError(
                 'leaves the joint limits',

@@ -27,8 +27,8 @@ from musculoskeletal_ae.ros.messages import (
     add_joints,
     array_message,
     is_heard,
-    joint_message,
     motor_message,
+    posture_message,
 )
 from musculoskeletal_ae.ros.second_publishers import COMMANDS, MOTOR_COMMAND
 from musculoskeletal_ae.signals.motor_interface import STATES
@@ -185,10 +185,10 @@ class Arm(Shell):
             effort = self.robot.tension_source.to_message(tension)
             message = motor_message(self.motors, length, effort, stamp)
             if motors is joints:
-                add_joints(message, self.robot.joints, theta)
+                add_joints(message, self.robot.units, theta)
             motors.publish(message)
         if joints is not None and joints is not motors and is_heard(joints):
-            joints.publish(joint_message(self.robot.joints, theta, stamp))
+            joints.publish(posture_message(self.robot.units, theta, stamp))
         if self._muscles is not None and is_heard(self._muscles):
             rows = reading_rows(self.robot, length=length, tension=tension, temperature=temperature)
             self._muscles.publish(array_message(rows, 'quantity', 'muscle'))

@@ -191,7 +191,7 @@ class BringupStatus(Shell):
 
     def _print_line(self, running_time: float) -> None:
         means = [sum(v) / len(v) if v else math.nan for v in (self.errors, self.anomalies)]
-        unit = self.robot.kinematics.distance_unit
+        unit = self.robot.units.distance_unit
         situation = self.situation
         self.last_known = [
             old if math.isnan(new) else new for new, old in zip(means, self.last_known)

@@ -176,7 +176,7 @@ class Controller(Shell):
         self.core.watchdog.second_publisher = intruders
 
     def _on_estimate(self, message: JointState) -> None:
-        theta = read_posture(message, self.robot.joints)
+        theta = read_posture(message, self.robot.units)
         sent = nanoseconds(message.header.stamp)
         if is_new := is_later(sent, self.estimate_sent):
             self.estimate_sent = sent
@@ -186,7 +186,7 @@ class Controller(Shell):
         self._step()
 
     def _target(self, message: JointState) -> None:
-        self.core.target(read_target(message, self.robot.joints))
+        self.core.target(read_target(message, self.robot.units))
         names = ', '.join(f'{n} {p:.3f}' for n, p in zip(message.name, message.position))
         self._log_accepted('target_joint_states', printable(names))
         warn = self.get_logger().warning
@@ -201,7 +201,7 @@ class Controller(Shell):
             warn(f'target clamped to the joint limits: {", ".join(target.clamped)}')
 
     def _trajectory(self, message: JointTrajectory) -> None:
-        points, stamp = read_trajectory(message, self.robot.joints), message.header.stamp
+        points, stamp = read_trajectory(message, self.robot.units), message.header.stamp
         begin = stamp.sec + 1e-9 * stamp.nanosec  # a stamp of 0 means: begin now
         self.core.trajectory(points, begin - self.now() if begin > 0.0 else 0.0)
         content = 'no points, so the motion ends'
@@ -245,12 +245,14 @@ class Controller(Shell):
         """
         progress = self.core.activities.follower.progress
         desired, names = progress.desired, ('positions', 'velocities', 'accelerations')
-        parts = {name: part.tolist() for name, part in zip(names, desired, strict=True)}
-        estimated = desired.theta - progress.error
+        outside = self.robot.units.to_position
+        values = zip(names, map(outside, desired), strict=True)
+        parts = {name: part.tolist() for name, part in values}
+        estimated, error = outside(desired.theta - progress.error), outside(progress.error)
         points = [
             JointTrajectoryPoint(**parts),
             JointTrajectoryPoint(positions=estimated.tolist()),
-            JointTrajectoryPoint(positions=progress.error.tolist()),
+            JointTrajectoryPoint(positions=error.tolist()),
         ]
         points[0].time_from_start = Duration(seconds=progress.time).to_msg()
         message = JointTrajectory(joint_names=self.robot.joints, points=points)

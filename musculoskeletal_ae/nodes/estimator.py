@@ -26,7 +26,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.estimation.estimator import Output
-from musculoskeletal_ae.estimation.lengths.length_calibration import check_stated_posture
+from musculoskeletal_ae.estimation.lengths.length_calibration import stated_theta
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
 from musculoskeletal_ae.estimation.lengths.offset_memory import OffsetMemory
 from musculoskeletal_ae.estimation.settings import Settings
@@ -44,6 +44,7 @@ from musculoskeletal_ae.ros.messages import (
     array_message,
     is_heard,
     joint_message,
+    posture_message,
     serve,
 )
 from musculoskeletal_ae.ros.second_publishers import AUTHORS
@@ -133,7 +134,7 @@ class Estimator(Shell):
             self.core.calibrate_lengths(self.posture)
 
     def _on_posture(self, posture: tuple[float, ...]) -> None:
-        check_stated_posture(self.robot, posture)
+        stated_theta(self.robot, posture)  # checks the posture
         self.posture = posture
 
     def _on_isolate_muscles(self, names: tuple[str, ...]) -> None:
@@ -241,7 +242,8 @@ class Estimator(Shell):
         theta = self.core.posture_of_marker(read_pose(message, self.root_frame))
         known = np.isfinite(theta)
         joints = [joint for joint, is_known in zip(self.robot.joints, known) if is_known]
-        self.by_camera.publish(joint_message(joints, theta[known], message.header.stamp))
+        position = self.robot.units.to_position(theta)[known]
+        self.by_camera.publish(joint_message(joints, position, message.header.stamp))
 
     # -- publishing -----------------------------------------------------------------------------
 
@@ -253,9 +255,10 @@ class Estimator(Shell):
             self.candidates.validator.message(
                 sample.tension_read, sample.length, sample.sliding, now, self.core.measured
             )
-        self.joints.publish(joint_message(self.robot.joints, state.theta, stamp))
+        self.joints.publish(posture_message(self.robot.units, state.theta, stamp))
         if output.covariance is not None and is_heard(self.covariance):
-            self.covariance.publish(array_message(output.covariance, 'joint', 'joint'))
+            covariance = self.robot.units.covariance_of_positions(output.covariance)
+            self.covariance.publish(array_message(covariance, 'joint', 'joint'))
         if is_heard(self.muscles):
             restored = np.array([state.length, state.tension])
             self.muscles.publish(array_message(restored, 'quantity', 'muscle'))
@@ -316,7 +319,9 @@ class Estimator(Shell):
         if trust is before:
             return
         self.published_trust = trust
-        self.trust.publish(array_message(trust.rows(time.monotonic()), 'quantity', 'joint'))
+        rows = trust.rows(time.monotonic())
+        rows[-1] = self.robot.units.to_position(trust.deviation)
+        self.trust.publish(array_message(rows, 'quantity', 'joint'))
         if before is not None:
             self.candidates.validator.forget()  # the readings so far may be wrong
             names = ', '.join(self.robot.joints[joint] for joint in trust.unused)

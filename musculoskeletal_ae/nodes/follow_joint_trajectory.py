@@ -50,7 +50,7 @@ class FollowJointTrajectory:
                 the error.
         """
         self._kind, self._core, self._start, self._refuse = kind, core, start, refuse
-        self._joints = node.robot.joints
+        self._joints, self._units = node.robot.joints, node.robot.units
         self._requested: FollowedGoal | None = None  # the goal that is being accepted
         self._goal: FollowedGoal | None = None
         self._handle: Any = None
@@ -62,7 +62,7 @@ class FollowJointTrajectory:
     def _ask(self, goal: Any) -> GoalResponse:
         try:
             bounds = [
-                read_tolerances(tolerances, self._joints)
+                read_tolerances(tolerances, self._units)
                 for tolerances in (goal.path_tolerance, goal.goal_tolerance)
             ]
             if not goal.trajectory.points:

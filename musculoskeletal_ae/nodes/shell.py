@@ -537,6 +537,7 @@ class Shell(Node):
 
         def take(message: Float64MultiArray) -> None:
             rows = read_array(message, JointTrust.ROWS, self.robot.joint_count, 'joint')
+            rows[-1] = self.robot.units.to_theta(rows[-1])
             try:
                 follow(JointTrust.from_rows(rows, self.now()))
             except ValueError as error:
@@ -563,11 +564,11 @@ class Shell(Node):
             some: Whether a message may lack joints, or have positions that are not finite. These
                 positions are NaN in θ, and those that are not finite are counted as ignored.
         """
-        joints = self.robot.joints
+        units = self.robot.units
 
         def take(message: JointState) -> None:
-            follow(read_posture(message, joints, some))
-            for name in joints_not_finite(message, joints):
+            follow(read_posture(message, units, some))
+            for name in joints_not_finite(message, units.names):
                 self._reception.ignore(topic, f'position of {name} is not finite')
 
         self.listen(JointState, topic, take, SENSOR)

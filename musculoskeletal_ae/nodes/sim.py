@@ -80,9 +80,8 @@ class Sim(Arm):
     def _fix(self, message: JointState) -> None:
         fixed = np.full(self.robot.joint_count, np.nan)
         if message.name or message.position or message.velocity or message.effort:
-            joints = self.robot.joints
-            for name, (angle, _) in read_target(message, joints).items():
-                fixed[joints.index(name)] = angle
+            for name, (angle, _) in read_target(message, self.robot.units).items():
+                fixed[self.robot.joints.index(name)] = angle
         self.fixed = fixed
 
     def _tick(self) -> None:

@@ -25,7 +25,8 @@ from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot import series_elastic
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
-from musculoskeletal_ae.robot.joint_tree import PRISMATIC, REVOLUTE, Coupling, resolved
+from musculoskeletal_ae.robot.joint_tree import REVOLUTE, Coupling, resolved
+from musculoskeletal_ae.robot.joint_units import PRISMATIC, JointUnits
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.robot.motors import NO_MOTORS, Motors, MotorTopics, read_motors
 from musculoskeletal_ae.robot.muscle_file import (
@@ -190,12 +191,11 @@ class RobotDescription:
     def spring_notes(self) -> list[str]:
         """One line for each joint with a spring, which states its stiffness and rest position."""
         springs, lines = self.joint_elasticity, list[str]()
-        for i, joint in enumerate(self.joints):
-            kind = self.model.joints[self.model.getJointId(joint)].shortname()
-            stiffness, angle = ('N/m', 'm') if kind in PRISMATIC else ('N·m/rad', 'rad')
+        for i, unit in enumerate(JointUnits.of_model(self.model, self.joints)):
             if springs.is_sprung[i]:
-                own = f'{springs.stiffness[i, i]:.3g} {stiffness}'
-                lines.append(f'{joint}: spring of {own}, at rest at {springs.rest[i]:.3g} {angle}')
+                own = unit.stiffness_text(springs.stiffness[i, i], '.3g')
+                rest = unit.position_text(springs.rest[i], '.3g')
+                lines.append(f'{self.joints[i]}: spring of {own}, at rest at {rest}')
         return lines
 
 
@@ -259,7 +259,9 @@ def load_description(robot: str | Path) -> RobotDescription:
         release=np.array(release),
         end_effectors=_read_end_effectors(content, model, couplings, order, fail),
         couplings=couplings,
-        joint_elasticity=_read_joint_elasticity(content, couplings, fail),
+        joint_elasticity=JointUnits.of_model(model, content.joints).elasticity_to_core(
+            _read_joint_elasticity(content, couplings, fail)
+        ),
         motors=read_motors(directory, muscles),
         warnings=tuple(warnings),
     )
@@ -379,7 +381,7 @@ def _read_couplings(
 def _read_joint_elasticity(
     content: MuscleFile, couplings: Iterable[str], fail: Fail
 ) -> JointElasticity:
-    """Return the springs and dampers of the joints."""
+    """Return the springs and dampers of the joints, in the units of the joints."""
     joints = content.joints
     stiffness, rest, damping = (
         np.zeros(shape) for shape in ((len(joints),) * 2, *[len(joints)] * 2)

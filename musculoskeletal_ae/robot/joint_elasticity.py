@@ -70,6 +70,15 @@ class JointElasticity:
         stiffness = scale[:, None] * self.stiffness * scale
         return JointElasticity(stiffness, stiffness @ (self.rest + shift), self.damping)
 
+    def scaled(self, radian: Array) -> JointElasticity:
+        """Return the same springs and dampers for other units of the joint angles.
+
+        Args:
+            radian: Value of one unit of the new angles in the present units, (D,).
+        """
+        stiffness = radian[:, None] * self.stiffness * radian
+        return JointElasticity(stiffness, radian * self.preload, radian**2 * self.damping)
+
     def of_joints(self, joints: Ints) -> JointElasticity:
         """Return the elasticity of some joints (indices), while all other joints are held at 0."""
         rows = np.ix_(joints, joints)

@@ -9,10 +9,12 @@ where a is the joint axis. The pose of a prismatic joint is its fixed placement 
 translation θ a. Both are sums of constant matrices with scalar factors, so that all joints are
 computed by the same operation.
 
-The position q of a coupled joint is a polynomial of the position of its master, Σ c_k θ_masterᵏ,
-which is usually linear. θ are the positions of the joints that are not coupled, and q those of all
-joints of the tree. With A(θ) = ∂q/∂θ, pinocchio's gravity g, inertia M and Jacobian J with respect
-to q become Aᵀ g, Aᵀ M A and J A with respect to θ.
+q are the positions of all joints of the tree [rad or m], and θ [rad] those of the joints that are
+not coupled to another one. The position q of a coupled joint is a polynomial of the position of its
+master, which is usually linear. A prismatic joint moves by RACK per radian of θ (`JointUnits`). The
+position of every joint is therefore a polynomial of one entry of θ, Σ terms_k θᵏ. With
+A(θ) = ∂q/∂θ, pinocchio's gravity g, inertia M and Jacobian J with respect to q become Aᵀ g, Aᵀ M A
+and J A with respect to θ.
 """
 
 from __future__ import annotations
@@ -24,9 +26,9 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.robot.joint_units import PRISMATIC, JointUnits
 
 REVOLUTE = ('JointModelRX', 'JointModelRY', 'JointModelRZ', 'JointModelRevoluteUnaligned')
-PRISMATIC = ('JointModelPX', 'JointModelPY', 'JointModelPZ', 'JointModelPrismaticUnaligned')
 
 
 class JointPoses(NamedTuple):
@@ -144,22 +146,23 @@ class JointTree:
         second: See `first`, (J, 4, 4).
         theta_index: Index in θ of the entry that moves each joint, -1 for the root link, (J,).
         terms: Coefficients of q = Σ terms_k θᵏ, the constant first, (J, K).
-        is_coupled: Whether there are coupled joints.
+        is_geared: Whether there are coupled or prismatic joints, so that ∂q/∂θ is not 1.
         is_nonlinear: Whether a coupling is not linear.
         moved_by: 1 where an entry of θ moves a joint of the tree, else 0, (J−1, D).
         descends_from: Entry [i, j] is true if joint i is joint j or a descendant of it, (J, J).
     """
 
     def __init__(
-        self, model: pin.Model, joints: Sequence[str], couplings: Mapping[str, Coupling]
+        self, model: pin.Model, units: JointUnits, couplings: Mapping[str, Coupling]
     ) -> None:
         """Read the tree of a model.
 
         Args:
-            model: The model, which has only the joints in `joints` and the joints coupled to them.
-            joints: The D joints of θ, in order.
-            couplings: Coupling of each coupled joint.
+            model: The model, which has only the joints of θ and the joints coupled to them.
+            units: Names and units of the D joints of θ, in order.
+            couplings: Coupling of each coupled joint, whose terms refer to positions.
         """
+        joints = units.names
         count, ids = model.njoints, [model.getJointId(name) for name in joints]
 
         self.order = np.array([model.joints[i].idx_q for i in ids])
@@ -183,12 +186,13 @@ class JointTree:
         self.theta_index[ids] = np.arange(len(ids))
         most = max([2, *(len(coupling.terms) for coupling in couplings.values())])
         self.terms = np.zeros((count, most))
-        self.terms[:, 1] = 1.0
+        self.terms[ids, 1] = units.radian
         for name, coupling in couplings.items():
             i = model.getJointId(name)
-            self.theta_index[i] = list(joints).index(coupling.master)
-            self.terms[i] = [*coupling.terms, *[0.0] * (most - len(coupling.terms))]
-        self.is_coupled, self.is_nonlinear = bool(couplings), most > 2
+            self.theta_index[i] = k = joints.index(coupling.master)
+            powers = np.arange(len(coupling.terms))
+            self.terms[i, powers] = np.array(coupling.terms) * units.radian[k] ** powers
+        self.is_geared, self.is_nonlinear = bool(couplings) or bool(units.slides.any()), most > 2
         self.moved_by: Array = 1.0 * np.eye(len(ids))[self.theta_index[1:]]
         self.descends_from = np.eye(count, dtype=bool)
         for i in range(1, count):
@@ -197,7 +201,7 @@ class JointTree:
     def in_parents(self, theta: Array) -> Array:
         """Return homogeneous poses (N, J, 4, 4) of all joints in their parents at θ (N, D)."""
         angle = theta[:, self.theta_index]
-        if self.is_coupled:
+        if self.is_geared:
             angle = polyval(angle, self.terms)
         angle = angle[..., None, None]
         first, second = np.sin(angle), 1.0 - np.cos(angle)
@@ -224,26 +228,26 @@ class JointTree:
         """Return the positions of all joints of the tree, including coupled joints, (..., J−1).
 
         Args:
-            theta: θ [rad] or [m], (..., D).
+            theta: θ [rad], (..., D).
 
         Returns:
             The positions [rad] or [m] in pinocchio's order, without the root link.
         """
         q: Array = theta[..., self.theta_index[1:]]
-        return polyval(q, self.terms[1:]) if self.is_coupled else q
+        return polyval(q, self.terms[1:]) if self.is_geared else q
 
     def ratios(self, theta: Array) -> Array:
-        """Return the speed of each joint of the tree relative to that of its master, (..., J−1).
+        """Return the speed of each joint of the tree relative to its entry of θ, (..., J−1).
 
-        For a joint that is not coupled, the ratio is 1. `theta` is θ [rad] or [m], (..., D).
+        For a revolute joint that is not coupled, the ratio is 1. `theta` is θ [rad], (..., D).
         """
         return polyval(theta[..., self.theta_index[1:]], derivative(self.terms[1:]))
 
     def curvatures(self, theta: Array) -> Array:
-        """Return the second derivative of each joint's position with respect to its master's.
+        """Return the second derivative of each joint's position with respect to its entry of θ.
 
         Args:
-            theta: θ [rad] or [m], (..., D).
+            theta: θ [rad], (..., D).
 
         Returns:
             One value for each joint of the tree, (..., J−1); 0 unless its coupling is nonlinear.
@@ -254,7 +258,7 @@ class JointTree:
     def transmission(self, theta: Array) -> Array:
         """Return the derivative of all joint positions q of the tree with respect to θ, (J−1, D).
 
-        `theta` is θ [rad] or [m], (D,).
+        `theta` is θ [rad], (D,).
         """
         return self.ratios(theta)[:, None] * self.moved_by
 
@@ -267,12 +271,12 @@ class JointTree:
 
         Args:
             values: One value for each joint of the tree, (*N, ..., J−1).
-            theta: θ [rad] or [m], (*N, D).
+            theta: θ [rad], (*N, D).
 
         Returns:
             Torques or derivatives with respect to θ, (*N, ..., D).
         """
-        if not self.is_coupled:
+        if not self.is_geared:
             of_joints: Array = values[..., self.order]
             return of_joints
         ratios = self.ratios(theta)
@@ -287,9 +291,9 @@ class JointTree:
 
         Args:
             matrix: The matrix B, (J−1, J−1).
-            theta: θ [rad] or [m], (D,).
+            theta: θ [rad], (D,).
         """
-        if not self.is_coupled:
+        if not self.is_geared:
             return self.of_theta(self.of_theta(matrix, theta).T, theta).T
         transmission = self.transmission(theta)
         return transmission.T @ matrix @ transmission

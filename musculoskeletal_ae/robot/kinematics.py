@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -18,21 +17,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.joint_tree import Coupling, JointTree
-
-#: travel of a prismatic joint that counts as one radian of a revolute joint [m], wherever both are
-#: treated alike: the radius of the pinion of an assumed rack
-RACK = 0.06
-
-
-class Units(NamedTuple):
-    """Units of a joint's position, torque and stiffness."""
-
-    theta: str
-    torque: str
-    stiffness: str
-
-
-TURNS, SLIDES = Units('rad', 'N·m', 'N·m/rad'), Units('m', 'N', 'N/m')
+from musculoskeletal_ae.robot.joint_units import JointUnits
 
 
 def body_frames(model: pin.Model) -> list[pin.Frame]:
@@ -98,7 +83,7 @@ class Kinematics:
             full_model: Model of the whole URDF.
             joints: The D joints of θ, in order.
             end_effector: Link for poses and external wrenches.
-            couplings: Coupling of each coupled joint.
+            couplings: Coupling of each coupled joint; their terms refer to positions.
             elasticity: Springs and dampers of the joints; None if there are none.
         """
         #: springs and dampers of the joints
@@ -114,19 +99,14 @@ class Kinematics:
         self.data = self.model.createData()
         ids = [self.model.getJointId(name) for name in joints]
         order = np.array([self.model.joints[i].idx_q for i in ids])
-        self.lower: Array = self.model.lowerPositionLimit[order].copy()
-        self.upper: Array = self.model.upperPositionLimit[order].copy()
+        #: units of the joints of θ
+        self.units = JointUnits.of_model(self.model, joints)
+        self.lower: Array = self.units.to_theta(self.model.lowerPositionLimit[order])
+        self.upper: Array = self.units.to_theta(self.model.upperPositionLimit[order])
         self._end_effector = end_effector
         self.end_effector_frame = self.model.getFrameId(end_effector, pin.FrameType.BODY)
-        self.tree = JointTree(self.model, joints, {name: couplings[name] for name in followers})
-        #: whether each joint of θ is prismatic, (D,)
-        self.slides = self.tree.prismatic[ids]
-        #: displacement of each joint of θ that counts as one radian [rad or m], (D,)
-        self.radian: Array = np.where(self.slides, RACK, 1.0)
-        #: units of each joint of θ
-        self.units = tuple(SLIDES if slides else TURNS for slides in self.slides)
-        #: unit of a distance between postures, for messages
-        self.distance_unit = ' and '.join(sorted({unit.theta for unit in self.units}, reverse=True))
+        own = {name: couplings[name] for name in followers}
+        self.tree = JointTree(self.model, self.units, own)
 
     def attach(self, link: str, xyz: Array) -> tuple[int, Array]:
         """Return the joint that carries a link, and a point of the link in the frame of the joint.
@@ -197,7 +177,7 @@ class Kinematics:
             acceleration: θ̈ [rad/s²], (D,).
         """
         tree, rates = self.tree, np.array([velocity, acceleration])[:, self.tree.theta_index[1:]]
-        if tree.is_coupled:
+        if tree.is_geared:
             squared_velocity = rates[0] ** 2
             rates = tree.ratios(theta) * rates
             rates[1] += tree.curvatures(theta) * squared_velocity
@@ -221,13 +201,9 @@ class Kinematics:
         return result + self.elasticity.stiffness
 
     def joint_inertia(self, theta: Array) -> Array:
-        """Return the inertia that each joint moves while all other joints are held, (D,).
+        """Return the inertia that each joint moves while all other joints are held [kg·m²], (D,).
 
-        Args:
-            theta: Joint angles [rad], (D,).
-
-        Returns:
-            The inertia [kg·m²], for prismatic joints the mass [kg].
+        `theta` are the joint angles [rad], (D,).
         """
         inertia = joint_space_inertia(self.model, self.data, self.tree.angles(theta))
         return np.diag(self.tree.of_both(inertia, theta))
@@ -242,7 +218,7 @@ class Kinematics:
         q, frame = tree.angles(theta), self.end_effector_frame
         jacobian = pin.computeFrameJacobian(self.model, self.data, q, frame, axes)
         jacobian = jacobian.reshape(6, -1)
-        return jacobian @ tree.transmission(theta) if tree.is_coupled else jacobian[:, tree.order]
+        return jacobian @ tree.transmission(theta) if tree.is_geared else jacobian[:, tree.order]
 
     def link_pose(self, theta: Array, link: str) -> pin.SE3:
         """Return the pose of a link in the root link's frame at θ (D,)."""

@@ -35,8 +35,8 @@ class Robot:
     muscles: tuple[str, ...]  # names of the muscles, in the order of T and l
     tension: TensionRange
     stiffness: Array  # K_stiff of muscle stiffness control [N/m], (M,)
-    lower: Array  # lower joint limits [rad] ([m] of prismatic joints), (D,)
-    upper: Array  # upper joint limits, (D,)
+    lower: Array  # lower joint limits [rad], (D,)
+    upper: Array  # upper joint limits [rad], (D,)
 
     def __init__(self, description: RobotDescription) -> None:
         self.description = description
@@ -62,6 +62,7 @@ class Robot:
         self.routes = Routes(self.kinematics, description.routes)
         self.groups = groups(self.routes.crossed)
         self.lower, self.upper = self.kinematics.lower, self.kinematics.upper
+        #: units of the joints in files, messages and texts
         self.units = self.kinematics.units
 
     @classmethod
@@ -209,8 +210,8 @@ class Robot:
 
     def posture_text(self, theta: Array, digits: int = 2) -> str:
         """Return the joint positions θ (D,) as a text with the names and units of the joints."""
-        each = zip(self.joints, theta, self.units, strict=True)
-        return ', '.join(f'{name} {value:.{digits}f} {unit.theta}' for name, value, unit in each)
+        each, form = zip(self.joints, theta, self.units, strict=True), f'.{digits}f'
+        return ', '.join(f'{name} {unit.position_text(value, form)}' for name, value, unit in each)
 
     def random_postures(self, count: int, rng: np.random.Generator, margin: float = 0.0) -> Array:
         """Return uniformly distributed random θ [rad], (count, D).

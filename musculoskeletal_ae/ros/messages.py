@@ -24,6 +24,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 if TYPE_CHECKING:  # a slow import, which --help of the tools does not need
+    from musculoskeletal_ae.robot.joint_units import JointUnits
     from musculoskeletal_ae.signals.motor_interface import MotorInterface
 
 # The three qualities of service (doc/reference/topics_and_services.md).
@@ -49,9 +50,14 @@ def _layout(sizes: tuple[int, ...], labels: tuple[str, ...]) -> MultiArrayLayout
     return MultiArrayLayout(dim=dimensions)
 
 
-def joint_message(joints: Sequence[str], theta: Array, stamp: Time) -> JointState:
-    """Return a JointState with the names and the positions θ [rad], (D,), of joints."""
-    message = JointState(name=joints, position=array('d', theta.tobytes()))
+def posture_message(units: JointUnits, theta: Array, stamp: Time) -> JointState:
+    """Return a JointState with the names and positions of all joints, at θ [rad], (D,)."""
+    return joint_message(units.names, units.to_position(theta), stamp)
+
+
+def joint_message(names: Sequence[str], position: Array, stamp: Time) -> JointState:
+    """Return a JointState with names and positions, each in its own unit."""
+    message = JointState(name=names, position=array('d', position.tobytes()))
     message.header.stamp = stamp
     return message
 
@@ -73,12 +79,12 @@ def motor_message(motors: MotorInterface, length: Array, tension: Array, stamp: 
     return message
 
 
-def add_joints(message: JointState, joints: Sequence[str], theta: Array) -> None:
-    """Append joints at positions θ [rad], (D,), to a JointState; their other values are NaN."""
-    message.name = [*message.name, *joints]
-    message.position.extend(theta.tolist())
+def add_joints(message: JointState, units: JointUnits, theta: Array) -> None:
+    """Append all joints at θ [rad], (D,), to a JointState; their other values are NaN."""
+    message.name = [*message.name, *units.names]
+    message.position.extend(units.to_position(theta).tolist())
     for unknown in (message.velocity, message.effort):
-        unknown.extend([math.nan] * len(joints))
+        unknown.extend([math.nan] * len(units))
 
 
 def is_heard(publisher: Publisher) -> bool:

@@ -136,7 +136,7 @@ class View(Node):
     # -- messages -------------------------------------------------------------------------------
 
     def _subscribe(self) -> None:
-        robot, joints = self.robot, self.robot.joints
+        robot, units = self.robot, self.robot.units
 
         def muscles(message: Any) -> Array:
             reading = self.motors.reading(message)
@@ -145,7 +145,7 @@ class View(Node):
             )
 
         table: list[tuple[str, type, str, QoSProfile, Callable[[Any], Any]]] = [
-            (arm, JointState, topic, NEWEST, partial(read_posture, joints=joints, some=is_measured))
+            (arm, JointState, topic, NEWEST, partial(read_posture, units=units, some=is_measured))
             for arm, topic in ARM_TOPICS.items()
             for is_measured in [arm == 'measured']
         ]
@@ -268,7 +268,7 @@ class View(Node):
         counts = situation.count('samples'), situation.count('checkpoints')
         learned = f'samples {counts[0]} · networks {counts[1]}'
         lines = [
-            figures('measured' in posture, error, anomaly, self.robot.kinematics.distance_unit)
+            figures('measured' in posture, error, anomaly, self.robot.units.distance_unit)
             + shown_distance,
             f'{learned} · {situation.doing or "–"}',
             f'waiting for {self.motors.state_topic}' if states is None else situation.hint(),
@@ -374,15 +374,16 @@ class View(Node):
         """
         match what:
             case 'targets':
-                stamp, theta = self.get_clock().now().to_msg(), np.array([*value.values()])
-                self.targets.publish(joint_message([*value], theta, stamp))
+                stamp, position = self.get_clock().now().to_msg(), np.array([*value.values()])
+                self.targets.publish(joint_message([*value], position, stamp))
             case 'hand':
                 if value.shape != (3,) or not np.isfinite(value).all():
                     raise ValueError(f'expected a position of three numbers [m], got {value}')
                 if (theta := self._newest('estimated')) is not None:
                     pose = pin.SE3(np.eye(3), value)
                     target = inverse_kinematics(self.robot, pose, theta, POSITION_ONLY).theta
-                    self._do('targets', dict(zip(self.robot.joints, target)))
+                    position = self.robot.units.to_position(target)
+                    self._do('targets', dict(zip(self.robot.joints, position)))
             case 'push':
                 wrench = WrenchStamped()
                 wrench.wrench.force = Vector3(**dict(zip('xyz', value.tolist())))

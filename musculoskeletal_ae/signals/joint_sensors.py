@@ -23,6 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.robot.joint_units import JointUnits
 from musculoskeletal_ae.robot.robot import Robot
 
 LEAST_MOTION = 0.05  # smallest range of θ of a joint that is judged [rad]
@@ -56,9 +57,9 @@ class JointFault(NamedTuple):
     end: float = 0.0
 
 
-def corrected(theta: Array, faults: Iterable[JointFault]) -> Array:
+def corrected(theta: Array, faults: Iterable[JointFault], units: JointUnits) -> Array:
     """Return θ (N, D) as the joint sensors would publish it without these faults."""
-    theta = theta.copy()
+    theta = units.to_position(theta)  # the sensors publish positions
     for fault in faults:
         joints = list(fault.joints)
         if fault.kind == SIGN:
@@ -67,7 +68,7 @@ def corrected(theta: Array, faults: Iterable[JointFault]) -> Array:
             theta[:, joints] = theta[:, joints[::-1]]
         elif fault.kind == DEGREES:
             theta[:, joints] = np.radians(theta[:, joints])
-    return theta
+    return units.to_theta(theta)
 
 
 class Judgement(NamedTuple):
@@ -178,15 +179,14 @@ def stuck_sensors(
             constant = np.flatnonzero(np.ptp(theta[rows], axis=0) == 0.0)
             jacobian = robot.routes.muscle_jacobian(theta[rows])[:, used][:, :, constant]
             error = (length[rows] - robot.muscle_lengths(theta[rows], tension[rows]))[:, used]
-            radian = robot.kinematics.radian[j]
             motion = _hidden_motion(error - error.mean(axis=0), jacobian)[:, constant == j]
             away = np.zeros(1)
             if len(outside := _rows_outside(theta, begin, end)) >= LEAST_SAMPLES:
                 usual = length[outside] - robot.muscle_lengths(theta[outside], tension[outside])
                 error -= np.median(usual[:, used], axis=0)
                 away = _hidden_motion(error, jacobian)[:, constant == j]
-            is_moving = np.ptp(np.percentile(motion, [5, 95])) > STUCK_MOTION * radian
-            if is_moving or abs(np.median(away)) > STUCK_OFFSET * radian:
+            is_moving = np.ptp(np.percentile(motion, [5, 95])) > STUCK_MOTION
+            if is_moving or abs(np.median(away)) > STUCK_OFFSET:
                 faults.append(JointFault(STUCK, (j,), float(time[begin]), float(time[end])))
     return faults
 
@@ -233,14 +233,14 @@ class _Lengths:
         """
         robot = self.robot
         beyond = np.maximum(theta - robot.upper, robot.lower - theta)
-        if (beyond > BEYOND * robot.kinematics.radian).any():
+        if (beyond > BEYOND).any():
             return np.inf
         error = self._centred(self._length[:, self._used] - self._model(theta))
         return float(np.sqrt(np.square(error).mean()))
 
     def moved(self, theta: Array) -> Bools:
         """Return which joints have moved enough to be judged, (D,)."""
-        is_enough: Bools = np.ptp(theta, axis=0) > LEAST_MOTION * self.robot.kinematics.radian
+        is_enough: Bools = np.ptp(theta, axis=0) > LEAST_MOTION
         return is_enough
 
     def signs(self, theta: Array) -> _Signs:
@@ -304,9 +304,8 @@ def _hypotheses(lengths: _Lengths, theta: Array) -> Iterator[_Hypothesis]:
     The faults are wrong signs, degrees instead of radians, and two exchanged joints.
     """
     robot = lengths.robot
-    turning = np.flatnonzero(~robot.kinematics.slides).tolist()
-    most = BEYOND * robot.kinematics.radian
-    is_beyond = np.maximum(theta - robot.upper, robot.lower - theta).max(axis=0) > most
+    turning = np.flatnonzero(~robot.units.slides).tolist()
+    is_beyond = np.maximum(theta - robot.upper, robot.lower - theta).max(axis=0) > BEYOND
     far = np.flatnonzero(is_beyond).tolist()
     faults = list[JointFault]()
     if far:  # readings beyond the limits may be legal with the other sign, or as degrees
@@ -316,10 +315,10 @@ def _hypotheses(lengths: _Lengths, theta: Array) -> Iterator[_Hypothesis]:
     pairs = list(combinations(np.flatnonzero(lengths.moved(theta)).tolist(), 2))
     if pairs:  # yield only the best exchange, because the caller's search for signs takes time
         exchanges = [JointFault(ORDER, pair) for pair in pairs]
-        misfits = [lengths.misfit(corrected(theta, [fault])) for fault in exchanges]
+        misfits = [lengths.misfit(corrected(theta, [fault], robot.units)) for fault in exchanges]
         faults.append(exchanges[int(np.argmin(misfits))])
     for fault in faults:
-        yield _Hypothesis(fault, corrected(theta, [fault]))
+        yield _Hypothesis(fault, corrected(theta, [fault], robot.units))
 
 
 def _repeats(time: Array, values: Array) -> Iterator[tuple[int, int]]:

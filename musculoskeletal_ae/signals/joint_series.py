@@ -120,9 +120,8 @@ def judge_series(robot: Robot, time: Array, theta: Array) -> JointSeries:
         usable[(since <= time) & (time <= until), j] = np.nan
     for (j, kind), readings in impossible.items():
         if readings:
-            name, unit = robot.joints[j], robot.units[j].theta
-            example = f'such as {readings[0]:.3g} {unit}'
-            found.append((len(readings), f'{name}: {kind.value}, {example}'))
+            name, example = robot.joints[j], robot.units[j].position_text(readings[0], '.3g')
+            found.append((len(readings), f'{name}: {kind.value}, such as {example}'))
     is_unused = np.asarray((np.isfinite(theta) & np.isnan(usable)).any(axis=1))
     is_turned = np.asarray((np.abs(usable - theta) > np.pi).any(axis=1))
     texts = [_text(is_unused, found, ', which are not used')] if found else []
@@ -150,7 +149,7 @@ def _subtract_turns(robot: Robot, time: Array, theta: Array) -> list[tuple[int, 
     margin = LIMITS.joint_outside * (robot.upper - robot.lower)
     middle = 0.5 * (robot.lower + robot.upper)
     turns = np.round((theta - middle) / (2.0 * np.pi))
-    turns[:, np.asarray(robot.kinematics.slides)] = 0.0
+    turns[:, robot.units.slides] = 0.0
     is_turned = np.nan_to_num(turns) != 0.0
     joints = np.flatnonzero(is_turned.any(axis=0)).tolist()
     is_positive = not (theta[:, joints] < 0.0).any() and np.nanmax(theta, initial=0.0) < 2.0 * np.pi
@@ -189,7 +188,6 @@ def _drop_constants(robot: Robot, time: Array, theta: Array) -> list[tuple[int, 
         The number of readings of each false constant, with a text about it.
     """
     found = []
-    radian = np.broadcast_to(robot.kinematics.radian, robot.joint_count)
     groups = [[*range(robot.joint_count)]] if robot.joint_count > 1 else []
     groups += [[j] for j in range(robot.joint_count)]
     for joints in groups:
@@ -199,11 +197,11 @@ def _drop_constants(robot: Robot, time: Array, theta: Array) -> list[tuple[int, 
             continue
         constants, which = np.unique(readings, axis=0, return_inverse=True)
         largest = _largest_changes(time[rows])
-        for constant in _interrupting(which.ravel(), readings / radian[joints], largest):
+        for constant in _interrupting(which.ravel(), readings, largest):
             is_it = which.ravel() == constant
             theta[np.ix_(rows[is_it], joints)] = np.nan
             values = ', '.join(
-                f'{robot.joints[j]} {value + 0.0:.3g} {robot.units[j].theta}'
+                f'{robot.joints[j]} {robot.units[j].position_text(value + 0.0, ".3g")}'
                 for j, value in zip(joints, constants[constant].tolist())
             )
             found.append((int(is_it.sum()), f'a constant interrupts the other readings: {values}'))
@@ -225,13 +223,12 @@ def _has_wrong_scale(robot: Robot, time: Array, theta: Array, is_outside: Bools)
         theta: Measured θ [rad], (N, D).
         is_outside: Which readings are far outside the limits, (N, D).
     """
-    radian = np.broadcast_to(robot.kinematics.radian, robot.joint_count)
     for j in np.flatnonzero(is_outside.any(axis=0)).tolist():
         rows = np.flatnonzero(np.isfinite(theta[:, j]))
         outside = is_outside[rows, j]
         crosses = outside[1:] != outside[:-1]
         changes = np.abs(np.diff(theta[rows, j]))
-        is_smooth = changes <= _largest_changes(time[rows]) * radian[j]
+        is_smooth = changes <= _largest_changes(time[rows])
         if outside.mean() > WRONG_SCALE or is_smooth[crosses].mean() > WRONG_SCALE:
             return True
     return False

@@ -31,11 +31,10 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
 
-#: Constant part of the largest change between two readings of a joint sensor [rad]; for prismatic
-#: joints times `kinematics.radian`. It is far beyond the noise, resolution and backlash of sensors.
+#: constant part of the largest change between two readings of a joint sensor [rad], far beyond the
+#: noise, resolution and backlash of sensors
 STEP = 0.1
-#: Largest speed of a joint [rad/s]; for prismatic joints times `kinematics.radian`. Emulated arms
-#: reach 5.4 rad/s when a tendon slips.
+#: largest speed of a joint [rad/s]; emulated arms reach 5.4 rad/s when a tendon slips
 SPEED = 10.0
 #: report a series of impossible readings that has lasted for this time [s]; a burst is shorter,
 #: even with the time in which the readings of a moving arm settle again
@@ -95,17 +94,14 @@ class JointChannel:
             sensor.
     """
 
-    def __init__(self, low: float, high: float, radian: float) -> None:
+    def __init__(self, low: float, high: float) -> None:
         """Start without readings.
 
         Args:
             low: Lowest possible reading [rad].
             high: Highest possible reading [rad].
-            radian: 1 for a revolute joint, and for a prismatic joint the displacement [m] that
-                counts as 1 rad.
         """
         self._low, self._high = low, high
-        self._step, self._speed = STEP * radian, SPEED * radian
         self.read_at: float | None = None
         self.reset()
 
@@ -124,7 +120,7 @@ class JointChannel:
         if not self._low <= value <= self._high:
             return JointReading.OUTSIDE
         elapsed = time - self._time
-        largest = self._step + self._speed * min(elapsed, LIMITS.longest_step)
+        largest = STEP + SPEED * min(elapsed, LIMITS.longest_step)
         # After a pause, any reading may be right, as at the beginning.
         is_first = not elapsed <= LIMITS.pause
         if not abs(value - self._last) <= largest:
@@ -160,8 +156,7 @@ class JointStream:
     def __init__(self, robot: Robot) -> None:
         """Start without readings."""
         margin = LIMITS.joint_outside * (robot.upper - robot.lower)
-        radian = np.broadcast_to(robot.kinematics.radian, margin.shape)
-        limits = robot.lower - margin, robot.upper + margin, radian
+        limits = robot.lower - margin, robot.upper + margin
         self._joints = robot.joints
         self._channels = [JointChannel(*each) for each in zip(*(part.tolist() for part in limits))]
         self.rejected: Counter[tuple[str, JointReading]] = Counter()

@@ -129,7 +129,8 @@ def check_posture(robot: Robot, theta: Array, outside: float) -> None:
         return
     j = int(np.nanargmax(share))
     margin, unit = outside * (robot.upper - robot.lower)[j], robot.units[j].theta
-    value, least, most = distinct(theta[j], robot.lower[j] - margin, robot.upper[j] + margin)
+    values = np.array([theta[j], robot.lower[j] - margin, robot.upper[j] + margin])
+    value, least, most = distinct(*robot.units.to_position(values, j))
     raise MessageError(
         'θ far outside the joint limits',
         f'{robot.joints[j]} is {value} {unit}; legal: {least} to {most} {unit}',

@@ -84,7 +84,7 @@ def train(args: Namespace) -> None:
         print(f'estimated joint-sensor offsets: {offsets}')
     for path, pairs in recordings.items():
         kind = 'held out' if path in args.hold_out else 'learned from'
-        unit, after = robot.kinematics.distance_unit, error(learner.mae, pairs)
+        unit, after = robot.units.distance_unit, error(learner.mae, pairs)
         change = f'{before[path]:.4f} → {after:.4f} {unit}'
         note = 'before → after learning; reference: the recorded joint sensors'
         if offsets:
@@ -168,10 +168,11 @@ def offset_text(robot: Robot, zero: Array) -> str:
 
     Args:
         robot: The geometric model.
-        zero: Offset of each joint sensor [rad or m], (D,).
+        zero: Offset of each joint sensor [rad], (D,).
     """
-    shown = np.flatnonzero(np.abs(zero) >= LEAST_OFFSET * robot.kinematics.radian)
-    return ', '.join(f'{robot.joints[j]} {zero[j]:.4f} {robot.units[j].theta}' for j in shown)
+    shown = np.flatnonzero(np.abs(zero) >= LEAST_OFFSET)
+    each = ((robot.joints[j], robot.units[j].position_text(zero[j], '.4f')) for j in shown)
+    return ', '.join(f'{name} {offset}' for name, offset in each)
 
 
 def _keep(learner: Learner, args: Namespace) -> str:
@@ -210,7 +211,7 @@ def repetition(robot: Robot, theta: Array, learned: Array) -> str:
     theta, learned = theta[known[0]], learned[known[1]]
     if robot.joint_count < 2 or not len(theta) or not len(learned):
         return ''
-    distance, _ = KDTree(learned / robot.kinematics.radian).query(theta / robot.kinematics.radian)
+    distance, _ = KDTree(learned).query(theta)
     share = float(np.mean(distance < REPEATED))
     if share <= REPEATED_SHARE:
         return ''
@@ -256,7 +257,7 @@ def anomaly_in(
         text = f'an anomaly ({muscle}: {finding.kind.identifier}) begins {at:.1f} s after the start'
         if row:
             before = error(mae, recording.first(row))
-            text += f'; until then the error is {before:.4f} {robot.kinematics.distance_unit}'
+            text += f'; until then the error is {before:.4f} {robot.units.distance_unit}'
         return f'{text}. Hold out a healthy recording'
     return ''
 

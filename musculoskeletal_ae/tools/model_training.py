@@ -62,7 +62,7 @@ def train(args: Namespace) -> None:
     rng = np.random.default_rng([args.seed, 2])
     limit, most = robot.tension.limit, robot.tension.max
     planned = pair_errors(trained.mae, random_states(robot, HELD_OUT_STATES, rng, limit))
-    print(model_error(planned, robot.kinematics.distance_unit))
+    print(model_error(planned, robot.units.distance_unit))
     print(table(planned, f'{HELD_OUT_STATES} unseen states, T in [0, {shown(limit)}] N'))
     if (most > limit).any():
         overload = pair_errors(trained.mae, random_states(robot, HELD_OUT_STATES, rng, most, limit))
@@ -115,7 +115,7 @@ def joint_table(robot: Robot, errors: list[PairError]) -> str:
     estimates = {e.output: e.elements for e in errors if e.mask is Mask.TENSION_LENGTH}
     width = max(len(name) for name in robot.joints) + 2
     rows = zip(robot.joints, estimates['theta'], robot.units)
-    lines = [f'{name:<{width}}{error:.4f} {unit.theta}' for name, error, unit in rows]
+    lines = [f'{name:<{width}}{unit.position_text(error, ".4f")}' for name, error, unit in rows]
     return '\n'.join(['', 'mean error of each joint angle, estimated from T and l (②)', *lines, ''])
 
 
@@ -153,12 +153,15 @@ def plot(robot: Robot, trained: Trained, errors: list[PairError]) -> Any:
     grid.scale(0.8, 2.2)
     for axes, (output, unit, _) in zip((joints, tensions, lengths), OUTPUTS):
         one, names = ('joint', robot.joints) if output == 'theta' else ('muscle', robot.muscles)
-        if output == 'theta':  # 'rad', 'm' or both
-            unit = ' or '.join(sorted({each.theta for each in robot.units}, reverse=True))
+        if output == 'theta':
+            unit = robot.units.position_unit
         place = np.arange(len(names))
         for i, error in enumerate(e for e in errors if e.output == output):
             label = f'from {ENTERED[error.mask]}'
-            axes.barh(place + 0.27 * (i - 1), error.elements, 0.27, label=label, color=f'C{i}')
+            values = error.elements
+            if output == 'theta':
+                values = robot.units.to_position(values)
+            axes.barh(place + 0.27 * (i - 1), values, 0.27, label=label, color=f'C{i}')
         axes.set_yticks(place, names, fontsize=8)
         axes.invert_yaxis()
         axes.set(xlabel=f'mean |error| [{unit}]', title=f'{SYMBOLS[output]} of each {one}')

@@ -3,7 +3,7 @@
 
 Requests of visitors call `act` in viser's threads, with the name of the request and its value:
 
-    targets          target angles by joint [rad]
+    targets          target positions by joint [rad or m]
     hand             target position of the hand [m]
     push             force on the hand [N]
     rupture, repair  name of the muscle
@@ -158,10 +158,11 @@ class Controls:
             gizmo.on_update(lambda event: setattr(self._gizmo, 'visible', _chosen(event)))
             # A slider can end only at multiples of its step. Steps of at most a hundredth of the
             # range let it cover almost the whole range.
-            spans = np.minimum(robot.upper - robot.lower, 100.0)
+            low, high = map(robot.units.to_position, (robot.lower, robot.upper))
+            spans = np.minimum(high - low, 100.0)
             places = np.ceil(2.0 - np.log10(spans)).astype(int).tolist()
             steps = np.array([float(f'1e-{n}') for n in places])
-            limits = np.ceil(robot.lower / steps) * steps, np.floor(robot.upper / steps) * steps
+            limits = np.ceil(low / steps) * steps, np.floor(high / steps) * steps
             self.sliders = [
                 self._slider(*each, 'targets') for each in zip(robot.joints, *limits, steps)
             ]
@@ -252,7 +253,7 @@ class Controls:
 
     def _is_at_rest(self, theta: Array, now: float) -> bool:
         """Return whether the estimate θ [rad] (D,) has hardly changed for REST_TIME [s]."""
-        span = np.array([slider.max - slider.min for slider in self.sliders])
+        span = self._robot.upper - self._robot.lower
         posture, since = self._rest
         if (np.abs(theta - posture) <= REST_SHARE * span).all():
             return now - since >= REST_TIME
@@ -261,8 +262,9 @@ class Controls:
 
     def _show(self, theta: Array) -> None:
         """Set the sliders to a posture θ [rad] (D,)."""
-        for joint, angle, slider in zip(self._robot.joints, theta, self.sliders):
-            near = round(np.clip(angle, slider.min, slider.max) / slider.step) * slider.step
+        positions = self._robot.units.to_position(theta)
+        for joint, position, slider in zip(self._robot.joints, positions, self.sliders):
+            near = round(np.clip(position, slider.min, slider.max) / slider.step) * slider.step
             value = float(np.clip(near, slider.min, slider.max))
             if value != slider.value:
                 self._set(('targets', joint), value)

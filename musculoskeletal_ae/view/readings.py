@@ -122,7 +122,7 @@ class Readings:
 
     def _add_plots(self, gui: Any, robot: Robot) -> None:
         look: dict[str, Any] = {'legend': {'show': False}, 'cursor': {'show': False}}
-        for curve in curves(robot.kinematics.distance_unit):
+        for curve in curves(robot.units.distance_unit):
             empty = (np.zeros(0),) * (1 + len(curve.lines))
             plot = gui.add_uplot(
                 empty, ({}, *curve.lines), title=curve.title, height=HEIGHT,

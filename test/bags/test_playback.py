@@ -161,8 +161,8 @@ def motion(tmp_path, times, first=(), bunch=0):
 def test_a_demonstration_contains_the_joints_that_most_messages_name(tmp_path):
     taught = motion(tmp_path, [0.02 * k for k in range(1, 101)], first=(0.005, 0.01))
     assert taught.joints == ('elbow', 'shoulder')
-    assert taught.theta[:, 0] == pytest.approx(1.0)
-    assert taught.theta[-1, 1] == pytest.approx(0.7, abs=0.02)
+    assert taught.position[:, 0] == pytest.approx(1.0)
+    assert taught.position[-1, 1] == pytest.approx(0.7, abs=0.02)
 
 
 def test_a_demonstration_that_was_recorded_in_bunches_is_the_same_motion(tmp_path):
@@ -170,7 +170,7 @@ def test_a_demonstration_that_was_recorded_in_bunches_is_the_same_motion(tmp_pat
     regular = motion(tmp_path / 'regular', times)
     bunched = motion(tmp_path / 'bunched', times, bunch=SECOND // 2)
     assert bunched.time == pytest.approx(regular.time)
-    assert bunched.theta == pytest.approx(regular.theta)
+    assert bunched.position == pytest.approx(regular.position)
 
 
 @pytest.mark.parametrize(
@@ -194,4 +194,4 @@ def test_a_steady_motion_is_smoothed_to_itself(tmp_path):
     taught = motion(tmp_path, times)
     middle = slice(10, -10)  # near the ends, the running mean has samples on one side only
     expected = 0.5 + 0.1 * (taught.time - taught.time[0] + times[0])
-    np.testing.assert_allclose(taught.theta[middle, 1], expected[middle], atol=1e-6)
+    np.testing.assert_allclose(taught.position[middle, 1], expected[middle], atol=1e-6)

@@ -27,7 +27,6 @@ from musculoskeletal_ae.motion.slowness import slowness
 from musculoskeletal_ae.motion.tension_plan import TURNING
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.actuation import DEPTH
-from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme, least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
@@ -308,13 +307,13 @@ def sliding(tmp_path_factory):
     robot = Robot.load(write_robot(tmp_path_factory.mktemp('slider'), slider=True))
     robot = robot.without(robot.muscle_indices(['slider_in', 'slider_out']))
     postures = robot.random_postures(100, np.random.default_rng(0))
-    return robot, postures, robot.kinematics.holding_torque(postures)[:, -1]
+    return robot, postures, robot.units.to_effort(robot.kinematics.holding_torque(postures))[:, -1]
 
 
 def test_a_prismatic_joint_without_muscles_lacks_force_in_newtons(sliding):
     robot, postures, force = sliding
     reported = [lacking(robot, ExactMae(robot), theta) for theta in postures]
-    notable = reach.NOTABLE / RACK
+    notable = reach.NOTABLE / robot.units[-1].radian
     assert reported == [f'{f:.2f} N at joint wrist' if f > notable else '' for f in np.abs(force)]
     assert 0 < np.sum(np.abs(force) > notable) < len(force)
 

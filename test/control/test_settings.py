@@ -8,18 +8,20 @@ import pytest
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.parameters import parameters_of
-from musculoskeletal_ae.robot.kinematics import RACK
+from musculoskeletal_ae.robot.joint_units import RACK, JointUnits
+
+TURNING = JointUnits('ab', [False, False])
 
 
 @pytest.mark.parametrize('stiffness', [(), (0.0,)])
 def test_joint_stiffness_left_empty_demands_nothing_of_any_joint(stiffness):
-    assert Settings(joint_stiffness=stiffness).desired_stiffness((1.0, 1.0, 1.0)) == (0.0, 0.0, 0.0)
-    assert Settings(joint_stiffness=(5.0, 0.0)).desired_stiffness((1.0, 1.0)) == (5.0, 0.0)
+    assert not Settings(joint_stiffness=stiffness).desired_stiffness(TURNING).any()
+    assert Settings(joint_stiffness=(5.0, 0.0)).desired_stiffness(TURNING).tolist() == [5.0, 0.0]
 
 
 def test_joint_stiffness_needs_one_number_for_each_joint():
     with pytest.raises(MusculoskeletalError, match='legal: 2 numbers of at least 0'):
-        Settings(joint_stiffness=(1.0, 2.0, 3.0)).desired_stiffness((1.0, 1.0))
+        Settings(joint_stiffness=(1.0, 2.0, 3.0)).desired_stiffness(TURNING)
 
 
 @pytest.mark.parametrize(
@@ -41,9 +43,10 @@ def test_settings_are_checked_wherever_they_are_made(wrong, legal):
 
 def test_the_limit_of_joint_stiffness_of_a_prismatic_joint_is_that_of_a_pinion():
     """A pinion moves a rack: the limit of 1000 N·m/rad is divided by the square of its radius."""
-    parameter, radian = parameters_of(Settings)['joint_stiffness'], (1.0, RACK)
+    parameter, units = parameters_of(Settings)['joint_stiffness'], JointUnits('ab', [False, True])
     stiffness = parameter.checked([1000.0, 1000.0 / RACK**2])
-    assert Settings(joint_stiffness=stiffness).desired_stiffness(radian) == stiffness
+    desired = Settings(joint_stiffness=stiffness).desired_stiffness(units)
+    assert desired == pytest.approx([1000.0, 1000.0])
     for beyond in ((1001.0, 0.0), (0.0, 1001.0 / RACK**2)):
         with pytest.raises(MusculoskeletalError, match=r'at most 1000, 277778 |0 to 277778 '):
-            Settings(joint_stiffness=beyond).desired_stiffness(radian)
+            Settings(joint_stiffness=beyond).desired_stiffness(units)

@@ -223,7 +223,8 @@ def test_no_legal_wrench_breaks_the_emulator_and_a_reset_mends_it(name, reality)
 def test_the_sensor_of_a_prismatic_joint_errs_by_millimetres(tmp_path, reality):
     robot = Robot.load(write_robot(tmp_path, slider=True))
     arms = [make_arm(robot, seed, reality) for seed in range(3)]
-    off = np.array([[arm.sense().theta[-1] - arm.theta[-1] for _ in range(30)] for arm in arms])
+    off = np.array([[arm.sense().theta - arm.theta for _ in range(30)] for arm in arms])
+    off = robot.units.to_position(off)[..., -1]
     assert np.abs(off).max() < 0.01
     assert 1e-5 < off.std(axis=1).max() < 2e-4
 
@@ -240,5 +241,5 @@ def test_a_prismatic_joint_stops_at_its_limits(tmp_path, reality):
             arm.command_tension(pull)
             arm.step(0.1)
             beyond = np.maximum(arm.theta - robot.upper, robot.lower - arm.theta)
-            assert beyond[-1] < 0.01
+            assert robot.units.to_position(beyond)[-1] < 0.01
         pull[:] = robot.tension.bias

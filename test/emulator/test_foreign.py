@@ -63,7 +63,7 @@ def test_a_foreign_body_without_effects_is_the_described_body(robot, coupled, im
         theta = model.random_postures(20, np.random.default_rng(0))
         lengths, jacobian = true.absolute_lengths(theta), true.muscle_jacobian(theta)
         np.testing.assert_allclose(lengths, model.routes.absolute_lengths(theta), atol=1e-9)
-        if not model.kinematics.tree.is_coupled or model is coupled:
+        if not model.kinematics.tree.is_geared or model is coupled:
             slopes = model.routes.muscle_jacobian(theta)
             np.testing.assert_allclose(jacobian, slopes, atol=1e-6)
         tension = np.broadcast_to(model.tension.limit, lengths.shape)

@@ -40,9 +40,9 @@ def test_the_elbows_of_two_arms_are_found_by_name():
 
 def test_without_known_names_the_first_and_last_revolute_joints_are_shoulder_and_elbow(tmp_path):
     robot = Robot.load(write_robot(tmp_path / 'other', slider=True))
-    assert robot.kinematics.slides.tolist() == [False, False, False, True]
+    assert robot.units.slides.tolist() == [False, False, False, True]
     assert shoulder(robot) == 0
     assert elbow(robot) == robot.joint_count - 2
     assert np.flatnonzero(elbows(robot)).tolist() == [elbow(robot)]
-    assert plot_unit(robot, robot.joint_count - 1) == (1000.0, 'mm')
+    assert plot_unit(robot, robot.joint_count - 1) == (60.0, 'mm')  # of 1 rad
     assert robot.lower[elbow(robot)] <= flexed(robot) <= robot.upper[elbow(robot)]

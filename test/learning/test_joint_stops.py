@@ -23,9 +23,8 @@ def within(margin: float) -> np.ndarray:
     return np.random.default_rng(3).uniform(LOWER + margin, UPPER - margin, (150, 3))
 
 
-def estimated_zeros(read, radian=1.0) -> tuple[np.ndarray, np.ndarray]:
-    ones = np.ones(len(LOWER))
-    return sensor_zeros(read * radian, LOWER * radian, UPPER * radian, radian * ones)
+def estimated_zeros(read) -> tuple[np.ndarray, np.ndarray]:
+    return sensor_zeros(read, LOWER, UPPER)
 
 
 @pytest.mark.parametrize('seed', range(5))
@@ -84,10 +83,3 @@ def test_a_joint_without_sensor_has_no_offset():
     assert np.isfinite(spread).all()
     read[:] = np.nan
     assert estimated_zeros(read[:0])[0] == pytest.approx(np.zeros(3))
-
-
-def test_offsets_of_prismatic_joints_scale_with_their_radian():
-    read = rests() + TRUE
-    (zero, spread), (slid, slid_spread) = estimated_zeros(read), estimated_zeros(read, 0.02)
-    assert slid == pytest.approx(0.02 * zero)
-    assert slid_spread == pytest.approx(0.02 * spread)

@@ -120,13 +120,14 @@ def test_two_centimetres_of_a_prismatic_joint_are_another_posture(tmp_path):
     robot = Robot.load(write_robot(tmp_path, slider=True))
     learner, pull = Learner(robot), np.full(robot.muscle_count, 60.0)
     theta = 0.5 * (robot.lower + robot.upper)
-    theta[-1], length = 0.01, robot.muscle_lengths(theta, pull)
+    theta[-1], length = 0.01 / 0.06, robot.muscle_lengths(theta, pull)
     # The arm rests for 4 s, moves at 5 mm/s for 4 s while no length changes, and rests again.
     for time in np.arange(0.0, 12.0, DT):
-        theta = theta + [0.0, 0.0, 0.0, 0.005 * DT * (4.0 <= time < 8.0)]
+        moved = np.array([0.0, 0.0, 0.0, 0.005 * DT * (4.0 <= time < 8.0)])
+        theta = theta + robot.units.to_theta(moved)
         learner.step(time, theta, pull, length)
-    angles = [sample.theta[-1] for sample in learner.samples.samples]
-    np.testing.assert_allclose(angles, [0.01, 0.03], atol=1e-4)
+    positions = [robot.units.to_position(each.theta)[-1] for each in learner.samples.samples]
+    np.testing.assert_allclose(positions, [0.01, 0.03], atol=1e-4)
 
 
 def test_a_new_sample_brings_one_update_at_least_a_second_after_the_last(learner, stage):

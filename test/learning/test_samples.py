@@ -12,13 +12,11 @@ from musculoskeletal_ae.learning.collector import SampleCollector
 from musculoskeletal_ae.learning.margin import MARGIN
 from musculoskeletal_ae.learning.rest import RestDetector
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
-from musculoskeletal_ae.robot.kinematics import RACK
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 
 DT = 0.01
-SLIDES = np.array([1.0, RACK])  # travel per radian if the second joint is prismatic
 
 
 def reading(theta, length):
@@ -81,11 +79,6 @@ def test_a_rest_does_not_depend_on_what_was_before_it(before):
         used.reset()
 
 
-def test_a_prismatic_joint_at_a_centimetre_a_second_is_no_rest():
-    assert run(RestDetector(), 3.0, theta=lambda t: 0.01 * t)
-    assert run(RestDetector(radian=SLIDES), 3.0, theta=lambda t: 0.01 * t) == []
-
-
 def test_a_rest_that_ends_early_still_counts():
     rests = run(RestDetector(), 2.0, theta=lambda t: max(0.0, t - 0.6))
     assert len(rests) == 1
@@ -136,13 +129,6 @@ def test_the_store_takes_only_new_postures_and_tensions():
     assert not store.is_new(at(0.04, -0.04))
     assert store.is_new(at(0.06, 0.0))
     assert store.is_new(at(0.0, 0.0)._replace(tension=np.array([61.0])))
-
-
-def test_3_mm_of_a_prismatic_joint_are_a_new_posture():
-    store = SampleStore(radian=SLIDES)
-    store.add(at(0.0, 0.0))
-    assert not store.is_new(at(0.04, 0.0025))
-    assert store.is_new(at(0.0, 0.0035))
 
 
 def test_a_full_store_keeps_the_newest_and_its_coverage():

@@ -119,14 +119,14 @@ def test_errors_within_the_dead_band_are_not_corrected(robot):
 
 def test_60_mm_of_a_prismatic_joint_count_as_one_radian(tmp_path):
     robot = Robot.load(write_robot(tmp_path, slider=True))
-    feedback, slides = rested(robot), robot.kinematics.slides
-    step(feedback, robot, 0.9 * DEADBAND * robot.kinematics.radian, holding(robot))
+    feedback, units = rested(robot), robot.units
+    step(feedback, robot, units.to_theta(np.array([0.0, 0.0, 0.0, 0.0017])), holding(robot))
     assert not feedback.correction.any()
     tension = holding(robot)
     for _ in range(300):
         step(feedback, robot, np.ones(robot.joint_count), tension, dt=0.1)
-    assert feedback.correction[slides] == pytest.approx(0.06 * CORRECTION)
-    assert feedback.correction[~slides] == pytest.approx(CORRECTION)
+    correction = units.to_position(feedback.correction)
+    assert correction == pytest.approx(CORRECTION * np.array([1.0, 1.0, 1.0, 0.06]))
 
 
 def test_without_gain_nothing_is_corrected(robot):

@@ -126,11 +126,11 @@ def test_tolerances_of_unknown_joints_or_not_finite_are_refused_and_zero_means_n
     def one(position, name=ROBOT.joints[1]):
         return SimpleNamespace(name=name, position=position, velocity=0.0, acceleration=0.0)
 
-    assert read_tolerances([], ROBOT.joints).tolist() == [np.inf, np.inf]
-    assert read_tolerances([one(0.1)], ROBOT.joints).tolist() == [np.inf, 0.1]
+    assert read_tolerances([], ROBOT.units).tolist() == [np.inf, np.inf]
+    assert read_tolerances([one(0.1)], ROBOT.units).tolist() == [np.inf, 0.1]
     for none in (0.0, -1.0):
-        assert read_tolerances([one(none)], ROBOT.joints).tolist() == [np.inf, np.inf]
+        assert read_tolerances([one(none)], ROBOT.units).tolist() == [np.inf, np.inf]
     with pytest.raises(MessageError, match='unknown joint'):
-        read_tolerances([one(0.1, 'no_joint')], ROBOT.joints)
+        read_tolerances([one(0.1, 'no_joint')], ROBOT.units)
     with pytest.raises(MessageError, match='not finite'):
-        read_tolerances([one(np.nan)], ROBOT.joints)
+        read_tolerances([one(np.nan)], ROBOT.units)

@@ -68,9 +68,10 @@ def test_a_prismatic_joint_is_held_as_by_a_pinion(control, tmp_path):
             tension = held.step(inputs(mae, theta, limit, robot)).value
         return -mae.muscle_jacobian(theta, tension).T @ tension
 
-    theta = middle - 0.02 * robot.kinematics.radian
+    theta = middle - robot.units.to_theta(np.array([0.02, 0.02, 0.02, 0.0012]))
     extra = torque(theta) - robot.kinematics.holding_torque(theta)
-    np.testing.assert_allclose(extra * robot.kinematics.radian, extra[0], atol=0.1)
+    force = robot.units.to_effort(extra)[-1]
+    np.testing.assert_allclose([*extra[:3], 0.06 * force], extra[0], atol=0.1)
     assert extra[0] > 0.1
 
 

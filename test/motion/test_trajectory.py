@@ -150,7 +150,7 @@ def test_a_refusal_for_a_prismatic_joint_is_in_metres(tmp_path):
     robot = Robot.load(write_robot(tmp_path, slider=True))
     start, still = 0.5 * (robot.lower + robot.upper), np.zeros((1, 4))
     for off, reported in ((0.001, None), (0.01, 'wrist exceeds its limits by 0.01 m')):
-        end = np.append(start[:3], robot.upper[3] + off)
+        end = np.append(start[:3], robot.upper[3] + off / 0.06)
         points = TrajectoryPoints(np.arange(4), np.ones(1), end[None], still, None)
         trajectory = Trajectory.through(Setpoint.resting(start), points)
         with pytest.raises(MessageError, match=reported) if reported else nullcontext():

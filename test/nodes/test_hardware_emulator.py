@@ -5,6 +5,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from geometry_msgs.msg import PoseStamped, WrenchStamped
+from robots import write_robot
 from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
@@ -207,3 +208,12 @@ def test_an_accelerometer_is_published_on_request(graph):
     assert abs(np.linalg.norm([held.x, held.y, held.z]) - 9.81) < 0.5
     with pytest.raises(MusculoskeletalError, match=r'parameter sensors: .*forearm'):
         graph.host(HardwareEmulator, robot='arm26', sensors=['imu:knee'])
+
+
+def test_the_sensor_of_a_prismatic_joint_is_published_in_metres(graph, tmp_path):
+    write_robot(tmp_path / 'slider', slider=True)
+    graph.listen(JointState, 'joint_states')
+    graph.host(HardwareEmulator, robot=str(tmp_path / 'slider'), seed=1)
+    joints = graph.next('joint_states')
+    assert joints.name[-1] == 'wrist'
+    assert -0.01 < joints.position[-1] < 0.06

@@ -7,17 +7,20 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import WrenchStamped
+from robots import write_robot
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, String
 from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.message_reading import read_muscle_states
 from musculoskeletal_ae.motion.methods import first_command
 from musculoskeletal_ae.nodes.controller import Controller
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.sim import Sim
+from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros.messages import LATCHED, array_message
 from musculoskeletal_ae.simulation.simulation import Simulation
 
@@ -210,3 +213,19 @@ def test_preset_paper_runs_and_an_unknown_one_is_refused(graph, arm26, trained_f
     assert np.all((theta >= arm26.lower) & (theta <= arm26.upper))
     with pytest.raises(MusculoskeletalError, match=r'parameter preset: .*default, paper'):
         graph.host(Sim, robot='arm26', preset='magic')
+
+
+def test_a_prismatic_joint_is_fixed_and_published_in_metres(graph, tmp_path):
+    robot = Robot.load(write_robot(tmp_path / 'slider', slider=True))
+    file = tmp_path / 'mae.safetensors'
+    checkpoint.save(initial_mae(robot, steps=300).mae, file)
+    graph.listen(JointState, 'sim/joint_states')
+    graph.host(Sim, robot=str(tmp_path / 'slider'), checkpoint=str(file))
+    fixed = JointState(name=['wrist'], position=[0.03])
+    publisher = graph.publisher(JointState, 'sim/fixed_joint_states')
+
+    def is_there():
+        publisher.publish(fixed)
+        return abs(posture(graph)[-1] - 0.03) < 1e-3
+
+    graph.wait(is_there, 'the wrist at 30 mm')

@@ -14,7 +14,7 @@ from musculoskeletal_ae.design.holding_remedies import remedies
 from musculoskeletal_ae.design.robot_report import plot
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.figures import save_figure
-from musculoskeletal_ae.robot.kinematics import RACK
+from musculoskeletal_ae.robot.joint_units import RACK
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.tools.check_robot import main
@@ -148,10 +148,10 @@ def test_a_prismatic_joint_has_the_stiffness_of_a_pinion_that_moves_it(tmp_path)
     assert held.any()  # premise of this test: the muscles can hold some postures
     theta, tension = result.setting.theta[held], result.tension[held]
     raw, k = robot.routes.muscle_jacobian, robot.muscle_stiffness(theta, tension)
-    mixed = joint_stiffness(raw(theta), muscle_hessian(raw, theta), k, tension)
-    lowest = [
-        eigh(each, np.diag([1.0, 1.0, 1.0, RACK**-2]), eigvals_only=True)[0] for each in mixed
-    ]
+    stiffness = joint_stiffness(raw(theta), muscle_hessian(raw, theta), k, tension)
+    scale = np.array([1.0, 1.0, 1.0, RACK])
+    mixed = stiffness / scale / scale[:, None]  # in the units of the joints
+    lowest = [eigh(each, np.diag(scale**-2), eigvals_only=True)[0] for each in mixed]
     np.testing.assert_allclose(result.stiffness[held], lowest, rtol=1e-6)
 
 

@@ -12,8 +12,9 @@ def full_configuration(robot: Robot, theta):
     """Return the configuration q of the whole URDF at θ, computed without the code under test."""
     model = robot.description.model
     q = pin.neutral(model)
-    for name, angle in zip(robot.joints, theta, strict=True):
-        q[model.joints[model.getJointId(name)].idx_q] = angle
+    position = robot.units.to_position(theta)
+    for name, value in zip(robot.joints, position, strict=True):
+        q[model.joints[model.getJointId(name)].idx_q] = value
     return q
 
 
@@ -80,10 +81,11 @@ def test_end_effector_jacobian_is_the_motion_of_its_pose_in_root_axes(robot):
 
 def test_limits_follow_the_order_of_theta(robot):
     model = robot.description.model
+    lower, upper = (robot.units.to_position(limit) for limit in (robot.lower, robot.upper))
     for k, name in enumerate(robot.joints):
         at = model.joints[model.getJointId(name)].idx_q
-        assert robot.lower[k] == model.lowerPositionLimit[at]
-        assert robot.upper[k] == model.upperPositionLimit[at]
+        assert lower[k] == model.lowerPositionLimit[at]
+        assert upper[k] == model.upperPositionLimit[at]
 
 
 def test_the_order_of_joints_permutes_and_changes_nothing_else(tmp_path):
@@ -135,9 +137,10 @@ def test_joint_inertia_is_the_diagonal_of_the_mass_matrix(robot):
     at = [model.joints[model.getJointId(name)].idx_v for name in robot.joints]
     for theta in robot.random_postures(3, np.random.default_rng(7)):
         q = np.empty(model.nq)
-        q[at] = theta
-        mass = pin.crba(model, model.createData(), q)
-        np.testing.assert_allclose(robot.kinematics.joint_inertia(theta), np.diag(mass)[at])
+        q[at] = robot.units.to_position(theta)
+        mass = np.diag(pin.crba(model, model.createData(), q))[at]
+        inertia = robot.kinematics.joint_inertia(theta)
+        np.testing.assert_allclose(robot.units.to_effort(robot.units.to_effort(inertia)), mass)
 
 
 def test_musashi_reaches_the_postures_of_the_paper():

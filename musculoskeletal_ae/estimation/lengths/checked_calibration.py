@@ -15,7 +15,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.lengths.length_calibration import (
     LengthCalibration,
-    check_stated_posture,
+    stated_theta,
 )
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -27,8 +27,8 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 from musculoskeletal_ae.signals.wiring import Judgement
 
 SHIFTED = 0.02  # use an estimated offset if it differs by more than this from the one in use [m]
-#: Reject a stated posture if a joint sensor differs by more than this [rad]; for prismatic joints
-#: times `kinematics.radian` [m]. A larger difference is due to a wrong posture or a faulty sensor.
+#: Reject a stated posture if a joint sensor differs by more than this [rad]. A larger difference is
+#: due to a wrong posture or a faulty sensor.
 STATED_ERROR = 0.2
 #: compare the stated posture with the median of this number of measured postures, at least and at
 #: most
@@ -39,7 +39,7 @@ class CheckedCalibration:
     """Runs a length calibration, and decides when its offsets are used and count as known.
 
     Attributes:
-        posture: The stated posture of the arm [rad], (D,), or () if it moves gently.
+        posture: The stated posture, as the constructor gets it.
     """
 
     def __init__(self, robot: Robot, mae: Mae | None, posture: tuple[float, ...] = ()) -> None:
@@ -48,7 +48,8 @@ class CheckedCalibration:
         Args:
             robot: The nominal body.
             mae: The network; its isolated muscles are ignored.
-            posture: θ in which the arm stands [rad], (D,); () if it moves gently.
+            posture: Positions of the joints at which the arm stands [rad or m], (D,); () if it
+                moves gently.
 
         Raises:
             MusculoskeletalError: If there is no network, if the posture is not valid, or if no
@@ -59,15 +60,14 @@ class CheckedCalibration:
                 'a length calibration requires a checkpoint; set the parameter `checkpoint`, or '
                 'start the learner'
             )
-        check_stated_posture(robot, posture)
+        self.posture, self._stated = posture, stated_theta(robot, posture)
         if not posture and not robot.tension_source.is_known:
             raise MusculoskeletalError(
                 'without tensions (tension_source: none), lengths can be calibrated only in a '
                 'known posture; hold the arm still and set the parameter zero_posture'
             )
-        self.posture, self._robot = posture, robot
-        stated = np.array(posture) if posture else None
-        self._calibration = LengthCalibration(robot, mae, stated)
+        self._robot = robot
+        self._calibration = LengthCalibration(robot, mae, self._stated)
         self._used: Array | None = None  # offsets in use [m], (M,); None before the first estimate
         #: θ measured last while the arm stands [rad], (D,) each
         self._measured: deque[Array] = deque(maxlen=MOST)
@@ -144,16 +144,17 @@ class CheckedCalibration:
 
     def _posture_problem(self) -> str:
         """Return why the arm does not stand in the stated posture, as a text for users, or ''."""
-        if len(self._measured) < LEAST:
+        if self._stated is None or len(self._measured) < LEAST:
             return ''
-        measured, kinematics = np.median(self._measured, axis=0), self._robot.kinematics
-        difference = np.abs(measured - self.posture) / kinematics.radian
+        measured = np.median(self._measured, axis=0)
+        difference = np.abs(measured - self._stated)
         j = int(difference.argmax())
         if difference[j] <= STATED_ERROR:
             return ''
-        unit, legal = self._robot.units[j].theta, STATED_ERROR * kinematics.radian[j]
+        text = self._robot.units[j].position_text
         return (
-            f'zero_posture states {self.posture[j]:.2f} {unit} for {self._robot.joints[j]}, but '
-            f'its sensor measures {measured[j]:.2f} {unit} (legal: a difference of at most '
-            f'{legal:g} {unit}); correct zero_posture or the sensor, and call estimator/zero again'
+            f'zero_posture states {text(self._stated[j])} for {self._robot.joints[j]}, but '
+            f'its sensor measures {text(measured[j])} (legal: a difference of at most '
+            f'{text(STATED_ERROR, "g")}); correct zero_posture or the sensor, and call '
+            'estimator/zero again'
         )

@@ -223,25 +223,29 @@ class LengthCalibration:
         return ''
 
 
-def check_stated_posture(robot: Robot, posture: tuple[float, ...]) -> None:
-    """Check the posture that a user has stated for a length calibration.
+def stated_theta(robot: Robot, posture: tuple[float, ...]) -> Array | None:
+    """Check the posture that a user has stated for a length calibration, and return its θ.
 
     Args:
         robot: The nominal body.
-        posture: Joint angles [rad], (D,); () means no posture and is legal.
+        posture: Positions of the joints [rad or m], (D,); () means no posture and is legal.
+
+    Returns:
+        θ [rad], (D,); None without a posture.
 
     Raises:
         MusculoskeletalError: If the posture does not have one value for each joint, or is outside
             the joint limits; the text names the legal ranges.
     """
     if not posture:
-        return
-    theta = np.array(posture)
+        return None
+    units = robot.units
+    theta = units.to_theta(np.array(posture)) if len(posture) == len(units) else np.zeros(0)
     # The measured angle of a joint at its stop may slightly exceed the limit.
     beyond = BEYOND_STOP * (robot.upper - robot.lower)
     low, high = robot.lower - beyond, robot.upper + beyond
     if theta.shape == low.shape and ((theta >= low) & (theta <= high)).all():
-        return
-    limits = zip(robot.units, robot.lower, robot.upper, strict=True)
+        return theta
+    limits = zip(units, units.to_position(robot.lower), units.to_position(robot.upper))
     legal = ', '.join(f'{low:.2f} to {high:.2f} {unit.theta}' for unit, low, high in limits)
     raise MusculoskeletalError(f'zero_posture is {list(posture)}; legal: an empty list, or {legal}')

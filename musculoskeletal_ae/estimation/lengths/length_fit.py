@@ -203,7 +203,7 @@ class LengthFit:
         drawn, unbalanced = list[Array](), list[Array]()
         for _ in range(DRAWN_POSTURES // FITTED_POSTURES):
             drawn.append(self._robot.random_postures(FITTED_POSTURES, self._rng))
-            torque = self._model.radian * self._model.torque(drawn[-1], tension)[0]
+            torque = self._model.torque(drawn[-1], tension)[0]
             unbalanced.append(np.linalg.norm(torque, axis=1))
             yield
         first = np.concatenate(drawn)[np.argsort(np.concatenate(unbalanced))[:FITTED_POSTURES]]
@@ -219,7 +219,7 @@ class LengthFit:
             residual = self.used * (length - mae.lengths(theta, tension))
             parts = (
                 residual / COARSE_LENGTH,
-                self._model.outside(theta) / (COARSE_ANGLE * self._model.radian),
+                self._model.outside(theta) / COARSE_ANGLE,
             )
             costs = [np.log1p(each**2).sum(axis=(1, 2)) for each in parts]
             cost[n : n + BATCH] = np.sum(costs, axis=0)
@@ -227,9 +227,7 @@ class LengthFit:
             yield
         order = np.argsort(cost)[:COMPARED_FITS]
         for n in order:
-            torque = (
-                self._model.radian * self._model.torque(postures[n], few.tension)[0] / COARSE_TORQUE
-            )
+            torque = self._model.torque(postures[n], few.tension)[0] / COARSE_TORQUE
             cost[n] += np.log1p(torque**2).sum()
             yield
         best = order[np.argsort(cost[order])][:REFINED_FITS]

@@ -26,9 +26,6 @@ from musculoskeletal_ae.gauss_newton import Equations, RightSides, SolvedStep, s
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-# Constants in rad and N·m are for revolute joints. For a prismatic joint, angles are multiplied by
-# `kinematics.RACK` and become [m], and torques are divided by it and become [N].
-
 LENGTH_NOISE = 0.0004  # standard deviation of the network's error of a length [m]
 #: standard deviation of the network's error of a joint torque, apart from friction [N·m]
 TORQUE_NOISE = 0.4
@@ -70,10 +67,9 @@ class LengthModel:
         """Create the model; `rng` draws the postures over which the torques are compared."""
         self.robot, self._mae = robot, mae
         muscle_count, joint_count = robot.muscle_count, robot.joint_count
-        self.radian = radian = robot.kinematics.radian
         postures = robot.random_postures(64, rng)
-        weight = np.abs(radian * robot.kinematics.weight_torque(postures)).max()
-        moment_arms = np.abs(radian * robot.routes.muscle_jacobian(postures))
+        weight = np.abs(robot.kinematics.weight_torque(postures)).max()
+        moment_arms = np.abs(robot.routes.muscle_jacobian(postures))
         # Joints with a vertical axis have friction although they carry no weight.
         by_bias = (robot.description.tension.bias @ moment_arms).max()
         weight = max(weight, LEAST_WEIGHT * by_bias)
@@ -81,12 +77,11 @@ class LengthModel:
         self.prior_mean: Array = np.repeat([0.0, FRICTION, 0.0, 0.0], counts)
         spread = OFFSET, FRICTION, TENSION_OFFSET, JOINT_FRICTION * weight
         self.prior_spread: Array = np.repeat(spread, counts)
-        self.prior_spread[-joint_count:] /= radian
-        self._torque_noise = TORQUE_NOISE / radian
         self.used = ~np.isin(np.arange(muscle_count), mae.isolated)
         length_weight = np.where(self.used, 1.0, ISOLATED_WEIGHT)
         length_noise = LENGTH_NOISE * _noise_factors(mae) / length_weight
-        self.noise: Array = np.concatenate((length_noise, self._torque_noise, LIMIT_NOISE * radian))
+        of_joints = np.repeat([TORQUE_NOISE, LIMIT_NOISE], joint_count)
+        self.noise: Array = np.concatenate((length_noise, of_joints))
 
     def outside(self, theta: Array) -> Array:
         """Return the excess of postures over the joint limits [rad], (..., D)."""
@@ -138,9 +133,9 @@ class LengthModel:
         torque = unbalanced + joint_friction * turning
         # A stop can carry any torque, so the residual of a joint at its stop means nothing. It is
         # replaced by a typical one, so that the fit neither seeks nor avoids stops.
-        at_stop = AT_STOP * self.radian
-        is_free = (self.robot.lower + at_stop < theta) & (theta < self.robot.upper - at_stop)
-        torque = np.where(is_free, torque, self._torque_noise)
+        low, high = self.robot.lower + AT_STOP, self.robot.upper - AT_STOP
+        is_free = (low < theta) & (theta < high)
+        torque = np.where(is_free, torque, TORQUE_NOISE)
         residuals = [moments.length - offset - length, torque, outside]
         value = np.concatenate(residuals, axis=1) / self.noise
         if not derivatives:
@@ -177,9 +172,8 @@ class MomentFit:
     def __init__(self, model: LengthModel, moments: Moments, theta: Array) -> None:
         """Prepare the fit; the first postures `theta` (K, D) show how the joints turn."""
         self._model, self._moments = model, moments
-        radian = model.radian
-        self._turning = _turning(theta, STICKING * radian)
-        self._largest_step = LARGEST_STEP * radian
+        self._turning = _turning(theta)
+        self._largest_step = np.full(model.robot.joint_count, LARGEST_STEP)
         self._precision = model.prior_spread**-2
         self.usual = self._largest_step**-2, self._precision
         self._by_theta: Array  # ∂residual/∂θ, (K, M + 2D, D)
@@ -235,17 +229,16 @@ class MomentFit:
         return self.point(point.constants + step.common, point.theta + turned)
 
 
-def _turning(theta: Array, sticking: Array) -> Array:
+def _turning(theta: Array) -> Array:
     """Return the direction in which each joint moved last, in [−1, 1], (K, D).
 
-    Args:
-        theta: K consecutive postures [rad], (K, D).
-        sticking: Motion after a reversal over which the direction changes its sign [rad], (D,).
+    After a reversal, the direction changes its sign over a motion of STICKING. `theta` are K
+    consecutive postures [rad], (K, D).
     """
     result, reference = np.zeros_like(theta), theta[0].copy()
     for k, posture in enumerate(theta):
-        reference = np.clip(reference, posture - sticking, posture + sticking)
-        result[k] = (posture - reference) / sticking
+        reference = np.clip(reference, posture - STICKING, posture + STICKING)
+        result[k] = (posture - reference) / STICKING
     return result
 
 

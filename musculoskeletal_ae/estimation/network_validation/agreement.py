@@ -56,7 +56,8 @@ class Comparison(NamedTuple):
 
     name: str
     owners: tuple[str, ...]  # joint or muscle of each entry
-    error: Array  # error of each joint [rad] or muscle [m], or the relative error of all lengths
+    #: error of each joint [rad or m] or muscle [m], or the relative error of all lengths
+    error: Array
     limit: Array  # largest permitted error of each entry
     source: str  # source of the reference
 
@@ -118,7 +119,7 @@ class AgreementCheck:
             tension: Bone-side tensions [N], (N, M).
         """
         angle = ANGLE_MOVED if self._has_learned else ANGLE_MOVED_INITIAL
-        limit = angle * self._robot.kinematics.radian
+        limit = np.full(self._robot.joint_count, angle)
         change = self._length_error(mae, old, tension, self._in_use.lengths(old, tension))
         length_limit = np.full(len(change), LENGTH_MOVED)
         return [
@@ -138,7 +139,7 @@ class AgreementCheck:
         """
         measured = self._messages.theta[rows]
         error, error_in_use = (_median(theta[rows] - measured) for theta in (new, old))
-        least = ANGLE_FLOOR * self._robot.kinematics.radian
+        least = np.full(self._robot.joint_count, ANGLE_FLOOR)
         length_error, length_error_in_use = (
             self._length_error(
                 each, measured, *(part[rows] for part in self._messages.readings(each))
@@ -155,7 +156,8 @@ class AgreementCheck:
         return comparisons
 
     def _angles(self, error: Array, limit: Array, source: str) -> Comparison:
-        return Comparison('θ', self._robot.joints, error, limit, source)
+        outside = self._robot.units.to_position
+        return Comparison('θ', self._robot.joints, outside(error), outside(limit), source)
 
     def _lengths(self, error: Array, limit: Array, source: str) -> Comparison:
         return Comparison('l by ① at θ', self._robot.muscles, error, limit, source)

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Units of the joints: the border between θ and the positions of joints in files and messages.
+
+The core knows one kind of joint. All entries of θ are in [rad], all joint torques in [N·m]. A
+prismatic joint is treated as if a pinion of radius RACK moved it: θ is the angle of the pinion. In
+files, messages and texts, its position is in [m], its torque is a force in [N]. With r = RACK for
+prismatic joints and r = 1 for revolute ones,
+
+    position = r θ,   effort = τ / r,   stiffness outside = K / r²
+
+What reads a position converts it to θ, and what publishes or prints θ converts it back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple, SupportsIndex
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
+
+if TYPE_CHECKING:  # a slow import, which the parameters of the nodes do not need
+    import pinocchio as pin
+
+PRISMATIC = ('JointModelPX', 'JointModelPY', 'JointModelPZ', 'JointModelPrismaticUnaligned')
+#: travel of a prismatic joint that counts as one radian [m]: the radius of the assumed pinion
+RACK = 0.06
+
+
+class JointUnit(NamedTuple):
+    """Units of one joint's position, torque and stiffness outside the core."""
+
+    radian: float  # position of the joint at θ = 1 rad
+    theta: str
+    torque: str
+    stiffness: str
+
+    def position_text(self, theta: float, form: str = '.2f') -> str:
+        """Return the joint's position with its unit, for θ [rad]; `form` is a format."""
+        return f'{theta * self.radian:{form}} {self.theta}'
+
+    def range_text(self, low: float, high: float, form: str = '.2f') -> str:
+        """Return a range of positions with its unit, such as '[0.00, 0.05] m', for θ [rad]."""
+        low, high = low * self.radian, high * self.radian
+        return f'[{low:{form}}, {high:{form}}] {self.theta}'
+
+    def torque_text(self, torque: float, form: str = '.2f') -> str:
+        """Return a joint torque, or the force on a prismatic joint, for a torque in [N·m]."""
+        return f'{torque / self.radian:{form}} {self.torque}'
+
+    def stiffness_text(self, stiffness: float, form: str = '.2f') -> str:
+        """Return a joint stiffness with its unit, for a stiffness in [N·m/rad]."""
+        return f'{stiffness / self.radian**2:{form}} {self.stiffness}'
+
+
+TURN, SLIDE = JointUnit(1.0, 'rad', 'N·m', 'N·m/rad'), JointUnit(RACK, 'm', 'N', 'N/m')
+
+
+class JointUnits:
+    """Names and units of D joints, and conversions between θ and the positions outside."""
+
+    def __init__(self, names: Sequence[str], slides: Sequence[bool]) -> None:
+        """State the names of the joints, in the order of θ, and whether each is prismatic."""
+        self.names = tuple(names)
+        self._units = tuple(SLIDE if is_prismatic else TURN for is_prismatic in slides)
+        #: whether each joint is prismatic, (D,)
+        self.slides: Bools = np.array(slides, dtype=bool)
+        #: position of each joint at θ = 1 rad [rad or m], (D,)
+        self.radian: Array = np.array([unit.radian for unit in self._units])
+
+    @classmethod
+    def of_model(cls, model: pin.Model, joints: Sequence[str]) -> JointUnits:
+        """Return the units of some joints of a pinocchio model."""
+        kinds = [model.joints[model.getJointId(name)].shortname() for name in joints]
+        return cls(joints, [kind in PRISMATIC for kind in kinds])
+
+    def __getitem__(self, joint: SupportsIndex) -> JointUnit:
+        return self._units[joint]
+
+    def __len__(self) -> int:
+        return len(self._units)
+
+    def __iter__(self) -> Iterator[JointUnit]:
+        return iter(self._units)
+
+    def to_theta(self, position: Array, joints: Ints | slice | int = slice(None)) -> Array:
+        """Return θ [rad], (..., D), for positions, velocities or accelerations of the joints.
+
+        Args:
+            position: Values in [rad] or [m], (..., D).
+            joints: Indices of the joints in the last axis, or the index of the only joint; by
+                default all.
+        """
+        theta: Array = position / self.radian[joints]
+        return theta
+
+    def to_position(self, theta: Array, joints: Ints | slice | int = slice(None)) -> Array:
+        """Return positions, velocities or accelerations in [rad] or [m]: inverse of `to_theta`."""
+        position: Array = theta * self.radian[joints]
+        return position
+
+    def covariance_of_positions(self, covariance: Array) -> Array:
+        """Return the covariance of the positions for that of θ [rad²], (D, D) each."""
+        result: Array = self.radian[:, None] * covariance * self.radian
+        return result
+
+    def to_effort(self, torque: Array) -> Array:
+        """Return torques and forces [N·m or N], (..., D), for joint torques [N·m], (..., D)."""
+        effort: Array = torque / self.radian
+        return effort
+
+    def to_stiffness(self, stiffness: Array) -> Array:
+        """Return joint stiffnesses [N·m/rad], (D,), for those in [N·m/rad or N/m], (D,)."""
+        result: Array = stiffness * self.radian**2
+        return result
+
+    def elasticity_to_core(self, outside: JointElasticity) -> JointElasticity:
+        """Return springs and dampers in [N·m] and [rad] for those in the units of the joints."""
+        return outside.scaled(self.radian)
+
+    def elasticity_outside(self, elasticity: JointElasticity) -> JointElasticity:
+        """Return springs and dampers in the units of the joints: the inverse."""
+        return elasticity.scaled(1.0 / self.radian)
+
+    @property
+    def distance_unit(self) -> str:
+        """Unit of a distance ‖Δθ‖ between postures, for texts."""
+        return f'rad ({1e3 * RACK:g} mm = 1 rad)' if self.slides.any() else 'rad'
+
+    @property
+    def position_unit(self) -> str:
+        """Units of positions in a list of all joints, such as 'rad or m'."""
+        return ' or '.join(sorted({unit.theta for unit in self}, reverse=True))
