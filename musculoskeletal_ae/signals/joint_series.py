@@ -114,7 +114,7 @@ def judge_series(robot: Robot, time: Array, theta: Array) -> JointSeries:
             is_outside[n, j] = stream.newest[j] is JointReading.OUTSIDE
         for j, series in stream.impossible(now).items():
             lasting[j, series.since] = series.until
-    if _has_wrong_scale(robot, time, theta, is_outside):
+    if _has_wrong_scale(time, theta, is_outside):
         return JointSeries(theta, 0.0, '', '')
     for (j, since), until in lasting.items():
         usable[(since <= time) & (time <= until), j] = np.nan
@@ -214,11 +214,10 @@ def _largest_changes(time: Array) -> Array:
     return changes
 
 
-def _has_wrong_scale(robot: Robot, time: Array, theta: Array, is_outside: Bools) -> bool:
+def _has_wrong_scale(time: Array, theta: Array, is_outside: Bools) -> bool:
     """Return whether readings are outside the limits because of their unit, sign or zero.
 
     Args:
-        robot: The robot.
         time: Times of the messages [s], (N,).
         theta: Measured θ [rad], (N, D).
         is_outside: Which readings are far outside the limits, (N, D).
