@@ -92,7 +92,7 @@ def test_samples_and_network_come_back_to_the_bit(tmp_path, arm26, initial):
     store = SampleStore()
     for sample in (
         plain,
-        plain._replace(spread=np.full(2, 0.02), gravity=gravity, body_version=3, isolated=(1, 4)),
+        plain._replace(spread=np.full(2, 0.02), gravity=gravity, isolated=(1, 4)),
     ):
         store.add(sample)
     store.forget(1, newest=1)
