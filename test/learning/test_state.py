@@ -240,7 +240,7 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
     network = initial_mae(small, 'default', steps=2).mae
     store = SampleStore()
     for _ in range(4):
-        theta, *parts, spread, gravity, _, _ = stage.sample()
+        theta, *parts, spread, gravity, _ = stage.sample()
         measured = theta, *(part[kept] for part in parts), spread, gravity
         # In the robot without the added muscle, this index is that of the muscle after it.
         store.add(Sample(*measured, isolated=(added,)))
