@@ -42,8 +42,8 @@ TOPICS = 'joint_states,muscle_states,muscle_length_command,robot_description'
 # `teaching` is short; it also contains the demonstration, the pushes and the commands.
 TEACHING_RATE = 50.0  # [Hz]
 TAUGHT = ',muscle_tension_command,estimated_joint_states,joint_trajectory'
-LEFT_OUT = ',anomaly_detected,isolated_muscles,target_joint_states'  # of `isolation`
-ANOMALY = ',anomaly,anomaly_detected'  # of `rupture`: A before and after the muscle is cut
+LEFT_OUT = ',body_state,target_joint_states'  # of `isolation`
+ANOMALY = ',anomaly,body_state'  # of `rupture`: A before and after the muscle is cut
 PUSHED = 'hardware_emulator/external_wrench'
 POSTURE = [0.2, -0.6, 0.1, -1.2, 0.0]  # [rad]
 

@@ -537,10 +537,8 @@ class Attack:
 LATCHING = (
     'mae_checkpoint',
     'accepted_checkpoint',
-    'anomaly_detected',
-    'isolated_muscles',
+    'body_state',
     'joint_sensor_trust',
-    'muscle_length_zeros',
     'rejected_checkpoint',
 )
 KINDS_OF = {'muscle_states': 'Float64MultiArray', 'anomaly': 'Float64'}

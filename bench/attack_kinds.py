@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from rcl_interfaces.srv import SetParameters
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
+from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from bench.attack_graph import COOLING, NODES, OWN, PATIENCE, Attack, digest, set_request
@@ -26,7 +26,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import LENGTH_SCALE
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.ros.messages import LATCHED, array_message, bytes_message
-from musculoskeletal_ae.signals.body_state import LengthOffsets
+from musculoskeletal_ae.signals.body_state import Anomaly, BodyState, LengthOffsets
 
 MOMENTS = 'holding', 'exploring'
 LASTING = 4.0  # duration of an attack [s]
@@ -229,44 +229,60 @@ class Scene:
         return self.attack.genuine[topic]
 
 
-def _zeros(scene: Scene, offset: float, deviation: float) -> Float64MultiArray:
+def _body(
+    scene: Scene,
+    offset: float = 0.0,
+    deviation: float = 0.0,
+    isolated: Sequence[int] = (),
+    anomaly: Anomaly = Anomaly.NONE,
+) -> Float64MultiArray:
+    """Return a false body state, with offsets of alternating sign."""
     muscles = scene.attack.robot.muscle_count
     sign = np.where(np.arange(muscles) % 2, 1.0, -1.0)
     offsets = LengthOffsets(sign * offset, np.full(muscles, deviation))
-    false = replace(offsets, generation=scene.rng.randrange(1, 2**50))
-    return array_message(false.rows, 'quantity', 'muscle')
+    suspect = None if anomaly is Anomaly.NONE else 0
+    generation = scene.rng.randrange(1, 2**50)
+    body = BodyState(offsets, tuple(isolated), anomaly, suspect, generation)
+    return array_message(body.rows, 'quantity', 'muscle')
 
 
 def zeros_unknown_then_false(scene: Scene) -> None:
     """Publish unknown length offsets, then false ones."""
-    scene.latch('muscle_length_zeros', _zeros(scene, 0.0, 1.0), _zeros(scene, OFFSET, 1e-3))
+    scene.latch('body_state', _body(scene, 0.0, 1.0), _body(scene, OFFSET, 1e-3))
 
 
 def zeros_false(scene: Scene) -> None:
     """Publish false length offsets."""
-    scene.latch('muscle_length_zeros', _zeros(scene, OFFSET, 1e-3))
+    scene.latch('body_state', _body(scene, OFFSET, 1e-3))
 
 
 def zeros_alternating(scene: Scene) -> None:
     """Publish alternating length offsets."""
-    pair = [_zeros(scene, OFFSET, 1e-3), _zeros(scene, -OFFSET, 1e-3)]
-    scene.latch('muscle_length_zeros', *pair * 10)
+    pair = [_body(scene, OFFSET, 1e-3), _body(scene, -OFFSET, 1e-3)]
+    scene.latch('body_state', *pair * 10)
 
 
 def isolate_most(scene: Scene) -> None:
     """Isolate most muscles."""
-    scene.latch('isolated_muscles', String(data=','.join(scene.attack.robot.muscles[:-1])))
+    most = range(scene.attack.robot.muscle_count - 1)
+    scene.latch('body_state', _body(scene, isolated=most))
 
 
 def isolate_all(scene: Scene) -> None:
     """Isolate all muscles."""
-    scene.latch('isolated_muscles', String(data=','.join(scene.attack.robot.muscles)))
+    muscles = range(scene.attack.robot.muscle_count)
+    scene.latch('body_state', _body(scene, isolated=muscles))
 
 
 def isolate_in_turns(scene: Scene) -> None:
     """Isolate changing sets of muscles."""
-    names = [String(data=name) for name in (*scene.attack.robot.muscles, '')]
-    scene.latch('isolated_muscles', *names)
+    each = [_body(scene, isolated=[m]) for m in range(scene.attack.robot.muscle_count)]
+    scene.latch('body_state', *each, _body(scene))
+
+
+def _denials(scene: Scene) -> list[Float64MultiArray]:
+    """Return body states by which there was no anomaly, or the anomaly has ended."""
+    return [_body(scene, anomaly=each) for each in (Anomaly.NONE, Anomaly.ENDED)]
 
 
 def deny_an_anomaly(scene: Scene) -> None:
@@ -278,7 +294,7 @@ def deny_an_anomaly(scene: Scene) -> None:
         attack.wait(
             lambda: attack.situation.detected, 'a rupture is detected', f'rupture of {muscle}'
         )
-        scene.publish('anomaly_detected', Bool(data=False), qos=LATCHED)
+        scene.publish('body_state', *_denials(scene), qos=LATCHED)
         attack.call(Trigger, 'controller/reset')
         attack.call(SetBool, 'controller/explore', SetBool.Request(data=True))
         attack.spin(LASTING)
@@ -294,7 +310,7 @@ def deny_and_go(scene: Scene) -> None:
             'a rupture is detected',
             'rupture of the first muscle',
         )
-        scene.publish('anomaly_detected', *[Bool(data=False)] * 3, qos=LATCHED)
+        scene.publish('body_state', *_denials(scene), qos=LATCHED)
         attack.end_strangers()
         attack.spin(0.5)
         answer = attack.call(Trigger, 'controller/reset')
@@ -457,12 +473,13 @@ def random_event(scene: Scene) -> None:
         scene.publish('target_joint_states', message, period=0.0)
 
     def false_state() -> None:
-        topic, message = rng.choice((
-            ('isolated_muscles', String(data=rng.choice(robot.muscles))),
-            ('muscle_length_zeros', _zeros(scene, rng.choice((OFFSET, -OFFSET)), 1e-3)),
-            ('anomaly_detected', Bool(data=rng.random() < 0.5)),
+        message = rng.choice((
+            _body(scene, isolated=[rng.randrange(robot.muscle_count)]),
+            _body(scene, rng.choice((OFFSET, -OFFSET)), 1e-3),
+            _body(scene, anomaly=rng.choice((Anomaly.NONE, Anomaly.FOUND))),
+            _body(scene, anomaly=Anomaly.ENDED),
         ))  # fmt: skip
-        scene.publish(topic, message, qos=LATCHED)
+        scene.publish('body_state', message, qos=LATCHED)
         attack.end_strangers()
 
     def suspend() -> None:

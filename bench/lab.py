@@ -21,7 +21,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -204,7 +203,6 @@ class Lab:
         self._estimates: list[Array] = []
         self._command: Array | None = None  # length command for the driver [m], (M,)
         self._published_body: BodyState | None = self.estimator.body
-        self._published_anomaly = False
         self._published_trust = self.estimator.joint_trust
 
     # -- time -----------------------------------------------------------------------------------
@@ -283,30 +281,28 @@ class Lab:
     def publish(self) -> None:
         """Send what has changed in the estimator to the other nodes."""
         core = self.estimator
-        detected = bool(core.cause)
-        if detected != self._published_anomaly:
-            self._published_anomaly = detected
-            self._to_controller.append(partial(self._tell_controller, detected))
-            self._to_learner.append(lambda: self.learner.anomaly(detected))
-            doubtful = self.validator.mae
-            older = self.validator.anomaly(detected, self.now)
-            if older is not None and doubtful is not None:
-                self._use(older)
-                self._reject(doubtful, 'an anomaly was detected soon after it was accepted')
         if (trust := core.joint_trust) is not self._published_trust:
             self._published_trust = trust
             self.validator.forget()
             self._to_learner.append(lambda: self.learner.use_joint_trust(trust))
         if core.body is not self._published_body:
-            self._published_body = core.body
-            self.validator.isolated = core.body.isolated
-            self.validator.forget()
-            body = core.body
+            before, body = self._published_body, core.body
+            self._published_body = body
             self._to_controller.append(lambda: self.controller.use_body(body))
             self._to_learner.append(lambda: self.learner.use_body(body))
+            self.validator.isolated = body.isolated
+            if before is None or body.offsets != before.offsets:
+                self.validator.forget()
+            if body.has_anomaly != (before is not None and before.has_anomaly):
+                self._follow_anomaly(body.has_anomaly)
 
-    def _tell_controller(self, detected: bool) -> None:
-        self.controller.anomaly(detected)
+    def _follow_anomaly(self, detected: bool) -> None:
+        """Replace a network that was accepted shortly before an anomaly."""
+        doubtful = self.validator.mae
+        older = self.validator.anomaly(detected, self.now)
+        if older is not None and doubtful is not None:
+            self._use(older)
+            self._reject(doubtful, 'an anomaly was detected soon after it was accepted')
 
     def _validate(self, candidate: Mae) -> None:
         """Let the estimator validate a network of the learner and, if it is accepted, use it."""
@@ -319,7 +315,6 @@ class Lab:
             self._reject(candidate, str(error))
             return
         self._use(self.validator.with_detector(candidate, self.now))
-        self.estimator.keep_isolated()
 
     def choose_network(self, mae: Mae) -> bool:
         """Let a user choose a network for the estimator; return whether it is accepted."""
@@ -397,10 +392,11 @@ class Lab:
         robot = self.arm.robot
         self._process_of(node).restart(self.now + RESTARTING)
         if node == ESTIMATOR:
-            self.estimator = Estimator(robot)
+            left = self.estimator.body  # a real estimator saves it
+            self.estimator = Estimator(robot, first_generation=left.generation + 1)
+            self.estimator.isolate(left.isolated)
             self.validator = CheckpointValidator(robot)
             self._candidate, self._published_body = None, None
-            self._published_anomaly = False
             self._published_trust = self.estimator.joint_trust
             self._estimates.clear()
             self.before_step.append(self._start_estimator(self.now + RESTARTING))
@@ -413,7 +409,6 @@ class Lab:
             if former.mae is not None:
                 core.use(former.mae)
             core.use_body(self.estimator.body)
-            core.anomaly(bool(self.estimator.cause))
         else:
             before = self.learner
             with tempfile.TemporaryDirectory() as name:
@@ -423,7 +418,6 @@ class Lab:
                 learner = Learner(robot, seed=0, steps=STEPS, trainer=Seldom, directory=Path(name))
                 learner.keeper.close()
             learner.use_body(self.controller.stream.body)
-            learner.anomaly(self._published_anomaly)
             self.learner = learner
 
     def _start_estimator(self, at: float) -> Callable[[Lab], None]:

@@ -81,7 +81,7 @@ class Loop:
         self.estimator, self.controller = Estimator(robot), Controller(robot, seed=seed)
         self.estimator.use(mae)
         self.controller.use(mae)
-        self._offsets, self._detected = self.estimator.body.offsets, False
+        self._offsets = self.estimator.body.offsets
 
     def step(self) -> Output | None:
         """Simulate one message; return the results of the estimator."""
@@ -93,16 +93,13 @@ class Loop:
         message = read.message(self.driver.arm.robot)
         with suppress(RejectionError):
             output = estimator.take(message, now, now)
-        if estimator.body.offsets is not self._offsets:
+        if estimator.body is not controller.stream.body:
             self._offsets = estimator.body.offsets
             controller.use_body(estimator.body)
         with suppress(RejectionError):
             controller.take(message, now)
         if output is not None:
             controller.estimated(output.state.theta, now)
-        if bool(estimator.cause) != self._detected:
-            self._detected = bool(estimator.cause)
-            controller.anomaly(self._detected)
         if (command := controller.step(now)) is not None:
             self.driver.command(command.value + self._offsets.offset)
             estimator.commanded(now, length=command.value)

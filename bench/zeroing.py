@@ -73,7 +73,7 @@ class Loop:
         message = read.message(self.arm.robot)
         estimate = estimator.take(message, now, now)
         zeros = estimator.body.offsets
-        if zeros is not self._zeros:
+        if zeros != self._zeros:
             control.use_body(estimator.body)
             self._zeros = zeros
         if estimate is not None:

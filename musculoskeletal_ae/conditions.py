@@ -64,13 +64,13 @@ class Reaction(Enum):
     """Consequence of a finding: what the estimator does about it."""
 
     WARN = 'reports it'
-    STOP = 'raises anomaly_detected, which stops the arm'
+    STOP = 'latches an anomaly, which stops the arm'
     ISOLATE = (
-        'raises anomaly_detected, which stops the arm; with `on_anomaly: isolate`, isolates and '
+        'latches an anomaly, which stops the arm; with `on_anomaly: isolate`, isolates and '
         'verifies the muscle'
     )
     ISOLATE_AT_ONCE = (
-        'raises anomaly_detected, which stops the arm; with `on_anomaly: isolate`, isolates the '
+        'latches an anomaly, which stops the arm; with `on_anomaly: isolate`, isolates the '
         'muscle without a stop and without a verification instead'
     )
     ISOLATE_ONLY = 'with `on_anomaly: isolate`, isolates the muscle without a stop'
@@ -432,8 +432,9 @@ class ConditionKind(Enum):
         'length_offsets_not_saved',
         'estimator',
         'warn',
-        'the file that keeps the length offsets for the next estimator cannot be written',
-        'the length offsets are not on disk',
+        'the file that keeps length offsets and isolated muscles for the next estimator cannot be '
+        'written',
+        'length offsets and isolated muscles are not on disk',
         (Step.FREE_DISK,),
     )
 
@@ -506,7 +507,7 @@ class ConditionKind(Enum):
         'anomaly_detected',
         'controller',
         'error',
-        'anomaly_detected is true; the estimator reports the finding',
+        'an anomaly is present; the estimator reports the finding',
         'the estimator has found a fault, which it reports',
         (Step.RESET_CONTROLLER,),
         Stop(Action.RELEASE, _VERIFICATION),

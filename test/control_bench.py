@@ -15,6 +15,7 @@ from musculoskeletal_ae.control.command import LENGTH, Pull, unchanging
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import Anomaly
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 ROBOT = Robot.load('arm26')
@@ -106,6 +107,22 @@ class Bench:
 
     def isolate(self, muscles):
         self.core.use_body(self.core.stream.body.with_isolated(muscles))
+
+    def find(self, muscle=0):
+        """Let the estimator find a fault of a muscle."""
+        self.core.use_body(self.core.stream.body.with_anomaly(Anomaly.FOUND, muscle))
+
+    def verify(self, muscle):
+        """Let the estimator find a fault of a muscle, isolate and verify it."""
+        body = self.core.stream.body.with_anomaly(Anomaly.VERIFYING, muscle)
+        self.core.use_body(body.with_isolated([*body.isolated, muscle]))
+
+    def end_anomaly(self, isolated=None):
+        """Let the estimator end the anomaly; `isolated` are the muscles isolated from then on."""
+        body = self.core.stream.body
+        isolated = body.isolated if isolated is None else isolated
+        ended = body.with_anomaly(Anomaly.ENDED, body.suspect).with_isolated(isolated)
+        self.core.use_body(ended)
 
     def stop(self):
         self.core.stop(ConditionKind.OPERATOR)

@@ -13,6 +13,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,12 +25,13 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
-from std_msgs.msg import Float64MultiArray, String, UInt8MultiArray
+from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from musculoskeletal_ae.conditions import CONDITIONS, Condition, from_json
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros.executor import LeanExecutor
 from musculoskeletal_ae.ros.messages import LATCHED, array_message, bytes_message
+from musculoskeletal_ae.signals.body_state import ROWS, BodyState
 
 DEADLINE = 180.0  # longest wait on a loaded machine; then the test fails [s]
 PATIENCE = 600.0  # longest time until a process writes its next line or ends [s]
@@ -293,6 +295,21 @@ class Graph:
         self.wait(future.done, f'an answer of {client.srv_name}')
         return future.result()
 
+    def tell_body(self, body: BodyState) -> None:
+        """Publish a body state, as the estimator does."""
+        publisher = self.publisher(Float64MultiArray, 'body_state', LATCHED)
+        publisher.publish(array_message(body.rows, 'quantity', 'muscle'))
+
+    def follow_body(self, topic: str = 'body_state') -> list[BodyState]:
+        """Return a list to which each published body state is appended."""
+        bodies: list[BodyState] = []
+
+        def take(message: Float64MultiArray) -> None:
+            bodies.append(BodyState.of_rows(np.reshape(message.data, (ROWS, -1))))
+
+        self.node.create_subscription(Float64MultiArray, topic, take, LATCHED)
+        return bodies
+
     def set_parameter(self, node: str, name: str, value: Any) -> tuple[bool, str]:
         """Set a parameter of another node; return success and reason."""
         message: ParameterMessage = Parameter(name, value=value).to_parameter_msg()
@@ -312,7 +329,8 @@ class Graph:
 
 def no_number_of(graph: Graph, robot: Robot, muscle: str) -> Callable[[], None]:
     """Isolate a muscle; return a function that publishes states with its tension as NaN."""
-    graph.publisher(String, 'isolated_muscles', LATCHED).publish(String(data=muscle))
+    body = BodyState.healthy(robot.muscle_count).with_isolated([robot.muscles.index(muscle)])
+    graph.tell_body(replace(body, generation=1))
     publisher = graph.publisher(Float64MultiArray, 'muscle_states')
     rows = np.tile([[0.0], [61.0], [25.0]], robot.muscle_count)
     rows[1, robot.muscles.index(muscle)] = np.nan

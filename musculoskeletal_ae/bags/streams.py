@@ -5,7 +5,7 @@ import heapq
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import chain
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LATEST
 from musculoskeletal_ae.bags.timed_messages import TimedMessages
-from musculoskeletal_ae.bags.topics import interface_topics
+from musculoskeletal_ae.bags.topics import EARLIER, interface_topics
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.message_reading import (
     joints_not_finite,
@@ -150,13 +150,16 @@ class _ArmStreams:
         self._muscle_stream = MuscleStream(robot)
         self.had_offsets: list[bool] = []
         muscles = robot.muscle_count
+        self._bodies: list[BodyState] = []
+        self._body = _Stream((ROWS, muscles), self._body_rows)
         self._isolated = _Stream((muscles,), self._isolated_mask)
-        self._offsets = _Stream((ROWS, muscles), self._offset_rows)
+        self._offsets = _Stream((3, muscles), self._offset_rows)
         self.by_topic = {
             'joint_states': _Stream((robot.joint_count,), self._posture),
             'muscle_states': _Stream((3, muscles), self._muscle_states),
             'muscle_length_command': _Stream((muscles,), self._command),
             'muscle_tension_command': _Stream((muscles,), self._command),
+            'body_state': self._body,
             'isolated_muscles': self._isolated,
             'muscle_length_zeros': self._offsets,
         }
@@ -170,7 +173,7 @@ class _ArmStreams:
     def _muscle_states(self, message: Any, arrival: Arrival) -> Array:
         stream = self._muscle_stream
         now = arrival.received_at
-        stream.use_body(_body_at(now, stream.body, self._isolated, self._offsets))
+        stream.use_body(self._body_at(now, stream.body))
         reading = self._interface.reading(message)
         sample = stream.take(reading, now, delay=arrival.delay)
         self.had_offsets.append(stream.body.offsets.known)
@@ -179,16 +182,58 @@ class _ArmStreams:
     def _command(self, message: Any, _: Arrival) -> Array:
         return read_array(message, 1, self._robot.muscle_count)
 
+    def _body_rows(self, message: Any, _: Arrival) -> Array:
+        body = BodyState.of_rows(read_array(message, ROWS, self._robot.muscle_count))
+        self._bodies.append(body)
+        return body.rows
+
     def _offset_rows(self, message: Any, _: Arrival) -> Array:
         muscles = self._robot.muscle_count
         if len(message.data) == 2 * muscles:  # recorded with version 0.1.0: without trust
             offsets = LengthOffsets(*read_array(message, 2, muscles))
-            return replace(offsets, generation=len(self._offsets.values) + 1).rows
-        return LengthOffsets.of_rows(read_array(message, ROWS, muscles)).rows
+        else:  # with trust, and a generation
+            offset, deviation, trust, _ = read_array(message, 4, muscles)
+            offsets = LengthOffsets(offset, deviation, trust)
+        return BodyState.of_rows(BodyState(offsets).rows).offsets.rows
 
     def _isolated_mask(self, message: Any, _: Arrival) -> Array:
         indices = self._robot.muscle_indices(read_names(message))
         return np.isin(np.arange(self._robot.muscle_count), indices).astype(float)
+
+    def isolated(self) -> Series:
+        """Return which muscles are isolated from when on: 1 for isolated muscles, else 0."""
+        time, rows = self._body.series()
+        return Series(time, rows[:, ISOLATED_ROW]) if len(time) else self._isolated.series()
+
+    def _body_at(self, time: float, before: BodyState) -> BodyState:
+        """Return the body state at a time [s] of the recording; `before` if nothing has changed.
+
+        Before the first message, its isolated muscles hold, and its offsets if they are known: it
+        was published before the bag began, but the recorder received it a little late.
+        """
+        if not self._bodies:
+            return self._earlier_body_at(time, before)
+        number = int(np.searchsorted(self._body.times, time, side='right'))
+        body = self._bodies[max(number - 1, 0)]
+        if number == 0 and not body.offsets.known:
+            body = body.with_offsets(before.offsets)
+        return before if body == before else body
+
+    def _earlier_body_at(self, time: float, before: BodyState) -> BodyState:
+        """Return the body state from the two topics of a recording of an earlier version.
+
+        Arguments and result are as in `_body_at`.
+        """
+        body, isolated, offsets = before, self._isolated, self._offsets
+        if isolated.values:
+            newest = isolated.values[_latched(isolated.times, time)]
+            body = body.with_isolated(np.flatnonzero(newest))
+        if offsets.values:
+            number = int(np.searchsorted(offsets.times, time, side='right'))
+            known = LengthOffsets(*offsets.values[max(number - 1, 0)])
+            if (number or known.known) and known != body.offsets:
+                body = body.with_offsets(known)
+        return body
 
 
 #: reasons of rejection that another number or names of muscles or joints explain
@@ -200,7 +245,8 @@ CHECK_DRIVER = (
 )
 #: topics of the body state; they are read before all others, because the recorder may have received
 #: a body state only after the first readings to which it applies
-BODY_TOPICS = 'isolated_muscles', 'muscle_length_zeros'
+BODY_TOPICS = 'body_state', *EARLIER
+ISOLATED_ROW = 3  # row of a body state that tells which muscles are isolated
 
 
 def read_streams(
@@ -213,8 +259,8 @@ def read_streams(
     """Read sensor data and commands of one arm.
 
     Muscle states pass through the same `MuscleStream` as on a robot, which rejects and counts
-    implausible messages. Each length is corrected by the newest length offsets on the topic
-    `muscle_length_zeros`. If the first offsets on this topic are known, they also correct earlier
+    implausible messages. Each length is corrected by the length offsets of the newest body state
+    (topic `body_state`). If the offsets of the first one are known, they also correct earlier
     lengths. Muscle states that were received while offsets were unknown are rejected.
 
     False readings of joint sensors are left out (`signals/joint_series.py`).
@@ -251,9 +297,7 @@ def read_streams(
     optional = f'{recorded.get("joint_states")} as joint_states'
     _check_fit(bag, {key: each for key, each in used.items() if key != optional}, warnings)
     notes = (messages.note,) if messages.note else ()
-    joints, states, lengths, tensions, isolated, _ = (
-        stream.series() for stream in arm.by_topic.values()
-    )
+    joints, states, lengths, tensions, *_ = (stream.series() for stream in arm.by_topic.values())
     is_known = np.array(arm.had_offsets, dtype=bool)
     if not is_known.all():
         reason = f'{labels["muscle_states"]}: length offsets unknown'
@@ -262,7 +306,7 @@ def read_streams(
     judged = judge_series(robot, joints.time, joints.values)
     is_usable, times_read = np.isfinite(judged.theta).any(axis=1), joints.time
     joints = Series(joints.time[is_usable], judged.theta[is_usable])
-    series = joints, states, lengths, tensions, isolated
+    series = joints, states, lengths, tensions, arm.isolated()
     false = times_read[~is_usable]
     return Streams(*series, reception.rejected, reception.ignored, notes, judged, false)
 
@@ -347,28 +391,3 @@ def _latched(times: ArrayLike, when: ArrayLike) -> Any:
     may have been published before recording began.
     """
     return np.maximum(np.searchsorted(times, when, side='right') - 1, 0)
-
-
-def _body_at(time: float, before: BodyState, isolated: _Stream, offsets: _Stream) -> BodyState:
-    """Return the isolated muscles and length offsets that held at a time [s] of the recording.
-
-    Args:
-        time: Time since the bag's start [s].
-        before: The body state at the previous message; it is returned if nothing has changed.
-        isolated: The recorded isolated muscles.
-        offsets: The recorded length offsets.
-    """
-    body = before
-    if isolated.values:
-        body = body.with_isolated(np.flatnonzero(isolated.values[_latched(isolated.times, time)]))
-    if offsets.values:
-        # Number of messages with offsets so far. If the first one has known offsets, it was
-        # published before the bag began, but the recorder received it a little late.
-        number = int(np.searchsorted(offsets.times, time, side='right'))
-        if number == 0 and LengthOffsets.of_rows(offsets.values[0]).known:
-            number = 1
-        if number:
-            newest = LengthOffsets.of_rows(offsets.values[number - 1])
-            if newest.generation != body.offsets.generation:
-                body = body.with_offsets(newest)
-    return body

@@ -26,6 +26,11 @@ DEFAULT, ALL = 'default', 'all'  # selections of topics
 
 TOPICS = read_table(__file__, 'topics.yaml', dict[str, Topic])
 SENT = [name for name, topic in TOPICS.items() if topic.sent]
+#: topics that recordings of earlier versions have instead of `body_state`
+EARLIER = {
+    'isolated_muscles': Topic('std_msgs/msg/String', latched=True),
+    'muscle_length_zeros': Topic(ARRAY, latched=True),
+}
 
 
 def topics_with(motors: MotorTopics) -> dict[str, Topic]:
@@ -44,8 +49,8 @@ def interface_topics(
 ) -> dict[str, str]:
     """Return the recorded name of each topic of the interface, by its relative name.
 
-    If a ros2_control robot has a topic for its motor states, this topic is returned as
-    `muscle_states`.
+    The topics of `EARLIER` are included. If a ros2_control robot has a topic for its motor states,
+    this topic is returned as `muscle_states`.
 
     Args:
         bag: The recording.
@@ -57,7 +62,7 @@ def interface_topics(
             missing, or if a topic has another type than the interface.
     """
     names = _relative_names(bag, namespace, motors)
-    topics = topics_with(motors)
+    topics = topics_with(motors) | EARLIER
     ours = {relative: name for name, relative in names.items() if relative in topics}
     for relative, name in ours.items():
         _compare_type(bag, name, topics[relative].type)
@@ -68,7 +73,7 @@ def interface_topics(
         recorded = ours['muscle_states'] = ours[state_topic]
         if interface_name(recorded) == 'joint_states':
             ours.setdefault('joint_states', recorded)
-    return {name: recorded for name, recorded in ours.items() if name in TOPICS}
+    return {name: recorded for name, recorded in ours.items() if name in TOPICS | EARLIER}
 
 
 def select(

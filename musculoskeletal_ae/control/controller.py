@@ -10,9 +10,9 @@ computes the commands (`follower`, `ramps`, `torque`, `exploration`, `calibratin
 passes the limiter before it is published.
 
 Plans assume that isolated muscles have no tension, and the modules of isolated muscles are
-commanded to keep the tendons slack. A muscle that is isolated during an anomaly is the suspect.
-While the arm is stopped, the suspect is wound in slightly to verify the fault. The arm resumes when
-the verification has ended the anomaly, unless another stop cause needs a reset.
+commanded to keep the tendons slack. While the estimator verifies a suspect, the arm is stopped, and
+the suspect is wound in slightly. The arm resumes when the verification has ended the anomaly,
+unless another stop cause needs a reset.
 
 `now` is the time of a steady clock [s], and `time` is the time of the messages' clock [s].
 """
@@ -52,7 +52,7 @@ from musculoskeletal_ae.motion.torque import GravityCompensation, TorqueControl
 from musculoskeletal_ae.motion.trajectory import Setpoint
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import BodyState
+from musculoskeletal_ae.signals.body_state import Anomaly, BodyState
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence, check_posture
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
@@ -61,14 +61,8 @@ RESTORE = 'call estimator/restore to use isolated muscles again'
 GUIDED = (
     'with method `float`, the arm is guided by hand; set the parameter `method` to another method'
 )
-#: Longest time by which the message on the isolation of a suspect may precede the message on its
-#: anomaly [s]. It is also the longest time that the estimator needs to revoke the length offsets
-#: after a jump of lengths.
+#: longest time that the estimator needs to revoke the length offsets after a jump of lengths [s]
 REACTION_TIME = 1.0
-#: Time after which a verification is abandoned if its suspect is not isolated any more, although
-#: the anomaly lasts [s]. When a verification ends, the message on the anomaly may come this much
-#: later than the message on the isolated muscles.
-LOST_TIME = 3.0
 #: longest time that a length calibration needs for its first estimate [s]; if messages arrive at
 #: 10 Hz, it needs 3.5 s
 FIRST_ESTIMATE = 5.0
@@ -155,47 +149,6 @@ class Activities:
         return control.step(inputs)
 
 
-class Suspicion:
-    """Determines which muscle the estimator suspects of causing the present anomaly.
-
-    The estimator reports the anomaly and the isolation of the suspect in two messages, which may
-    arrive in either order.
-    """
-
-    def __init__(self) -> None:
-        self._isolated: tuple[int, float] | None = None  # last isolated muscle, and its time [s]
-        self._anomaly_at = math.inf
-        self._lost_at = math.inf  # time since which there is an anomaly, but no suspect [s]
-
-    def note_anomaly(self, now: float) -> None:
-        """Record that an anomaly was detected."""
-        self._anomaly_at = now
-
-    def note_isolated(self, muscle: int, now: float) -> None:
-        """Record that a muscle was isolated."""
-        self._isolated = muscle, now
-
-    def suspect(self, has_anomaly: bool, isolated: tuple[int, ...]) -> int | None:
-        """Return the suspect, or None if no muscle is suspected.
-
-        Args:
-            has_anomaly: Whether an anomaly is present.
-            isolated: Indices of all isolated muscles.
-        """
-        if not has_anomaly or self._isolated is None:
-            return None
-        muscle, at = self._isolated
-        return muscle if muscle in isolated and at > self._anomaly_at - REACTION_TIME else None
-
-    def note_lost(self, is_lost: bool, now: float) -> None:
-        """Record whether there is an anomaly without a suspect."""
-        self._lost_at = min(self._lost_at, now) if is_lost else math.inf
-
-    def is_lost(self, now: float) -> bool:
-        """Return whether there has been an anomaly without a suspect for LOST_TIME."""
-        return now - self._lost_at > LOST_TIME
-
-
 class Controller:
     """Computes motor commands from targets, the estimated posture and muscle states.
 
@@ -241,7 +194,6 @@ class Controller:
         self.sent_at = 0.0  # time of the last publication [s]; set by the caller
         self._estimate_problem = Persistence()
         self._jumped_at = math.inf  # time of the last jump of lengths [s]
-        self._suspicion = Suspicion()
         #: number of messages after which the filtered muscle states are newer than the last pause
         self._awaited_samples = 0
         if self.settings.method == 'float':
@@ -338,21 +290,30 @@ class Controller:
         self.estimate = theta
 
     def use_body(self, body: BodyState) -> None:
-        """Apply a body state: isolated muscles and length offsets."""
+        """Apply a body state: length offsets, isolated muscles and the anomaly."""
         before = self.stream.body
-        if body.offsets is not before.offsets:
+        if body.offsets != before.offsets:
             self._use_offsets(body)
         self.stream.use_body(body)
-        if body.isolated == before.isolated:
-            return
-        self.robot = self.robot.without(body.isolated)
-        self.target_state.unreachable_reason = ''
-        self._use_parts()
-        if self.mae is not None:
-            self.activities.follower.plan_anew()
-        if added := set(body.isolated) - set(before.isolated):
-            self._suspicion.note_isolated(max(added), self.watchdog.steps.stepped_at)
-        self._note_suspect()
+        if body.isolated != before.isolated:
+            self.robot = self.robot.without(body.isolated)
+            self.target_state.unreachable_reason = ''
+            self._use_parts()
+            if self.mae is not None:
+                self.activities.follower.plan_anew()
+        self._use_anomaly(body)
+
+    def _use_anomaly(self, body: BodyState) -> None:
+        """Stop the arm while an anomaly is present; resume after the verification of a suspect."""
+        self.watchdog.has_anomaly = body.has_anomaly
+        is_verified = body.anomaly is Anomaly.VERIFYING
+        self.stopping.suspect = body.suspect if is_verified else None
+        if body.has_anomaly:
+            self.stop(ConditionKind.ANOMALY)
+        if body.anomaly is Anomaly.ENDED:
+            self.supervisor.on_verified()
+        else:
+            self.supervisor.on_suspect(is_verified)
 
     def _use_offsets(self, body: BodyState) -> None:
         before = self.stream.body.offsets
@@ -374,30 +335,6 @@ class Controller:
         """Pass robot and settings to all parts."""
         for part in (self.watchdog, self.planner, self.activities, self.limiter, self.stopping):
             part.use(self.robot, self.settings)
-
-    def anomaly(self, detected: bool) -> None:
-        """Record whether an anomaly is present.
-
-        A detected anomaly stops the arm. When the anomaly has ended, the arm resumes unless
-        another stop cause needs a reset.
-        """
-        if detected and not self.watchdog.has_anomaly:
-            self._suspicion.note_anomaly(self.watchdog.steps.stepped_at)
-        self.watchdog.has_anomaly = detected
-        if detected:
-            self.stop(ConditionKind.ANOMALY)
-        else:
-            self.supervisor.on_verified()
-        self._note_suspect()
-
-    def _note_suspect(self) -> None:
-        isolated = self.stream.body.isolated
-        suspect = self._suspicion.suspect(self.watchdog.has_anomaly, isolated)
-        self.stopping.suspect = suspect
-        is_lost = self.watchdog.has_anomaly and suspect is None
-        self._suspicion.note_lost(is_lost, self.watchdog.steps.stepped_at)
-        if suspect is not None:
-            self.supervisor.on_suspect(True)
 
     def clock_jumped_back(self) -> None:
         """Adapt to a backward jump of the messages' clock.
@@ -601,7 +538,7 @@ class Controller:
         present = self.stop_conditions(now)
         stale_estimate = any(each.kind is ConditionKind.STALE_ESTIMATE for each in present)
         # If estimates are missing, the estimator may have restarted without the suspect.
-        if stale_estimate or self._suspicion.is_lost(now):
+        if stale_estimate:
             self.supervisor.on_suspect(False)
         if self.limiter.command is not None or not self.supervisor.is_running:
             # Before the first command, causes do not stop the arm, because it does not move yet.

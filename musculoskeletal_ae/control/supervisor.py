@@ -47,10 +47,9 @@ class Event(Enum):
     LATCHING_CAUSE = 'any other cause'
     CLEARED = 'no cause for 0.2 s'
     RELEASED = 'hold_time is over and the arm is released'
-    SUSPECT = 'the estimator has isolated a suspect muscle'
-    SUSPECT_LOST = 'the estimator has stopped, or has no suspect any more'
+    SUSPECT = 'the estimator verifies a suspect muscle'
+    NOT_VERIFIED = 'the estimator has stopped or verifies nothing, or another cause needs a reset'
     VERIFIED = 'verification ended the anomaly, and no cause needs a reset'
-    VERIFIED_IN_VAIN = 'verification ended the anomaly, but another cause needs a reset'
     NOTHING_PRESENT = 'no cause is present'
     RESET = 'controller/reset without a cause present'
 
@@ -73,9 +72,8 @@ TRANSITIONS: dict[tuple[StopState, Event], StopState] = {
     (_S.PAUSED, _E.RESET): _S.RUNNING,
     (_S.STOPPED, _E.SUSPECT): _S.VERIFYING,
     (_S.STOPPED, _E.RESET): _S.RUNNING,
-    (_S.VERIFYING, _E.SUSPECT_LOST): _S.STOPPED,
+    (_S.VERIFYING, _E.NOT_VERIFIED): _S.STOPPED,
     (_S.VERIFYING, _E.VERIFIED): _S.RESUMING,
-    (_S.VERIFYING, _E.VERIFIED_IN_VAIN): _S.STOPPED,
     (_S.VERIFYING, _E.RESET): _S.RUNNING,
     (_S.RESUMING, _E.LATCHING_CAUSE): _S.STOPPED,
     (_S.RESUMING, _E.NOTHING_PRESENT): _S.RUNNING,
@@ -230,21 +228,21 @@ class Supervisor:
         if released:
             self._fire(Event.RELEASED)
 
-    def on_suspect(self, is_isolated: bool) -> None:
+    def on_suspect(self, is_verified: bool) -> None:
         """Start or abandon the verification of a suspect muscle.
 
         `on_verified` ends a verification that is complete.
 
         Args:
-            is_isolated: True if the estimator has isolated a suspect. False if it has no suspect
-                any more although the anomaly lasts, or if estimates are missing: the estimator may
-                then have restarted, and would no longer have a suspect.
+            is_verified: True if the estimator verifies a suspect. False if it does not although it
+                has ended no anomaly, or if estimates are missing: the estimator may then have
+                restarted, and would no longer have a suspect.
         """
-        self._fire(Event.SUSPECT if is_isolated else Event.SUSPECT_LOST)
+        self._fire(Event.SUSPECT if is_verified else Event.NOT_VERIFIED)
 
     def on_verified(self) -> None:
         """Resume if a verification has ended the anomaly and no cause needs a reset."""
-        self._fire(Event.VERIFIED if self._is_verifiable else Event.VERIFIED_IN_VAIN)
+        self._fire(Event.VERIFIED if self._is_verifiable else Event.NOT_VERIFIED)
 
     def on_reset(self, present: Sequence[Condition]) -> Condition | None:
         """End the stop, and return None; if a cause is still present, return the first one instead.

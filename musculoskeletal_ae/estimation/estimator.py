@@ -6,10 +6,11 @@
                          │                ▼                              ▼              ▼
                      BodyState ◄── LengthCalibration              ContactEstimator   SuspectHandling
                          ▲                                                              │
-                         └────────────── isolated muscles ──────────────────────────────┘
+                         └───────── isolated muscles, anomaly ──────────────────────────┘
 
-The body state consists of the isolated muscles and the length offsets. When they change, only the
-estimator creates a new body state, which its node publishes. `length_trust.py` decides which length
+The body state consists of the length offsets, the isolated muscles and the anomaly. When one of
+them changes, only the estimator creates a new body state, which its node publishes.
+`length_trust.py` decides which length
 offsets are known; the other parts provide evidence. During a length calibration, only the
 detectors that do not need lengths report findings. `suspects.py` describes the sequence from a
 rupture to resuming.
@@ -17,6 +18,7 @@ rupture to resuming.
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -88,7 +90,7 @@ class Estimator:
 
     Attributes:
         robot: The nominal body, with all muscles.
-        body: Isolated muscles and length offsets.
+        body: The body state, with a new generation after each change.
         trust: Decides which length offsets are known.
         stream: Converts messages into samples.
         heat: Thermal models of the muscle modules.
@@ -116,11 +118,12 @@ class Estimator:
         Args:
             robot: The nominal body.
             preset: Name of the preset that provides the detectors.
-            first_generation: Generation of the first change of the length offsets.
+            first_generation: Generation of the first body state; larger than those of all body
+                states before a restart.
         """
         self.robot = robot
-        self.trust = LengthTrust(robot.muscle_count, first_generation)
-        self.body = BodyState(self.trust.offsets)
+        self.trust = LengthTrust(robot.muscle_count)
+        self.body = BodyState(self.trust.offsets, generation=first_generation)
         self.stream = MuscleStream(robot, self.body)
         self.heat = Heat(robot)
         self.state = StateEstimator()
@@ -139,9 +142,6 @@ class Estimator:
         self.joint_check = JointCheck(robot)
         #: usable readings of the joint sensors [rad] and their times [s], (2, D); NaN if unknown
         self._readings = np.full((2, robot.joint_count), np.nan)
-        #: whether `mae.isolated` of a new network decides which muscles are isolated; this ends
-        #: with the first finding or call of `isolate` or `keep_isolated`
-        self._follows_network = True
 
     @property
     def mae(self) -> Mae | None:
@@ -187,42 +187,33 @@ class Estimator:
     def use(self, mae: Mae) -> None:
         """Use another network and its healthy statistics, without the isolated muscles.
 
-        The network determines the isolated muscles until the first finding or call of `isolate` or
-        `keep_isolated`; from then on, this estimator determines them. A running length calibration
-        starts again, because its estimate depends on the network.
+        A running length calibration starts again, because its estimate depends on the network.
 
         Raises:
             numpy.linalg.LinAlgError: If the network's statistics are singular; the previous network
                 then stays in use.
         """
-        isolated = mae.isolated if self._follows_network else self.body.isolated
-        reduced = mae.without(isolated)
+        reduced = mae.without(self.body.isolated)
         self.health.use(reduced)
         self.joint_check.use(reduced)
         self.contact.use(reduced)
         self.mounting.use(reduced)
         self.stream.use_transmission(reduced.transmission)
-        self.state.use(mae, isolated)
-        self._use_body(self.body.with_isolated(isolated))
+        self.state.use(mae, self.body.isolated)
         if self.calibration is not None:
             posture = self.calibration.posture
             self.calibration = CheckedCalibration(self.robot, reduced, posture)
-
-    def keep_isolated(self) -> None:
-        """Keep the present isolated muscles even if another network is used later."""
-        self._follows_network = False
 
     def isolate(self, muscles: Iterable[int]) -> None:
         """Isolate exactly these muscles (indices in T and l), and restore all others.
 
         Restoring a suspect ends its verification; the finding stays latched.
         """
-        self._follows_network = False
-        body = self.body.with_isolated(muscles)
-        has_changed = body is not self.body
-        self._use_body(body)
-        self.suspects.on_isolated(body.isolated)
-        if has_changed and self.state.complete_mae is not None:
+        before = self.body.isolated
+        isolated = self.body.with_isolated(muscles).isolated
+        self.suspects.on_isolated(isolated)
+        self._update_body(isolated=isolated)
+        if isolated != before and self.state.complete_mae is not None:
             self.use(self.state.complete_mae)
         self.health.reset()
 
@@ -299,8 +290,8 @@ class Estimator:
         if verification is not None and verification.muscle in restored:
             raise MusculoskeletalError(
                 f'{self.robot.muscles[verification.muscle]} is being verified, which ends by '
-                f'itself within {LONGEST:g} s; wait until anomaly_detected is false, then call '
-                'estimator/restore again if the muscle is still isolated'
+                f'itself within {LONGEST:g} s; wait until then, and call estimator/restore again '
+                'if the muscle is still isolated'
             )
         if problems := list(filter(None, map(self._repair_problem, restored))):
             again = 'then call estimator/restore again'
@@ -472,11 +463,18 @@ class Estimator:
     ) -> None:
         """Decide by new evidence on length offsets, and use the result (`LengthTrust.take`)."""
         if self.trust.take(evidence, muscles, found):
-            self._use_body(self.body.with_offsets(self.trust.offsets))
+            self._update_body(offsets=self.trust.offsets)
 
-    def _use_body(self, body: BodyState) -> None:
-        self.body = body
-        self.stream.use_body(body)
+    def _update_body(self, **changes: Any) -> None:
+        """Change attributes of the body state, and the anomaly as `suspects` says.
+
+        A body state that differs from the one before has the next generation.
+        """
+        suspects, before = self.suspects, self.body
+        body = replace(before, anomaly=suspects.anomaly, suspect=suspects.suspect, **changes)
+        if body != before:
+            self.body = replace(body, generation=before.generation + 1)
+            self.stream.use_body(self.body)
 
     def _measured_theta(self, readings: Array) -> Array | None:
         """Return fresh readings (D,), or None if a joint sensor has none or is not used."""
@@ -552,16 +550,14 @@ class Estimator:
         isolated = self.suspects.take(finding, self.body.isolated, now)
         if set(isolated) != set(self.body.isolated):
             self.isolate(isolated)
+        self._update_body()
         if is_repair:
             self._note(Evidence.MOVED, [finding.muscle])
             self.health.reset()  # evidence from before the repair is no longer valid
             return False
         if finding.kind.revokes is not None and finding.muscle not in self.body.isolated:
             self._note(finding.kind, [finding.muscle] if finding.is_of_one_length else None)
-        is_latched = before is None and self.suspects.finding is not None
-        if is_latched:
-            self._follows_network = False
-        return is_latched
+        return before is None and self.suspects.finding is not None
 
     def _verify(self, sample: MuscleSample, estimate: Estimate, dt: float, now: float) -> None:
         verification, mae = self.suspects.verification, self.mae
@@ -584,6 +580,7 @@ class Estimator:
     def _clear(self, isolated: tuple[int, ...]) -> None:
         if isolated != self.body.isolated:
             self.isolate(isolated)
+        self._update_body()
         self.health.reset()
 
     def _calibrate(

@@ -6,7 +6,7 @@ The sequence after the rupture of a tendon, with `on_anomaly: isolate`:
  1. Rupture. The muscle has no tension, and its readings disagree with the other muscles.
  2. Finding. A detector of `health.py` names the muscle: after about half a second if the modules
     keep T_bias, otherwise as soon as the tendon should carry load. The finding is latched: the
-    estimator publishes `anomaly_detected`, and the controller stops the arm.
+    estimator publishes a body state with an anomaly, and the controller stops the arm.
  3. Isolation. The suspect is isolated immediately: estimation and control continue without it.
  4. Verification. The controller winds the suspect in by a few millimetres. `verification.py`
     classifies its response: ruptured, jammed, sensor fault, or healthy.
@@ -52,6 +52,7 @@ from musculoskeletal_ae.estimation.verification import (
 )
 from musculoskeletal_ae.remedy import REPAIR
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import Anomaly
 
 ACQUITTALS = 2  # number of suspects verified as healthy after which the next one is not verified
 WITHIN = 60.0  # time during which a suspect verified as healthy counts [s]
@@ -67,6 +68,8 @@ class SuspectHandling:
     Attributes:
         settings: Settings with `on_anomaly`.
         finding: The latched finding, or None.
+        suspect: Index of the muscle that the newest latched finding names, also after its end; None
+            before the first.
         verification: The running verification of the suspect, or None.
         last_verdict: Index of the last verified suspect, or of a muscle isolated without a
             verification, and its verdict; None before the first.
@@ -77,10 +80,20 @@ class SuspectHandling:
         self._robot = robot
         self.settings = Settings()
         self.finding: Finding | None = None
+        self.suspect: int | None = None
         self.verification: Verification | None = None
         self.last_verdict: tuple[int, VerificationVerdict] | None = None
         self.faults: dict[int, VerificationVerdict] = {}
         self._acquitted: list[float] = []  # times at which suspects were verified as healthy [s]
+
+    @property
+    def anomaly(self) -> Anomaly:
+        """What has become of the newest latched finding."""
+        if self.suspect is None:
+            return Anomaly.NONE
+        if self.finding is None:
+            return Anomaly.ENDED
+        return Anomaly.FOUND if self.verification is None else Anomaly.VERIFYING
 
     @property
     def cause(self) -> str:
@@ -121,9 +134,9 @@ class SuspectHandling:
         if self.finding is not None:
             if finding.kind.revokes is not None and self.finding.kind.revokes is None:
                 isolated = self.clear(isolated)  # the earlier finding is based on wrong lengths
-                self.finding = finding
+                self.finding, self.suspect = finding, muscle
             return isolated
-        self.finding = finding
+        self.finding, self.suspect = finding, muscle
         recent = [time for time in self._acquitted if now - time < WITHIN]
         may_isolate = isolates and finding.kind.reaction is Reaction.ISOLATE
         if not may_isolate or len(recent) >= ACQUITTALS:

@@ -73,11 +73,15 @@ class IsolatingLoop(ClosedLoop):
         """Connect an arm at rest."""
         self.estimator = Estimator(arm.robot, mae.preset)
         self.estimator.configure(EstimatorSettings(on_anomaly='isolate'))
-        self._latched, self.isolated = False, tuple[int, ...]()
         #: isolated muscles and the reason, after each verification
         self.verdicts: list[tuple[tuple[int, ...], str]] = []
         self.error = np.nan  # ‖θ_est − θ‖ at the last message [rad]
         super().__init__(arm, mae, Settings(), seed)
+
+    @property
+    def isolated(self) -> tuple[int, ...]:
+        """Indices of the muscles that the controller does not use."""
+        return self.core.stream.body.isolated
 
     def use(self, mae: Mae) -> None:
         """Use a network for estimation, detection and control."""
@@ -85,18 +89,15 @@ class IsolatingLoop(ClosedLoop):
         self.estimator.use(mae)
 
     def estimate(self, read: Readings, now: float) -> Array:
-        """Estimate θ [rad] (D,), and report anomalies and isolations as the estimator node does."""
+        """Estimate θ [rad] (D,), and pass the body state on as the estimator node does."""
         core, true = self.estimator, self.arm.theta
         estimate = core.take(read.message(self.arm.robot), now, now)
         assert estimate is not None
-        if bool(core.cause) != self._latched:
-            self._latched = bool(core.cause)
-            self.core.anomaly(self._latched)
-            if not self._latched:
-                self.verdicts.append((core.body.isolated, core.suspects.last_verification))
-        if core.body.isolated != self.isolated:
-            self.isolated = core.body.isolated
+        before = self.core.stream.body
+        if core.body is not before:
             self.core.use_body(core.body)
+            if before.has_anomaly and not core.body.has_anomaly:
+                self.verdicts.append((core.body.isolated, core.suspects.last_verification))
         self.error = float(np.linalg.norm(estimate.state.theta - true))
         return estimate.state.theta
 

@@ -6,8 +6,8 @@
     gravity ─────────────────────────────────────┴► paired by time (`pairing`)
          ─► at rest (`rest`) ─► no anomaly near (`margin`) ─► new (`samples`)
 
-Values of isolated muscles are replaced by 0 before messages are paired. A sample contains the
-version of the body state at that time, and the muscles that were isolated then.
+Values of isolated muscles are replaced by 0 before messages are paired. A sample names the muscles
+that were isolated when it was taken.
 """
 
 from collections import Counter
@@ -190,7 +190,6 @@ class SampleCollector:
             message.sliding,
             self._spread,
             gravity,
-            self.body.version,
             self.body.isolated,
         )
         self._margin.pass_time(dt)
@@ -223,22 +222,22 @@ class SampleCollector:
     # -- changes of state -----------------------------------------------------------------------
 
     def use_body(self, body: BodyState) -> None:
-        """Use another body state for samples from now on; discard incomplete samples."""
+        """Use another body state from now on.
+
+        Incomplete samples are discarded, unless only the anomaly has changed. No samples are
+        collected from shortly before an anomaly until shortly after its reset.
+        """
+        before = self.body
         self._stream.use_body(body)
-        self.healthy.use_isolated(body.isolated)
-        self.reset()
+        if lost := self._margin.set_anomaly(body.has_anomaly):
+            self.rejected['anomaly'] += lost
+        if (body.offsets, body.isolated) != (before.offsets, before.isolated):
+            self.healthy.use_isolated(body.isolated)
+            self.reset()
 
     def use_joint_trust(self, trust: JointTrust) -> None:
         """Use another trust in the joint sensors for readings from now on."""
         self.joint_trust = trust
-
-    def set_anomaly(self, is_anomaly: bool) -> None:
-        """Set whether an anomaly is present.
-
-        No samples are collected from shortly before an anomaly until shortly after its reset.
-        """
-        if lost := self._margin.set_anomaly(is_anomaly):
-            self.rejected['anomaly'] += lost
 
     def reset(self) -> None:
         """Discard incomplete samples, for example after a backward jump of the clock."""

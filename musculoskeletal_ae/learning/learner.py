@@ -21,7 +21,6 @@ way as the messages of a robot, except that training takes no time.
 import math
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -118,10 +117,6 @@ class Learner:
         self.joint_history = JointHistory(samples, robot.joint_count)
         self._time = -math.inf  # time of the last message [s]
         self._jumps = 0  # number of jumps of lengths so far
-        if self.samples:
-            # Use a higher body-state version than those of the saved samples, so that no version
-            # repeats.
-            self._use_body(replace(self.body, version=self.samples.body_version + 1))
         if saved is not None:
             self._start(saved)
             return
@@ -218,7 +213,7 @@ class Learner:
 
     @property
     def body(self) -> BodyState:
-        """The body state: length offsets and isolated muscles."""
+        """The body state, of which the learner uses offsets, isolated muscles and anomaly."""
         return self.collector.body
 
     @property
@@ -234,18 +229,18 @@ class Learner:
     def use_body(self, body: BodyState) -> None:
         """Use another body state from now on.
 
-        Isolated muscles are not learned. While the length offsets are unknown, learning pauses.
-        Samples that were taken under wrong length offsets are dropped or corrected
-        (`offset_history`); all others are kept.
+        Isolated muscles are not learned. While the length offsets are unknown, or an anomaly is
+        present, learning pauses. Samples that were taken under wrong length offsets are dropped or
+        corrected (`offset_history`); all others are kept.
         """
         isolated_before = self.isolated
         self._use_body(body)
         if body.isolated != isolated_before:
             self.scheduler.note_news()
-            self._publish_isolation()
+        self._publish_isolation()
 
     def _use_body(self, body: BodyState) -> None:
-        offsets, has_changed = body.offsets, body.offsets is not self.body.offsets
+        offsets, has_changed = body.offsets, body.offsets != self.body.offsets
         if has_changed:
             self.keeper.reset()
         self.collector.use_body(body)
@@ -277,11 +272,6 @@ class Learner:
         if unused:
             self.reset()
         self._note_new_samples()
-
-    def anomaly(self, detected: bool) -> None:
-        """Stop learning if an anomaly is `detected`; resume learning otherwise."""
-        self.collector.set_anomaly(detected)
-        self._publish_isolation()
 
     def _publish_isolation(self) -> None:
         """Publish the network with the isolated muscles, except while an anomaly is present."""

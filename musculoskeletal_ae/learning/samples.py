@@ -44,8 +44,7 @@ class Sample(NamedTuple):
     spread: Array = NOTHING
     #: direction of gravity in the frames of the tree's joints, (3J,); NaN or empty without an IMU
     gravity: Array = NOTHING
-    #: version of the `BodyState` under which the sample was taken, and the muscles isolated then
-    body_version: int = 0
+    #: indices of the muscles that were isolated when the sample was taken
     isolated: tuple[int, ...] = ()
 
 
@@ -230,11 +229,6 @@ class SampleStore:
             used = ~np.isin(np.arange(len(by)), sample.isolated)
             self.samples[i] = sample._replace(length=sample.length + by * used)
         return len(places)
-
-    @property
-    def body_version(self) -> int:
-        """The newest body-state version among the stored samples; 0 if there are none."""
-        return max((sample.body_version for sample in self.samples), default=0)
 
     def clear(self) -> None:
         """Forget all samples."""

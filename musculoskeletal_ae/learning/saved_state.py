@@ -23,7 +23,8 @@ Values = tuple[float, ...]
 class SavedSample(msgspec.Struct, frozen=True, array_like=True):
     """One `Sample` with its number and the muscles that it describes, as in `StoredSample`.
 
-    `isolated` are indices into the muscles of the saved state.
+    `isolated` are indices into the muscles of the saved state. `unused` is 0; states of earlier
+    versions have another number there.
     """
 
     number: int
@@ -34,7 +35,7 @@ class SavedSample(msgspec.Struct, frozen=True, array_like=True):
     spread: Values
     gravity: Values
     known: tuple[bool, ...]
-    body_version: int
+    unused: int
     isolated: tuple[int, ...]
 
 
@@ -85,7 +86,7 @@ def _saved(stored: StoredSample) -> SavedSample:
         spread,
         gravity,
         tuple(stored.known.tolist()),
-        sample.body_version,
+        0,
         sample.isolated,
     )
 
@@ -178,9 +179,7 @@ def _restored(saved: SavedSample, state: SavedState, robot: Robot) -> StoredSamp
     known[places] = saved.known
     spread, gravity = np.array(saved.spread), np.array(saved.gravity)
     isolated = tuple(sorted(places[muscle] for muscle in saved.isolated))
-    sample = Sample(
-        theta, tension, length, direction, spread, gravity, saved.body_version, isolated
-    )
+    sample = Sample(theta, tension, length, direction, spread, gravity, isolated)
     return StoredSample(sample, known, saved.number)
 
 

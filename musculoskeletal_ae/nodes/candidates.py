@@ -41,17 +41,14 @@ class Candidates:
         queue: Queue in which the candidates from the topic wait; it validates them in small steps.
     """
 
-    def __init__(
-        self, node: Shell, use: Callable[[Mae], None], on_candidate: Callable[[], None]
-    ) -> None:
+    def __init__(self, node: Shell, use: Callable[[Mae], None]) -> None:
         """Start without a network.
 
         Args:
             node: The estimator.
             use: Called with each network that the estimator is to use from now on.
-            on_candidate: Called when a candidate from the topic was accepted.
         """
-        self._node, self._use, self._on_candidate = node, use, on_candidate
+        self._node, self._use = node, use
         self.validator = CheckpointValidator(node.robot)
         self._accepted = node.create_publisher(UInt8MultiArray, ACCEPTED, LATCHED)
         self._rejected = node.create_publisher(KeyValue, REJECTED, LATCHED)
@@ -103,7 +100,6 @@ class Candidates:
         except CheckpointError as error:
             self._reject(mae, str(error))
             raise
-        self._on_candidate()
 
     def _reject(self, mae: Mae, reason: str) -> None:
         self._rejected.publish(KeyValue(key=str(mae.version), value=printable(reason)))

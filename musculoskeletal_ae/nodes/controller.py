@@ -2,9 +2,9 @@
 """The node `controller`: computes muscle commands for a target posture, with a latched safe stop.
 
 target_joint_states, joint_trajectory, target_pose, target_twist, estimated_joint_states,
-muscle_states, anomaly_detected, isolated_muscles → muscle_length_command, or muscle_tension_command
-with the methods `tension` and `float`; controller_state, controller_mode. Action
-follow_joint_trajectory, where control_msgs is installed.
+muscle_states, body_state → muscle_length_command, or muscle_tension_command with the methods
+`tension` and `float`; controller_state, controller_mode. Action follow_joint_trajectory, where
+control_msgs is installed.
 """
 
 import time
@@ -94,7 +94,7 @@ class Controller(Shell):
         for name in parameters_of(Settings):
             self.parameters.on_change(name, self.core.configure, lambda _: self._settings())
         self.needed.add('muscle_states', 'estimated_joint_states')
-        self.follow_offsets(self._use_body)
+        self.follow_body(lambda: self.core.use_body(self.body))
         self.sources.watch(*AUTHORS)
         self.follow_muscle_messages(self._muscles)
         self.listen(JointState, 'estimated_joint_states', self._on_estimate, SENSOR)
@@ -111,8 +111,6 @@ class Controller(Shell):
             self.action = module.FollowJointTrajectory(
                 self, kind, self.core, self._trajectory, refuse
             )
-        self.follow_anomaly(self._anomaly)
-        self.follow_isolated(self._use_body)
         serve(self, SetBool, 'controller/explore', self._explore)
         serve(self, Trigger, 'controller/stop', self._stop)
         serve(self, Trigger, 'controller/reset', self._reset)
@@ -162,14 +160,8 @@ class Controller(Shell):
                 f'{problem}; legal: {legal}; or let the driver subscribe to muscle_tension_command'
             )
 
-    def _use_body(self) -> None:
-        self.core.use_body(self.body)
-
     def _muscles(self, message: Float64MultiArray, now: float, delay: float) -> None:
         self.core.take(message, now, delay)
-
-    def _anomaly(self, detected: bool) -> None:
-        self.core.anomaly(detected)
 
     def on_intruders(self, intruders: str) -> None:
         """Stop while another node publishes a topic that belongs to one of the arm's nodes."""

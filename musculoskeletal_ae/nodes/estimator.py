@@ -2,8 +2,8 @@
 """The node `estimator`: estimates joint angles from muscle length and tension, detects anomalies.
 
 muscle_states → estimated_joint_states with estimated_joint_covariance, estimated_muscle_states,
-anomaly, anomaly_detected, estimated_external_wrench, isolated_muscles, muscle_length_zeros,
-joint_sensor_trust, estimated/markers; on request muscle_joint_states and /tf.
+anomaly, body_state, joint_sensor_trust, estimated_external_wrench, estimated/markers; on request
+muscle_joint_states and /tf.
 mae_checkpoint → accepted_checkpoint, the networks that have passed the validation, and
 rejected_checkpoint, the versions of those that have not.
 marker_pose → vision_joint_states, the joint angles measured by a camera.
@@ -19,17 +19,18 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, Vector3, WrenchStamped
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, Float64, Float64MultiArray, String
+from std_msgs.msg import Float64, Float64MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
+from musculoskeletal_ae.estimation.body_memory import BodyMemory
 from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.estimation.estimator import Output
 from musculoskeletal_ae.estimation.lengths.length_calibration import stated_theta
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
-from musculoskeletal_ae.estimation.lengths.offset_memory import OffsetMemory
 from musculoskeletal_ae.estimation.settings import Settings
+from musculoskeletal_ae.estimation.verification import VerificationVerdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.message_reading import read_pose
@@ -48,7 +49,6 @@ from musculoskeletal_ae.ros.messages import (
     serve,
 )
 from musculoskeletal_ae.ros.second_publishers import AUTHORS
-from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, RejectionError
 
@@ -60,22 +60,17 @@ class Estimator(Shell):
 
     def __init__(self, **options: Any) -> None:
         super().__init__('estimator', **options)
-        self.memory = OffsetMemory(self.state_directory(), self.robot.muscles)
+        self.memory = BodyMemory(self.state_directory(), self.robot.muscles)
         found = self.memory.found
-        # The time distinguishes the decisions of this estimator from those of an earlier one.
+        # The time distinguishes the body states of this estimator from those of an earlier one.
         generation = max(time.time_ns() // 1_000_000, 0 if found is None else found.generation + 1)
         self.core = Core(self.robot, self.parameter('preset'), generation)
-        # After a restart of this node, the learner's first network determines which muscles are
-        # isolated. `keep_isolated` ensures that later networks do not change that.
-        self.candidates = Candidates(self, self._use, self.core.keep_isolated)
+        self.candidates = Candidates(self, self._use)
         self._advertise()
         self.sources.watch(*OWN_TOPICS)
-        # Last values published on the latched topics; None if nothing was published yet.
-        self.published_anomaly = False
-        self.published_isolated: tuple[int, ...] | None = None
-        self.published_offsets: LengthOffsets | None = None
-        self.published_trust: JointTrust | None = None
-        self.detected.publish(Bool(data=self.published_anomaly))
+        self.published_trust: JointTrust | None = None  # None if none was published yet
+        #: the last logged verdict on a muscle, with its index
+        self.logged_verdict: tuple[int, VerificationVerdict] | None = None
         self.needed.add('muscle_states')
         if not self.get_parameter('use_sim_time').value:  # simulated time may be slow
             self.needed.expect_rate('muscle_states', self.rate)
@@ -84,24 +79,25 @@ class Estimator(Shell):
         self.follow_parameter('zero_posture', self._on_posture)
         if self.parameter('zero_at_start'):
             self.core.distrust_lengths(Evidence.NOT_CALIBRATED)
-        elif found is not None:
+        elif found is not None and found.offset is not None:
             self.core.distrust_lengths(Evidence.RESTARTED, found.offset)
         self.follow_parameter('isolate_muscles', self._on_isolate_muscles)
+        self.core.isolate([*self.muscles_to_isolate, *(() if found is None else found.isolated)])
         self.candidates.follow()
-        if self.parameter('isolate_muscles'):
-            self._isolate(set(self.muscles_to_isolate))
+        if found is None and (chosen := self.core.state.complete_mae) is not None:
+            # At its first start, the estimator isolates the muscles that the chosen network lacks.
+            self.core.isolate([*self.muscles_to_isolate, *chosen.isolated])
         self.follow_parameter(
             'on_anomaly', lambda value: self.core.configure(Settings(on_anomaly=value))
         )
         self.follow_muscle_messages(self._on_muscles)
         self.follow_posture('joint_states', self._on_joints, some=True)
-        self._publish_offsets()
+        self._publish_body()
         self._publish_joint_trust()
         for kind in ('length', 'tension'):
             self.follow_muscles(f'muscle_{kind}_command', partial(self._on_command, kind))
         self.listen(PoseStamped, 'marker_pose', self._on_marker, SENSOR)
         Markers(self, 'estimated', self._lines)
-        serve(self, Trigger, 'estimator/check_health', self._check_health)
         serve(self, Trigger, 'estimator/reset', self._reset_or_confirm)
         serve(self, Trigger, 'estimator/zero', self._calibrate)
         serve(self, Trigger, 'estimator/isolate', self._isolate_more)
@@ -115,9 +111,7 @@ class Estimator(Shell):
         self.anomaly = publisher(Float64, 'anomaly', RELIABLE)
         self.wrench = publisher(WrenchStamped, 'estimated_external_wrench', RELIABLE)
         self.by_camera = publisher(JointState, 'vision_joint_states', RELIABLE)
-        self.detected = publisher(Bool, 'anomaly_detected', LATCHED)
-        self.isolated = publisher(String, 'isolated_muscles', LATCHED)
-        self.offsets = publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
+        self.bodies = publisher(Float64MultiArray, 'body_state', LATCHED)
         self.trust = publisher(Float64MultiArray, 'joint_sensor_trust', LATCHED)
         self.mirror = None
         if self.parameter('mirror_muscles'):
@@ -129,9 +123,9 @@ class Estimator(Shell):
 
     def _use(self, mae: Mae) -> None:
         self.core.use(mae)
-        self._publish_isolated()
         if Evidence.NOT_CALIBRATED in self.core.trust.evidence:  # it waits for the first network
             self.core.calibrate_lengths(self.posture)
+            self._publish_body()
 
     def _on_posture(self, posture: tuple[float, ...]) -> None:
         stated_theta(self.robot, posture)  # checks the posture
@@ -142,18 +136,12 @@ class Estimator(Shell):
 
     def _calibrate(self, request: Trigger.Request) -> str:
         self.core.calibrate_lengths(self.posture)
-        self._publish_offsets()
         self._reset(request)
         if self.posture:
             doing = 'hold the arm still in zero_posture'
         else:
             doing = 'call controller/explore, unless the arm explores already'
         return f'calibrating length offsets: {doing}; /diagnostics shows the progress'
-
-    def _isolate(self, muscles: set[int]) -> str:
-        self.core.isolate(muscles)
-        self._publish_isolated()
-        return f'isolated: {self.robot.names(self.core.body.isolated) or "none"}'
 
     def _isolate_more(self, request: Trigger.Request) -> str:
         if not self.muscles_to_isolate:
@@ -162,16 +150,20 @@ class Estimator(Shell):
             )
         wanted = {*self.core.body.isolated, *self.muscles_to_isolate}
         self.core.reset(wanted)  # called before isolating, because a reset restores a suspect
-        answer = self._isolate(wanted)
+        self.core.isolate(wanted)
         self._reset(request)
-        return answer
+        return self._isolated
 
     def _restore(self, _: Trigger.Request) -> str:
         isolated = self.core.body.isolated
         restored = self.muscles_to_isolate or isolated  # all muscles if the parameter names none
         self.core.restore(restored)
         self.candidates.validator.declare_repaired(restored, time.monotonic())
-        self._publish_isolated()
+        self._publish_body()
+        return self._isolated
+
+    @property
+    def _isolated(self) -> str:
         return f'isolated: {self.robot.names(self.core.body.isolated) or "none"}'
 
     def _reset_or_confirm(self, request: Trigger.Request) -> str:
@@ -187,26 +179,12 @@ class Estimator(Shell):
         self.core.reset()
         if finding is not None:
             self.candidates.validator.declare_repaired(finding.muscles, time.monotonic())
-        self._publish_offsets()
-        self.published_anomaly = False
-        self.candidates.on_anomaly(False)
-        self.detected.publish(Bool(data=False))
-        self._publish_isolated()
+        self._publish_body()
         self._report()
         if finding is None:
             return 'no anomaly was detected'
         muscle = self.robot.muscles[finding.muscle]
         return f'cleared the anomaly of {muscle}; a fault that is still present is detected again'
-
-    def _check_health(self, _: Trigger.Request) -> str:
-        """Confirm that no anomaly is detected; other nodes then clear the anomaly they latched.
-
-        Raises:
-            MusculoskeletalError: If an anomaly is detected.
-        """
-        if cause := self.core.cause:
-            raise MusculoskeletalError(f'anomaly detected: {cause}')
-        return 'no anomaly is detected'
 
     # -- messages -------------------------------------------------------------------------------
 
@@ -222,15 +200,12 @@ class Estimator(Shell):
 
     def _on_muscles(self, message: Float64MultiArray, now: float, delay: float) -> None:
         clock = self.get_clock().now()
-        isolated = self.core.body.isolated
         try:
             output = self.core.take(message, clock.nanoseconds * 1e-9, now, delay)
         except RejectionError:
-            if self.core.body.isolated != isolated:  # the core has isolated a muscle with a fault
-                self.get_logger().warning(self.core.suspects.last_verification)
-                self._publish_isolated()
+            self._publish_body()  # a rejected message may also show a fault
             raise
-        self._publish_offsets()
+        self._publish_body()
         self._publish_joint_trust()
         sample = self.core.sample
         if self.mirror is not None and self.core.body.offsets.known and sample is not None:
@@ -270,7 +245,6 @@ class Estimator(Shell):
             force = output.contact.force().tolist()
             wrench.wrench.force = Vector3(**dict(zip('xyz', force)))
             self.wrench.publish(wrench)
-        self._publish_anomaly()
 
     def _publish_mirror(self, sample: MuscleSample, stamp: Any) -> None:
         assert self.mirror is not None
@@ -278,38 +252,29 @@ class Estimator(Shell):
         message.effort = self.robot.tension_source.known(sample.motor_tension).tolist()
         self.mirror.publish(message)
 
-    def _publish_anomaly(self) -> None:
-        """Publish anomaly_detected and isolated_muscles if they changed."""
-        detected = bool(self.core.cause)
-        if detected != self.published_anomaly:
-            self.published_anomaly = detected
-            self.detected.publish(Bool(data=detected))  # first, because it stops the arm
-            if detected:
-                text = f'anomaly detected: {self.core.cause}; {self.core.advice}'
-            else:
-                text = self.core.suspects.last_verification
-            self.get_logger().warning(text)
-            self.candidates.on_anomaly(detected)
-            self._report()  # at once, because the report names the suspect
-        self._publish_isolated()
-
-    def _publish_isolated(self) -> None:
-        isolated = self.core.body.isolated
-        if isolated != self.published_isolated:
-            self.published_isolated = self.candidates.validator.isolated = isolated
-            self.body = self.core.body
-            self.isolated.publish(String(data=self.robot.names(isolated)))
-
-    def _publish_offsets(self) -> None:
-        offsets = self.core.body.offsets
-        if offsets is not self.published_offsets:
-            self.published_offsets, self.body = offsets, self.core.body
+    def _publish_body(self) -> None:
+        """Publish the body state if it has changed, and act on the change."""
+        body, before, suspects = self.core.body, self.body, self.core.suspects
+        if body is before:
+            return
+        self.body = body
+        self.bodies.publish(array_message(body.rows, 'quantity', 'muscle'))
+        self.memory.note(body)
+        self.candidates.validator.isolated = body.isolated
+        if body.offsets != before.offsets:
             self.candidates.validator.forget()
-            self.offsets.publish(array_message(offsets.rows, 'quantity', 'muscle'))
-            self.memory.note(offsets)
+        if suspects.last_verdict is not self.logged_verdict:
+            self.logged_verdict = suspects.last_verdict
+            self.get_logger().warning(suspects.last_verification)
+        if body.has_anomaly != before.has_anomaly:
+            if body.has_anomaly:
+                text = f'anomaly detected: {self.core.cause}; {self.core.advice}'
+                self.get_logger().warning(text)
+            self.candidates.on_anomaly(body.has_anomaly)
+            self._report()  # at once, because the report names the suspect
 
     def conditions(self) -> Iterable[Condition]:
-        """Yield the conditions of the core, and that the length offsets cannot be saved."""
+        """Yield the conditions of the core, and that the body state cannot be saved."""
         yield from super().conditions()
         if problem := self.memory.problem:
             yield ConditionKind.OFFSETS_NOT_SAVED.condition(problem)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `learner`: learns the body online, and publishes the network for the estimator.
 
-muscle_states, joint_states or vision_joint_states (or neither), imu, anomaly_detected,
-isolated_muscles, muscle_length_zeros, joint_sensor_trust → mae_checkpoint.
+muscle_states, joint_states or vision_joint_states (or neither), imu, body_state, joint_sensor_trust
+→ mae_checkpoint.
 accepted_checkpoint and rejected_checkpoint are the estimator's answers.
 """
 
@@ -71,11 +71,8 @@ class Learner(Shell):
         self.accelerometers = LinkSensors()
         self.listen(Imu, IMU, self._take_imu, SENSOR)
         self.needed.add('muscle_states')
-        self.follow_offsets(self._use_offsets)
+        self.follow_body(lambda: core.use_body(self.body))
         self.follow_muscle_messages(self._take_muscle_states)
-        self.follow_anomaly(core.anomaly)
-        self.has_heard_isolated = False
-        self.follow_isolated(self._isolate)
         serve(self, SetBool, 'learner/enable', self._enable)
         serve(self, Trigger, 'learner/save', lambda _: f'saved in {self.core.save()}')
         serve(self, Trigger, 'learner/relearn', self._relearn)
@@ -130,19 +127,6 @@ class Learner(Shell):
 
     def _take_muscle_states(self, message: Float64MultiArray, _: float, delay: float) -> None:
         self.core.take(message, self.now(), delay)
-
-    def _use_offsets(self) -> None:
-        self.core.use_body(self.core.body.with_offsets(self.body.offsets))
-
-    def _isolate(self) -> None:
-        # An estimator that has just started does not have our network yet, and so does not know
-        # which muscles are isolated. Ignore its first message if the message names no muscle.
-        number = self._reception.arrivals['isolated_muscles'].number
-        knows = number > 1 or (number == 0 and self.has_heard_isolated)
-        muscles = self.body.isolated
-        if muscles or knows or not self.core.isolated:
-            self.core.isolate(muscles)
-        self.has_heard_isolated = True
 
     def _use_accepted(self, message: UInt8MultiArray) -> Iterator[None]:
         mae = checkpoint.from_bytes(bytes(message.data), self.robot)

@@ -27,7 +27,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, QoSProfile
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
+from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.awake_clock import AwakeClock
@@ -44,10 +44,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.message_reading import (
     joints_not_finite,
     read_array,
-    read_names,
     read_posture,
 )
-from musculoskeletal_ae.nodes.anomaly_latch import AnomalyLatch
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, CheckpointQueue
 from musculoskeletal_ae.nodes.parameters import check_names
 from musculoskeletal_ae.reception import SHOWN, Reception
@@ -67,7 +65,7 @@ from musculoskeletal_ae.ros.second_publishers import (
     Sources,
     Twins,
 )
-from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
+from musculoskeletal_ae.signals.body_state import ROWS, BodyState
 from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.motor_interface import STATES, MotorInterface
 
@@ -131,7 +129,7 @@ class Shell(Node):
             self._subscribe_anew,
         )
         self.rejected = self._reception.rejected  # number of messages, by topic and reason
-        #: offsets and isolated muscles that the estimator has published
+        #: the newest body state that the estimator has published
         self.body = BodyState.healthy(self.robot.muscle_count)
         hardware = self.robot.description.directory.name
         self._diagnostics = Diagnostics(self, self._reception, hardware)
@@ -508,29 +506,19 @@ class Shell(Node):
 
         self.listen(kind, STATES, take, SENSOR)
 
-    def follow_offsets(self, changed: Callable[[], object]) -> None:
-        """Update `body` with the estimator's length offsets; call `changed` after each decision.
+    def follow_body(self, changed: Callable[[], object]) -> None:
+        """Update `body` with each body state of the estimator, and call `changed` then.
 
-        A decision may be received several times, because the topic is latched. It is used once.
+        A body state may be received several times, because the topic is latched. It is used once.
         """
 
         def take(rows: Array) -> None:
-            offsets = LengthOffsets.of_rows(rows)
-            if offsets.generation != self.body.offsets.generation:
-                self.body = self.body.with_offsets(offsets)
+            body = BodyState.of_rows(rows)
+            if body.generation != self.body.generation:
+                self.body = body
                 changed()
 
-        self.follow_muscles('muscle_length_zeros', take, ROWS, LATCHED)
-
-    def follow_isolated(self, changed: Callable[[], object]) -> None:
-        """Update `body` with the estimator's isolated muscles; call `changed` after each update."""
-
-        def take(message: String) -> None:
-            muscles = self.robot.muscle_indices(read_names(message))
-            self.body = self.body.with_isolated(muscles)
-            changed()
-
-        self.listen(String, 'isolated_muscles', take, LATCHED)
+        self.follow_muscles('body_state', take, ROWS, LATCHED)
 
     def follow_joint_trust(self, follow: Callable[[JointTrust], object]) -> None:
         """Call `follow` with the estimator's trust in the joint sensors, in times of `now`."""
@@ -544,14 +532,6 @@ class Shell(Node):
                 raise MessageError('impossible trust', str(error)) from error
 
         self.listen(Float64MultiArray, 'joint_sensor_trust', take, LATCHED)
-
-    def follow_anomaly(self, follow: Callable[[bool], object]) -> None:
-        """Call `follow` whenever an anomaly begins or ends.
-
-        An anomaly ends only when the estimator confirms it by a service (`AnomalyLatch`).
-        """
-        latch = AnomalyLatch(self, follow)
-        self.listen(Bool, 'anomaly_detected', lambda message: latch.take(message.data), LATCHED)
 
     def follow_posture(
         self, topic: str, follow: Callable[[Array], object], some: bool = False

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `sim`: simulates the learned body, driven by the same commands as the real arm.
 
-muscle_length_command → sim/joint_states, sim/muscle_states, sim/markers. With as_robot:=true the
-node replaces the robot and publishes joint_states, muscle_states, robot_description, sim/markers.
+muscle_length_command, body_state → sim/joint_states, sim/muscle_states, sim/markers. With
+as_robot:=true the node replaces the robot, whose body is healthy, and publishes joint_states,
+muscle_states, robot_description, sim/markers.
 The topic sim/external_wrench applies an external wrench, and sim/fixed_joint_states fixes joints. A
 command holds until the next command; before the first command, muscles are at T_bias. The node
 ignores muscle_tension_command, and its modules stay at 25 °C.
@@ -52,9 +53,10 @@ class Sim(Arm):
         else:
             self.follow_muscles('muscle_length_command', self._command)
         self.follow_wrench('sim', partial(setattr, self, 'wrench'))
-        if not self.as_robot:  # sensors of a simulated robot have no offsets
-            self.follow_offsets(lambda: None)  # `_command` reads `body.offsets`
-        self.follow_isolated(self._isolate)
+        # The sensors of a simulated robot have no offsets, and isolation does not change it, as it
+        # does not change a real arm.
+        if not self.as_robot:
+            self.follow_body(self._isolate)  # `_command` reads `body.offsets`
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)
         self.ticked = self.get_clock().now()
         self.create_timer(1.0 / self.rate, self._tick)
@@ -62,16 +64,14 @@ class Sim(Arm):
     def _use_checkpoint(self, mae: Mae) -> None:
         if self.arm is None:
             arm = Simulation(self.robot, mae, self.parameter('preset'))
-            if not self.as_robot:
-                arm.isolate(self.body.isolated)
+            arm.isolate(self.body.isolated)
             arm.settle()
             self.arm = arm
         else:
             self.arm.use(mae)
 
     def _isolate(self) -> None:
-        # With as_robot, isolation does not change the simulation, as it does not change a real arm.
-        if self.arm is not None and not self.as_robot:
+        if self.arm is not None and self.arm.robot.isolated != self.body.isolated:
             self.arm.isolate(self.body.isolated)
 
     def _command(self, length: Array) -> None:

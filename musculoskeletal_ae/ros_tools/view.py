@@ -37,7 +37,6 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.message_reading import (
     read_array,
     read_muscle_states,
-    read_names,
     read_posture,
 )
 from musculoskeletal_ae.nodes.situation import Situation, figures, nodes_in_graph
@@ -50,6 +49,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros import diagnostics
 from musculoskeletal_ae.ros.messages import LATCHED, RELIABLE, joint_message
 from musculoskeletal_ae.ros_tools.ros_tool import ROS_HELP, message_class, run_tool, start_ros
+from musculoskeletal_ae.signals.body_state import ROWS, BodyState
 from musculoskeletal_ae.signals.motor_interface import STATES, MotorInterface
 
 #: QoS of topics of which only the newest message counts
@@ -144,6 +144,9 @@ class View(Node):
                 reading, robot.muscle_count, self._isolated(), math.nan, robot.tension_source
             )
 
+        def body(message: Any) -> BodyState:
+            return BodyState.of_rows(read_array(message, ROWS, robot.muscle_count))
+
         table: list[tuple[str, type, str, QoSProfile, Callable[[Any], Any]]] = [
             (arm, JointState, topic, NEWEST, partial(read_posture, units=units, some=is_measured))
             for arm, topic in ARM_TOPICS.items()
@@ -154,7 +157,7 @@ class View(Node):
             ('played', Float64MultiArray, 'replay/position', NEWEST,
              lambda m: read_array(m, 1, 2).tolist()),
             ('anomaly', Float64, 'anomaly', NEWEST, lambda m: m.data),
-            ('isolated', String, 'isolated_muscles', LATCHED, read_names),
+            ('body', Float64MultiArray, 'body_state', LATCHED, body),
             ('mode', String, 'controller_mode', LATCHED, lambda m: m.data),
             ('', DiagnosticArray, '/diagnostics', MANY, self.situation.diagnosed),
         ]  # fmt: skip
@@ -256,7 +259,8 @@ class View(Node):
         return np.flatnonzero(np.isin(self.robot.muscles, names))
 
     def _isolated(self) -> Ints:
-        return self._places(self._newest('isolated', math.inf) or [])
+        body = self._newest('body', math.inf)
+        return np.array([] if body is None else body.isolated, dtype=int)
 
     def _tell(self, posture: dict[str, Array], states: Array | None) -> None:
         situation, error, anomaly = self.situation, math.nan, self._newest('anomaly')

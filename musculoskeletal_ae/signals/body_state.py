@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The body state: isolated muscles and length offsets as one immutable value.
+"""The body state: length offsets, isolated muscles and the anomaly as one immutable value.
 
-The estimator owns the body state and publishes it on the latched topics `isolated_muscles` and
-`muscle_length_zeros`. The nodes that use muscle states receive it. Every change creates a new
-object with the next version number.
+The estimator owns the body state. It publishes each change as a whole on the latched topic
+`body_state`, with the number of the change, and no other node changes it. All other nodes use the
+newest message. It states everything that they need, so that they compare it with no other message.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from musculoskeletal_ae.exceptions import MessageError
 #: without a trust count as known if their standard deviation is smaller.
 UNKNOWN = 1.0
 MOST_OFFSET = 10.0  # reject messages with a larger offset of a length sensor [m]
-ROWS = 4  # number of rows in a message on `muscle_length_zeros`
+ROWS = 6  # number of rows in a message on `body_state`
 
 
 class Trust(IntEnum):
-    """Whether the length offset of a muscle may be used, as published in `muscle_length_zeros`.
+    """Whether the length offset of a muscle may be used, as published in `body_state`.
 
     The estimator decides this in `estimation/lengths/length_trust.py`, and all other nodes follow
     it.
@@ -37,7 +37,24 @@ class Trust(IntEnum):
     REVOKED = 2  # was known until a finding of the estimator contradicted it
 
 
-@dataclass(frozen=True)
+class Anomaly(IntEnum):
+    """What has become of the estimator's newest finding, as published in `body_state`.
+
+    A restarted estimator reports NONE, because it does not know of earlier findings. Only ENDED
+    lets an arm that was stopped for a verification move again.
+    """
+
+    NONE = 0  # no finding since the estimator was started
+    FOUND = 1  # the finding is latched, and the arm is to stop
+    VERIFYING = 2  # as FOUND; the suspect is isolated, and is wound in to verify the fault
+    ENDED = 3  # the anomaly was ended by a verification or by `estimator/reset`
+
+
+#: stages in which an anomaly is present
+PRESENT = frozenset({Anomaly.FOUND, Anomaly.VERIFYING})
+
+
+@dataclass(frozen=True, eq=False)
 class LengthOffsets:
     """Length offsets, which are subtracted from sensor values, and whether they may be trusted.
 
@@ -46,15 +63,11 @@ class LengthOffsets:
         deviation: Standard deviation of o [m], (M,). An offset that was revoked keeps the one that
             it had.
         trust: Value of `Trust` for each muscle, (M,).
-        generation: Number of the estimator's decision. The estimator raises it whenever it changes
-            or confirms an offset, and never uses a number again, even after a restart. 0 stands for
-            the assumption that every node starts with: the offsets are zero.
     """
 
     offset: Array
     deviation: Array
     trust: Ints = field(default_factory=lambda: np.zeros(0, dtype=int))
-    generation: int = 0
 
     def __post_init__(self) -> None:
         """Complete a missing trust."""
@@ -72,36 +85,16 @@ class LengthOffsets:
         """Return unknown offsets."""
         return cls(np.zeros(muscle_count), np.full(muscle_count, UNKNOWN))
 
-    @classmethod
-    def of_rows(cls, rows: Array) -> LengthOffsets:
-        """Return the offsets of a message: offset, standard deviation, trust, generation, (4, M).
+    def __eq__(self, other: object) -> bool:
+        """Return whether all offsets, standard deviations and trusts are equal."""
+        return isinstance(other, LengthOffsets) and np.array_equal(self.rows, other.rows)
 
-        Raises:
-            MessageError: If a value is illegal.
-        """
-        offset, deviation, trust, generation = rows
-        is_legal = (
-            np.abs(offset).max() <= MOST_OFFSET
-            and deviation.min() >= 0.0
-            and np.isin(trust, list(Trust)).all()
-            and (generation == generation[0]).all()
-            and generation[0] >= 0.0
-            and generation[0] == round(generation[0])
-        )
-        if not is_legal:
-            legal = (
-                f'offsets within ±{MOST_OFFSET:g} m, standard deviations >= 0, a trust of '
-                f'{", ".join(f"{each:d}" for each in Trust)}, and the same whole number >= 0 as '
-                'the generation of all muscles'
-            )
-            raise MessageError('impossible offsets', f'expected {legal}, got {rows.tolist()}')
-        return cls(offset, deviation, trust.astype(int), int(generation[0]))
+    __hash__ = None  # type: ignore[assignment]
 
-    @property
+    @cached_property
     def rows(self) -> Array:
-        """The content of a message on `muscle_length_zeros`, (4, M)."""
-        generation = np.full(len(self.offset), float(self.generation))
-        return np.stack([self.offset, self.deviation, self.trust.astype(float), generation])
+        """Offset [m], standard deviation [m] and trust of each muscle, (3, M)."""
+        return np.stack([self.offset, self.deviation, self.trust.astype(float)])
 
     @cached_property
     def known(self) -> bool:
@@ -121,22 +114,58 @@ class LengthOffsets:
 
 @dataclass(frozen=True)
 class BodyState:
-    """Isolated muscles and length offsets, as all nodes use them.
+    """Length offsets, isolated muscles and the anomaly, as all nodes use them.
 
     Attributes:
         offsets: Length offsets of all muscles.
         isolated: Indices of the isolated muscles, in ascending order.
-        version: Number of changes so far.
+        anomaly: What has become of the newest finding.
+        suspect: Index of the muscle that the newest finding names; None before the first finding.
+        generation: Number of the state. The estimator raises it with each change, and never uses a
+            number again, even after a restart. 0 stands for the assumption that every node starts
+            with: a healthy body whose length offsets are zero.
     """
 
     offsets: LengthOffsets
     isolated: tuple[int, ...] = ()
-    version: int = 0
+    anomaly: Anomaly = Anomaly.NONE
+    suspect: int | None = None
+    generation: int = 0
 
     @classmethod
     def healthy(cls, muscle_count: int) -> BodyState:
-        """Return the state with known offsets of zero and no isolated muscle."""
+        """Return the state with known offsets of zero, no isolated muscle and no anomaly."""
         return cls(LengthOffsets.none(muscle_count))
+
+    @classmethod
+    def of_rows(cls, rows: Array) -> BodyState:
+        """Return the state that a message on `body_state` describes, (6, M).
+
+        Its rows are offset, standard deviation and trust of each length, whether the muscle is
+        isolated, the anomaly that concerns it, and the generation.
+
+        Raises:
+            MessageError: If a value is illegal.
+        """
+        offset, deviation, trust, isolated, anomaly, generation = rows
+        _check(rows)
+        suspects = np.flatnonzero(anomaly)
+        return cls(
+            LengthOffsets(offset, deviation, trust.astype(int)),
+            tuple(np.flatnonzero(isolated).tolist()),
+            Anomaly(int(anomaly.max())),
+            int(suspects[0]) if len(suspects) else None,
+            int(generation[0]),
+        )
+
+    @cached_property
+    def rows(self) -> Array:
+        """The content of a message on `body_state`, (6, M)."""
+        anomaly = np.zeros(self.muscle_count)
+        if self.suspect is not None:
+            anomaly[self.suspect] = self.anomaly
+        generation = np.full(self.muscle_count, float(self.generation))
+        return np.stack([*self.offsets.rows, ~self.used, anomaly, generation])
 
     @property
     def muscle_count(self) -> int:
@@ -148,13 +177,54 @@ class BodyState:
         """Which muscles are not isolated, (M,)."""
         return ~np.isin(np.arange(self.muscle_count), self.isolated)
 
+    @property
+    def has_anomaly(self) -> bool:
+        """Whether an anomaly is present."""
+        return self.anomaly in PRESENT
+
     def with_isolated(self, muscles: Iterable[int]) -> BodyState:
         """Return the state in which exactly these muscles are isolated."""
         isolated = tuple(sorted({int(muscle) for muscle in muscles}))
-        if isolated == self.isolated:
-            return self
-        return replace(self, isolated=isolated, version=self.version + 1)
+        return self if isolated == self.isolated else replace(self, isolated=isolated)
 
     def with_offsets(self, offsets: LengthOffsets) -> BodyState:
         """Return the state with other length offsets."""
-        return replace(self, offsets=offsets, version=self.version + 1)
+        return replace(self, offsets=offsets)
+
+    def with_anomaly(self, anomaly: Anomaly, suspect: int | None = None) -> BodyState:
+        """Return the state with another anomaly, and the muscle that its finding names."""
+        return replace(self, anomaly=anomaly, suspect=suspect)
+
+
+def _check(rows: Array) -> None:
+    """Check the content of a message on `body_state`.
+
+    Raises:
+        MessageError: If a value is illegal.
+    """
+    offset, deviation, trust, isolated, anomaly, generation = rows
+    is_verified = anomaly == Anomaly.VERIFYING
+    is_legal = (
+        np.abs(offset).max() <= MOST_OFFSET
+        and deviation.min() >= 0.0
+        and np.isin(trust, list(Trust)).all()
+        and np.isin(isolated, (0.0, 1.0)).all()
+        and np.isin(anomaly, list(Anomaly)).all()
+        and np.count_nonzero(anomaly) <= 1
+        and isolated[is_verified].all()
+        and (generation == generation[0]).all()
+        and generation[0] >= 0.0
+        and generation[0] == round(generation[0])
+    )
+    if not is_legal:
+
+        def values(kind: type[IntEnum]) -> str:
+            return ', '.join(f'{each:d}' for each in kind)
+
+        legal = (
+            f'offsets within ±{MOST_OFFSET:g} m, standard deviations >= 0, a trust of '
+            f'{values(Trust)}, 1 for isolated muscles and 0 for others, an anomaly of '
+            f'{values(Anomaly)} that is 0 for all muscles but one and not {Anomaly.VERIFYING:d} '
+            'for a muscle in use, and the same whole number >= 0 as the generation of all muscles'
+        )
+        raise MessageError('impossible body state', f'expected {legal}, got {rows.tolist()}')

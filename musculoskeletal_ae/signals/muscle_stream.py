@@ -208,7 +208,7 @@ class MuscleStream:
 
     def use_body(self, body: BodyState) -> None:
         """Use another body state from now on."""
-        has_new_offsets = body.offsets is not self.body.offsets
+        has_new_offsets = body.offsets != self.body.offsets
         is_calibrated = has_new_offsets and not body.offsets.revoked
         if has_new_offsets:  # the change of lengths is not a motion
             self._direction = FrictionDirection()

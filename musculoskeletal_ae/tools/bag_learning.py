@@ -34,6 +34,7 @@ from musculoskeletal_ae.options import DEFAULT_SEED
 from musculoskeletal_ae.process_signals import STOP, Reaction
 from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import Anomaly
 from musculoskeletal_ae.signals.friction import directions
 from musculoskeletal_ae.signals.muscle_readings import MuscleReading, muscle_reading
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
@@ -311,7 +312,7 @@ def learn(
     validator = CheckpointValidator(learner.robot)
     newest, stop = None, ''
     learner.reset()
-    learner.anomaly(False)
+    learner.use_body(learner.body.with_anomaly(Anomaly.NONE))
     steps = np.diff(recording.time, prepend=recording.time[:1])
     for dt, at, theta, length, tension, recorded in zip(steps, *recording, strict=True):
         isolated = _isolated(recorded, learner.isolated)
@@ -334,7 +335,7 @@ def learn(
             validator.message(sample.tension_read, sample.length, sample.sliding, at, theta)
         finding = _finding(health, mae, sample, min(dt, LONGEST_STEP))
         if finding is not None:
-            learner.anomaly(True)
+            learner.use_body(learner.body.with_anomaly(Anomaly.FOUND, finding.muscle))
             if (before := validator.anomaly(True, at)) is not None:
                 learner.note_accepted(before)
                 learner.note_rejected(newest.version, 'an anomaly was detected soon after')

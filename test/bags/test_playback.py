@@ -121,9 +121,8 @@ def test_a_window_lies_within_the_bag(bag, content):
 def test_what_was_latched_before_the_start_comes_first(bag, content):
     opened = Bag.open(bag)
     names = (
-        'accepted_checkpoint', 'anomaly_detected', 'controller_mode', 'isolated_muscles',
-        'joint_sensor_trust', 'mae_checkpoint', 'muscle_length_zeros', 'rejected_checkpoint',
-        'robot_description',
+        'accepted_checkpoint', 'body_state', 'controller_mode', 'joint_sensor_trust',
+        'mae_checkpoint', 'rejected_checkpoint', 'robot_description',
     )  # fmt: skip
     assert latched_topics(opened) == {f'/left_arm/{name}' for name in names}
     last = [next(s for s in content[39::-1] if s.topic.endswith(name)) for name in names]

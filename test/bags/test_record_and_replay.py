@@ -87,7 +87,7 @@ def test_a_killed_recorder_loses_at_most_the_last_second(tool, graph, tmp_path, 
 
 def test_what_comes_before_a_simulated_clock_has_no_time(tool, graph, tmp_path):
     recorder = record(tool, graph, tmp_path / 'bag', '--ros-args', '-p', 'use_sim_time:=true')
-    graph.publisher(String, 'isolated_muscles', LATCHED).publish(String(data='biceps_long'))
+    graph.publisher(String, 'controller_mode', LATCHED).publish(String(data='holding'))
     publisher = graph.publisher(Float64MultiArray, 'muscle_states')
     message = Float64MultiArray(data=array('d', [1.0] * 18))
     clock = graph.publisher(Clock, '/clock')
@@ -119,14 +119,14 @@ def test_a_recording_without_a_topic_that_was_asked_for_says_so(tool, graph, tmp
 
 
 @pytest.mark.parametrize(
-    'early', ['muscle_states', pytest.param('isolated_muscles', marks=pytest.mark.thorough)]
+    'early', ['muscle_states', pytest.param('controller_mode', marks=pytest.mark.thorough)]
 )
 def test_publishers_that_offer_less_than_usual_are_recorded(tool, graph, tmp_path, early):
     """One publisher exists before the recorder, the other one does not."""
-    topics = {'muscle_states': Float64MultiArray, 'isolated_muscles': String}
-    qos = {  # the usual publishers are reliable, and that of isolated_muscles is latched
+    topics = {'muscle_states': Float64MultiArray, 'controller_mode': String}
+    qos = {  # the usual publishers are reliable, and that of controller_mode is latched
         'muscle_states': QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT),
-        'isolated_muscles': QoSProfile(depth=5),
+        'controller_mode': QoSProfile(depth=5),
     }
 
     publishers = {early: graph.node.create_publisher(topics[early], early, qos[early])}
@@ -135,7 +135,7 @@ def test_publishers_that_offer_less_than_usual_are_recorded(tool, graph, tmp_pat
         publishers[name] = graph.node.create_publisher(topics[name], name, qos[name])
     content = {
         'muscle_states': Float64MultiArray(data=array('d', [1.0] * 18)),
-        'isolated_muscles': String(data='biceps_long'),
+        'controller_mode': String(data='holding'),
     }
     for name, publisher in publishers.items():
         graph.wait(publisher.get_subscription_count, f'a subscriber of {name}')

@@ -12,7 +12,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import LengthOffsets
+from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 
 
 @pytest.fixture(scope='module')
@@ -90,15 +90,25 @@ def test_invalid_messages_are_left_out_and_counted_by_reason(arm, robot, tmp_pat
     assert_array_equal(result.joints.values[1], arm.theta[0])
 
 
-@pytest.mark.parametrize('is_old', [False, True], ids=['with trust', 'of version 0.1.0'])
-def test_lengths_count_from_their_zeros_and_not_while_these_are_sought(
-    arm, robot, tmp_path, is_old
-):
+def body_message(form, body):
+    """Return topic and content of a message of a body state, as this or an earlier version does."""
+    rows = body.rows
+    if form == 'this version':
+        return '/body_state', array(rows)
+    known = rows[:2] if form == 'version 0.1.0' else rows[[0, 1, 2, 5]]
+    return '/muscle_length_zeros', array(known)
+
+
+FORMS = 'this version', 'later than 0.1.0', 'version 0.1.0'
+
+
+@pytest.mark.parametrize('form', FORMS)
+def test_lengths_count_from_their_zeros_and_not_while_these_are_sought(arm, robot, tmp_path, form):
     offset = np.linspace(-0.08, 0.08, robot.muscle_count)
     sought, found = LengthOffsets.unknown(len(offset)), LengthOffsets(offset, 0.0 * offset)
     for generation, (at, offsets) in enumerate([(0.5, sought), (1.0, found)], 1):
-        rows = replace(offsets, generation=generation).rows
-        arm.add('/muscle_length_zeros', ARRAY, at - 0.001, array(rows[:2] if is_old else rows))
+        topic, content = body_message(form, BodyState(offsets, generation=generation))
+        arm.add(topic, ARRAY, at - 0.001, content)
     result = streams(arm, robot, tmp_path)
     assert result.rejected == {'/muscle_states: length offsets unknown': 50}
     assert_allclose(result.muscles.time, [*arm.time[:50], *arm.time[100:]], atol=1e-9)
@@ -106,15 +116,18 @@ def test_lengths_count_from_their_zeros_and_not_while_these_are_sought(
     assert_allclose(result.muscles.values[50:, 0], arm.length[100:] - offset)
 
 
-def test_zeros_that_were_known_before_count_from_the_beginning(arm, robot, tmp_path):
+@pytest.mark.parametrize('form', FORMS)
+def test_zeros_that_were_known_before_count_from_the_beginning(arm, robot, tmp_path, form):
     offset, surely = np.linspace(-0.08, 0.08, robot.muscle_count), np.full(robot.muscle_count, 1e-3)
-    arm.add('/muscle_length_zeros', ARRAY, 0.501, array([offset, surely]))
+    topic, content = body_message(form, BodyState(LengthOffsets(offset, surely), generation=1))
+    arm.add(topic, ARRAY, 0.501, content)
     result = streams(arm, robot, tmp_path)
     assert not result.rejected
     assert_allclose(result.muscles.values[:, 0], arm.length - offset)
 
 
-def test_of_isolated_muscles_nothing_counts_while_they_are(arm, robot, tmp_path):
+@pytest.mark.parametrize('is_earlier', [False, True])
+def test_of_isolated_muscles_nothing_counts_while_they_are(arm, robot, tmp_path, is_earlier):
     count, (first, second) = robot.muscle_count, robot.muscles[:2]
     for i in range(0, len(arm.content), 2):
         lost = 0 if i < 200 else 1
@@ -122,8 +135,14 @@ def test_of_isolated_muscles_nothing_counts_while_they_are(arm, robot, tmp_path)
         rows[1][lost] = np.nan
         arm.content[i] = arm.content[i]._replace(data=array(rows))
     # The first message arrives after the first muscle states, as a latched message may.
-    arm.add('/isolated_muscles', STRING, 0.501, string(first))
-    arm.add('/isolated_muscles', STRING, 0.999, string(second))
+    if is_earlier:
+        arm.add('/isolated_muscles', STRING, 0.501, string(first))
+        arm.add('/isolated_muscles', STRING, 0.999, string(second))
+    else:
+        healthy = BodyState.healthy(count)
+        for muscle, at in ((0, 0.501), (1, 0.999)):
+            body = replace(healthy, isolated=(muscle,), generation=muscle + 1)
+            arm.add('/body_state', ARRAY, at, array(body.rows))
     result = streams(arm, robot, tmp_path)
     assert not result.rejected
     pairs = result.pairs()

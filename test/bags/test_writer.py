@@ -17,9 +17,8 @@ from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.exceptions import BagError
 
 LATCHED = (
-    'robot_description', 'accepted_checkpoint', 'anomaly_detected', 'controller_mode',
-    'isolated_muscles', 'joint_sensor_trust', 'mae_checkpoint', 'muscle_length_zeros',
-    'rejected_checkpoint',
+    'robot_description', 'accepted_checkpoint', 'body_state', 'controller_mode',
+    'joint_sensor_trust', 'mae_checkpoint', 'rejected_checkpoint',
 )  # fmt: skip
 
 

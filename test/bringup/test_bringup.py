@@ -17,7 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from graph import DEADLINE, Graph, Process
 from rcl_interfaces.srv import GetParameters
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, String, UInt8MultiArray
+from std_msgs.msg import String, UInt8MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.importing.convert import import_robot
@@ -242,9 +242,9 @@ def has_learned(output):
 
 def a_rupture_is_shown_and_a_dead_node_named(graph, arm, run):
     emulator = f'{arm}/hardware_emulator'
-    detected = graph.listen(Bool, f'{arm}/anomaly_detected', LATCHED)
+    bodies = graph.follow_body(f'{arm}/body_state')
     assert graph.set_parameter(emulator, 'faults', ['rupture:brachialis'])[0]
-    graph.wait(lambda: detected and detected[-1].data, 'the detection')
+    graph.wait(lambda: bodies and bodies[-1].has_anomaly, 'the detection')
     line = run.wait_for_output(': brachialis: ')
     assert Step.REPAIR_MUSCLE.text in line and 'estimator/reset' in line
     assert graph.set_parameter(emulator, 'faults', [''])[0]
@@ -252,7 +252,7 @@ def a_rupture_is_shown_and_a_dead_node_named(graph, arm, run):
         lambda: (
             graph.call(Trigger, f'{arm}/estimator/reset').success
             and graph.spin(2.0) is None
-            and not detected[-1].data
+            and not bodies[-1].has_anomaly
         ),
         'the detection to stay cleared',
     )

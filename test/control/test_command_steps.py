@@ -23,7 +23,7 @@ from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import METHODS
 from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.signals.body_state import LengthOffsets
+from musculoskeletal_ae.signals.body_state import Anomaly, LengthOffsets
 
 DT, SMALL = 0.01, 1e-9
 COUNT, LIMIT = ROBOT.muscle_count, ROBOT.tension.limit
@@ -142,9 +142,9 @@ class Arm(RuleBasedStateMachine):
     def isolate(self, muscles):
         self.core.use_body(self.core.stream.body.with_isolated(tuple(sorted(muscles))))
 
-    @rule(detected=st.booleans())
-    def anomaly(self, detected):
-        self.core.anomaly(detected)
+    @rule(anomaly=st.sampled_from(Anomaly), suspect=MUSCLES)
+    def anomaly(self, anomaly, suspect):
+        self.core.use_body(self.core.stream.body.with_anomaly(anomaly, suspect))
 
     @rule(muscle=MUSCLES, by=st.floats(-0.02, 0.02), known=st.booleans())
     def find_offsets(self, muscle, by, known):

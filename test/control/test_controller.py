@@ -158,10 +158,10 @@ def test_stale_sensor_data_stop_the_arm_and_a_reset_is_refused_while_they_are_st
 
 def test_an_anomaly_stops_the_arm_even_before_the_first_command():
     bench = Bench()
-    bench.core.anomaly(True)
+    bench.find()
     bench.target(REST)
     assert bench.step(3) == [None] * 3
-    bench.core.anomaly(False)
+    bench.end_anomaly()
     assert bench.step(3) == [None] * 3
     assert bench.core.reset(bench.now) is None
     assert None not in bench.step(3)
@@ -387,10 +387,10 @@ def test_a_stop_for_an_anomaly_needs_only_a_reset_and_the_estimator_states_the_r
     bench = Bench()
     bench.target(REST)
     bench.step(50)
-    bench.core.anomaly(True)
+    bench.find()
     bench.step(50)
     assert bench.steps() == ['reset_controller']
-    bench.core.anomaly(False)
+    bench.end_anomaly()
     bench.step(50)
     assert bench.steps() == ['reset_controller']
 

@@ -81,8 +81,6 @@ class Loop:
         self.controller.use_body(self.estimator.body)
         if estimate is not None:
             self.controller.estimated(estimate.state.theta, self.now)
-            if estimate.detected:
-                self.controller.anomaly(True)
 
     def mend(self):
         """Repair the arm, and call the services that a user would call.
@@ -95,7 +93,6 @@ class Loop:
         self.run(3.0)
         self.estimator.reset()
         self.controller.use_body(self.estimator.body)
-        self.controller.anomaly(False)
         refused = self.controller.reset(self.now)
         self.run(2.0)
         return refused

@@ -341,14 +341,15 @@ def causes(bench):
 @pytest.mark.parametrize('is_confirmed', [True, False])
 def test_during_an_anomaly_the_estimator_decides_whether_a_jump_is_due_to_a_repair(is_confirmed):
     bench = distorting()
-    bench.core.anomaly(True)
+    bench.find()
     bench.lies(round((LIMITS.settled + REACTION_TIME + 0.5) / DT), length=with_a_jump)
     bench.lie = lambda read: np.array([with_a_jump(read[0]), *read[1:]])
     assert causes(bench) == ['anomaly_detected']
     if is_confirmed:
         body = bench.core.stream.body
-        bench.core.use_body(body.with_offsets(replace(body.offsets)))
-    bench.core.anomaly(False)
+        confirmed = replace(body.offsets, deviation=body.offsets.deviation + 0.01)
+        bench.core.use_body(body.with_offsets(confirmed))
+    bench.end_anomaly()
     bench.step(50)
     assert causes(bench) == ([] if is_confirmed else ['length_offsets_revoked'])
 

@@ -9,6 +9,7 @@ from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.signals.body_state import Anomaly
 
 REASON = 'l by ①, brachialis: relative error 3 from the geometric model, limit 1.7'
 
@@ -137,7 +138,7 @@ def test_the_learner_returns_with_the_estimator_and_keeps_the_doubtful_network_a
     scene.learner.note_accepted(first)
     doubtful = scene.propose(initial)
     scene.learner.note_accepted(doubtful)
-    scene.learner.anomaly(True)
+    scene.learner.use_body(scene.learner.body.with_anomaly(Anomaly.FOUND, 0))
     # The messages on two topics may arrive in either order.
     if is_rejected_first:
         scene.reject(doubtful)

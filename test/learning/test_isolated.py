@@ -7,6 +7,7 @@ from learning.conftest import job
 from learning.test_learner import IdleTrainer
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.signals.body_state import Anomaly
 
 LOST = 2
 
@@ -43,7 +44,7 @@ def test_isolated_muscles_and_samples_outlast_a_restart_of_the_learner(
         learner.accept(stage.sample())
     learner.isolate((LOST,))
     body = learner.body
-    learner.accept(stage.sample()._replace(body_version=body.version, isolated=body.isolated))
+    learner.accept(stage.sample()._replace(isolated=body.isolated))
     assert [known[LOST] for known in learner.samples.known] == [True] * 3 + [False]
     assert learner.trainer.jobs == []
     data = learner.poll(0.0)
@@ -54,7 +55,6 @@ def test_isolated_muscles_and_samples_outlast_a_restart_of_the_learner(
     assert again.isolated == again.mae.isolated == (LOST,)
     assert len(again.samples) == 4
     assert [sample.isolated for sample in again.samples.samples] == [()] * 3 + [(LOST,)]
-    assert again.body.version > again.samples.body_version  # a version number is never used twice
     again.isolate(())
     assert checkpoint.from_bytes(again.checkpoint, arm26).isolated == ()
     again.close()
@@ -62,13 +62,13 @@ def test_isolated_muscles_and_samples_outlast_a_restart_of_the_learner(
 
 def test_while_a_suspect_is_verified_nothing_is_published(arm26, initial):
     learner = Learner(arm26, initial, trainer=IdleTrainer)
-    learner.anomaly(True)
+    learner.use_body(learner.body.with_anomaly(Anomaly.FOUND, 0))
     version = learner.mae.version
     learner.isolate((LOST,))
     learner.isolate(())  # the verification has found that the muscle is healthy
-    learner.anomaly(False)
+    learner.use_body(learner.body.with_anomaly(Anomaly.ENDED, 0))
     assert learner.mae.version == version
-    learner.anomaly(True)
+    learner.use_body(learner.body.with_anomaly(Anomaly.FOUND, 0))
     learner.isolate((LOST,))
-    learner.anomaly(False)
+    learner.use_body(learner.body.with_anomaly(Anomaly.ENDED, 0))
     assert learner.mae.isolated == (LOST,)

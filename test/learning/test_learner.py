@@ -13,7 +13,7 @@ from musculoskeletal_ae.learning.margin import MARGIN
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import LengthOffsets
+from musculoskeletal_ae.signals.body_state import Anomaly, LengthOffsets
 
 DT = 0.02  # time between two messages [s]
 
@@ -194,12 +194,12 @@ def test_a_clock_that_goes_back_stops_neither_updates_nor_checkpoints(learner, s
 
 def test_an_anomaly_stops_learning_until_its_reset(learner, stage):
     accept(learner, stage, 2)
-    learner.anomaly(True)
+    learner.use_body(learner.body.with_anomaly(Anomaly.FOUND, 0))
     arm = Arm(learner, stage)
     arm.rest(10.0)
     assert learner.trainer.jobs == []
     assert len(learner.samples) == 2
-    learner.anomaly(False)
+    learner.use_body(learner.body.with_anomaly(Anomaly.ENDED, 0))
     arm.rest(2.0 * MARGIN + 1.5)
     assert len(learner.samples) == 3
     assert learner.trainer.jobs
@@ -226,7 +226,7 @@ def test_nothing_is_learned_while_the_length_offsets_are_unknown(learner, stage)
     learner.use_body(learner.body.with_offsets(LengthOffsets.none(6)))
     # The learner first compares the new offsets with messages, so the first sample comes later.
     arm.rest(3.0 * MARGIN)
-    assert [sample.body_version for sample in learner.samples.samples] == [learner.body.version]
+    assert len(learner.samples) == 1
 
 
 def calibrated(learner):
@@ -277,7 +277,7 @@ def test_a_roll_back_does_not_restore_the_calibration_of_the_arm_before(learner,
     assert calibrated(learner)
     learner.relearn([2])
     arm.rest(3.0)
-    learner.anomaly(True)
+    learner.use_body(learner.body.with_anomaly(Anomaly.FOUND, 0))
     arm.rest(0.5)
     assert not calibrated(learner)
 
@@ -382,9 +382,15 @@ def test_an_accelerometer_reading_in_motion_is_not_used_for_the_next_rest(arm26,
     assert not any(sample.gravity.size for sample in learner.samples.samples)
 
 
+def find(learner, is_present):
+    """Let the estimator find a fault of a muscle, or end the anomaly."""
+    anomaly = Anomaly.FOUND if is_present else Anomaly.ENDED
+    learner.use_body(learner.body.with_anomaly(anomaly, 0))
+
+
 @pytest.mark.parametrize(
     ('stop', 'goes_back'),
-    [(Learner.anomaly, True), (lambda learner, stopped: learner.enable(not stopped), False)],
+    [(find, True), (lambda learner, stopped: learner.enable(not stopped), False)],
 )
 def test_an_update_that_ends_while_learning_is_stopped_is_not_used(learner, stage, stop, goes_back):
     accept(learner, stage, 3)

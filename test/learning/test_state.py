@@ -92,7 +92,7 @@ def test_samples_and_network_come_back_to_the_bit(tmp_path, arm26, initial):
     store = SampleStore()
     for sample in (
         plain,
-        plain._replace(spread=np.full(2, 0.02), gravity=gravity, body_version=3, isolated=(1, 4)),
+        plain._replace(spread=np.full(2, 0.02), gravity=gravity, isolated=(1, 4)),
     ):
         store.add(sample)
     store.forget(1, newest=1)
@@ -240,7 +240,7 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
     network = initial_mae(small, 'default', steps=2).mae
     store = SampleStore()
     for _ in range(4):
-        theta, *parts, spread, gravity, _, _ = stage.sample()
+        theta, *parts, spread, gravity, _ = stage.sample()
         measured = theta, *(part[kept] for part in parts), spread, gravity
         # In the robot without the added muscle, this index is that of the muscle after it.
         store.add(Sample(*measured, isolated=(added,)))

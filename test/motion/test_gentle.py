@@ -102,6 +102,7 @@ def test_new_length_offsets_do_not_move_the_arm(loop):
 def test_a_length_calibration_moves_the_arm_only_after_its_first_estimate_even_after_a_stop(loop):
     loop.core.explore(True)
     loop.run(1.0)
+    loop.know(loop.offset)
     loop.begin_calibration()
     loop.has_estimates = False
     before = loop.commands[-1]

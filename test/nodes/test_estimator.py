@@ -11,7 +11,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, Float64, Float64MultiArray
+from std_msgs.msg import Float64, Float64MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -19,7 +19,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import Estimator
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.ros.messages import LATCHED, array_message
+from musculoskeletal_ae.ros.messages import array_message
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def estimator(graph, trained_file):
     graph.listen(JointState, 'vision_joint_states')
     graph.listen(Float64MultiArray, 'estimated_muscle_states')
     graph.listen(Float64, 'anomaly')
-    graph.listen(Bool, 'anomaly_detected', LATCHED)
+    graph.bodies = graph.follow_body()
     graph.listen(DiagnosticArray, '/diagnostics')
     graph.muscles = graph.publisher(Float64MultiArray, 'muscle_states')
     return graph
@@ -78,9 +78,8 @@ def test_estimates_are_published_by_name_and_near_the_truth(estimator, arm26, he
     np.testing.assert_allclose(tension, 60.0, atol=20.0)
     values_of_a = estimator.received['anomaly']
     assert np.isfinite(estimator.wait(lambda: values_of_a, 'A')[-1].data)
-    detected = estimator.received['anomaly_detected']
-    estimator.wait(lambda: detected, 'the latched decision')
-    assert detected[0].data is False
+    estimator.wait(lambda: estimator.bodies, 'the latched body state')
+    assert not estimator.bodies[0].has_anomaly
 
 
 def test_bad_messages_are_counted_by_reason_and_the_next_good_one_works(estimator, healthy):
@@ -160,24 +159,24 @@ def test_a_checkpoint_is_replaced_by_parameter_and_topic_and_an_unfit_one_refuse
 
 def test_an_anomaly_is_published_logged_and_latched_until_reset(estimator, healthy):
     command = estimator.publisher(Float64MultiArray, 'muscle_tension_command')
-    detected = estimator.received['anomaly_detected']
+    bodies = estimator.bodies
     sick = deepcopy(healthy)
     sick.data[6] = 0.0
 
     def observed():
         command.publish(array_message(np.full(6, 60.0), 'muscle'))
         answer(estimator, sick)
-        return detected and detected[-1].data
+        return bodies and bodies[-1].has_anomaly
 
     estimator.wait(observed, 'the detection')
     estimator.wait(lambda: estimator.report('estimator').level == 'error', 'the report of an error')
     assert 'slack_tendon' in estimator.report('estimator').identifiers
     for _ in range(8):
         answer(estimator, healthy)
-    assert detected[-1].data
+    assert bodies[-1].has_anomaly
     response = estimator.call(Trigger, 'estimator/reset')
     assert response.success and response.message.startswith('cleared the anomaly')
-    estimator.wait(lambda: not detected[-1].data, 'the reset')
+    estimator.wait(lambda: not bodies[-1].has_anomaly, 'the reset')
     assert estimator.call(Trigger, 'estimator/reset').message == 'no anomaly was detected'
 
 
@@ -188,13 +187,13 @@ def test_a_muscle_without_its_commanded_length_or_tension_is_an_anomaly(
     healthy.data[6 + 2] = 0.0  # no tension in muscle 2
     command = estimator.publisher(Float64MultiArray, f'muscle_{kind}_command')
     demand = np.array(healthy.data[:6]) - 0.003 if kind == 'length' else np.full(6, 60.0)
-    detected = estimator.received['anomaly_detected']
+    bodies = estimator.bodies
 
     def observed():
         command.publish(array_message(demand, 'muscle'))
         estimator.muscles.publish(healthy)
         estimator.spin(0.02)
-        return detected and detected[-1].data
+        return bodies and bodies[-1].has_anomaly
 
     estimator.wait(observed, 'the detection')
     assert estimator.estimator.core.cause.startswith(arm26.muscles[2])

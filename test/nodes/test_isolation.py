@@ -6,20 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from controlled_arm import ControlledArm
-from std_msgs.msg import Bool, String
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.ros.messages import LATCHED
+from musculoskeletal_ae.signals.body_state import Anomaly
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -0.9])
 
 
 @pytest.fixture
 def arm(graph, arm26, trained_file):
-    graph.listen(String, 'isolated_muscles', LATCHED)
-    graph.listen(Bool, 'anomaly_detected', LATCHED)
     arm = ControlledArm(graph, arm26, trained_file)
     arm.target(HERE)
     arm.goes_to(HERE)
@@ -28,19 +25,30 @@ def arm(graph, arm26, trained_file):
 
 def test_a_ruptured_muscle_is_verified_isolated_and_restored(arm):
     graph, name = arm.graph, arm.robot.muscles[3]
-    assert graph.received['isolated_muscles'][-1].data == ''
+    bodies = graph.follow_body()
+    graph.wait(lambda: bodies, 'the body state')
+    assert (bodies[-1].isolated, bodies[-1].anomaly) == ((), Anomaly.NONE)
     assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
     assert graph.set_parameter('hardware_emulator', 'faults', [f'rupture:{name}'])[0]
-    graph.wait(lambda: graph.received['anomaly_detected'][-1].data, 'the anomaly')
+    graph.wait(lambda: bodies[-1].has_anomaly, 'the anomaly')
+    # One message tells of finding, isolation and verification.
+    assert (bodies[-1].isolated, bodies[-1].anomaly, bodies[-1].suspect) == (
+        (3,),
+        Anomaly.VERIFYING,
+        3,
+    )
+    assert len(bodies) == 2
     graph.wait(lambda: arm.state().values['mode'] == 'verifying', 'the verification')
     graph.wait(
         lambda: graph.report('estimator').values['verification'] == 'running',
         'the verification to be reported',
     )
     assert graph.report('estimator').values['suspect muscle'] == name
-    graph.wait(lambda: not graph.received['anomaly_detected'][-1].data, 'the end of the anomaly')
+    graph.wait(lambda: not bodies[-1].has_anomaly, 'the end of the anomaly')
+    assert bodies[-1].anomaly is Anomaly.ENDED
     assert arm.estimator.core.suspects.last_verification == f'{name}: ruptured'
-    assert graph.received['isolated_muscles'][-1].data == name
+    assert bodies[-1].isolated == (3,)
+    assert len(bodies) == 3
     graph.wait(lambda: arm.controller.core.supervisor.is_running, 'the arm to go on')
     assert arm.controller.core.robot.isolated == (3,)
     arm.target(THERE)
@@ -94,17 +102,54 @@ def test_muscles_are_isolated_by_service_and_unknown_names_are_refused(arm, trai
     assert arm.estimator.core.body.isolated == (1, 2)
 
 
-def test_a_restarted_estimator_takes_isolated_muscles_from_the_network(graph, arm26, trained):
-    known = replace(trained['default'].without((4,)), version=5)
-    reported = graph.listen(String, 'isolated_muscles', LATCHED)
-    estimator = graph.host(Estimator, robot='arm26')
-    graph.send_network(checkpoint.to_bytes(known))
-    graph.wait(lambda: reported, 'the list of isolated muscles')
-    assert reported[-1].data == arm26.muscles[4]
-    assert estimator.core.mae.isolated == (4,)
-    # Only the first network determines the isolated muscles. From now on the estimator does.
-    graph.wait(lambda: not estimator.candidates.queue.is_busy, 'the end of the validation')
-    others = replace(trained['default'].without((1, 2)), version=6)
+def test_a_restarted_estimator_remembers_isolated_muscles(graph, arm26, trained):
+    bodies = graph.follow_body()
+    names = list(arm26.muscles[1:3])
+    estimator = graph.host(Estimator, robot='arm26', isolate_muscles=names)
+    graph.send_network(checkpoint.to_bytes(replace(trained['default'], version=5)))
+    graph.wait(lambda: estimator.checkpoint_version == 5, 'the network')
+    assert graph.set_parameter('estimator', 'isolate_muscles', names[:1])[0]
+    graph.wait(lambda: graph.call(Trigger, 'estimator/restore').success, 'the restoration')
+    graph.wait(lambda: bodies and bodies[-1].isolated == (2,), 'the restored muscle')
+    before = bodies[-1]
+    graph.end(estimator)
+    restarted = graph.host(Estimator, robot='arm26')
+    graph.wait(lambda: bodies[-1].generation > before.generation, 'its first body state')
+    assert bodies[-1].isolated == (2,)
+    # The learner's network may name other muscles, but only the estimator decides.
+    others = replace(trained['default'].without((1, 4)), version=6)
     graph.send_network(checkpoint.to_bytes(others))
-    graph.wait(lambda: estimator.checkpoint_version == 6, 'the next network')
-    assert estimator.core.body.isolated == (4,)
+    graph.wait(lambda: restarted.checkpoint_version == 6, 'the next network')
+    assert restarted.core.mae.isolated == restarted.core.body.isolated == (2,)
+    assert bodies[-1].isolated == (2,)
+
+
+def test_at_its_first_start_the_estimator_isolates_what_the_chosen_network_lacks(
+    graph, trained, tmp_path
+):
+    file = str(tmp_path / 'without.safetensors')
+    checkpoint.save(trained['default'].without((4,)), file)
+    bodies = graph.follow_body()
+    graph.host(Estimator, robot='arm26', checkpoint=file)
+    graph.wait(lambda: bodies, 'the body state')
+    assert bodies[-1].isolated == (4,)
+
+
+def test_a_stop_outlasts_a_restart_of_the_estimator_and_no_suspect_is_used_again(arm):
+    graph, name = arm.graph, arm.robot.muscles[3]
+    bodies = graph.follow_body()
+    assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
+    assert graph.set_parameter('hardware_emulator', 'faults', [f'rupture:{name}'])[0]
+    graph.wait(lambda: arm.state().values['mode'] == 'verifying', 'the verification')
+    graph.end(arm.estimator)
+    count = len(bodies)
+    arm.estimator = graph.host(Estimator, robot='arm26', checkpoint=arm.checkpoint)
+    graph.wait(lambda: len(bodies) > count, 'the body state of the new estimator')
+    assert (bodies[-1].isolated, bodies[-1].anomaly) == ((3,), Anomaly.NONE)
+    graph.wait(lambda: arm.state().values['mode'] == 'stopped', 'the end of the verification')
+    graph.spin(1.0)
+    assert arm.controller.core.supervisor.is_latched
+    assert arm.controller.core.robot.isolated == (3,)
+    graph.wait(lambda: graph.call(Trigger, 'controller/reset').success, 'the reset')
+    arm.goes_to(HERE)
+    assert arm.controller.core.robot.isolated == (3,)

@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from graph import DEADLINE, LOOK
 from processes import is_running
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Imu, JointState
-from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
+from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -28,6 +29,7 @@ from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.ros.messages import LATCHED, array_message
 from musculoskeletal_ae.ros.running import NICENESS
+from musculoskeletal_ae.signals.body_state import Anomaly, BodyState
 
 REST, MOVE = 0.8, 0.1  # duration of a rest, and of the motion between two rests [s]
 DT = 0.02
@@ -215,14 +217,9 @@ def test_the_learner_saves_what_the_estimator_accepts_and_returns_from_what_it_r
     assert learner.report().values['last rejected network'] == 'it is too wrong'
 
 
-def confirm(_, response):
-    response.success = True
-    return response
-
-
 def test_an_anomaly_and_learner_enable_stop_learning_for_a_time(host, graph):
     learner = host()
-    detected = graph.publisher(Bool, 'anomaly_detected', LATCHED)
+    healthy = BodyState.healthy(6)
     learner.learn(lambda: learner.updates >= 1, 'an update')
 
     def learns_nothing():
@@ -240,12 +237,11 @@ def test_an_anomaly_and_learner_enable_stop_learning_for_a_time(host, graph):
     learns_nothing()
     assert graph.call(SetBool, 'learner/enable', SetBool.Request(data=True)).success
     learns_again()
-    detected.publish(Bool(data=True))
+    graph.tell_body(replace(healthy, anomaly=Anomaly.FOUND, suspect=0, generation=1))
     learner.learn(lambda: 'anomaly' in learner.report().message, 'the learner to pause')
     learns_nothing()
     assert int(learner.report().values['not learned: anomaly']) >= 3
-    graph.node.create_service(Trigger, 'estimator/check_health', confirm)
-    detected.publish(Bool(data=False))
+    graph.tell_body(replace(healthy, anomaly=Anomaly.ENDED, suspect=0, generation=2))
     learns_again()
     assert not graph.call(Trigger, 'learner/save').success  # this learner has no state directory
 
@@ -329,25 +325,18 @@ def test_parameters_refused_together_change_nothing(host, arm26, trained_file, s
     assert together(checkpoint='').successful
 
 
-def test_the_learner_follows_the_isolated_muscles_of_a_running_estimator(
-    host, graph, arm26, trained, tmp_path
-):
-    file, names = str(tmp_path / 'without.safetensors'), arm26.muscles
+def test_the_learner_follows_the_isolated_muscles_of_the_estimator(host, graph, trained, tmp_path):
+    file, healthy = str(tmp_path / 'without.safetensors'), BodyState.healthy(6)
     checkpoint.save(trained['default'].without((4,)), file)
     learner = host(checkpoint=file)
-    isolated = graph.publisher(String, 'isolated_muscles', LATCHED)
 
     def known():
         return learner.node.core.mae.isolated
 
-    isolated.publish(String(data=''))  # an estimator that has just started publishes this
-    graph.wait(
-        lambda: learner.node.has_heard_isolated, 'the learner to receive the isolated muscles'
-    )
     assert known() == (4,)
-    for text, muscles in ((f'{names[2]}, {names[4]}', (2, 4)), (names[2], (2,)), ('', ())):
-        isolated.publish(String(data=text))
-        graph.wait(lambda wanted=muscles: known() == wanted, text or 'nobody')
+    for generation, muscles in enumerate([(4,), (2, 4), (2,), ()], 1):
+        graph.tell_body(replace(healthy, isolated=muscles, generation=generation))
+        graph.wait(lambda wanted=muscles: known() == wanted, f'{muscles}')
 
 
 def test_the_learner_gives_up_the_joint_sensors_that_the_estimator_doubts(host, graph, arm26):

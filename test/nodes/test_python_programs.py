@@ -75,7 +75,7 @@ def explores_healthily(arm):
 
 
 # A program that does not wait for the verification must not do any harm either.
-HASTY = 'while detected[-1]:', 'while False:'
+HASTY = 'while bodies[-1][1] == VERIFYING:', 'while False:'
 
 
 @pytest.mark.parametrize(

@@ -188,22 +188,12 @@ def test_the_simulator_as_robot_closes_the_loop_with_estimator_and_controller(
     assert graph.node.count_publishers('sim/joint_states') == 0
 
 
-def test_the_simulator_as_robot_keeps_tension_in_isolated_muscles(graph, arm26, trained_file):
-    graph.listen(Float64MultiArray, 'muscle_states')
+def test_the_simulator_as_robot_uses_neither_length_offsets_nor_isolation(graph, trained_file):
     shell = graph.host(Sim, robot='arm26', checkpoint=trained_file, as_robot=True, rate=2.0)
-    graph.publisher(String, 'isolated_muscles', LATCHED).publish(String(data=arm26.muscles[1]))
-    graph.wait(lambda: shell.body.isolated == (1,), 'the isolation')
-    graph.next('muscle_states', 2)
-    _, tension, _ = read_muscle_states(graph.received['muscle_states'][-1], 6)
-    np.testing.assert_array_equal(tension, arm26.tension.bias)
     assert shell.longest_step == 1.0  # two periods of the rate of 2 Hz [s]
-
-
-def test_the_simulator_as_robot_does_not_use_length_offsets_of_others(graph, trained_file):
-    shell = graph.host(Sim, robot='arm26', checkpoint=trained_file, as_robot=True)
     topics = {subscription.topic_name for subscription in shell.subscriptions}
     assert f'{graph.namespace}/muscle_length_command' in topics
-    assert f'{graph.namespace}/muscle_length_zeros' not in topics
+    assert f'{graph.namespace}/body_state' not in topics
 
 
 def test_preset_paper_runs_and_an_unknown_one_is_refused(graph, arm26, trained_file):

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Second publishers are detected from the graph, from reports and from stamps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from controlled_arm import ControlledArm
@@ -9,7 +11,7 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, Float64MultiArray, String, UInt8MultiArray
+from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.nodes.controller import Controller
@@ -27,7 +29,7 @@ from musculoskeletal_ae.ros.second_publishers import (
     Twins,
     full_name,
 )
-from musculoskeletal_ae.signals.body_state import Trust
+from musculoskeletal_ae.signals.body_state import Anomaly, BodyState, LengthOffsets
 
 FIRST, SECOND = Publisher('/estimator', b'1'), Publisher('/estimator', b'2')
 
@@ -111,17 +113,15 @@ def test_two_publishers_of_one_link_are_noticed_but_two_links_are_not():
     assert sensors.problem == ''
 
 
+def strange_body(count):
+    """Return a body state in which everything is wrong: offsets, isolated muscles and anomaly."""
+    offsets = LengthOffsets(np.full(count, 0.08), np.full(count, 1e-3))
+    body = BodyState(offsets, (1, 2), Anomaly.VERIFYING, 1, generation=99)
+    return array_message(body.rows, 'quantity', 'muscle')
+
+
 STRANGE = {
-    'isolated_muscles': (String, lambda robot: String(data=','.join(robot.muscles))),
-    'muscle_length_zeros': (
-        Float64MultiArray,
-        lambda robot: array_message(
-            np.outer([0.08, 1e-3, Trust.KNOWN, 99.0], np.ones(robot.muscle_count)),
-            'quantity',
-            'muscle',
-        ),
-    ),
-    'anomaly_detected': (Bool, lambda _: Bool(data=True)),
+    'body_state': (Float64MultiArray, lambda robot: strange_body(robot.muscle_count)),
     'accepted_checkpoint': (UInt8MultiArray, lambda _: UInt8MultiArray(data=b'not a network')),
 }
 
@@ -168,22 +168,38 @@ def test_a_second_clock_stops_the_nodes_that_use_it(graph):
     graph.wait(lambda: not follower.intruders, 'the end of the second clock')
 
 
-@pytest.mark.parametrize('confirmed', [False, True])
-def test_the_end_of_an_anomaly_counts_once_the_estimator_confirms_it(graph, confirmed):
-    controller = graph.host(Controller, robot='arm26')
-    asked = []
+@pytest.mark.parametrize('denial', [Anomaly.NONE, Anomaly.ENDED])
+def test_another_node_cannot_end_an_anomaly(graph, arm26, trained_file, denial):
+    arm = ControlledArm(graph, arm26, trained_file)
+    core, name = arm.controller.core, arm26.muscles[3]
+    arm.target([-0.5, -1.2])
+    graph.wait(lambda: arm.count() > 30, 'commands')
+    assert graph.set_parameter('hardware_emulator', 'faults', [f'rupture:{name}'])[0]
+    graph.wait(lambda: core.watchdog.has_anomaly, 'the anomaly')
+    body = replace(core.stream.body.with_anomaly(denial, 3), isolated=(), generation=2**52)
+    stranger = graph.publisher(Float64MultiArray, 'body_state', LATCHED)
+    stranger.publish(array_message(body.rows, 'quantity', 'muscle'))
+    rejected = 'body_state: several publishers'
+    graph.wait(lambda: arm.controller.rejected[rejected], 'the rejection')
+    assert core.watchdog.has_anomaly and core.supervisor.is_latched
+    graph.node.destroy_publisher(stranger)
+    graph.spin(0.5)
+    assert core.watchdog.has_anomaly
+    assert not graph.call(Trigger, 'controller/reset').success
 
-    def answer(_, response):
-        asked.append(True)
-        response.success = confirmed
-        return response
 
-    graph.node.create_service(Trigger, 'estimator/check_health', answer)
-    detected = graph.publisher(Bool, 'anomaly_detected', LATCHED)
-    watchdog = controller.core.watchdog
-    detected.publish(Bool(data=True))
-    graph.wait(lambda: watchdog.has_anomaly, 'the anomaly')
-    detected.publish(Bool(data=False))
-    graph.wait(lambda: asked, 'the call of the service')
-    graph.spin(0.2)
-    assert watchdog.has_anomaly is not confirmed
+def test_without_an_estimator_no_body_state_ends_a_stop_by_itself(graph, arm26, trained_file):
+    arm = ControlledArm(graph, arm26, trained_file)
+    core, name = arm.controller.core, arm26.muscles[3]
+    arm.target([-0.5, -1.2])
+    graph.wait(lambda: arm.count() > 30, 'commands')
+    assert graph.set_parameter('estimator', 'on_anomaly', 'isolate')[0]
+    assert graph.set_parameter('hardware_emulator', 'faults', [f'rupture:{name}'])[0]
+    graph.wait(lambda: arm.state().values['mode'] == 'verifying', 'the verification')
+    assert graph.set_parameter('controller', 'max_age', 0.5)[0]
+    graph.end(arm.estimator)
+    graph.tell_body(replace(BodyState.healthy(6), generation=2**52))
+    graph.wait(lambda: not core.watchdog.has_anomaly, 'the false body state')
+    graph.spin(1.0)
+    assert core.supervisor.is_latched
+    assert not graph.call(Trigger, 'controller/reset').success

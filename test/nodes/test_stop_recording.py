@@ -7,7 +7,7 @@ import os
 import pytest
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, Float64MultiArray
+from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import topics_with
@@ -34,7 +34,7 @@ def states(value):
 
 
 def test_the_last_seconds_and_what_was_latched_before_are_kept(recording, now):
-    recording.heard('anomaly_detected', serialize_message(Bool(data=True)))
+    recording.heard('body_state', states(1.0))
     for n in range(400):
         now[0] += 100_000_000
         recording.heard('muscle_states', states(float(n)))
@@ -45,21 +45,21 @@ def test_the_last_seconds_and_what_was_latched_before_are_kept(recording, now):
     times = [m.log_time for m in messages]
     assert len(messages) == 102
     assert max(times) - min(times) == int(SECONDS * 1e9)
-    assert set(bag.topics) == {'/arm/anomaly_detected', '/arm/muscle_states'}
+    assert set(bag.topics) == {'/arm/body_state', '/arm/muscle_states'}
     assert (recording.saved / FILE).read_text() == 'a cause\n'
 
 
 @pytest.mark.parametrize('most', [stop_recording.MOST, 3])
 def test_what_was_latched_before_is_kept_though_newer_came(recording, now, monkeypatch, most):
     monkeypatch.setattr(stop_recording, 'MOST', most)
-    for step, detected in enumerate((True, False, True, False)):
+    for step in range(4):
         now[0] += int((0.4 if step else 0.0) * SECONDS * 1e9)
-        recording.heard('anomaly_detected', serialize_message(Bool(data=detected)))
+        recording.heard('body_state', states(float(step)))
     recording.save('a cause', 10)
     recording.close()
     bag = Bag.open(recording.saved)
-    kept = [bag.decode(message).data for message in bag.messages()]
-    assert kept == [True, False, True, False]
+    kept = [bag.decode(message).data[0] for message in bag.messages()]
+    assert kept == [0.0, 1.0, 2.0, 3.0]
 
 
 def test_large_messages_do_not_fill_the_memory(recording, monkeypatch):

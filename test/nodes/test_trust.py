@@ -13,7 +13,7 @@ from graph import DEADLINE, LOOK
 from network_attacks import ATTACKS
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, Float64MultiArray
+from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.estimation.network_validation import validator
@@ -129,13 +129,13 @@ def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_n
     arm.graph.wait(lambda: all(n.core.mae.version == first for n in nodes), 'the proven network')
 
 
-def test_impossible_length_offsets_are_refused(graph, trained_file):
+def test_an_impossible_body_state_is_refused(graph, trained_file):
     controller = graph.host(Controller, robot='arm26', checkpoint=trained_file)
-    zeros = np.zeros((4, 6))
-    zeros[0] = 1e17
-    latched = graph.publisher(Float64MultiArray, 'muscle_length_zeros', LATCHED)
-    latched.publish(array_message(zeros, 'quantity', 'muscle'))
-    reason = 'muscle_length_zeros: impossible offsets'
+    rows = np.zeros((6, 6))
+    rows[0] = 1e17
+    latched = graph.publisher(Float64MultiArray, 'body_state', LATCHED)
+    latched.publish(array_message(rows, 'quantity', 'muscle'))
+    reason = 'body_state: impossible body state'
     graph.wait(lambda: controller.rejected[reason], 'the refusal')
     assert not controller.body.offsets.offset.any()
 
@@ -234,8 +234,8 @@ def test_a_muscle_ruptured_before_the_start_is_detected(graph, trained_file):
     muscle = 'deltoid_anterior'
     hardware = graph.host(HardwareEmulator, robot='arm26', seed=0, faults=[f'rupture:{muscle}'])
     hardware.arm.step(3.0)
-    detected = graph.listen(Bool, 'anomaly_detected', LATCHED)
+    bodies = graph.follow_body()
     estimator = graph.host(Estimator, robot='arm26', checkpoint=trained_file)
     graph.host(Controller, robot='arm26', checkpoint=trained_file, explore=True, max_age=10.0)
-    graph.wait(lambda: detected and detected[-1].data, 'the detection')
+    graph.wait(lambda: bodies and bodies[-1].has_anomaly, 'the detection')
     assert estimator.core.cause.startswith(muscle)

@@ -19,7 +19,7 @@ from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters
 from robots import write_robot
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, String
+from std_msgs.msg import String
 
 from musculoskeletal_ae.conditions import stop_causes
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -211,7 +211,7 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
     graph.start('hardware_emulator', robot='arm26')
     nodes = {'robot': 'arm26', 'checkpoint': trained_file, 'max_age': 10.0, 'first_duration': 2.0}
     graph.start('combined', **nodes)  # estimator and controller
-    detected = graph.listen(Bool, 'anomaly_detected', LATCHED)
+    bodies = graph.follow_body()
     targets = graph.listen(JointState, 'target_joint_states')
     modes = graph.listen(String, 'controller_mode', LATCHED)
     graph.listen(JointState, 'estimated_joint_states')
@@ -246,7 +246,7 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         )
         page.close_notifications()
         assert page.screenshot(SCREENSHOTS / 'moving.png') != before
-        assert not targets and not any(message.data for message in detected)
+        assert not targets and not any(body.has_anomaly for body in bodies)
         page.press('End exploring')
         graph.wait(lambda: modes[-1].data == 'idle', 'the end of the exploration')
         # When the arm comes to rest, the sliders show its posture, and would replace a number that
@@ -259,7 +259,7 @@ def test_a_visitor_sees_the_arm_move_ruptures_a_muscle_and_sees_the_anomaly(
         see('exploring')
         page.press('Rupture')
         see('ERROR: estimator: ')
-        assert detected[-1].data
+        assert bodies[-1].has_anomaly
         # The page must refuse this as long as the muscle is ruptured, because the arm would stop
         # again.
         graph.wait(

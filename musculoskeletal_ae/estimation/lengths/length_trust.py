@@ -4,14 +4,14 @@
 Detectors, the length calibration, the joint sensors, the check of a repaired muscle and a restart
 provide evidence. `TRANSITIONS` has the trust that follows from each of them. A finding revokes
 offsets if the declaration of its kind says so (`conditions.py`). The estimator publishes the result
-on `muscle_length_zeros`, and all other nodes follow it.
+on `body_state`, and all other nodes follow it.
 
     start ── ASSUMED ───────────────────► KNOWN ── a finding that revokes offsets ──► REVOKED
     start ── NOT_CALIBRATED, RESTARTED ─► UNKNOWN ── CALIBRATED ─► KNOWN ◄── AGREES ── REVOKED
     any ──── CALIBRATING ───────────────► UNKNOWN
     KNOWN ── MOVED, then CONFIRMED ─────► KNOWN
 
-The estimator itself knows that it has restarted, because it saves its offsets (`offset_memory`).
+The estimator itself knows that it has restarted, because it saves its offsets (`body_memory`).
 """
 
 from __future__ import annotations
@@ -76,17 +76,14 @@ class LengthTrust:
             revoked its offset.
     """
 
-    def __init__(self, muscle_count: int, first_generation: int = 1) -> None:
+    def __init__(self, muscle_count: int) -> None:
         """Assume that the length sensors are absolute, so that all offsets are zero.
 
         Args:
             muscle_count: Number of muscles M.
-            first_generation: Generation of the first decision; larger than those of all decisions
-                before a restart.
         """
         self.offsets = LengthOffsets.none(muscle_count)
         self.evidence: list[Evidence | ConditionKind] = [Evidence.ASSUMED] * muscle_count
-        self._generation = first_generation
 
     def take(
         self,
@@ -95,8 +92,6 @@ class LengthTrust:
         found: LengthOffsets | None = None,
     ) -> bool:
         """Decide by new evidence; return whether this has changed an offset or a trust.
-
-        Each change is a new decision with the next generation.
 
         Args:
             evidence: The evidence, or the kind of a finding that revokes length offsets.
@@ -109,7 +104,7 @@ class LengthTrust:
         concerned = [m for m in candidates if previous.trust[m] in transition.before]
         for muscle in concerned:
             self.evidence[muscle] = evidence
-        rows = previous.rows
+        rows = previous.rows.copy()
         if found is not None:
             rows[:2, concerned] = found.rows[:2, concerned]
         if evidence is Evidence.CONFIRMED:
@@ -117,9 +112,8 @@ class LengthTrust:
         rows[2, concerned] = transition.after
         if (rows == previous.rows).all():
             return False
-        offset, deviation, trust, _ = rows
-        self.offsets = LengthOffsets(offset, deviation, trust.astype(int), self._generation)
-        self._generation += 1
+        offset, deviation, trust = rows
+        self.offsets = LengthOffsets(offset, deviation, trust.astype(int))
         return True
 
     @property

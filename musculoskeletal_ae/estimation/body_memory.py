@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keeps length offsets and isolated muscles on disk, for the next start of the estimator.
+
+An estimator that finds the file `estimator.offsets` isolates the muscles that it names. It
+considers its length offsets unknown until the next length calibration, because the modules may have
+lost their counts meanwhile. It uses the saved offsets until then, so that estimates and commands
+change little. The file has no offsets if they are known to be zero, as those of absolute sensors
+that were never calibrated. As long as the body is healthy as well, there is no file.
+
+Without this file, an estimator that has restarted would assume a healthy body with offsets of zero.
+The other nodes would have to conclude from the change that this is wrong.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.files import read_text
+from musculoskeletal_ae.signals.body_state import MOST_OFFSET, BodyState, LengthOffsets
+
+FILE = 'estimator.offsets'
+LARGEST = 1_000_000  # size limit of the file [bytes]
+
+
+class SavedBody(NamedTuple):
+    """What the previous estimator has left behind."""
+
+    #: offsets [m], (M,), 0 for muscles that the file does not name; None if they were known to be 0
+    offset: Array | None
+    isolated: tuple[int, ...]  # indices of the isolated muscles
+    generation: int
+
+
+class BodyMemory:
+    """Reads and writes the file.
+
+    Attributes:
+        found: What the previous estimator has left behind; None if there was none.
+        problem: Why the present body state is not saved, as a text for users, or ''.
+    """
+
+    def __init__(self, directory: Path | None, muscles: Sequence[str]) -> None:
+        """Read the file.
+
+        Args:
+            directory: Directory of the file. With None, nothing is read or saved.
+            muscles: Names of all muscles.
+        """
+        self._muscles = muscles
+        self._file: Path | None = None
+        self._was_decided = True  # whether the last offsets were known or revoked
+        self._saved: tuple[LengthOffsets, tuple[int, ...]] | None = None  # what the file contains
+        self.found: SavedBody | None = None
+        self._has_file = False
+        self.problem = ''
+        # A NUL in the path raises a ValueError, and an unknown home directory a RuntimeError.
+        with suppress(OSError, ValueError, RuntimeError):
+            if directory is not None:
+                self._file = directory.expanduser() / FILE
+                self._has_file = self._file.exists()
+                if self._has_file:
+                    self.found = self._read(self._file)
+
+    def _read(self, file: Path) -> SavedBody:
+        """Return the content of the file; offsets of 0 and no isolated muscle if it is damaged."""
+        nothing = SavedBody(np.zeros(len(self._muscles)), (), 0)
+        with suppress(MusculoskeletalError, ValueError, TypeError, KeyError, AttributeError):
+            content = json.loads(
+                read_text(file, lambda _, problem: MusculoskeletalError(problem), LARGEST)
+            )
+            names, generation = content.get('isolated', []), int(content['generation'])
+            isolated = tuple(m for m, name in enumerate(self._muscles) if name in names)
+            saved = content['offset']
+            if saved is None and generation >= 0:
+                return SavedBody(None, isolated, generation)
+            offset = np.array([float(saved.get(name, 0.0)) for name in self._muscles])
+            if (np.abs(offset) <= MOST_OFFSET).all() and generation >= 0:
+                return SavedBody(offset, isolated, generation)
+        return nothing
+
+    def note(self, body: BodyState) -> None:
+        """Save the body state that holds from now on.
+
+        Provisional offsets of a calibration are not saved.
+        """
+        offsets = body.offsets
+        is_decided = offsets.known or bool(offsets.revoked)
+        if self._saved is not None and not (is_decided or self._was_decided):
+            offsets, _ = self._saved
+        self._was_decided = is_decided
+        is_healthy = _are_zero(offsets) and not body.isolated
+        is_known = self._saved == (offsets, body.isolated)
+        if self._file is None or is_known or (is_healthy and not self._has_file):
+            return
+        self._saved = offsets, body.isolated
+        try:
+            self._save(self._file, offsets, body)
+            self._has_file = True
+            self.problem = ''
+        except OSError as error:
+            self.problem = (
+                'length offsets and isolated muscles cannot be saved, so a restarted estimator '
+                f'will not know them: {error}'
+            )
+
+    def _save(self, file: Path, offsets: LengthOffsets, body: BodyState) -> None:
+        by_name = dict(zip(self._muscles, offsets.offset.tolist(), strict=True))
+        content = {
+            'generation': body.generation,
+            'offset': None if _are_zero(offsets) else by_name,
+            'isolated': [self._muscles[muscle] for muscle in body.isolated],
+        }
+        file.parent.mkdir(parents=True, exist_ok=True)
+        # Write without fsync, which could delay an estimate by 0.1 s. If the process is killed,
+        # nothing that was written is lost. A power failure may leave an empty file, which counts as
+        # a damaged one.
+        new = file.with_name(f'.{FILE}')
+        new.write_text(json.dumps(content), encoding='utf-8')
+        new.replace(file)
+
+
+def _are_zero(offsets: LengthOffsets) -> bool:
+    """Return whether all offsets are known to be zero."""
+    return offsets.known and not offsets.offset.any()

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A restarted estimator knows which offsets were calibrated or revoked, and who was isolated."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from musculoskeletal_ae.estimation.body_memory import FILE, BodyMemory
+from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets, Trust
+
+MUSCLES = ['biceps', 'triceps']
+OFFSETS = LengthOffsets(np.array([0.05, -0.08]), np.full(2, 1e-3))
+FOUND = BodyState(OFFSETS, (1,), generation=12)
+HEALTHY = BodyState.healthy(2)
+
+
+@pytest.fixture
+def memory(tmp_path):
+    return BodyMemory(tmp_path / 'new', MUSCLES)
+
+
+def found_later(tmp_path, muscles=MUSCLES):
+    return BodyMemory(tmp_path / 'new', muscles).found
+
+
+def test_the_next_estimator_finds_the_body_by_the_names_of_the_muscles(memory, tmp_path):
+    memory.note(FOUND)
+    found = found_later(tmp_path, ['triceps', 'brachialis', 'biceps'])
+    assert_array_equal(found.offset, [-0.08, 0.0, 0.05])
+    assert found.isolated == (0,)
+    assert found.generation == 12
+
+
+def test_a_healthy_body_with_absolute_sensors_leaves_no_file(memory, tmp_path):
+    memory.note(HEALTHY)
+    assert found_later(tmp_path) is None
+
+
+def test_absolute_sensors_keep_offsets_that_are_known_to_be_zero(memory, tmp_path):
+    memory.note(replace(HEALTHY, isolated=(0,), generation=1))
+    assert found_later(tmp_path) == (None, (0,), 1)
+    trust = np.array([Trust.REVOKED, Trust.KNOWN])
+    revoked = replace(HEALTHY, offsets=replace(HEALTHY.offsets, trust=trust), generation=2)
+    memory.note(revoked)
+    assert_array_equal(found_later(tmp_path).offset, np.zeros(2))
+    memory.note(replace(HEALTHY, generation=3))  # joint sensors agree with the lengths again
+    assert found_later(tmp_path) == (None, (), 3)
+
+
+def test_provisional_offsets_of_a_calibration_are_not_saved_but_isolated_muscles_are(
+    memory, tmp_path
+):
+    memory.note(FOUND)
+    memory.note(BodyState(LengthOffsets.unknown(2), (1,), generation=13))
+    provisional = replace(OFFSETS, trust=np.full(2, Trust.UNKNOWN))
+    memory.note(BodyState(provisional, (1,), generation=14))
+    assert found_later(tmp_path).generation == 13
+    memory.note(BodyState(provisional, (0, 1), generation=15))
+    found = found_later(tmp_path)
+    assert_array_equal(found.offset, np.zeros(2))
+    assert found.isolated == (0, 1)
+
+
+def test_a_file_of_an_earlier_version_names_no_isolated_muscles(tmp_path):
+    (tmp_path / FILE).write_text('{"generation": 5, "offset": {"biceps": 0.05}}')
+    found = BodyMemory(tmp_path, MUSCLES).found
+    assert_array_equal(found.offset, [0.05, 0.0])
+    assert (found.isolated, found.generation) == ((), 5)
+
+
+@pytest.mark.parametrize(
+    'content', ['', 'null', '[1]', '{"generation": 1, "offset": {"biceps": 1e9}}', '\0']
+)
+def test_a_damaged_file_still_says_that_the_offsets_are_unknown(tmp_path, content):
+    (tmp_path / FILE).write_text(content)
+    found = BodyMemory(tmp_path, MUSCLES).found
+    assert_array_equal(found.offset, np.zeros(2))
+
+
+def test_a_body_that_cannot_be_saved_is_reported_and_changes_nothing_else(tmp_path):
+    file = tmp_path / 'file'
+    file.write_text('')
+    memory = BodyMemory(file, MUSCLES)
+    memory.note(FOUND)
+    assert 'cannot be saved' in memory.problem
+    assert BodyMemory(None, MUSCLES).found is None
