@@ -50,7 +50,8 @@ doc/howto/your_robot.md is the guide for your own robot.
                              other postures; for a MuJoCo model: the model without deviations)
   --reality kin|foreign|FILE.xml
                              emulator model: kin, foreign (with mechanics that the learner does not
-                             model), or a MuJoCo model with the robot's names (default: kin)
+                             model), or the model.xml that import_robot wrote for the robot
+                             (default: kin)
   --joint-source sensor|marker|none
                              joint angles for the learner: from sensors, from a camera that observes
                              the hand, or none (the first network then takes 20 samples, about two
@@ -350,20 +351,15 @@ train_once() {
 # takes seconds, and the cached checkpoint is found again, because its file name depends on the name
 # and the contents of this directory, not on its path.
 import_mujoco() {
-  local status name
+  local name
   name=$(basename "$mujoco" .xml)
   mujoco=$(realpath "$mujoco")
   robot=$logs/${name//[^A-Za-z0-9_.-]/_} && robot_directory=$robot
   say "importing $mujoco"
-  launch import_robot "$mujoco" --out "$robot" --play "${chain[@]}" > >(tee -p "$logs/import.log") 2>&1
-  wait_for import_robot
-  status=$?
-  case $status in
-    0) ;;
-    3) own_clock=true ;;
-    *) exit 1 ;;
-  esac
-  reality=$mujoco
+  launch import_robot "$mujoco" --out "$robot" "${chain[@]}" > >(tee -p "$logs/import.log") 2>&1
+  wait_for import_robot || exit 1
+  reality=$robot/model.xml
+  own_clock=true
 }
 
 # --- The system ----------------------------------------------------------------------------------
@@ -389,7 +385,9 @@ fi
 
 quoted() { printf "'%s'" "${1//\'/\'\'}"; } # as YAML, the format of ROS parameters
 
-own_clock=false # whether the emulated arm may be too slow for real time, so that it publishes /clock
+# Whether the emulated arm publishes /clock, because it may be too slow for real time. This is unknown
+# for a MuJoCo model.
+own_clock=false
 [ -z "$mujoco" ] || import_mujoco
 [ -n "$checkpoint" ] || train_once
 
@@ -414,9 +412,6 @@ elif [ -z "$bag" ]; then
   [[ $reality =~ ^(kin|foreign)$ ]] || ! is_given --seed || deviates=true
   start_node hardware_emulator -p "reality:=$(quoted "$reality")" -p "deviates:=$deviates" \
     -p "clock:=$own_clock" "${camera[@]}"
-  # Show warnings about a deviating robot file here, not only in the log.
-  tail -n +1 -s 0.2 -f --pid="$!" "$logs/hardware_emulator.log" </dev/null 2>/dev/null |
-    sed -un 's/^\[WARN\][^:]*: \(reality .*\)/-- \1/p' &
 fi
 
 kept_in estimator

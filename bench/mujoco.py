@@ -253,8 +253,8 @@ def attempt(error: Callable[[Study, int], float], study: Study, seed: int) -> st
 def nodes_row(name: str, file: Path, chain: dict[str, Any], args: Namespace) -> list[str]:
     """Import a model, run all nodes, and return the cells with the CPU time of each node."""
     robot: Robot = import_robot(file, args.out / name / 'robot', **chain).robot
-    emulator = f'reality:={file.resolve()}', 'deviates:=true', f'seed:={args.seeds[0]}'
     directory = str(robot.description.directory)
+    emulator = f'reality:={directory}/model.xml', 'deviates:=true', f'seed:={args.seeds[0]}'
     ((_, _, wire),) = systems(directory, [RATE], [ALL_NODES], args.seconds, emulator)
     cells = [name, str(robot.joint_count), str(robot.muscle_count)]
     cells += [f'{wire.cpu[node]:.0f}' for node in KINDS[ALL_NODES]]
@@ -270,7 +270,7 @@ def model_rows(
     robot: Robot = import_robot(file, folder / 'robot', **chain).robot
     study = Individuals(
         robot, 'default', args.seeds, args.minutes, quick=args.quick, folder=folder,
-        reality=str(file),
+        reality=str(folder / 'robot' / 'model.xml'),
     )  # fmt: skip
     start = time.process_time()
     online_learning.train_initial(study, study.preset)

@@ -9,7 +9,6 @@ file imports neither learning nor the geometric routes nor the series elastic cl
 
 import copy
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +23,8 @@ from musculoskeletal_ae.emulator.effects import NONE, Draw, Effects
 from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import STEP, Arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.importing.adapted_mjcf import HAND
 from musculoskeletal_ae.robot.description import Wrap
-from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.robot.robot import Robot
 
 GUIDES_EVERY = 5  # number of steps between two updates of the guides
@@ -34,8 +33,7 @@ HOUR = 3600.0  # duration of an hour [s]
 BEDDING_TIME = 2.0 * HOUR  # time constant with which a new tendon lengthens [s]
 NUDGE = 1e-7  # change of the joint angles where MuJoCo's wrapping fails [rad]
 SLIP_TIME = 5.0 * HOUR  # mean time between two slips of a tendon on its spool [s]
-OTHER_LIMITS = 0.02  # tolerated difference of a file's joint limits, relative to the joint's range
-OTHER_ROUTE = 0.02  # tolerated difference of a file's route lengths [m]
+OTHER_ROUTE = 0.02  # refuse a file if the length of a muscle differs by more in most postures [m]
 
 
 class ForeignBody:
@@ -123,13 +121,11 @@ def _individual_model(robot: Robot, draw: Draw) -> Any:
     so some tendons may still jump.
     """
     again = np.zeros(robot.muscle_count, dtype=np.int64)
-    model = mujoco_model.from_directory(robot, draw, again).compile()
+    model = mujoco_model.from_directory(robot, draw, again)
     if not any(isinstance(item, Wrap) for route in robot.description.routes for item in route):
         return model
 
-    nominal = ForeignBody(
-        robot, mujoco_model.from_directory(robot, Draw(0, NONE), again).compile(), draw
-    )
+    nominal = ForeignBody(robot, mujoco_model.from_directory(robot, Draw(0, NONE), again), draw)
 
     def slipping(model: Any) -> Bools:
         body = ForeignBody(robot, model, draw)
@@ -137,18 +133,39 @@ def _individual_model(robot: Robot, draw: Draw) -> Any:
 
     while again.max() < MOST_DRAWS and (wrong := slipping(model)).any():
         again += wrong
-        model = mujoco_model.from_directory(robot, draw, again).compile()
+        model = mujoco_model.from_directory(robot, draw, again)
     return model
 
 
-def _deviate(robot: Robot, model: Any, draw: Draw) -> None:
+def _imported_model(robot: Robot, file: Path, draw: Draw, deviates: bool) -> Any:
+    """Return the MuJoCo model of a file that `import_robot` wrote, with or without deviations.
+
+    Raises:
+        MusculoskeletalError: If the file is not the model of the robot.
+    """
+    model = mujoco_model.from_file(robot, file)
+    given = ForeignBody(robot, copy.copy(model), draw)
+    theta = robot.random_postures(100, np.random.default_rng(0))
+    relative = given.absolute_lengths(theta) - given.length_at_zero
+    off = np.abs(relative - robot.muscle_lengths(theta, np.zeros(robot.muscle_count)))
+    typical = np.median(off, axis=0)  # a length that jumps may differ in some postures
+    for m in np.flatnonzero(typical > OTHER_ROUTE):
+        name, millimetres = robot.muscles[m], 1e3 * typical[m]
+        problem = f'muscle {name!r} is typically {millimetres:.0f} mm longer or shorter there'
+        raise mujoco_model.other_robot(robot, file, problem)
+    if deviates:
+        _deviate(robot, model, given, draw)
+    return model
+
+
+def _deviate(robot: Robot, model: Any, given: ForeignBody, draw: Draw) -> None:
     """Give the MuJoCo model of a file the random deviations of an individual, in place.
 
     If displaced attachment points make the length of a tendon jump, because the tendon slips over
     the end of an object, its points are redrawn. The number of draws is limited (MOST_DRAWS), so
-    some tendons may still jump. Tendons that jump in the file are not redrawn.
+    some tendons may still jump. Tendons that jump in the body `given`, that of the file, are not
+    redrawn.
     """
-    given = ForeignBody(robot, copy.copy(model), draw)
     attachments = deviation.Attachments(robot, model, draw)
     for _ in range(MOST_DRAWS):
         body = ForeignBody(robot, copy.copy(model), draw)
@@ -157,42 +174,6 @@ def _deviate(robot: Robot, model: Any, draw: Draw) -> None:
             break
         attachments.move(wrong)
     deviation.change_masses(model, draw)
-
-
-def _route_warnings(robot: Robot, file: Path, off: Array) -> tuple[str, ...]:
-    """Return a warning for each muscle whose length in the file is off by more than 20 mm.
-
-    Args:
-        robot: The robot.
-        file: The MJCF file.
-        off: Lengths in the file minus those of the robot's geometric model, in N postures [m],
-            (N, M).
-    """
-    largest = np.abs(off).max(axis=0)
-    return tuple(
-        f'reality {file}: muscle {robot.muscles[m]!r} is up to {1e3 * largest[m]:.0f} mm longer or '
-        f'shorter there than in {robot.description.directory}; check that both are the same robot'
-        for m in np.flatnonzero(largest > OTHER_ROUTE)
-    )
-
-
-def _limit_warnings(robot: Robot, file: Path, model: Any) -> Iterator[str]:
-    """Yield a warning for each joint whose limits differ between the file and the robot.
-
-    Differences of up to 2 % of the joint's range are tolerated.
-    """
-    ends = robot.units.to_position(robot.lower), robot.units.to_position(robot.upper)
-    for name, lower, upper in zip(robot.joints, *ends):
-        joint = model.joint(name).id
-        unlimited = np.array([-np.inf, np.inf])
-        actual = model.jnt_range[joint] if model.jnt_limited[joint] else unlimited
-        if np.abs(actual - (lower, upper)).max() > OTHER_LIMITS * (upper - lower):
-            there = f'moves from {actual[0]:.4g} to {actual[1]:.4g} there'
-            yield (
-                f'reality {file}: joint {name!r} {there}, in {robot.description.directory} from '
-                f'{lower:.4g} to {upper:.4g}; the emulated arm stops at the limits of the file: '
-                'give it the same range in both (angles in MJCF are in degrees by default)'
-            )
 
 
 class LateSensors:
@@ -288,7 +269,8 @@ class ForeignArm(Arm):
                 is built from the robot directory. An arm that equals `file` uses only
                 `joint_friction`: the value 0 removes all friction that the file defines. An arm
                 that deviates from `file` ignores `effects`.
-            file: MJCF model of the arm, instead of a body that is built from the robot directory.
+            file: The `model.xml` that `import_robot` wrote beside the robot, instead of a body that
+                is built from the robot directory.
             deviates: Whether the arm is an individual that differs from `file`
                 (`emulator/deviation.py`).
 
@@ -300,11 +282,13 @@ class ForeignArm(Arm):
             self.effects = deviation.effects(robot)
         draw = self._draw = Draw(seed, self.effects)
         try:
-            model = mujoco_model.from_file(robot, file) if file else _individual_model(robot, draw)
-            self._model = model
-            if file is not None and deviates:
-                _deviate(robot, model, draw)
-            data = self._data = mujoco.MjData(model)
+            if file is None:
+                model = _individual_model(robot, draw)
+            else:
+                model = _imported_model(robot, file, draw, deviates)
+            mujoco_model.set_options(model)
+            self._model, data = model, mujoco.MjData(model)
+            self._data = data
             self.individual = body = ForeignBody(robot, copy.copy(model), draw)
             if file is not None and deviates:
                 body.length_bias = deviation.slack(robot, draw)
@@ -319,12 +303,11 @@ class ForeignArm(Arm):
             model.dof_frictionloss[:] = model.tendon_frictionloss[:] = 0.0
         self._angles, self._rates = data.qpos, data.qvel
         self._order = np.array([model.joint(name).id for name in robot.joints])
-        self._hand = model.body(mujoco_model.HAND).id
+        self._hand = model.body(HAND).id
         self._guides = self._make_guides()
         muscles = robot.muscle_count
         self._memory = tendons.Memory(*(np.zeros(muscles) for _ in tendons.Memory._fields))
         self._memory = self._memory._replace(slow=np.zeros((muscles, len(tendons.TIMES))))
-        no_tension = np.zeros(muscles)
         guided = tendons.GuideParts(self._guides, self._muscle.end_tension, self._memory.bend)
         self._guides_handle = tendons.make_handle(guided)
         body.set_posture(data, 0.5 * (robot.lower + robot.upper))
@@ -333,11 +316,6 @@ class ForeignArm(Arm):
         at_zero, bend = body.length_at_zero, self._memory.bend
         theta = robot.random_postures(500, np.random.default_rng(0))
         span = body.absolute_lengths(theta) - at_zero
-        if file and not deviates:
-            model_lengths = robot.muscle_lengths(theta, no_tension)
-            self.warnings = _route_warnings(robot, file, span - model_lengths)
-        if file:  # an individual that deviates has the joint limits of the file, too
-            self.warnings = *self.warnings, *_limit_warnings(robot, file, model)
         self.tendons = tendons.make_tendons(robot, body.elastic, at_zero, span, bend, draw)
         stretch = body.elastic.elongation(robot.tension.max)
         self._module_constants = self._make_modules(span, stretch)
@@ -363,21 +341,18 @@ class ForeignArm(Arm):
         self._model.dof_frictionloss[joints] += load * draw.about('joint_friction', len(joints))
 
     def _root_pose(self) -> pin.SE3:
-        """Return the pose of the robot's root link in the world frame of the MJCF file.
+        """Return the pose of the robot's root link in the world frame of MuJoCo.
 
-        `import_robot` may rename or remove links, and adds an upright root to a tilted one. The
-        pose is therefore computed from the link that the file contains and that is nearest to the
-        root.
+        An imported robot may have another root than the MuJoCo model, so the pose is computed from
+        that of the hand. The arm must be at mid-range.
         """
-        robot, model, data = self.robot, self._model, self._data
-        known = mujoco_model.bodies_as_imported(model)
-        links = [str(frame.name) for frame in body_frames(robot.description.model)]  # root first
-        # `from_file` has checked that the file contains the end effector.
-        link = next((link for link in links if link in known), robot.description.end_effector)
-        i = known.get(link, self._hand)
-        there = pin.SE3(data.xmat[i].reshape(3, 3), data.xpos[i])
-        theta = 0.5 * (robot.lower + robot.upper)
-        return there * robot.kinematics.link_pose(theta, link).inverse()
+        theta = 0.5 * (self.robot.lower + self.robot.upper)
+        return self._hand_pose() * self.robot.kinematics.end_effector_pose(theta).inverse()
+
+    def _hand_pose(self) -> pin.SE3:
+        """Return the pose of the end effector in the world frame of MuJoCo."""
+        data, i = self._data, self._hand
+        return pin.SE3(data.xmat[i].reshape(3, 3), data.xpos[i])
 
     def _make_guides(self) -> tendons.Guides:
         model, data, sites = self._model, self._data, []
@@ -493,8 +468,7 @@ class ForeignArm(Arm):
     @property
     def hand(self) -> pin.SE3:
         """True pose of the end effector in the root link's frame."""
-        data, i = self._data, self._hand
-        return self._root.actInv(pin.SE3(data.xmat[i].reshape(3, 3), data.xpos[i]))
+        return self._root.actInv(self._hand_pose())
 
     def route_points(self) -> Array:
         """Return the true route points in the root link's frame [m], shape (P, 3)."""

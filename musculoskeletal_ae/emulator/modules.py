@@ -227,7 +227,6 @@ class Arm(ABC):
     """An emulated arm that takes the place of the hardware."""
 
     individual: Any  # the true body that the seed selects
-    warnings: tuple[str, ...] = ()  # warnings to report when the arm is started
     _angles: Array  # positions of all joints of the tree [rad] or [m]
     _rates: Array  # velocities of all joints of the tree [rad/s] or [m/s]
     _order: Ints  # indices of the joints of θ in `_angles` and `_rates`

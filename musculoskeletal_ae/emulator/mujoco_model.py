@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""MuJoCo model of a robot, built from its directory or from a user's MJCF file.
+"""MuJoCo model of a robot: built from its directory, or the body of an imported MuJoCo model.
 
 MuJoCo simulates rigid bodies, wrapping, joint stops and joint friction. The emulated muscle modules
-(`modules.py`) act on MuJoCo's tendons; the actuators of a file are removed.
+(`modules.py`) act on MuJoCo's tendons, each by a motor with the name of the muscle.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -19,13 +17,12 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.emulator.effects import Draw
 from musculoskeletal_ae.emulator.modules import STEP, joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.importing.mjcf import open_mjcf, resting_joints, tie_rims
-from musculoskeletal_ae.importing.source import names_of_all, safe_name
+from musculoskeletal_ae.importing.adapted_mjcf import HAND
 from musculoskeletal_ae.mujoco_version import check_mujoco
 from musculoskeletal_ae.robot.description import Wrap, branches
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.joint_tree import JointPoses
-from musculoskeletal_ae.robot.kinematics import Kinematics, body_frames, link_placement
+from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
 ARMATURE, DAMPING = 0.005, 0.4  # of a joint module [kg·m²], [N·m·s/rad]; chosen by hand
@@ -37,12 +34,7 @@ POSTURES = 300  # number of random postures in which the radii of heads and musc
 # Constraint stiffness (solimp) of couplings. With MuJoCo's default, which disregards the ratio of a
 # coupling, a prismatic joint that follows a revolute one would lag by centimetres.
 STIFF = [0.9999, 0.9999, 0.001, 0.5, 2.0]
-HAND, SPRING = 'hand of the emulator', 'spring'
-OF_MOTORS = (
-    *('actdim', 'actearly', 'actlimited', 'actrange', 'armature', 'biasprm', 'biastype'),
-    *('ctrllimited', 'ctrlrange', 'damping', 'delay', 'dynprm', 'dyntype', 'forcelimited'),
-    *('forcerange', 'gainprm', 'gaintype', 'gear', 'group', 'nsample'),
-)
+SPRING = 'spring'  # first word of the names of springs that couple joints
 
 Place = tuple[int, Array]  # joint, and position in its frame [m]
 Obstacle = tuple[int, Array, Array]  # joint, and centre [m] and axis in its frame
@@ -52,7 +44,7 @@ mujoco.set_mju_user_warning(lambda _: None)  # the default writes a file to the 
 
 
 def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
-    """Return the MuJoCo model (an MjSpec) of one individual of a robot directory.
+    """Return the compiled MuJoCo model of one individual of a robot directory.
 
     Args:
         robot: The robot.
@@ -63,7 +55,10 @@ def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
     add_routes(robot, draw, again, spec, bodies)
     joint, at = robot.kinematics.placement(robot.description.end_effector)
     _add_hand(bodies[joint], at)
-    return _with_motors(spec, robot)
+    for muscle in robot.muscles:
+        tendon = mujoco.mjtTrn.mjTRN_TENDON
+        spec.add_actuator(name=muscle, target=muscle, trntype=tendon)
+    return spec.compile()
 
 
 def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
@@ -316,252 +311,53 @@ def _add_hand(body: Any, at: pin.SE3) -> None:
     hand.explicitinertial, hand.ipos = True, np.zeros(3)
 
 
-@contextmanager
-def _loading(file: Path) -> Iterator[None]:
-    """Translate errors of MuJoCo into a MusculoskeletalError that names the file."""
-    try:
-        yield
-    except (OSError, ValueError, mujoco.FatalError) as error:
-        problem = f'MuJoCo cannot load it: {" ".join(str(error).split())}'
-        raise _file_error(file, problem) from error
-
-
 def from_file(robot: Robot, file: Path) -> Any:
-    """Return the compiled model of a user's MJCF file, with a motor on the tendon of each muscle.
+    """Return the compiled model of the file that `import_robot` wrote beside a robot.
 
-    Joints that the robot does not have are fixed in the position that `import_robot` uses.
+    The joint limits are those of the robot directory.
 
     Raises:
-        MusculoskeletalError: If MuJoCo cannot load the file, or the file lacks a joint, tendon or
-            body that the robot directory names, or a joint has another type or cannot be renamed.
+        MusculoskeletalError: If MuJoCo cannot load the file, if the file lacks a tendon, a motor or
+            the hand, or if its joints are not those of the robot.
     """
-    with _loading(file):
-        spec = open_mjcf(file)
-    followers, kinds, wraps = robot.kinematics.model.names[1:], mujoco.mjtJoint, mujoco.mjtWrap
-    links = _links_of_the_hand(robot)
-    hand = _rename_as_imported(spec, file, [*followers, *robot.muscles], [*links])
-    _split_balls(spec, followers)
-    tendons = [t for t in spec.tendons if all(w.type != wraps.mjWRAP_JOINT for w in t.path)]
-    for kind, present, wanted in (
-        ('joint', spec.joints, [*followers]),
-        ('spatial tendon', tendons, robot.muscles),
-        ('body', spec.bodies, [hand]),
+    try:
+        model = mujoco.MjModel.from_xml_path(str(file))
+    except (ValueError, mujoco.FatalError) as error:
+        reason = ' '.join(str(error).split())
+        raise MusculoskeletalError(f'reality {file}: MuJoCo cannot load it: {reason}') from error
+    joints = robot.kinematics.model.names[1:]
+    for kind, needed, get, count in (
+        ('joint', joints, model.joint, model.njnt),
+        ('tendon', robot.muscles, model.tendon, model.ntendon),
+        ('motor', robot.muscles, model.actuator, model.nu),
+        ('body', (HAND,), model.body, model.nbody),
     ):
-        names = [thing.name for thing in present]
-        if missing := [name for name in wanted if name not in names]:
-            available = ', '.join(filter(None, names))
-            problem = f'{kind} {missing[0]!r} of {robot.description.directory} is missing'
-            remedy = f'the file has: {available}; create the robot with import_robot'
-            raise _file_error(file, f'{problem}; {remedy}')
-    joint_types = {joint.name: joint.type for joint in spec.joints}
-    for name, slides in zip(followers, robot.kinematics.tree.prismatic[1:], strict=True):
-        expected = kinds.mjJNT_SLIDE if slides else kinds.mjJNT_HINGE
-        actual = joint_types[name]
-        if actual != expected:
-            there, here = (t.name.removeprefix('mjJNT_').lower() for t in (actual, expected))
-            problem = f'joint {name!r} is a {there}, but in {robot.description.directory} a {here}'
-            raise _file_error(file, f'{problem}; create the robot with import_robot')
-    # Delete these first, because they refer to other elements.
-    for thing in [*spec.actuators, *spec.sensors, *spec.keys, *spec.tuples]:
-        spec.delete(thing)
-    held = [joint for joint in spec.joints if joint.name not in followers]
-    held_names = {joint.name for joint in held if joint.name}
-    joint_equalities = _equalities(spec, mujoco.mjtEq.mjEQ_JOINT, held_names)
-    fixed_tendons = [t for t in spec.tendons if t not in tendons]
-    fixed_tendons = [
-        t for t in fixed_tendons if not held_names.isdisjoint(wrap.target.name for wrap in t.path)
-    ]
-    tendon_names = {tendon.name for tendon in fixed_tendons}
-    tendon_equalities = _equalities(spec, mujoco.mjtEq.mjEQ_TENDON, tendon_names)
-    placements = list[tuple[Any, dict[str, Array]]]()
-    if joint_equalities:
-        with _loading(file):
-            complete = spec.compile()
-        placements = _placements_of_held(complete, spec, held)
-    for thing in [*joint_equalities, *tendon_equalities, *fixed_tendons, *held]:
-        spec.delete(thing)
-    for pair in [*spec.pairs]:  # MuJoCo rejects a contact pair of two immobile bodies
-        if not any(map(_moves, (spec.geom(pair.geomname1), spec.geom(pair.geomname2)))):
-            spec.delete(pair)
-    for joint in spec.joints:  # these limits are for the file's own actuators
-        joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-    # MuJoCo does not find by name what was renamed after compilation, so search for the body.
-    at = links.get(hand) or next(at for link, at in links.items() if safe_name(hand, '') == link)
-    _add_hand(next(body for body in spec.bodies if body.name == hand), at)
-    with _loading(file):
-        model = _with_motors(spec, robot).compile()
-    tie_rims(model)
-    for thing, values in placements:
-        for name, value in values.items():
-            getattr(model, name)[thing.id] = value
-    if placements:
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        names = [get(i).name for i in range(count)]
+        if missing := [name for name in needed if name not in names]:
+            raise other_robot(robot, file, f'{kind} {missing[0]!r} is missing')
+        if kind == 'joint' and (more := [name for name in names if name not in [*needed]]):
+            raise other_robot(robot, file, f'joint {more[0]!r} is not one of the robot')
+    kinds = mujoco.mjtJoint
+    for name, slides in zip(joints, robot.kinematics.tree.prismatic[1:], strict=True):
+        if model.joint(name).type != (kinds.mjJNT_SLIDE if slides else kinds.mjJNT_HINGE):
+            raise other_robot(robot, file, f'joint {name!r} has another type')
+    ids = [model.joint(name).id for name in robot.joints]
+    ends = robot.units.to_position(np.array([robot.lower, robot.upper]))
+    model.jnt_limited[ids], model.jnt_range[ids] = 1, ends.T
     return model
 
 
-def _links_of_the_hand(robot: Robot) -> dict[str, pin.SE3]:
-    """Return the end effector's pose in the frame of each link that is rigidly connected to it.
-
-    The first link is the end effector itself; the links that carry it come next.
-    """
-    model, name = robot.description.model, robot.description.end_effector
-    joint, hand = link_placement(model, name)
-    frame, carriers = model.getFrameId(name, pin.FrameType.BODY), list[Any]()
-    while frame > 0 and model.frames[frame].parentJoint == joint:
-        carriers.append(model.frames[frame])
-        frame = model.frames[frame].parentFrame
-    links = dict[str, pin.SE3]()
-    for link in [*carriers, *body_frames(model)]:
-        if link.type == pin.FrameType.BODY and link.parentJoint == joint:
-            links.setdefault(str(link.name), link.placement.inverse() * hand)
-    return links
+def other_robot(robot: Robot, file: Path, problem: str) -> MusculoskeletalError:
+    """Return an error that says why a file does not describe a robot, and what to do."""
+    directory = robot.description.directory
+    remedy = 'import the MuJoCo model again, and use the model.xml that import_robot writes'
+    return MusculoskeletalError(
+        f'reality {file}: it is not the model of {directory}: {problem}; {remedy}'
+    )
 
 
-def _split_balls(spec: Any, followers: list[str]) -> None:
-    """Replace each ball joint by three hinges, if the robot has at least one of these hinges."""
-    wanted = set(followers)
-    for ball in [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_BALL]:
-        parts = [f'{safe_name(ball.name, "")}_{axis}' for axis in 'xyz']
-        if wanted.isdisjoint(parts):
-            continue
-        body, limit = ball.parent, float(ball.range[1])
-        names = 'pos', 'damping', 'stiffness', 'armature', 'frictionloss'
-        properties = {name: getattr(ball, name) for name in names}
-        properties['type'] = mujoco.mjtJoint.mjJNT_HINGE
-        limited = ball.limited != mujoco.mjtLimited.mjLIMITED_FALSE and limit > 0.0
-        spec.delete(ball)
-        for name, axis in zip(parts, np.eye(3)):
-            hinge = body.add_joint(name=name, axis=axis, **properties)
-            if limited:
-                hinge.limited, hinge.range = mujoco.mjtLimited.mjLIMITED_TRUE, [-limit, limit]
-
-
-def _moves(geom: Any) -> bool:
-    body = geom.parent
-    while body.name != 'world' and not body.joints:
-        body = body.parent
-    return bool(body.joints)
-
-
-def _equalities(spec: Any, kind: Any, names: set[str]) -> list[Any]:
-    """Return the equality constraints of type `kind` on a joint or tendon that `names` contains."""
-    equalities = [each for each in spec.equalities if each.type == kind]
-    return [each for each in equalities if not names.isdisjoint([each.name1, each.name2])]
-
-
-def _placements_of_held(
-    model: Any, spec: Any, held: list[Any]
-) -> list[tuple[Any, dict[str, Array]]]:
-    """Return the new placements of bodies and joints after the held joints have been removed.
-
-    Args:
-        model: The compiled model, with all joints.
-        spec: The MjSpec of the model.
-        held: The joints that are fixed in their position and removed.
-
-    Returns:
-        For each body or joint whose placement in its parent depends on a held joint, the values of
-        the model's fields (such as 'body_pos') that it must have without the held joints.
-    """
-    rest, data = resting_joints(model), mujoco.MjData(model)
-    for joint in held:
-        if joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
-            data.qpos[model.jnt_qposadr[joint.id]] = rest[joint.id]
-    mujoco.mj_kinematics(model, data)
-    poses = [pin.SE3(turn.reshape(3, 3), at) for turn, at in zip(data.xmat, data.xpos)]
-    holders = {joint.parent.id for joint in held}
-    placements = list[tuple[Any, dict[str, Array]]]()
-    for body in spec.bodies:
-        if body.id in holders:
-            pose = poses[model.body_parentid[body.id]].actInv(poses[body.id])
-            values = {'body_pos': pose.translation, 'body_quat': _turn(pose.rotation)}
-            placements.append((body, values))
-    for joint in spec.joints:
-        # A held joint of the same body may come after `joint` and move it.
-        if joint.parent.id in holders and joint not in held:
-            pose, i = poses[joint.parent.id], joint.id
-            axis = pose.rotation.T @ data.xaxis[i]
-            placements.append((joint, {'jnt_pos': pose.actInv(data.xanchor[i]), 'jnt_axis': axis}))
-    return placements
-
-
-def _rename_as_imported(spec: Any, file: Path, wanted: list[str], hands: list[str]) -> str:
-    """Rename the joints and tendons of a file as `import_robot` does, and find the hand's body.
-
-    Args:
-        spec: The model of the file, changed in place.
-        file: The file, for messages.
-        wanted: Names of joints and tendons that the robot needs.
-        hands: Names of links that may carry the end effector, the best first.
-
-    Returns:
-        The name of the first body in `hands` that the file contains.
-    """
-    kinds = {'joint': spec.joints, 'tendon': spec.tendons, 'body': spec.bodies}
-    bodies = {body.name for body in spec.bodies}
-    hand = next((name for name in hands if name in bodies), hands[0])
-    if {hand, *wanted} <= {thing.name for things in kinds.values() for thing in things}:
-        return hand
-    with _loading(file):
-        spec.compile()  # assigns ids
-    new: dict[str, dict[str, str]] = {'joint': {}, 'tendon': {}, 'body': {}}
-    fixed = [t for t in spec.tendons if t.path[0].type == mujoco.mjtWrap.mjWRAP_JOINT]
-    bound = {wrap.target.name: tendon.name for tendon in fixed for wrap in tendon.path}
-    for kind, things in kinds.items():
-        ordered = sorted(things, key=lambda thing: thing.id)
-        names = names_of_all(kind, (thing.name for thing in ordered))
-        renamed = list[tuple[Any, str]]()
-        for thing, name in zip(ordered, names, strict=True):
-            before = thing.name
-            # Also rename an element whose own name another element needs.
-            is_renamed = kind != 'body' and not {before, name}.isdisjoint(wanted)
-            if kind == 'joint' and before in bound and name != before and is_renamed:
-                problem = f'import_robot renames joint {before!r} to {name!r}, but MuJoCo cannot'
-                problem = f'{problem} rename it in tendon {bound[before]!r}'
-                raise _file_error(file, f'{problem}; use the new name in the file')
-            if not before or is_renamed:
-                renamed.append((thing, name))
-                thing.name = ''
-            new[kind][before or name] = name
-        for thing, name in renamed:
-            thing.name = name
-    kind_of_equality = {mujoco.mjtEq.mjEQ_JOINT: 'joint', mujoco.mjtEq.mjEQ_TENDON: 'tendon'}
-    for each in [e for e in spec.equalities if e.type in kind_of_equality]:
-        pairs = new[kind_of_equality[each.type]].items()
-        new_names = {old: name for old, name in pairs if not {old, name}.isdisjoint(wanted)}
-        each.name1 = new_names.get(each.name1, each.name1)
-        each.name2 = new_names.get(each.name2, each.name2)
-    own_names = {safe: name for name, safe in new['body'].items()}
-    return next((own_names[name] for name in hands if name in own_names), hand)
-
-
-def bodies_as_imported(model: Any) -> dict[str, int]:
-    """Return the ids of a file's bodies by their own names and by those of `import_robot`."""
-    own = {model.body(i).name: i for i in range(model.nbody)}
-    del own[HAND]
-    ids = [i for i in range(model.nbody) if model.body(i).name != HAND]
-    imported = names_of_all('body', (model.body(i).name for i in ids))
-    return own | dict(zip(imported, ids, strict=True))
-
-
-def _with_motors(spec: Any, robot: Robot) -> Any:
-    """Return the model with a motor on the tendon of each muscle."""
-    spec.option.timestep, spec.option.integrator = STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+def set_options(model: Any) -> None:
+    """Set the time step and the other options of the simulation in a compiled model."""
+    model.opt.timestep, model.opt.integrator = STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     # A diverged simulation stays diverged until `Arm.reset`.
-    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    # Settings that the file makes for its own actuators must not affect our motors.
-    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
-    spec.option.disableactuator = 0
-    plain = mujoco.MjSpec().add_actuator()
-    motor = {name: getattr(plain, name) for name in OF_MOTORS}
-    # MuJoCo does not find by name what was renamed after compilation.
-    tendons = {tendon.name: tendon for tendon in spec.tendons}
-    for muscle in robot.muscles:
-        tendons[muscle].actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
-        motor |= {'name': muscle, 'target': muscle}
-        spec.add_actuator(trntype=mujoco.mjtTrn.mjTRN_TENDON, **motor)
-    return spec
-
-
-def _file_error(file: Path, problem: str) -> MusculoskeletalError:
-    return MusculoskeletalError(f'reality {file}: {problem}')
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET

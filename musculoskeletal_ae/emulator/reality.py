@@ -28,16 +28,16 @@ def make_arm(
         seed: Selects the emulated individual, and seeds its noise.
         reality: The emulator model. The body of 'kin' differs from the geometric model only in ways
             that the learner can fit; 'foreign' has mechanics that the learner does not model.
-            Any other value is the path of an MJCF file, whose joints and tendons have the names of
-            the robot's joints and muscles.
+            Any other value is the path of the `model.xml` that `import_robot` wrote beside the
+            robot.
         friction: False removes the friction of tendons and joints. It has no effect on an
             individual of an MJCF file (`deviates`).
-        deviates: Whether the body of an MJCF file is an individual that differs from the file
+        deviates: Whether the body of a file is an individual that differs from the file
             (`emulator/deviation.py`). By default it equals the file.
 
     Raises:
         MusculoskeletalError: If `reality` is neither an emulator model nor a file, or if the model
-            of the arm cannot be built, for example because the file lacks a joint of the robot.
+            of the arm cannot be built, for example because the file is not that of the robot.
     """
     if reality == KIN:
         individual = Individual(robot, seed)
@@ -50,7 +50,7 @@ def make_arm(
         with suppress(RuntimeError, OSError):  # unknown home directory, name too long
             file = path if (path := Path(reality).expanduser()).is_file() else None
         if file is None:
-            legal = f'{KIN}, {FOREIGN} or an MJCF file'
+            legal = f'{KIN}, {FOREIGN} or the model.xml that import_robot writes'
             raise MusculoskeletalError(f'reality {reality[:80]!r} is unknown; legal: {legal}')
     # Imported here because `kin` does not need MuJoCo.
     from musculoskeletal_ae.emulator.effects import Effects

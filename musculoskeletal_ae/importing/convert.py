@@ -2,7 +2,6 @@
 """Convert a file of another format to a robot directory, and report the result (`import_robot`)."""
 
 import re
-import time
 from argparse import Namespace
 from collections import Counter
 from pathlib import Path
@@ -30,10 +29,6 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
 LARGEST = 20_000_000  # largest file [bytes]
-WARM_UP, PLAYED = 0.1, 1.0  # simulated times before and during the speed test [s]
-#: largest CPU time per second of model time that leaves enough for the other nodes [s]
-REAL_TIME = 0.5
-SLOW = 3  # exit status for a model that needs more CPU time than REAL_TIME
 OPENSIM = (
     'OpenSim models are not read; convert this model to MJCF with MyoConverter '
     '(https://github.com/MyoHub/myoconverter) and import the .xml file that it writes'
@@ -138,38 +133,7 @@ def run(args: Namespace) -> int:
         print(line)
     print(f'{args.out}: {robot.joint_count} joints, {robot.muscle_count} muscles')
     print(check_verdict(check_robot(robot)))
-    return play(robot, args.file) if args.play else 0
-
-
-def play(robot: Robot, file: Path) -> int:
-    """Simulate the file for a second, and print the CPU time that the simulation takes.
-
-    Returns:
-        0 if a second of the model needs at most REAL_TIME of CPU time, otherwise SLOW.
-
-    Raises:
-        MusculoskeletalError: If the file cannot be simulated.
-    """
-    from musculoskeletal_ae.emulator.reality import make_arm
-
-    arm = make_arm(robot, reality=str(file))
-    for warning in arm.warnings:
-        print(f'warning: {warning}')
-    arm.step(WARM_UP)
-    start = time.process_time()
-    arm.step(PLAYED)
-    needed = (time.process_time() - start) / PLAYED
-    message = f'simulation speed: one second of the model takes {needed:.2g} s of CPU time'
-    if needed <= REAL_TIME:
-        print(f'{message}, which is fast enough for real time')
-        return 0
-    slower = needed / REAL_TIME
-    print(
-        f'{message}. While the other nodes run, the emulator keeps up with real time only if a '
-        f'second takes at most {REAL_TIME:g} s; this model takes {slower:.2g} times as long. '
-        "`bringup.sh --mujoco` therefore lets all nodes follow the emulator's own clock"
-    )
-    return SLOW
+    return 0
 
 
 def length_verdict(comparison: Comparison | None) -> str:

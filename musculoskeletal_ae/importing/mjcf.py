@@ -9,6 +9,8 @@ Springs and dampers of joints, and springs of fixed tendons, become `joint_elast
 If a site lies on the rim of an object that its tendon wraps around, rounding decides in MuJoCo
 whether the tendon wraps. In this package, the site counts as outside (`robot/wrapping.py`). To make
 MuJoCo agree, the import reduces the radius of the object there by a share 2·RIM.
+
+`adapted_mjcf.py` writes the MuJoCo model that the emulator loads.
 """
 
 from collections import defaultdict
@@ -22,6 +24,7 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.importing.adapted_mjcf import AdaptedModel
 from musculoskeletal_ae.importing.source import (
     Source,
     Spring,
@@ -33,7 +36,7 @@ from musculoskeletal_ae.importing.source import (
 )
 from musculoskeletal_ae.mujoco_version import check_mujoco
 from musculoskeletal_ae.robot.description import RoutePoint, Wrap
-from musculoskeletal_ae.robot.joint_tree import Coupling, resolved
+from musculoskeletal_ae.robot.joint_tree import Coupling
 from musculoskeletal_ae.robot.wrapping import RIM
 
 check_mujoco()
@@ -63,34 +66,29 @@ def read_mjcf(file: Path, root: ET.Element) -> Source:
     # By default, MuJoCo writes warnings to a file in the working directory.
     mujoco.set_mju_user_warning(warnings.append)
     try:
-        model = open_mjcf(file).compile()
+        spec = mujoco.MjSpec.from_file(str(file))
+        spec.compiler.fusestatic = False  # fused bodies could not be links
+        model = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         raise refuse(file, f'MuJoCo cannot load it: {" ".join(str(error).split())}') from error
     finally:
         mujoco.set_mju_user_warning(lambda _: None)
-    source = _Reader(model, file.stem).source
+    reader = _Reader(model, file.stem)
+    source = reader.source
+
+    def adapted() -> str:
+        try:
+            text = AdaptedModel(source, spec, model, reader.names, reader.balls).text()
+            mujoco.MjModel.from_xml_string(text)
+        except (ValueError, LookupError, mujoco.FatalError) as error:
+            problem = f'cannot be adapted to the robot: {" ".join(str(error).split())}'
+            raise refuse(file, problem) from error
+        return text
+
+    source.adapted = adapted
     for warning in warnings:
         source.note('MuJoCo warns', ' '.join(warning.split()))
     return source
-
-
-def open_mjcf(file: Path) -> Any:
-    """Return the MjSpec of an MJCF file, with the option that MuJoCo fuses no bodies."""
-    spec = mujoco.MjSpec.from_file(str(file))
-    spec.compiler.fusestatic = False
-    return spec
-
-
-def resting_joints(model: Any) -> list[float]:
-    """Return the position [rad or m] of each joint at which `import_robot` would hold it fixed.
-
-    These are the initial positions in the file; coupled joints follow their masters.
-    """
-    reader = _Reader(model, '')
-    source = reader.source
-    source.couplings = resolved(source.couplings)
-    source.settle()
-    return [source.rest.get(name, 0.0) for name in reader.names['joint']]
 
 
 def tie_rims(model: Any) -> list[tuple[int, int]]:

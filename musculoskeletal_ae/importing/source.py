@@ -77,6 +77,8 @@ class Source:
     damping: dict[str, float] = field(default_factory=dict)  # by joint [N·m·s/rad]
     notes: list[str] = field(default_factory=list)
     lengths: Lengths | None = None
+    #: function that returns the body as a MuJoCo model, after `cut` (`adapted_mjcf.py`)
+    adapted: Callable[[], str] | None = None
     end_effector: str = ''
     #: named points that may be the end effector: link, and position in its frame [m]
     points: dict[str, tuple[str, Array]] = field(default_factory=dict)
@@ -447,7 +449,7 @@ def urdf(source: Source) -> str:
 
 
 def write(source: Source, out: Path) -> None:
-    """Write robot.urdf and muscles.yaml into a directory."""
+    """Write robot.urdf, muscles.yaml and, for a MuJoCo model, model.xml into a directory."""
     muscles: list[dict[str, Any]] = []
     for name, route in source.routes.items():
         muscles.append({'name': name, 'route': [written(item) for item in route]})
@@ -465,6 +467,8 @@ def write(source: Source, out: Path) -> None:
     head = ''.join(f'# {line}\n' for line in [f'Imported from {source.name}.', *source.notes])
     (out / 'muscles.yaml').write_text(head + text, encoding='utf-8')
     (out / 'robot.urdf').write_text(body, encoding='utf-8')
+    if source.adapted is not None:
+        (out / 'model.xml').write_text(source.adapted(), encoding='utf-8')
 
 
 def _joint_elasticity(source: Source, joints: list[str]) -> list[dict[str, Any]]:

@@ -43,8 +43,6 @@ class HardwareEmulator(Arm):
             self.parameter('reality'),
             deviates=self.parameter('deviates'),
         )
-        for warning in self.arm.warnings:
-            self.get_logger().warning(warning)
         # Simulate one step to load the compiled code, which would otherwise delay the first
         # messages.
         self.arm.step(0.01)

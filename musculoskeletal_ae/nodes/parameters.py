@@ -92,12 +92,12 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
         'seed': SEED,
         'reality': Parameter(
             'kin',
-            'emulator model: kin, foreign (an independent one in MuJoCo), or an MJCF file whose '
-            'joints and tendons have the names of the joints and muscles',
+            'emulator model: kin, foreign (an independent one in MuJoCo), or the model.xml that '
+            'import_robot wrote for the robot',
         ),
         'deviates': Parameter(
             False,
-            'if `reality` is an MJCF file: emulate an individual that deviates from the file, '
+            'if `reality` is a file: emulate an individual that deviates from the file, '
             'depending on `seed` (doc/howto/mujoco.md)',
         ),
         'clock': Parameter(

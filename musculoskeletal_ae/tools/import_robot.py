@@ -8,7 +8,7 @@ from musculoskeletal_ae.process_signals import import_heavy
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Import one model; exit status 0 if the written directory loads, 3 if `--play` is too slow."""
+    """Import one model; exit status 0 if the written directory loads."""
     parser = Parser(
         'import_robot',
         'Converts a MuJoCo model (MJCF), a cardsflow.xml beside its model.urdf or model.sdf, or a '
@@ -28,8 +28,6 @@ def main(argv: list[str] | None = None) -> int:
     text = 'end effector: a link, a site, or LINK_tip, the far end of a drawn link; '
     text += 'joints outside the chain to it are held fixed'
     parser.add_argument('--end', metavar='NAME', help=text)
-    text = 'simulate a second of an MJCF file and report its CPU time; exit status 3: over 0.5 s'
-    parser.add_argument('--play', action='store_true', help=text)
     args = parser.parse_args(argv)
     return exit_status(
         lambda: import_heavy('musculoskeletal_ae.importing.convert').run(args), out=args.out

@@ -35,7 +35,7 @@ def learned(tmp_path_factory):
     file = folder / 'own.xml'
     file.write_text(bodies.MJCF, encoding='utf-8')
     robot = import_robot(file, folder / 'robot').robot
-    individual = make_arm(robot, 3, str(file), deviates=True).individual
+    individual = make_arm(robot, 3, str(folder / 'robot' / 'model.xml'), deviates=True).individual
     displaced = import_robot(file, folder / 'displaced').robot
     displaced.routes.absolute_lengths = individual.absolute_lengths
     displaced.routes.length_at_zero = individual.length_at_zero

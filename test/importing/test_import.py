@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import bodies
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -544,3 +545,44 @@ def test_a_damaged_file_is_refused_or_read_but_nothing_else(tmp_path_factory, fo
         source = read_source(file)
         cut(source)
         assert urdf(source)
+
+
+#: a palm and a finger, whose capsules overlap; MuJoCo excludes contacts of parent and child
+LINKS = """<mujoco><compiler meshdir="parts"/><asset><mesh name="tip" file="tip.obj"/></asset>
+  <worldbody><body name="palm"><joint name="wrist" axis="0 1 0" range="-30 30"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -.4" size=".05"/>
+    <site name="a" pos=".06 0 -.2"/><site name="b" pos="-.06 0 -.2"/>
+    <body name="finger" pos="0 0 -.3"><joint name="knuckle" axis="0 1 0" range="-45 45"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -.3" size=".05"/>
+      <site name="c" pos=".06 0 -.1"/><site name="d" pos="-.06 0 -.1"/>
+      <body name="nail" pos="0 0 -.2"><joint name="last" axis="0 1 0" range="-9 9"/>
+        <geom type="mesh" mesh="tip"/><geom size=".05" pos="0 0 .2"/></body></body></body>
+  </worldbody>
+  <tendon><spatial name="out"><site site="a"/><site site="c"/></spatial>
+    <spatial name="in"><site site="b"/><site site="d"/></spatial></tendon></mujoco>"""
+TIP = 'v 0 0 0\nv .01 0 0\nv 0 .01 0\nv 0 0 .01\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n'
+
+
+@pytest.mark.parametrize('joints', [('wrist', 'knuckle', 'last'), ('knuckle',)])
+def test_the_model_beside_the_robot_keeps_contacts_and_meshes(tmp_path, monkeypatch, joints):
+    put(tmp_path / 'parts', 'tip.obj', TIP)
+    file = put(tmp_path, 'links.xml', LINKS)
+    monkeypatch.chdir(tmp_path)
+    import_robot(Path('links.xml'), tmp_path / 'out', joints=joints)
+    monkeypatch.chdir('/')
+    whole = mujoco.MjModel.from_xml_path(str(file))
+    adapted = mujoco.MjModel.from_xml_path(str(tmp_path / 'out' / 'model.xml'))
+    assert adapted.njnt == len(joints)
+    assert adapted.nmesh == 1
+
+    def touching(model):
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        return {
+            frozenset(model.body(model.geom_bodyid[geom]).name for geom in pair)
+            for pair in data.contact.geom
+        }
+
+    # The nail touches the palm, which is not its parent. MuJoCo has no contacts between two bodies
+    # that cannot move against each other.
+    assert touching(adapted) == touching(whole) == {frozenset(('palm', 'nail'))}
