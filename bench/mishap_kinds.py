@@ -26,8 +26,10 @@ from musculoskeletal_ae.remedy import Step
 
 Rng = np.random.Generator
 
-#: what a node says about itself in consequence of something else
+#: what a node says about itself in consequence of something else, and statements that only quote a
+#: reading or an estimate beyond its limits
 SELF = frozenset({
+    'tension_above_limit', 'implausible_estimate',
     'anomaly_detected', 'not_exploring', 'calibrating', 'learning_waits', 'gentle_only',
     'length_offsets_unknown', 'trajectory_slowed', 'nothing_to_learn',
 })  # fmt: skip
@@ -950,8 +952,7 @@ MISHAPS: tuple[Mishap, ...] = (
            allowed=REVOKED | REJECTED),
     Mishap('encoder loses counts', lost_counts, ONE_LENGTH | NOT_FOLLOWING,
            allowed=REVOKED | REJECTED | {'tension_above_limit', 'overload'}),
-    Mishap('noise on tension readings', noisy_tensions, is_harmless=True, says='nois',
-           allowed=frozenset({'tension_above_limit'})),
+    Mishap('noise on tension readings', noisy_tensions, is_harmless=True, says='nois'),
     Mishap('joint sensor sticks', joint_fault(float, 'sticks'), JOINT, says=OF_JOINT),
     Mishap('joint sensor reversed', joint_fault(lambda x: -x, 'reversed'), JOINT,
            says=OF_JOINT),

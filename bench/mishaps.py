@@ -109,7 +109,7 @@ explores again without any condition, or when the patience of the operator ends.
   when its tension differs from the demanded one by {tension} N, and a turned base when it has
   turned.
 - **false**: different false statements, over all cases. Statements about other muscles and joints
-  are false, too.
+  are false, too, unless they only quote a reading or an estimate beyond its limits.
 - **well**: cases in which the advice alone brought the arm back: it explores without any condition,
   and the true error of its estimate over {after} s is at most {ratio} times that before, or {more}
   rad more.

@@ -200,16 +200,8 @@ class LengthJumps:
             now: Time of reception by a steady clock [s].
             delay: How late the message is (`Arrival.delay`) [s].
         """
-        last, pause = self._last, self._pause(now, delay)
-        self._last, self._last_at, self._last_delay = length, now, delay
-        if last is None:
+        if not self.follow(length, used, now, delay):
             return JumpVerdict()
-        allowed = LIMITS.step + LIMITS.speed * min(pause, LIMITS.longest_step)
-        change = length - last
-        is_large: Bools = (np.abs(change) > LARGE * allowed) & used
-        if is_large.any():
-            is_jump = bool((np.abs(change[is_large]) > allowed).any())
-            self._note(LargeChange(now, is_large, change, allowed, pause, is_jump))
         jump = self._jump
         if jump is None or not jump.remaining(used).any():
             self._jump = None
@@ -222,6 +214,32 @@ class LengthJumps:
             return JumpVerdict()
         muscles = np.flatnonzero(jump.remaining(used)).tolist()
         return JumpVerdict(None, tuple(muscles), jump.is_unseen)
+
+    def follow(self, length: Array, used: Bools, now: float, delay: float = 0.0) -> bool:
+        """Compare lengths with those before them; return False if there are none before them.
+
+        This is all that happens with a message that is rejected because of other values: its
+        lengths show how far the arm has moved until the next message.
+
+        Args:
+            length: Lengths as measured [m], (M,). One that is not finite counts as unchanged.
+            used: Which muscles to check, (M,).
+            now: Time of reception by a steady clock [s].
+            delay: How late the message is (`Arrival.delay`) [s].
+        """
+        last, pause = self._last, self._pause(now, delay)
+        if last is not None:
+            length = np.where(np.isfinite(length), length, last)
+        self._last, self._last_at, self._last_delay = length, now, delay
+        if last is None:
+            return False
+        allowed = LIMITS.step + LIMITS.speed * min(pause, LIMITS.longest_step)
+        change = length - last
+        is_large: Bools = (np.abs(change) > LARGE * allowed) & used
+        if is_large.any():
+            is_jump = bool((np.abs(change[is_large]) > allowed).any())
+            self._note(LargeChange(now, is_large, change, allowed, pause, is_jump))
+        return True
 
     def _note(self, large: LargeChange) -> None:
         """Add a large change to the present jump, or begin one if the change is too large."""

@@ -253,6 +253,7 @@ class MuscleStream:
             raw = pull = None
             with suppress(MessageError):  # a message of another shape has no readings
                 raw = muscle_rows(message, muscle_count)
+                self._follow(raw, time if now is None else now, delay)
                 self._pull.note(raw)
                 pull = self._pull.median(self.body.offsets.offset)
             raise RejectionError(error.reason, str(error).partition(': ')[2], raw, pull) from error
@@ -303,9 +304,24 @@ class MuscleStream:
         known, used = self.body.offsets.known, self.body.used
         problem = self._levels.problem(states, used, known)
         if problem is not None:
+            self._follow(read, now, self._delay)
             return JumpVerdict(problem)
         verdict = self._jumps.step(read[Row.LENGTH], read[Row.TENSION], used, now, self._delay)
         self.displaced.note(verdict)
         # While the length offsets are unknown, lengths are unreliable in any case, so that a jump
         # is no reason to reject the message.
         return verdict if known else verdict._replace(problem=None)
+
+    def _follow(self, read: Array, now: float, delay: float) -> None:
+        """Note the plausible lengths of a message that is rejected because of other values.
+
+        Args:
+            read: The readings, (Q, M).
+            now: Time of reception by a steady clock [s].
+            delay: How late the message is (`Arrival.delay`) [s].
+        """
+        length, offsets = read[Row.LENGTH], self.body.offsets
+        if offsets.known:
+            is_possible = np.isfinite(self._levels.plausible_pull(read, offsets.offset)[Row.LENGTH])
+            length = np.where(is_possible, length, np.nan)
+        self._jumps.follow(length, self.body.used, now, delay)

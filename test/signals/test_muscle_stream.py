@@ -367,3 +367,17 @@ def test_failed_reads_of_all_motors_of_a_moving_arm_do_not_reject_what_follows(f
     right = [n for n in range(len(time)) if n % 90 not in range(50, 50 + count)]
     assert set(right) <= set(used)
     assert not stream.displaced.muscles
+
+
+@pytest.mark.parametrize('wrong', [{'length': (0, np.nan)}, {'tension': (0, 9e3)}])
+def test_an_arm_that_moves_while_one_sensor_fails_has_no_jump_afterwards(wrong):
+    stream, reasons = MuscleStream(ROBOT), []
+    for n in range(600):
+        states = resting(**(wrong if 20 <= n < 520 else {}))
+        states[0, 1:] += 0.1 * np.clip((n - 20) / 500, 0.0, 1.0)  # the arm sinks
+        try:
+            assert stream.take(reading(states), n * PERIOD).jumped == ()
+        except RejectionError as rejection:
+            reasons.append(rejection.reason)
+    assert len(reasons) == 500 and 'length jumped' not in reasons
+    assert not stream.displaced.muscles
