@@ -70,6 +70,34 @@ def test_links_between_documents_lead_somewhere():
     assert not broken
 
 
+def test_the_files_that_documents_and_docstrings_name_exist():
+    package = ROOT / 'musculoskeletal_ae'
+    files = [*DOC.glob('explanation/*.md'), ROOT / 'CONTRIBUTING.md', *package.rglob('*.py')]
+    missing = []
+    for file in files:
+        names = re.findall(r'`([a-z_]\w*/[\w/]+\.py)`', file.read_text('utf-8'))
+        missing += [
+            f'{file.relative_to(ROOT)}: {name}'
+            for name in names
+            if not any((folder / name).exists() for folder in (package, ROOT, file.parent))
+        ]
+    assert not missing
+
+
+def test_the_table_of_each_folder_names_its_own_files():
+    text, missing = (DOC / 'explanation' / 'architecture.md').read_text('utf-8'), []
+    for part in re.split(r'^(?=\*\*`)|^#', text, flags=re.M):
+        if (folder := re.match(r'\*\*`([\w/]+)/`\*\*', part)) is None:
+            continue
+        first_cells = ' '.join(re.findall(r'^\|([^|]*)\|', part, re.M))
+        missing += [
+            f'{folder[1]}: {name}'
+            for name in re.findall(r'`([\w/]+\.py)`', first_cells)
+            if not (ROOT / 'musculoskeletal_ae' / folder[1] / name).exists()
+        ]
+    assert not missing
+
+
 def test_the_python_of_the_readme_estimates_without_ros(trained_file, tmp_path):
     (lines,) = re.findall(r'```python\n(.*?)```', (ROOT / 'README.md').read_text('utf-8'), re.S)
     (tmp_path / 'learned.safetensors').write_bytes(Path(trained_file).read_bytes())

@@ -80,7 +80,7 @@ class ResidualModel(NamedTuple):
     in single precision, in which cosines take a seventh of the time of double precision.
     """
 
-    frequency: Singles  # [1/rad or 1/m], (K, D); 0 for joints that the muscle does not cross
+    frequency: Singles  # [1/rad], (K, D); 0 for joints that the muscle does not cross
     phase: Singles  # phases of the cosines [rad], (K,)
     basis: Singles  # directions in feature space along which the features vary most, (K, F)
 
@@ -113,7 +113,7 @@ class ResidualModel(NamedTuple):
         return (values @ self._scaled).astype(float)
 
     def slope(self, theta: Array, joints: Ints) -> Singles:
-        """Return ∂ψ/∂θ for the joints in `joints` [1/rad or 1/m], shape (joints, N, F)."""
+        """Return ∂ψ/∂θ for the joints in `joints` [1/rad], shape (joints, N, F)."""
         angles = theta @ self.frequency.T + self.phase
         values = -np.sin(angles.astype(self.phase.dtype)) * self.frequency.T[joints, None]
         return values @ self._scaled

@@ -193,7 +193,7 @@ class PostureModel:
     def stiffness(self, at: Unknowns) -> Array:
         """Return the joint stiffness −∂τ/∂θ [N·m/rad], (N, D, D).
 
-        The part that muscle tensions cause comes from the geometric model.
+        The part that the bone-side tensions cause comes from the geometric model.
         """
         within, theta = (self.joints[:, None], self.joints), at.theta
         kinematics = self._kinematics
@@ -215,7 +215,7 @@ class PostureModel:
         hessian = muscle_hessian(self.body.robot.routes.muscle_jacobian, own[moved])
         self._bent.theta[np.ix_(moved, joints)] = own[moved]
         read, direction = self.observed.tension[moved], self.observed.direction[moved]
-        tension = self.body.transmission.motor(read, direction)
+        tension = self.body.transmission.end(read, direction)
         self._bent.stiffness[np.ix_(moved, joints, joints)] = np.einsum(
             'nm,nmij->nij', tension, hessian
         )

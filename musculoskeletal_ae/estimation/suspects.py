@@ -11,7 +11,7 @@ The sequence after the rupture of a tendon, with `on_anomaly: isolate`:
  4. Verification. The controller winds the suspect in by a few millimetres. `verification.py`
     classifies its response: ruptured, jammed, sensor fault, or healthy.
  5. Resuming. A faulty muscle stays isolated, a healthy one is restored. Either way the anomaly is
-    over, and the controller resumes after a verification (`control/stops.py`).
+    over, and the controller resumes after a verification (`control/supervisor.py`).
 
 With `on_anomaly: stop` the sequence ends with step 2, and the finding stays latched until
 `estimator/reset`. The same applies if two suspects were verified as healthy within the last 60 s,

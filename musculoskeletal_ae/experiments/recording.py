@@ -57,9 +57,10 @@ class Motion(NamedTuple):
 
 
 class ClosedLoop:
-    """An emulated arm, the estimator and the controller, connected as the nodes connect them.
+    """An emulated arm, a network and the controller, connected as the nodes connect them.
 
-    Each message passes through sense → estimate → control → command.
+    Each message passes through sense → estimate → control → command. The network estimates; the
+    detectors of the estimator are not part of the loop.
     """
 
     def __init__(self, arm: Arm, mae: Mae, settings: Settings | None = None, seed: int = 0) -> None:
