@@ -649,7 +649,8 @@ class ConditionKind(Enum):
         'tension_limited_by_heat',
         'controller',
         'warn',
-        'the temperature of a winding limits the tension of its muscle',
+        'the temperature of a winding limits the tension of its muscle to less than 90 % of '
+        'tension.limit',
         'heat limits the tension',
         (Step.CHECK_COOLING, Step.WAIT_UNTIL_COOL),
     )

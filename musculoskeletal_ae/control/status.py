@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 #: fraction of the requested speed below which a slowed trajectory is reported by its duration [%]
 LEAST_SHARE = 10.0
+#: report a tension limit that heat lowers below this share of `tension.limit`; a healthy arm that
+#: explores may be some newtons below it all the time
+COOL = 0.9
 #: what the arm does during each activity, as a text for users
 DOING = {
     Activity.IDLE: 'no target',
@@ -161,10 +164,10 @@ def _missing_torque(core: Controller) -> Array | None:
 
 
 def _limited_by_heat(core: Controller) -> dict[str, float]:
-    """Return the tension limits [N] that heat lowers, by the name of the muscle."""
+    """Return the tension limits [N] that heat lowers noticeably, by the name of the muscle."""
     robot = core.robot
     limits = zip(robot.muscles, core.watchdog.heat.planned, robot.tension.limit)
-    return {name: float(limit) for name, limit, largest in limits if limit < largest}
+    return {name: float(limit) for name, limit, largest in limits if limit < COOL * largest}
 
 
 def _add_motion(core: Controller, values: dict[str, str]) -> None:
