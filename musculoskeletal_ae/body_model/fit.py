@@ -23,6 +23,7 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody, Poses
 from musculoskeletal_ae.body_model.postures import FIRST_NOISE, fit_jointly
 from musculoskeletal_ae.body_model.priors import PRIOR, REOPENED, MusclePrior
+from musculoskeletal_ae.body_model.remainder import learned_remainder
 from musculoskeletal_ae.gauss_newton import (
     Equations,
     RightSides,
@@ -88,7 +89,11 @@ def fit_body(
         priors.append(_reopened(body, replace(observed, theta=start), prior, m))
     means, spreads = map(list, zip(*priors, strict=True))
     is_learned = prior_mean is not None
-    return Fit(*fit_jointly(body, observed, start, means, spreads, LEAST_NOISE, is_learned))
+    fit = Fit(*fit_jointly(body, observed, start, means, spreads, LEAST_NOISE, is_learned))
+    own = np.isfinite(observed.theta) & (observed.spread == 0.0)
+    measured = replace(observed, theta=observed.theta - own * body.zero)
+    body.remainder = learned_remainder(body, measured, fit.weight, priors)
+    return fit
 
 
 def _prior(body: CalibratedBody, observed: Observations, m: int) -> MusclePrior:
@@ -226,7 +231,7 @@ def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
     lengths = mae.lengths(theta, tension)
     read = mae.transmission.reading(tension, np.zeros(shape))
     observed = Observations(theta, read, lengths, np.zeros(shape), everything)
-    poses = body.poses(theta)
+    poses, priors = body.poses(theta), list[MusclePrior]()
     for m, layout in enumerate(body.layouts):
         mean, spread = PRIOR.mean(layout), PRIOR.spread(layout)
         # The network's lengths contain no information about friction and drive, because its input
@@ -237,5 +242,7 @@ def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
             if mae.touch.drive is not None:
                 mean[layout.drive] = mae.touch.drive[:, m] / body.drive_units[:, m]
         prior = MusclePrior(mean, spread)
+        priors.append(prior)
         problem = MuscleFit(body, poses, observed, everything[:, m], prior, NETWORK_ERROR, m)
         body.parameters[m] = problem.run()
+    body.remainder = learned_remainder(body, observed, everything.astype(float), priors)

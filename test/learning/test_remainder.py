@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The remainder: lengths that the constants of the body model cannot express."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from learning.conftest import Stage
+from musculoskeletal_ae.body_model.body_fit import BodyFit
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.body_model.remainder import Remainder
+
+AMPLITUDE = 0.015  # of the coupling [m]
+
+
+def coupling(theta):
+    """Return the change of all lengths [m] (N, 6) of an elastic body, whose joints move together.
+
+    It changes each muscle with both joints, also those muscles that cross only one.
+    """
+    shoulder, elbow = theta.T
+    shapes = np.sin(1.5 * shoulder + 0.8), np.cos(1.2 * elbow), shoulder * elbow
+    mixed = np.array([[1.0, -0.5, 0.3, 0.0, 0.8, 0.2], [0.4, 0.9, -0.7, 0.5, 0.0, -0.6], [0.5] * 6])
+    return AMPLITUDE * np.stack(shapes, axis=1) @ mixed
+
+
+def coupled(observed):
+    return replace(observed, length=observed.length + coupling(observed.theta))
+
+
+def fitted(robot, observed):
+    fit = BodyFit(robot, None)
+    for _ in range(3):  # as in three updates
+        fit.fit(observed, observed.theta)
+    return fit.body
+
+
+def error(body, states):
+    """Return the mean error of the lengths [m] in states without friction."""
+    theta, tension, length = states
+    (predicted,) = body.lengths(theta, tension, np.zeros_like(tension))
+    return float(np.abs(predicted - length).mean())
+
+
+def kernel_ridge(observed, states):
+    """Return the mean error of kernel ridge regression, chosen by its error on the test states."""
+    theta, tension, length = states
+    inputs, asked = (
+        np.hstack([angles, pull / 200.0])
+        for angles, pull in ((observed.theta, observed.tension), (theta, tension))
+    )
+    mean, errors = observed.length.mean(axis=0), []
+    for width in (0.5, 1.0, 2.0, 4.0, 8.0):
+        for ridge in (1e-6, 1e-4, 1e-2):
+            kernel, across = (
+                np.exp(-np.square(own[:, None] - inputs).sum(axis=2) / (2.0 * width**2))
+                for own in (inputs, asked)
+            )
+            weights = np.linalg.solve(kernel + ridge * np.eye(len(kernel)), observed.length - mean)
+            errors.append(np.abs(across @ weights + mean - length).mean())
+    return float(min(errors))
+
+
+@pytest.fixture
+def elastic_stage(other_body):
+    """Return samples of a body, and states of it, to which a coupling was added."""
+    stage = Stage(other_body)
+    theta, tension, length = Stage(other_body, 1).states(300)
+    return stage, (theta, tension, length + coupling(theta))
+
+
+@pytest.mark.parametrize('count', [20, 60])
+def test_a_body_that_the_model_cannot_express_is_learned_better_than_by_regression(
+    arm26, elastic_stage, count
+):
+    stage, states = elastic_stage
+    observed = coupled(stage.observations(count))
+    assert error(fitted(arm26, observed), states) < kernel_ridge(observed, states)
+
+
+def test_more_samples_of_such_a_body_reduce_the_error_to_the_noise(arm26, elastic_stage):
+    stage, states = elastic_stage
+    observed = coupled(stage.observations(120))
+    few, many = (error(fitted(arm26, observed[:count]), states) for count in (15, 120))
+    assert many < 0.5 * few
+    assert many < 0.0005
+
+
+def test_a_body_that_the_model_can_express_keeps_no_remainder(arm26, stage):
+    observed = stage.observations(60)
+    remainder = fitted(arm26, observed).remainder.at(observed.theta, observed.tension)
+    assert np.abs(remainder).max() < 0.0002
+
+
+def test_a_touched_arm_does_not_bend_the_remainder(arm26, stage):
+    states, observed = stage.states(300), stage.observations(60)
+    length = observed.length.copy()
+    length[::12] += 0.03  # somebody held the arm, so these tendons were longer than usual
+    assert error(fitted(arm26, replace(observed, length=length)), states) < 0.002
+
+
+def test_without_all_joint_angles_no_remainder_is_learned(arm26, stage):
+    observed = stage.observations(20)
+    theta = observed.theta.copy()
+    theta[:, 1] = np.nan
+    fit = BodyFit(arm26, None)
+    fit.fit(replace(observed, theta=theta), observed.theta)
+    assert not fit.body.remainder.groups
+
+
+def test_a_body_without_samples_has_no_remainder(arm26):
+    theta = arm26.random_postures(3, np.random.default_rng(0))
+    remainder = CalibratedBody(arm26).remainder.at(theta, np.full((3, 6), 50.0))
+    np.testing.assert_array_equal(remainder, Remainder(6).at(theta, np.zeros((3, 6))))
+    np.testing.assert_array_equal(remainder, 0.0)
