@@ -89,10 +89,19 @@ def fit_body(
         priors.append(_reopened(body, replace(observed, theta=start), prior, m))
     means, spreads = map(list, zip(*priors, strict=True))
     is_learned = prior_mean is not None
-    fit = Fit(*fit_jointly(body, observed, start, means, spreads, LEAST_NOISE, is_learned))
+
+    def fitted() -> Fit:
+        return Fit(*fit_jointly(body, observed, start, means, spreads, LEAST_NOISE, is_learned))
+
+    fit = fitted()
     own = np.isfinite(observed.theta) & (observed.spread == 0.0)
-    measured = replace(observed, theta=observed.theta - own * body.zero)
-    body.remainder = learned_remainder(body, measured, fit.weight, priors)
+    measured = replace(observed, theta=np.where(own, observed.theta - body.zero, fit.theta))
+    before = body.remainder.at(measured.theta, observed.tension)
+    all_known = replace(measured, theta=observed.theta - own * body.zero)
+    body.remainder = learned_remainder(body, all_known, fit.weight, priors)
+    # The constants have to agree with the new remainder, or both would explain the same lengths.
+    if np.abs(body.remainder.at(measured.theta, observed.tension) - before).max() > LEAST_NOISE:
+        fit = fitted()
     return fit
 
 
@@ -246,3 +255,7 @@ def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
         problem = MuscleFit(body, poses, observed, everything[:, m], prior, NETWORK_ERROR, m)
         body.parameters[m] = problem.run()
     body.remainder = learned_remainder(body, observed, everything.astype(float), priors)
+    explained = replace(observed, length=lengths - body.remainder.at(theta, read))
+    for m, prior in enumerate(priors):
+        problem = MuscleFit(body, poses, explained, everything[:, m], prior, NETWORK_ERROR, m)
+        body.parameters[m] = problem.run()

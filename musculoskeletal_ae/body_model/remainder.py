@@ -109,8 +109,8 @@ class GroupRemainder:
     weights: Array  # α, (N, M): g = k(·, inputs) α
     #: error of each length that is predicted from all other samples [m], (N, M)
     left_out: Array
-    #: lower Cholesky factors of the covariance of each muscle's lengths, without the body's part
-    roots: tuple[Array, ...] = ()
+    #: lower Cholesky factor of k + σ² diag(1/ω), with the mean ω of all muscles, (N, N)
+    root: Array
 
     def at(self, theta: Array, tension: Array) -> Array:
         """Return g [m] of the group's muscles, (N, M), for θ and T of the whole body."""
@@ -119,12 +119,9 @@ class GroupRemainder:
     def variance(self, theta: Array, tension: Array) -> Array:
         """Return the posterior variance of g for a known body [m²], (N, M)."""
         covariance = self._covariance(theta, tension)
+        known = np.square(solve_triangular(self.root, covariance.T, lower=True)).sum(axis=0)
         amplitude = _constants(self.logarithms)[0]
-        known = [
-            np.square(solve_triangular(root, covariance.T, lower=True)).sum(axis=0)
-            for root in self.roots
-        ]
-        return np.maximum(amplitude**2 - np.stack(known, axis=1), 0.0)
+        return np.tile(np.maximum(amplitude**2 - known, 0.0)[:, None], len(self.muscles))
 
     def _covariance(self, theta: Array, tension: Array) -> Array:
         inputs = np.hstack([theta[:, self.joints], tension[:, self.muscles]]) / self.scale
@@ -223,18 +220,17 @@ def group_remainder(
     logarithms = min(found, key=lambda result: result.fun).x
     inputs = np.hstack([lengths.theta, lengths.tension]) / scale
     kernel = _kernel(_squares(inputs, inputs, len(joints)), logarithms)
-    weights, left_out, roots = [], [], []
+    weights, left_out = [], []
     for m in range(len(muscles)):
-        own = kernel + np.diag(_variances(lengths, logarithms, m))
-        covariance = own + lengths.by_body[m] @ lengths.by_body[m].T
+        noise = _variances(lengths.weight[:, m], logarithms)
+        covariance = kernel + lengths.by_body[m] @ lengths.by_body[m].T + np.diag(noise)
         inverse = cho_solve((cholesky(covariance, lower=True), True), np.eye(count))
         weights.append(inverse @ lengths.deviation[m])
         left_out.append(weights[-1] / np.diag(inverse))
-        roots.append(cholesky(own, lower=True))
     of_muscles, errors = (np.stack(part, axis=1) for part in (weights, left_out))
-    return GroupRemainder(
-        joints, muscles, scale, logarithms, inputs, of_muscles, errors, tuple(roots)
-    )
+    noise = _variances(lengths.weight.mean(axis=1), logarithms)
+    root = cholesky(kernel + np.diag(noise), lower=True)
+    return GroupRemainder(joints, muscles, scale, logarithms, inputs, of_muscles, errors, root)
 
 
 class _Evidence:
@@ -251,7 +247,7 @@ class _Evidence:
         value, identity = 0.0, np.eye(len(kernel))
         common, by_noise = np.zeros_like(kernel), 0.0
         for m, by_body in enumerate(self._by_body):
-            noise = _variances(self._lengths, logarithms, m)
+            noise = _variances(self._lengths.weight[:, m], logarithms)
             try:
                 root = cholesky(by_body + kernel + np.diag(noise), lower=True, check_finite=False)
             except LinAlgError:
@@ -301,8 +297,8 @@ def _kernel(squares: Sequence[Array], logarithms: Array) -> Array:
     return kernel
 
 
-def _variances(lengths: Lengths, logarithms: Array, m: int) -> Array:
-    """Return the variance of each measured length of muscle `m` [m²], (N,)."""
+def _variances(weight: Array, logarithms: Array) -> Array:
+    """Return the variance of measured lengths with robust weights ω (N,) [m²], (N,)."""
     noise = _constants(logarithms)[3]
-    variances: Array = noise**2 / np.maximum(lengths.weight[:, m], LEAST_WEIGHT) + JITTER
+    variances: Array = noise**2 / np.maximum(weight, LEAST_WEIGHT) + JITTER
     return variances
