@@ -224,13 +224,15 @@ NETWORK_ERROR = 0.001  # smallest σ of the network's lengths [m]
 FIXED = 1e-6  # prior spread of a parameter that a fit must not change
 
 
-def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
+def fit_to_network(
+    body: CalibratedBody, mae: Mae, seed: int = 0, *, with_remainder: bool = True
+) -> None:
     """Fit a body in place to the muscle lengths of a network that has learned a real arm.
 
     The samples from which the network was learned may be missing (after `train --from-bag`, on
     another machine, or if the state was lost). With this fit as prior, learning still continues
     from the learned body and does not start again from the geometric model. An exported model of
-    the learned body is fitted in the same way.
+    the learned body is fitted in the same way, but without a remainder, which it cannot contain.
     """
     robot, rng = body.robot, np.random.default_rng([seed, 0x1B])
     theta = robot.random_postures(NETWORK_STATES, rng)
@@ -254,6 +256,8 @@ def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
         priors.append(prior)
         problem = MuscleFit(body, poses, observed, everything[:, m], prior, NETWORK_ERROR, m)
         body.parameters[m] = problem.run()
+    if not with_remainder:
+        return
     body.remainder = learned_remainder(body, observed, everything.astype(float), priors)
     explained = replace(observed, length=lengths - body.remainder.at(theta, read))
     for m, prior in enumerate(priors):

@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 #: Unknowns of the evidence are the natural logarithms of a, b, c and σ, relative to these units:
 #: [m], joint ranges, T_limit and [m].
 UNITS = np.array([0.002, 0.5, 1.0, 0.001])
-USUAL = np.array([-1.5, 0.0, 2.0, -2.0])  # means of their prior
-SPREAD = np.array([2.0, 1.0, 1.0, 1.5])  # standard deviations of their prior
+USUAL = np.array([-1.5, 0.5, 2.0, -2.0])  # means of their prior
+SPREAD = np.array([2.0, 0.4, 1.0, 1.5])  # standard deviations of their prior
 BOUNDS = ((-8.0, 4.0), (-1.5, 3.0), (-1.5, 4.0), (-1.2, 3.0))
 #: initial values of a search: a trusted body, a wrong body, and one with a rough remainder
 STARTS = USUAL, USUAL + [2.5, 0.0, 0.0, 0.0], USUAL + [3.0, -1.0, 0.0, 1.0]
@@ -52,7 +52,7 @@ ROUNDS = 25  # largest number of iterations of a search that begins with STARTS
 FEW_ROUNDS = 4  # largest number of iterations of a search that continues from an earlier result
 JUDGING = 150  # largest number of samples that the evidence is computed from
 LEAST_SAMPLES = 5  # smallest number of samples from which a remainder is learned
-LEAST_WEIGHT = 1e-4  # smallest robust weight of a length; smaller ones count as this one
+UNKNOWN = 1.0  # variance of a length that a sample does not describe [m²]
 JITTER = 1e-10  # variance that keeps covariances positive definite [m²]
 
 
@@ -258,7 +258,8 @@ class _Evidence:
             value += float(np.log(np.diag(root)).sum())
             slope = inverse - np.outer(weights, weights)
             common += slope
-            by_noise += float(np.diag(slope) @ noise)
+            used = self._lengths.weight[:, m] > 0.0
+            by_noise += float(np.diag(slope)[used] @ noise[used])
         _, by_theta, by_tension, _ = _constants(logarithms)
         angles, tensions = self._squares
         deviation = (logarithms - USUAL) / SPREAD
@@ -299,6 +300,7 @@ def _kernel(squares: Sequence[Array], logarithms: Array) -> Array:
 
 def _variances(weight: Array, logarithms: Array) -> Array:
     """Return the variance of measured lengths with robust weights ω (N,) [m²], (N,)."""
-    noise = _constants(logarithms)[3]
-    variances: Array = noise**2 / np.maximum(weight, LEAST_WEIGHT) + JITTER
+    variances = np.full(len(weight), UNKNOWN)
+    used = weight > 0.0
+    variances[used] = _constants(logarithms)[3] ** 2 / weight[used] + JITTER
     return variances

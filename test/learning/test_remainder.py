@@ -10,8 +10,12 @@ from learning.conftest import Stage
 from musculoskeletal_ae.body_model.body_fit import BodyFit
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.remainder import Remainder
+from musculoskeletal_ae.learning.calibration import Healthy
+from musculoskeletal_ae.learning.job import Job
+from musculoskeletal_ae.learning.update import BodyUpdater
 
 AMPLITUDE = 0.015  # of the coupling [m]
+NO_MESSAGES = Healthy(np.empty((0, 18), dtype=np.float32), 0.0, 0)
 
 
 def coupling(theta):
@@ -114,3 +118,27 @@ def test_a_body_without_samples_has_no_remainder(arm26):
     remainder = CalibratedBody(arm26).remainder.at(theta, np.full((3, 6), 50.0))
     np.testing.assert_array_equal(remainder, Remainder(6).at(theta, np.zeros((3, 6))))
     np.testing.assert_array_equal(remainder, 0.0)
+
+
+def test_learning_continues_from_a_network_without_losing_its_remainder(
+    arm26, elastic_stage, initial
+):
+    stage, states = elastic_stage
+    updater = BodyUpdater(arm26, initial)
+    for _ in range(3):
+        update = updater.update(Job(coupled(stage.observations(60)), NO_MESSAGES, True, 100))
+    again = BodyFit(arm26, update.mae)
+    few = coupled(stage.observations(6))
+    again.fit(few, few.theta)
+    assert error(again.body, states) < 0.5 * error(fitted(arm26, few), states)
+
+
+def test_the_update_reports_what_the_body_model_cannot_express(arm26, elastic_stage, initial):
+    stage, _ = elastic_stage
+    plain = stage.observations(40)
+    sizes = [
+        BodyUpdater(arm26, initial).update(Job(observed, NO_MESSAGES, True, 1)).remainder.max()
+        for observed in (plain, coupled(plain))
+    ]
+    assert sizes[0] < 0.0002
+    assert sizes[1] > 0.002
