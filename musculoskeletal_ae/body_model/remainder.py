@@ -172,7 +172,7 @@ def learned_remainder(
     for group in body.robot.groups:
         joints, muscles = np.array(group.joints), np.array(group.muscles)
         rows = np.flatnonzero(np.isfinite(observed.theta[:, joints]).all(axis=1))
-        if len(rows) < LEAST_SAMPLES or not len(joints):
+        if len(rows) < LEAST_SAMPLES or not min(map(len, group)):
             continue
         own = observed[rows]
         if before is not None:
