@@ -74,6 +74,7 @@ class Process:
         """Share the computer with `load` other processes, on average."""
         self._per_core, self._rng = load / CORES, np.random.default_rng(seed)
         self._runs_at = 0.0  # time at which the process runs next [s]
+        self._subscribed_at = 0.0  # time from which it receives messages [s]
         self._waiting: list[Message] = []
         self._arrival = Arrival()
         self.lost = 0  # number of lost messages
@@ -81,15 +82,17 @@ class Process:
 
     def send(self, message: Message) -> None:
         """Put a message into the queue of the process, which reads it when it runs next."""
-        self._waiting.append(message)
+        if message.sent_at >= self._subscribed_at:
+            self._waiting.append(message)
 
     def suspend(self, until: float) -> None:
         """Do not run before the time `until` [s], as a process that was stopped by a signal."""
         self._runs_at = until
 
     def restart(self, at: float) -> None:
-        """End the process; its successor runs from the time `at` [s] on, with an empty queue."""
-        self._runs_at, self._arrival = at, Arrival()
+        """End the process; its successor runs and receives messages from the time `at` [s] on."""
+        self._runs_at = self._subscribed_at = at
+        self._arrival = Arrival()
         self._waiting.clear()
 
     def runs(self, now: float) -> float | None:

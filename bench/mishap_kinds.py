@@ -44,7 +44,9 @@ REVOKED = frozenset({
 })  # fmt: skip
 FROZEN = FAULTY | {'sensor_frozen'}
 MISSING = FAULTY | {'values_missing', 'implausible_muscle_states', 'readings_rejected'}
-TENSION_SENSOR = FAULTY | NOT_FOLLOWING | {'sensor_saturated', 'tension_above_limit', 'overload'}
+TENSION_SENSOR = FAULTY | NOT_FOLLOWING | {
+    'sensor_saturated', 'slack_tendon', 'tension_above_limit', 'overload',
+}  # fmt: skip
 JOINT = frozenset({
     'joint_sensors_doubted', 'joint_readings_impossible', 'joint_readings_missing',
 })  # fmt: skip
@@ -358,11 +360,18 @@ def changed(
         muscle, name = _any(rng, lab.arm.robot.muscles)
         size = rng.uniform(low, high) * (_sign(rng) if is_signed else 1.0)
 
+        shown, error = SHOWN_TENSION if row == TENSION else SHOWN_LENGTH, [0.0]
+
         def falsify(_: float, states: Array) -> None:
-            states[row, muscle] = change(float(states[row, muscle]), size)
+            value = float(states[row, muscle])
+            states[row, muscle] = change(value, size)
+            error[0] = abs(float(states[row, muscle]) - value)
 
         lab.wire.reading_faults.append(on_states(falsify))
-        return Case(f'{name}, {size:.3g} {unit}', _clear, (name,))
+        return Case(
+            f'{name}, {size:.3g} {unit}', _clear, (name,),
+            is_visible=lambda _: not error[0] <= shown,
+        )  # fmt: skip
 
     return begin
 
@@ -911,7 +920,8 @@ MISHAPS: tuple[Mishap, ...] = (
            allowed=REVOKED | REJECTED),
     Mishap('module jams', module_fault('stuck_motor'), JAM),
     Mishap('motor is weak', module_fault('winch_speed', 0.005, 0.02), JAM),
-    Mishap('length reading freezes', frozen(LENGTH), FROZEN | ONE_LENGTH, allowed=REVOKED),
+    Mishap('length reading freezes', frozen(LENGTH), FROZEN | ONE_LENGTH | NOT_FOLLOWING,
+           allowed=REVOKED),
     Mishap('tension reading freezes', frozen(TENSION), FROZEN | TENSION_SENSOR),
     Mishap('joint sensor slips', joint_slips, JOINT, says=OF_JOINT),
     Mishap('joint sensor drifts', joint_drifts, JOINT, says=OF_JOINT),
@@ -940,7 +950,8 @@ MISHAPS: tuple[Mishap, ...] = (
            allowed=REVOKED | REJECTED),
     Mishap('encoder loses counts', lost_counts, ONE_LENGTH | NOT_FOLLOWING,
            allowed=REVOKED | REJECTED | {'tension_above_limit', 'overload'}),
-    Mishap('noise on tension readings', noisy_tensions, is_harmless=True, says='nois'),
+    Mishap('noise on tension readings', noisy_tensions, is_harmless=True, says='nois',
+           allowed=frozenset({'tension_above_limit'})),
     Mishap('joint sensor sticks', joint_fault(float, 'sticks'), JOINT, says=OF_JOINT),
     Mishap('joint sensor reversed', joint_fault(lambda x: -x, 'reversed'), JOINT,
            says=OF_JOINT),

@@ -104,7 +104,10 @@ explores again without any condition, or when the patience of the operator ends.
 
 - **true**: cases with a true statement within {goal} s of the first effect, of those that need a
   statement. A case needs none if the mishap is harmless, or had no effect within {longest} s.
-- **after**: median time from the first effect to the first true statement.
+- **after**: median time from the first effect to the first true statement. Most mishaps have an
+  effect at once. Wrong readings have one from {angle} rad, {length} mm or {tension} N on, a module
+  when its tension differs from the demanded one by {tension} N, and a turned base when it has
+  turned.
 - **false**: different false statements, over all cases. Statements about other muscles and joints
   are false, too.
 - **well**: cases in which the advice alone brought the arm back: it explores without any condition,
@@ -225,7 +228,8 @@ class Course:
         self.stated.clear()
         self.peak = 0.0
         self.begun_at = self.started_at = self.lab.now
-        self.advised_at = None
+        self.advised_at = self.true_at = None
+        self.first_true = ''
         self.case = self.mishap.begin(self.lab, rng)
         self._wait_for_advice()
         self._follow_advice(self.lab.now + self.mishap.patience)
@@ -325,7 +329,7 @@ class Course:
         finding = lab.estimator.suspects.finding
         lab.estimator.reset()
         if finding is not None:
-            lab.validator.declare_repaired([finding.muscle], lab.now)
+            lab.validator.declare_repaired(finding.muscles, lab.now)
         lab.publish()
 
     def _mend_named(self, by: list[Statement]) -> str:
@@ -671,6 +675,9 @@ def page(of: Sequence[dict[str, Any]], realities: Sequence[str]) -> str:
         goal=f'{GOAL:g}',
         longest=f'{LONGEST_WAIT:g}',
         after=f'{AFTER:g}',
+        angle=f'{mishap_kinds.SHOWN_ANGLE:g}',
+        length=f'{1e3 * mishap_kinds.SHOWN_LENGTH:g}',
+        tension=f'{mishap_kinds.SHOWN_TENSION:g}',
         ratio=f'{WELL:g}',
         more=f'{WELL_RAD:g}',
     )

@@ -240,9 +240,9 @@ class ConditionKind(Enum):
         'slack_tendon',
         'estimator',
         'error',
-        'a muscle has no tension although its command demands some: its tendon has ruptured or is '
-        'slack, or its winch is jammed',
-        'a muscle has no tension',
+        'a muscle shows no tension although its command demands some: its tendon has ruptured or '
+        'is slack, its winch is jammed, or its sensor reads too little',
+        'a muscle shows no tension',
         REPAIR,
         reaction=Reaction.ISOLATE,
     )
@@ -353,7 +353,7 @@ class ConditionKind(Enum):
         'a joint that had readings in `joint_states` has had none for 1 s, or only NaN, although '
         '`muscle_states` are received',
         'no readings of joint sensors',
-        (Step.CHECK_JOINT_DRIVER,),
+        (Step.CHECK_JOINT_DRIVER, Step.CONFIRM_REMOVED_SENSORS),
     )
     READINGS_REJECTED = Declaration(
         'readings_rejected',

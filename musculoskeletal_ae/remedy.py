@@ -55,6 +55,11 @@ class Step(Enum):
         'check_joint_driver',
         'check the named joint sensors, their cables, and the driver that publishes joint_states',
     )
+    CONFIRM_REMOVED_SENSORS = (
+        'confirm_removed_sensors',
+        'if the sensors were removed for good, call estimator/reset',
+        1,
+    )
     CHECK_MODULE = (
         'check_module',
         'check drag, cooling and tension sensor of the module; then call estimator/reset',

@@ -59,6 +59,14 @@ def test_a_busy_process_takes_its_oldest_message_and_the_last_of_a_full_queue():
     assert gap > lab.QUEUE and process.longest_delay > gap * lab.SAMPLE_TIME
 
 
+def test_a_process_that_restarts_receives_no_message_from_before_its_start():
+    process = lab.Process(0.0, [0])
+    process.restart(2.0)
+    for sent_at in (0.0, 1.0, 2.0, 2.01):
+        process.send(lab.Message(sent_at, sent_at))
+    assert [content for _, _, content in process.receive(2.02)] == [2.0, 2.01]
+
+
 def test_a_healthy_arm_on_a_busy_computer_is_neither_suspected_nor_stopped(trained):
     loop = false_stops.BusyLoop(EmulatedArm(Robot.load('arm26'), 0), trained['default'], 0, 8.0)
     result = loop.watch(5.0)

@@ -55,8 +55,8 @@ def msc_compensation(robot: Robot, tension: Array) -> Array:
 
 def unchanging(robot: Robot, kind: str, sample: MuscleSample) -> Command:
     """Return a command that keeps the present tensions; `kind` is `LENGTH` or `TENSION`."""
-    tension = np.maximum(sample.model_tension, robot.tension.bias)
+    tension = np.maximum(sample.motor_tension, robot.tension.bias)
     if kind == TENSION:
         return Command(TENSION, tension)
-    length, motor = sample.length, sample.motor_tension
-    return Command(LENGTH, robot.actuation.unchanging_length(length, motor))
+    length = robot.actuation.unchanging_length(sample.length, sample.motor_tension)
+    return Command(LENGTH, length)

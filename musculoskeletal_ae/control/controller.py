@@ -694,7 +694,10 @@ class Controller:
         # Without a stop cause, all inputs are available.
         assert self.mae is not None and self.sample is not None and self.estimate is not None
         sample = self.sample
-        pull = Pull(sample.model_tension * sample.usable, sample.bone_tension * sample.usable)
+        pull = Pull(
+            np.where(sample.usable, sample.motor_tension, 0.0),
+            np.where(sample.usable, sample.bone_tension, 0.0),
+        )
         return Inputs(
             mae=self.mae,
             sample=sample,

@@ -228,7 +228,7 @@ class CommandLimiter:
             value = np.clip(value, least, limit)
         else:
             shortest = self._shortest(before, change, sample, limit, dt)
-            is_relaxed = sample.motor_tension * sample.usable <= limit
+            is_relaxed = np.where(sample.usable, sample.motor_tension, 0.0) <= limit
             shortest -= actuation.usable_lead(lead) * is_relaxed
             value = np.maximum(value, shortest)
             if rejected is not None:
@@ -248,7 +248,7 @@ class CommandLimiter:
         The result is not lowered below T_bias, so that uncertainty alone makes no tendon slack.
         """
         bias = self._robot.description.tension.bias
-        spread = np.fmax(sample.tension_spread, 0.0)  # NaN: tension unknown
+        spread = np.fmax(sample.tension_spread, 0.0)  # NaN: an isolated muscle reads NaN
         return np.maximum(limit - CONFIDENCE * spread, np.minimum(limit, bias))
 
     def _relieved(self, rejected: Array, sample: MuscleSample, limit: Array) -> Array:
@@ -289,10 +289,9 @@ class CommandLimiter:
     ) -> Array:
         """Return the shortest length commands [m], (M,), that demand no tension above the limit."""
         robot, actuation = self._robot, self._robot.actuation
-        tension = sample.motor_tension * sample.usable
+        tension = np.where(sample.usable & actuation.knows_tension, sample.motor_tension, 0.0)
         rate = self._tension_rate(sample.sent_at, tension)
         depth, most = actuation.depth(tension, rate, limit), actuation.largest_depth(limit)
-        tension = np.where(np.isfinite(tension), tension, 0.0)
         per_length = actuation.tension_per_length(limit)
         self._relief = np.clip(
             self._relief + RELIEF * dt * (tension - limit) / per_length, 0.0, most

@@ -167,7 +167,7 @@ class HeatLimit:
         # module is commanded to exert no more, except briefly during a verification.
         bias = robot.description.tension.bias
         tension = np.where(robot.used, sample.newest[1], bias)
-        tension = np.where(np.isnan(tension), sample.model_tension, tension)
+        tension = np.where(np.isnan(tension), sample.motor_tension, tension)
         self.heat.step(tension, sample.temperature, elapsed)
 
     def lower(self, highest: float, fall: Array | float) -> None:
@@ -238,7 +238,8 @@ class Watchdog:
         elapsed = states.age(now) if states.was_used else 0.0
         states.use(now)
         self.heat.take(self._robot, sample, elapsed)
-        self.overload.take(sample.motor_tension * sample.usable, now, sample.delay)
+        tension = np.where(sample.usable, sample.motor_tension, 0.0)
+        self.overload.take(tension, now, sample.delay)
 
     def take_rejected(self, tension: Array, used: Bools, now: float, delay: float) -> None:
         """Check the filtered tensions [N], (M,), of a rejected message for overload.

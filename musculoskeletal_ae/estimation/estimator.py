@@ -33,7 +33,7 @@ from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.joint_check import JointCheck
 from musculoskeletal_ae.estimation.lengths.checked_calibration import CheckedCalibration
-from musculoskeletal_ae.estimation.lengths.length_trust import EVIDENCE_OF, Evidence, LengthTrust
+from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthTrust
 from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
 from musculoskeletal_ae.estimation.mounting import MountingCheck
@@ -163,12 +163,12 @@ class Estimator:
         finding = self.suspects.finding
         if finding is None or self.suspects.verification is not None:
             return ()
-        muscle, check = finding.muscle, self._repair_check
-        is_moved = self.trust.evidence[muscle] is Evidence.MOVED
+        muscles, check = finding.muscles, self._repair_check
+        is_moved = any(self.trust.evidence[muscle] is Evidence.MOVED for muscle in muscles)
         is_repaired = finding.kind is ConditionKind.SLACK_TENDON or is_moved
         if finding.kind.steps != REPAIR or not is_repaired or check is None:
             return finding.kind.steps
-        is_wrong = check.is_taut_with_wrong_length(muscle)
+        is_wrong = any(map(check.is_taut_with_wrong_length, muscles))
         return (Step.CALIBRATE_LENGTHS,) if is_wrong else finding.kind.steps
 
     @property
@@ -279,11 +279,12 @@ class Estimator:
         return self.joint_check.trust
 
     def confirm_joint_sensors(self) -> tuple[int, ...]:
-        """Trust all joint sensors again, as the user wants; return the joints that were in doubt.
+        """Take the joint sensors as they are, as the user wants; return the joints concerned.
 
-        The readings of the doubtful time then count as well.
+        Sensors in doubt are trusted again, and the readings of the doubtful time count as well.
+        Sensors without readings count as removed until they report again.
         """
-        return self.joint_check.confirm()
+        return (*self.joint_check.confirm(), *self.joint_stream.do_without_missing())
 
     def restore(self, muscles: Iterable[int]) -> None:
         """Use isolated muscles (indices) again; muscles that are not isolated are ignored.
@@ -399,7 +400,7 @@ class Estimator:
             sent_apart = max(sample.sent_at - before.sent_at, 0.0)
         self.joint_stream.pass_time(min(elapsed, LONGEST_STEP))
         temperature = np.where(self.body.used, sample.temperature, np.nan)
-        self.heat.step(sample.model_tension, temperature, elapsed)
+        self.heat.step(sample.motor_tension, temperature, elapsed)
         if self.mae is None:
             return None
         self.stepped_at = now
@@ -454,7 +455,7 @@ class Estimator:
             pull = sample.bone_tension * self.body.used
             contact = self.contact.step(estimate.state.theta, pull, sent_apart)
             if self.suspects.finding is None:
-                self.mounting.step(estimate.state.theta, pull, contact.torque)
+                self.mounting.step(estimate.state.theta, pull, contact.torque, dt)
         self.output = Output(
             sample, estimate.state, estimate.covariance, estimate.anomaly, detected, contact
         )
@@ -464,7 +465,7 @@ class Estimator:
 
     def _note(
         self,
-        evidence: Evidence,
+        evidence: Evidence | ConditionKind,
         muscles: Iterable[int] | None = None,
         found: LengthOffsets | None = None,
     ) -> None:
@@ -499,9 +500,9 @@ class Estimator:
             self._handle(finding_of(jumped), now)
 
     def _check_suspect(self, isolating: Iterable[int]) -> None:
-        """Check that the suspect may be used again, unless it is among the muscles `isolating`.
+        """Check that the suspects may be used again, unless they are among the muscles `isolating`.
 
-        If its length has jumped since the finding, its length offset is then confirmed.
+        If the length of one has jumped since the finding, its length offset is then confirmed.
 
         Raises:
             MusculoskeletalError: If the suspect may not be used yet.
@@ -509,9 +510,10 @@ class Estimator:
         suspected = self.suspects.finding
         if suspected is None or suspected.kind.steps != REPAIR or suspected.muscle in isolating:
             return
-        if problem := self._repair_problem(suspected.muscle):
-            raise MusculoskeletalError(f'{problem}; then call estimator/reset again')
-        self._confirm([suspected.muscle])
+        used = [muscle for muscle in suspected.muscles if muscle not in isolating]
+        if problems := list(filter(None, map(self._repair_problem, used))):
+            raise MusculoskeletalError(f'{"; ".join(problems)}; then call estimator/reset again')
+        self._confirm(used)
 
     def _confirm(self, muscles: Iterable[int]) -> None:
         """Confirm the offsets of repaired muscles, if their lengths have changed in the repair."""
@@ -553,9 +555,8 @@ class Estimator:
             self._note(Evidence.MOVED, [finding.muscle])
             self.health.reset()  # evidence from before the repair is no longer valid
             return False
-        evidence = EVIDENCE_OF.get(finding.kind)
-        if evidence is not None and finding.muscle not in self.body.isolated:
-            self._note(evidence, [finding.muscle] if finding.is_of_one_length else None)
+        if finding.kind.revokes is not None and finding.muscle not in self.body.isolated:
+            self._note(finding.kind, [finding.muscle] if finding.is_of_one_length else None)
         is_latched = before is None and self.suspects.finding is not None
         if is_latched:
             self._follows_network = False
@@ -567,8 +568,9 @@ class Estimator:
         assert mae is not None
         muscle, command = verification.muscle, self._commands.length(now)
         pull = np.clip(sample.bone_tension, 0.0, self.robot.tension.limit)
+        tension = self.robot.tension_source.known(sample.motor_tension)
         verdict = verification.step(
-            tension=float(sample.motor_tension[muscle]),
+            tension=float(tension[muscle]),
             length=float(sample.length[muscle]),
             command=None if command is None else float(command[muscle]),
             likely=float(mae.lengths(estimate.state.theta, pull)[muscle]),

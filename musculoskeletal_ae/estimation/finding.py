@@ -26,13 +26,18 @@ class Finding:
             them.
         kind: Kind of the fault. Its declaration states the consequence and the remedy.
         evidence: The evidence as a text for users.
-        others: Indices of further muscles that the fault concerns, as far as they are known.
+        others: Indices of further muscles that the fault concerns, or that may be faulty instead.
     """
 
     muscle: int
     kind: ConditionKind
     evidence: str
     others: tuple[int, ...] = ()
+
+    @property
+    def muscles(self) -> tuple[int, ...]:
+        """Indices of all muscles that the fault may concern, the most suspect one first."""
+        return (self.muscle, *self.others)
 
     @property
     def is_of_one_length(self) -> bool:

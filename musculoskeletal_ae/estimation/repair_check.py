@@ -45,10 +45,9 @@ class RepairCheck(NamedTuple):
         """Return why a muscle must not be used yet, as a text for users; '' if it may be used."""
         robot, sample, demand, limit = self.robot, self.sample, self.demand, self.limit
         name, tension = robot.muscles[muscle], float(sample.motor_tension[muscle])
-        is_known = robot.tension_source.is_known
         if muscle in self.jumping:
             return f'the length of {name} has just jumped; wait for {LIMITS.settled:g} s'
-        if np.isnan(sample.length[muscle]) or (is_known and np.isnan(tension)):
+        if np.isnan(sample.length[muscle]) or np.isnan(tension):
             return f'{name}: a sensor reports NaN instead of a number; repair it'
         bias = float(robot.tension.bias[muscle])
         demanded = 0.0 if demand is None else float(demand[muscle])

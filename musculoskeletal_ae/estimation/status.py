@@ -64,7 +64,7 @@ def _finding(core: Estimator) -> Iterator[Condition]:
     finding = core.suspects.finding
     if finding is None:
         return
-    names = [core.robot.muscles[muscle] for muscle in (finding.muscle, *finding.others)]
+    names = [core.robot.muscles[muscle] for muscle in finding.muscles]
     detail = f'{", ".join(names)}: {finding.evidence}'
     if core.suspects.verification is not None:
         detail += f' (it is being verified, which ends by itself within {LONGEST:g} s)'
@@ -98,9 +98,9 @@ def _unknown_offsets(core: Estimator) -> Iterator[Condition]:
         steps = ()
     elif finding is not None and finding.kind.steps == REPAIR:
         steps = ()  # the lengths are calibrated after the repair
-    for evidence, muscles in core.trust.doubts.items():
+    for reason, muscles in core.trust.doubts.items():
         names = [core.robot.muscles[muscle] for muscle in muscles]
-        detail = f'{", ".join(names)}: {evidence.value}'
+        detail = f'{", ".join(names)}: {reason}'
         if calibration is not None:
             detail = f'{detail}; calibrating: {calibration.progress}'
         yield kind.LENGTH_OFFSETS_UNKNOWN.condition(detail, names, steps=steps)
@@ -181,7 +181,7 @@ def _residuals(core: Estimator) -> dict[str, str]:
         'suspect muscle': core.robot.muscles[suspect],
     }
     if residual.is_calibrated:
-        limit = residual.limit(output.state.theta, output.sample.model_tension)
+        limit = residual.limit(output.state.theta, output.sample.motor_tension)
         values[f'{residual.symbol} limit'] = f'{limit:.3g}'
     return values
 

@@ -134,13 +134,13 @@ class SuspectHandling:
     def explains(self, finding: Finding) -> bool:
         """Return whether a new finding is a wrong length that the repair of a muscle explains.
 
-        This is the case if the latched finding concerns the same muscle and is to be remedied by
+        This is the case if the latched finding may concern the same muscle and is to be remedied by
         its repair.
         """
         suspected = self.finding
         if suspected is None or suspected.kind.steps != REPAIR:
             return False
-        return finding.is_of_one_length and finding.muscle == suspected.muscle
+        return finding.is_of_one_length and finding.muscle in suspected.muscles
 
     def _law(self, muscle: int) -> ModuleLaw:
         robot, bias = self._robot, float(self._robot.description.tension.bias[muscle])

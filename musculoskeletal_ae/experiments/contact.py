@@ -28,18 +28,11 @@ HEALTHY = 3600.0  # duration of healthy exploration, shared by the individuals [
 LEAST, MOST = 10.0, 50.0  # range of the external forces [N]
 LIGHT, FIRM = 15.0, 20.0  # range of the forces that guide an arm in method `float` [N]
 MOVE = 4.0  # duration of the motion to a posture [s]
-QUICK_MOVE = 2.5  # the same in a shortened run [s]
 PUSH = 1.5  # duration of a push at rest [s]
 EVALUATED = 0.5  # duration of the last part of a push, over which estimates are averaged [s]
 APART = 3.0  # longest time between collisions [s]
-#: duration of the exploration before contacts of the healthy arm are counted [s], and the same in
-#: a shortened run
-WARM_UP, QUICK_WARM_UP = 5.0, 1.0
+WARM_UP = 5.0  # duration of the exploration before contacts of the healthy arm are counted [s]
 FLOATING = 30.0  # duration of the drift test [s]
-QUICK_FLOATING = 2.0  # duration of the drift test in a shortened run [s]
-#: factor on all other durations and numbers of tests in a shortened run, which makes at least one
-#: test of each kind
-QUICK_SHARE = 0.0002
 MOVED = 1.0  # duration of a collision, and of guiding the hand [s]
 SOON = 0.1  # a collision should be detected within this time [s]
 INSIDE = 0.1  # distance of postures from the joint limits, relative to the joint ranges
@@ -48,12 +41,9 @@ INSIDE = 0.1  # distance of postures from the joint limits, relative to the join
 class ContactLoop(ClosedLoop):
     """A closed loop that estimates external forces."""
 
-    def __init__(
-        self, arm: Arm, mae: Mae, settings: Settings, seed: int, move: float = MOVE
-    ) -> None:
-        """Connect an arm; `move` is the duration of a motion to a posture [s]."""
+    def __init__(self, arm: Arm, mae: Mae, settings: Settings, seed: int) -> None:
+        """Connect an arm."""
         self._contact, self._friction = ContactEstimator(arm.robot), FrictionDirection()
-        self._move = move
         super().__init__(arm, mae, settings, seed)
 
     def use(self, mae: Mae) -> None:
@@ -77,7 +67,7 @@ class ContactLoop(ClosedLoop):
         self.push(np.zeros(3))
         self.core.reset(self._now)
         self.target(theta)
-        self.contacts_during(self._move)
+        self.contacts_during(MOVE)
 
     def push(self, force: Array) -> None:
         """Apply a force [N] (3,) to the hand until the next call."""
@@ -90,23 +80,18 @@ def measure(study: Study, seed: int) -> Measured:
     The loop uses the network that has learned this individual.
     """
     robot, rng = study.robot, np.random.default_rng([seed, CONTACT_STREAM])
-    settings, share = Settings(first_duration=2.0), QUICK_SHARE if study.quick else 1.0
-    move, warm_up = (QUICK_MOVE, QUICK_WARM_UP) if study.quick else (MOVE, WARM_UP)
-    loop = ContactLoop(study.arm(seed), study.network(seed), settings, CONTACT_STREAM + seed, move)
-
-    def count(whole: float) -> int:
-        return max(1, round(share * whole))
-
+    settings = Settings(first_duration=2.0)
+    loop = ContactLoop(study.arm(seed), study.network(seed), settings, CONTACT_STREAM + seed)
     pushes = []
-    for _ in range(count(POSTURES)):
+    for _ in range(study.number(POSTURES)):
         loop.rest(_holdable(robot, rng))
         pushes += [_push_at_rest(loop, _force(robot, rng, LEAST, MOST)) for _ in range(2)]
-    forces, delays = _collisions(loop, rng, count(COLLISIONS))
+    forces, delays = _collisions(loop, rng, study.number(COLLISIONS))
     soon = delays <= SOON + 1e-9
     loop.arm.reset()
-    seconds = share * HEALTHY / len(study.seeds)
-    contacts = _healthy(loop, seconds, warm_up)
-    drift, moved = zip(*(_guide_by_hand(study, seed, rng, move) for _ in range(count(FLOATS))))
+    seconds = study.seconds(HEALTHY / len(study.seeds))
+    contacts = _healthy(loop, seconds, study.seconds(WARM_UP))
+    drift, moved = zip(*(_guide_by_hand(study, seed, rng) for _ in range(study.number(FLOATS))))
     true, estimated, free = columns(pushes)
     size, angle = _errors(true, estimated)
     numbers: dict[str, Any] = {
@@ -214,22 +199,19 @@ def _healthy(loop: ContactLoop, seconds: float, warm_up: float) -> int:
     return contacts
 
 
-def _guide_by_hand(
-    study: Study, seed: int, rng: np.random.Generator, move: float
-) -> tuple[float, float]:
+def _guide_by_hand(study: Study, seed: int, rng: np.random.Generator) -> tuple[float, float]:
     """Measure the drift of the arm under gravity compensation, and push its hand afterwards.
 
     Returns:
         The largest drift of a joint [rad], and the distance [m] by which the push moves the hand.
     """
     settings, arm = Settings(first_duration=2.0), study.arm(seed)
-    loop = ContactLoop(arm, study.network(seed), settings, seed, move)
+    loop = ContactLoop(arm, study.network(seed), settings, seed)
     loop.rest(_holdable(study.robot, rng))
     loop.core.configure(replace(settings, method='float'))
     loop.wait(MOVED)
     start, drift = arm.theta, 0.0
-    floating = QUICK_FLOATING if study.quick else FLOATING
-    for _ in range(round(floating / SAMPLE_TIME)):
+    for _ in range(round(study.seconds(FLOATING) / SAMPLE_TIME)):
         loop.step()
         drift = max(drift, float(np.abs(arm.theta - start).max()))
     before = arm.hand.translation.copy()

@@ -67,8 +67,6 @@ class Durations(NamedTuple):
 
 
 DURATIONS = Durations(5.0, 8.0, 5.0, 2.0)
-#: the same in a shortened run, whose approaches begin on the way to a start
-QUICK_DURATIONS = Durations(0.5, 2.0, 1.0, 0.5)
 
 
 class Approaches(NamedTuple):
@@ -142,7 +140,8 @@ def _bound(arm: Arm) -> float:
 def measure(study: Study, seed: int) -> Measured:
     """Measure the errors and tensions of every control method on one individual."""
     networks = {'default': study.network(seed), PAPER_PRESET: study.network(seed, PAPER_PRESET)}
-    count, durations = (1, QUICK_DURATIONS) if study.quick else (APPROACHES, DURATIONS)
+    # The approaches of a shortened run begin on the way to a start.
+    count, durations = study.number(APPROACHES), Durations(*map(study.seconds, DURATIONS))
     ended = protocol(study.arm(seed), networks, seed, count, durations)
     errors = {name: np.linalg.norm(offset, axis=-1) for name, offset in ended.offset.items()}
     numbers: dict[str, Any] = {

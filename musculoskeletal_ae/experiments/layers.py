@@ -51,7 +51,6 @@ HIDDEN = {
     'fewer units: 20, 10': (20, 10),
 }
 TRAININGS = 3  # number of trainings of each layout, which differ in the random seed
-QUICK_LAYOUTS, QUICK_TRAININGS = 1, 1
 QUICK_STEPS = 100  # number of steps of a shortened initial training
 ERRORS = 'before_rad', 'after_rad'  # numbers whose range over the trainings is reported
 
@@ -63,8 +62,8 @@ def measure(study: Study, seed: int) -> Measured:
     """
     if seed != study.seeds[0]:
         return Measured({}, {})
-    layouts = list(HIDDEN)[:QUICK_LAYOUTS] if study.quick else list(HIDDEN)
-    trainings = QUICK_TRAININGS if study.quick else TRAININGS
+    layouts = list(HIDDEN)[: study.number(len(HIDDEN))]
+    trainings = study.number(TRAININGS)
     trained = {
         name: [_trained(study, seed, HIDDEN[name], training) for training in range(trainings)]
         for name in layouts

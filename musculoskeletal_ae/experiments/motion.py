@@ -66,7 +66,6 @@ from musculoskeletal_ae.robot.tension import least_tension
 DURATIONS = (1.0, 2.0)  # durations of the motions [s]
 MOTIONS, CIRCLES = 6, 3  # numbers of motions of each duration, and of circles
 STARTING = 3.0  # duration of the motion to the first posture [s]
-QUICK_STARTING = 2.0  # the same in a shortened run [s]
 REST = 0.6  # duration of the rest after a motion [s]
 SETTLED = 0.5  # time after the end of a motion at which the settled error is read [s]
 OURS = 'trajectory'
@@ -107,12 +106,10 @@ class TrackedMotion(NamedTuple):
         return np.linalg.norm(self.desired - self.theta, axis=1)
 
 
-def loop_at(
-    arm: Arm, mae: Mae, start: Array, method: str, duration: float, starting: float = STARTING
-) -> ClosedLoop:
+def loop_at(arm: Arm, mae: Mae, start: Array, method: str, duration: float) -> ClosedLoop:
     """Move an arm to `start` [rad] (D,); return its closed loop with a control method.
 
-    The motion to `start` takes `starting` [s]. The settings of the method are chosen such that its
+    The motion to `start` takes STARTING [s]. The settings of the method are chosen such that its
     later motions take `duration` [s].
     """
     # A ramp takes RAMP_SHARE of the duration that its setting states. Method `second` has two
@@ -122,14 +119,14 @@ def loop_at(
     settings = Settings(rate_limit=SPEED_LIMIT)
     loop = ClosedLoop(arm, mae, settings)
     loop.step()
-    loop.go(start, starting)
+    loop.go(start, STARTING)
     if method != OURS:
         other = Settings(
             method=method, rate_limit=SPEED_LIMIT, target_duration=duration,
             first_duration=first_part, second_duration=0.5 * ramp,
         )  # fmt: skip
         loop.core.configure(other)
-        loop.go(start, starting)
+        loop.go(start, STARTING)
     return loop
 
 
@@ -243,14 +240,12 @@ def circles(
     return reachable
 
 
-def circle(
-    loop: ClosedLoop, start: Array, place: Place, starting: float = STARTING
-) -> tuple[Array, Array]:
+def circle(loop: ClosedLoop, start: Array, place: Place) -> tuple[Array, Array]:
     """Follow a circle once; return desired and true positions of the hand [m], each (N, 3).
 
-    The motion to the posture `start` takes `starting` [s].
+    The motion to the posture `start` takes STARTING [s].
     """
-    loop.go(start, starting)
+    loop.go(start, STARTING)
     loop.core.pose(place(0.0), False, -1.0)
     loop.wait(1.5)
     desired, true = [], []
@@ -270,7 +265,7 @@ def measure(study: Study, seed: int) -> Measured:
     """Measure tracking with every control method, circles of the hand, and contact."""
     mae, rng = study.network(seed), np.random.default_rng([seed, 0x307])
     robot = study.robot
-    count, starting = (1, QUICK_STARTING) if study.quick else (MOTIONS, STARTING)
+    count = study.number(MOTIONS)
     arm = study.arm(seed)
     postures = robot.random_postures(TRIES, rng)
     held = holdable_postures(robot, postures, count + 1, arm.individual.muscle_jacobian)
@@ -282,7 +277,7 @@ def measure(study: Study, seed: int) -> Measured:
         for duration in DURATIONS[:1] if study.quick and method != OURS else DURATIONS:
             name = f'{duration:.0f}s'
             try:
-                loop = loop_at(study.arm(seed), mae, postures[0], method, duration, starting)
+                loop = loop_at(study.arm(seed), mae, postures[0], method, duration)
                 runs = [follow(loop, a, b, method, duration) for a, b in pairwise(postures)]
             except MusculoskeletalError as error:
                 if method == OURS:
@@ -302,10 +297,10 @@ def measure(study: Study, seed: int) -> Measured:
     if 'attainable_ratio_1s' in ours:
         both = ours['attainable_ratio_1s'] + ours['attainable_ratio_2s']
         numbers['tension_ratio_attainable'] = 0.5 * both
-    loop = loop_at(study.arm(seed), mae, postures[0], OURS, 1.0, starting)
+    loop = loop_at(study.arm(seed), mae, postures[0], OURS, 1.0)
     numbers['settle_s'] = float(np.mean([settling(loop, goal) for goal in postures[1:]]))
-    found = circles(robot, mae, rng, 1 if study.quick else CIRCLES)
-    laps = [circle(loop, *each, starting) for each in found]
+    found = circles(robot, mae, rng, study.number(CIRCLES))
+    laps = [circle(loop, *each) for each in found]
     errors = [np.linalg.norm(true - desired, axis=1).mean() for desired, true in laps]
     numbers['hand_circle_m'] = float(np.mean(errors)) if laps else None
     traces['laps'] = laps

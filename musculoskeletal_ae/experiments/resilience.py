@@ -53,18 +53,15 @@ from musculoskeletal_ae.robot.tension import holding_tension
 
 EVERY = 10  # every tenth message of the held-out motion is evaluated
 TARGETS = 2  # number of targets that the arm approaches without each muscle
-QUICK_TARGETS = 1  # number of targets without each muscle in a shortened run
 MOVING = 12.0  # duration of healthy motion before a fault [s]
 LATEST_VERDICT = 10  # longest wait for the end of the first verification after a fault [s]
 AFTERWARDS = 6.0  # duration of the motion after this wait [s]
-QUICK_MOVING, QUICK_AFTERWARDS = 3.0, 1.0  # both durations in a shortened run [s]
 #: longest time to a target [s]; it allows for slow winches, and for further approaches if the arm
 #: falls
 LONGEST_APPROACH = 60
 SETTLING = 4  # after this time at rest, the arm has arrived [s]
 STILL = 0.02  # the arm rests if no joint moves more than this in a second [rad]
 HEALTHY_TIME = 18_000.0  # duration of healthy exploration, shared by the individuals [s]
-QUICK_HEALTHY_TIME = 5.0  # the same in a shortened run [s]
 PUSH_EVERY = 10.0  # time from one push to the next [s]
 PUSH = (10.0, 30.0)  # range of the forces of pushes [N]
 
@@ -118,27 +115,25 @@ class IsolatingLoop(ClosedLoop):
 
 
 def run_with_fault(
-    arm: Arm, mae: Mae, seed: int, muscle: int, sensor: str, quick: bool = False
+    study: Study, seed: int, muscle: int, sensor: str
 ) -> tuple[IsolatingLoop, Array]:
     """Let an arm explore, make a muscle or one of its sensors fail, and continue.
 
     Args:
-        arm: The arm.
-        mae: The network.
-        seed: Random seed of the exploration.
+        study: Options of the run.
+        seed: Seed of the individual and of its exploration.
         muscle: Index of the muscle.
         sensor: 'length' or 'tension' for a sensor that fails; '' for a rupture.
-        quick: Whether to shorten the motions before and after the fault.
 
     Returns:
         The loop, and the errors of the estimate [rad] since the isolation, or since the fault if no
         muscle was isolated.
     """
-    moving, afterwards = (QUICK_MOVING, QUICK_AFTERWARDS) if quick else (MOVING, AFTERWARDS)
-    loop = IsolatingLoop(arm, mae, seed)
+    arm = study.arm(seed)
+    loop = IsolatingLoop(arm, study.network(seed), seed)
     loop.run(1.0)
     loop.core.explore(True)
-    loop.run(moving)
+    loop.run(study.seconds(MOVING))
     name, errors = arm.robot.muscles[muscle], list[Array]()
     if sensor:
         arm.set_faults([f'dead_sensor:{sensor}:{name}'])
@@ -151,7 +146,7 @@ def run_with_fault(
         errors.append(loop.run(1.0))
         if loop.isolated and not before:
             errors.clear()
-    return loop, np.concatenate([*errors, loop.run(afterwards)])
+    return loop, np.concatenate([*errors, loop.run(study.seconds(AFTERWARDS))])
 
 
 class Reach(NamedTuple):
@@ -252,21 +247,21 @@ def measure(study: Study, seed: int) -> Measured:
     correct, distances, shares, sensor_errors, trapped = [], [], [], [], []
     by_muscle: dict[str, dict[str, Any]] = {}
     for m in rng.permutation(robot.muscle_count)[:1].tolist() if study.quick else muscles:
-        loop, _ = run_with_fault(study.arm(seed), mae, seed, m, '', study.quick)
+        loop, _ = run_with_fault(study, seed, m, '')
         isolated, reason = loop.verdicts[0] if loop.verdicts else ((), 'nothing')
         correct.append(isolated == (m,))
-        reach = measure_reach(loop, m, rng, QUICK_TARGETS if study.quick else TARGETS)
+        reach = measure_reach(loop, m, rng, study.number(TARGETS))
         shares.append(reach.share)
         distances += reach.distances
         trapped += reach.trapped
         row = {'found': reason, 'held_share': reach.share, 'estimate_rad': one[m]}
         for sensor in ('length',) if study.quick else ('length', 'tension'):
-            loop, errors = run_with_fault(study.arm(seed), mae, seed, m, sensor, study.quick)
+            loop, errors = run_with_fault(study, seed, m, sensor)
             sensor_errors.append(float(errors.mean()))
             reason = loop.verdicts[0][1] if loop.verdicts else 'nothing'
             row[f'dead_{sensor}'] = f'{reason}; {sensor_errors[-1]:.3f} rad'
         by_muscle[robot.muscles[m]] = row
-    duration = QUICK_HEALTHY_TIME if study.quick else HEALTHY_TIME / len(study.seeds)
+    duration = study.seconds(HEALTHY_TIME / len(study.seeds))
     isolations = isolations_of_healthy_arm(study.arm(seed), mae, seed, duration)
     arrived = [distance for distance in distances if distance is not None]
     numbers: dict[str, Any] = {

@@ -59,9 +59,6 @@ ABLATED = {
 }
 #: keys of ABLATED whose effects a shortened run removes; a full run does this for every key in turn
 QUICK = ('friction',)
-#: duration of the exploration in a shortened run [s], of individuals of the other emulator model
-#: and without these effects
-QUICK_EXPLORATION = 5.0
 ABLATION_INDIVIDUALS = 2  # number of individuals whose effects are removed
 #: label of a run with all effects and another exploration, which shows the difference between runs
 REPEATED = 'nothing: another run'
@@ -97,7 +94,7 @@ def _study_of_model(study: Study, seed: int, reality: str) -> Study:
     """
     if reality == study.reality:
         return study
-    minutes = QUICK_EXPLORATION / 60.0 if study.quick else study.minutes
+    minutes = study.seconds(60.0 * study.minutes) / 60.0
     part = replace(study, reality=reality, folder=study.folder / reality, minutes=minutes)
     part.folder.mkdir(exist_ok=True)
     for preset in PRESETS:
@@ -167,7 +164,7 @@ def _error_with_effects(
     held_out = record(arm(), study.network(None, 'default'), HELD_OUT_STREAM, study.held_out_time)
     explorer = seed if run is None else run
     learner, loop = online_learning.new_learner_and_loop(study, arm(), explorer, study.preset)
-    duration = QUICK_EXPLORATION if study.quick else 60.0 * study.minutes
+    duration = study.seconds(60.0 * study.minutes)
     stream = online_learning.explore(loop, learner, duration)
     online_learning.teach(learner, stream)
     return estimation_error(learner.mae, held_out)

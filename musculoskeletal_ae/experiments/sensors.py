@@ -40,7 +40,6 @@ from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 
 CAMERA = 10  # number of muscle messages for each message of the camera or the accelerometer
 SIGHTED = 10  # the camera detects the marker in one of this many samples
-QUICK_SHARE = 0.5  # share of the exploration from which the learners learn in a shortened run
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -67,8 +66,6 @@ def measure(study: Study, seed: int) -> Measured:
         'imu': (NONE, tilt),
     }
     stream = study.stream(seed, 'exploring')
-    if study.quick:
-        stream = stream.part(np.s_[: round(QUICK_SHARE * len(stream.length))])
     length, tension = stream.length, stream.tension
     # The network that controlled the exploration learned from all joint sensors.
     networks = {'before': study.network(None, 'default'), 'all': study.network(seed, 'default')}

@@ -26,6 +26,9 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot
 
+HELD_OUT = 300.0  # duration of the held-out motion [s]
+#: duration of a motion in a shortened run, as a share of the whole one, and its upper limit [s]
+QUICK_SHARE, QUICK_LIMIT = 0.25, 10.0
 DIGITS = 6  # significant digits of results; further digits are noise
 
 
@@ -64,10 +67,18 @@ class Study:
         """The compared presets: `paper`, and the preset of the run if it is another one."""
         return tuple(dict.fromkeys((PAPER_PRESET, self.preset)))
 
+    def number(self, whole: int) -> int:
+        """Return how often to measure something: `whole` times, or once in a shortened run."""
+        return 1 if self.quick else whole
+
+    def seconds(self, whole: float) -> float:
+        """Return the duration of a motion [s]: `whole`, or a part of it in a shortened run."""
+        return min(QUICK_SHARE * whole, QUICK_LIMIT) if self.quick else whole
+
     @property
     def held_out_time(self) -> float:
         """Duration of the held-out motion, which is never used for learning [s]."""
-        return 10.0 if self.quick else 300.0
+        return self.seconds(HELD_OUT)
 
     def arm(self, seed: int, friction: bool = True) -> Arm:
         """Return a new emulated arm at rest: the individual of a seed, with or without friction."""

@@ -82,7 +82,7 @@ class Calibrating(ActivityControl):
         posture. If none does, the step whose end misses the least holding torque is chosen.
         """
         robot, mae, theta = self._robot, inputs.mae, inputs.theta
-        tension = inputs.sample.model_tension * inputs.sample.usable
+        tension = inputs.pull.motor
         limits = robot.tension.bias, gentle_limit(robot)
         best, best_tension, least_missing = theta, tension, np.inf
         radian = robot.kinematics.radian

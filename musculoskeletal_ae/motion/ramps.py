@@ -157,8 +157,7 @@ class LengthRamps:
 
     def _begin(self, goal: Goal, inputs: Inputs) -> None:
         actuation = self._robot.actuation
-        tension = inputs.pull.motor if goal.tension is None else goal.tension
-        self._tension = actuation.known_tension(tension)
+        self._tension = inputs.pull.motor if goal.tension is None else goal.tension
         if goal.method == SECOND and not actuation.knows_tension:
             goal = goal._replace(method=FIRST)
         self._goal, self._limit = goal, inputs.limit

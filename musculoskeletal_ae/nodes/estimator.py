@@ -174,18 +174,18 @@ class Estimator(Shell):
         return f'isolated: {self.robot.names(self.core.body.isolated) or "none"}'
 
     def _reset_or_confirm(self, request: Trigger.Request) -> str:
-        """End the anomaly; if there is none, trust the doubted joint sensors again."""
+        """End the anomaly; if there is none, take the joint sensors as they are."""
         if not self.core.cause and (joints := self.core.confirm_joint_sensors()):
             self._publish_joint_trust()
             names = ', '.join(self.robot.joints[joint] for joint in joints)
-            return f'trusting these joint sensors again: {names}'
+            return f'these joint sensors are taken as they are: {names}'
         return self._reset(request)
 
     def _reset(self, _: Trigger.Request) -> str:
         finding = self.core.suspects.finding
         self.core.reset()
         if finding is not None:
-            self.candidates.validator.declare_repaired([finding.muscle], time.monotonic())
+            self.candidates.validator.declare_repaired(finding.muscles, time.monotonic())
         self._publish_offsets()
         self.published_anomaly = False
         self.candidates.on_anomaly(False)
@@ -272,7 +272,7 @@ class Estimator(Shell):
     def _publish_mirror(self, sample: MuscleSample, stamp: Any) -> None:
         assert self.mirror is not None
         message = joint_message(self.robot.muscles, sample.length, stamp)
-        message.effort = sample.motor_tension.tolist()
+        message.effort = self.robot.tension_source.known(sample.motor_tension).tolist()
         self.mirror.publish(message)
 
     def _publish_anomaly(self) -> None:

@@ -210,7 +210,7 @@ class Actuation(ABC):
         where the muscle has to be paid out.
 
         Args:
-            tension: Tensions [N], (M,); NaN where they are not known.
+            tension: Tensions [N], (M,).
             rate: Rates of change of the tensions [N/s], (M,).
             limit: Tension limits [N], (M,).
         """
@@ -242,7 +242,7 @@ class Actuation(ABC):
 
     @property
     def release(self) -> Array:
-        """Length that a stop pays out where no tension is known [m], (M,).
+        """Length that a stop pays out where no tension is measured [m], (M,).
 
         By default it is the length that lowers the tension from T_limit to T_bias in the same
         posture.
@@ -440,7 +440,7 @@ class PositionControl(Actuation):
 
     def present_tension(self, length: Array, command: Array, tension: Array) -> Array:  # noqa: ARG002
         """Return the measured tensions [N], (M,), or T_bias where they are lower."""
-        return np.maximum(self.known_tension(tension), self._bias)
+        return np.maximum(tension, self._bias)
 
     def is_pulling(self, length: Array, command: Array) -> Bools:  # noqa: ARG002
         """Return True for every module, (M,)."""
@@ -455,14 +455,15 @@ class PositionControl(Actuation):
 
         This is a part (SHARE) of the elongation that is left until the tension reaches its limit. A
         rising tension is first extrapolated by 0.04 s (AHEAD). Where the tension exceeds its limit,
-        the value is negative: the elongation by which the muscle has to be paid out. Where the
-        tension is not known (NaN), the value is `release`.
+        the value is negative: the elongation by which the muscle has to be paid out. If no tension
+        is measured, the value is `release`.
         """
+        if not self.knows_tension:
+            return self.release
         elongation = self._robot.elongation
         depth = elongation(limit) - elongation(tension)
         soon = elongation(limit) - elongation(tension + AHEAD * np.maximum(rate, 0.0))
-        depth = np.where(depth > 0.0, SHARE * np.maximum(soon, 0.0), depth)
-        return np.where(np.isfinite(tension), depth, self.release)
+        return np.where(depth > 0.0, SHARE * np.maximum(soon, 0.0), depth)
 
     def largest_depth(self, limit: Array) -> Array:  # noqa: ARG002
         """Return `release` [m], (M,): the value of `depth` where no tension is known."""
@@ -488,12 +489,12 @@ class PositionControl(Actuation):
         """Return the lengths to which a stop pays the muscles out [m], (M,), at most `longest`.
 
         At these lengths, the tension falls to T_bias. A muscle whose tension does not exceed T_bias
-        keeps its command `last`. Where the tension is not known or out of date, the result is
+        keeps its command `last`. Where no tension is measured, or it is out of date, the result is
         `start` plus `release`.
         """
         robot, bias = self._robot, self._whole.bias
         end = start + self.release
-        if is_fresh:
+        if is_fresh and self.knows_tension:
             # The tension sensor of an isolated muscle may be faulty.
             is_known = np.isfinite(tension) & robot.used
             excess = robot.elongation(tension) - robot.elongation(bias)

@@ -90,8 +90,9 @@ class JointChannel:
 
     Attributes:
         series: The newest series of impossible readings.
-        read_at: Time of the newest reading, on the clock of `JointStream.pass_time` [s]; None
-            before the first.
+        read_at: Time of the newest reading, on the clock of `JointStream.pass_time` [s]; None if
+            no readings are expected, because there was none yet, or because the user removed the
+            sensor.
     """
 
     def __init__(self, low: float, high: float, radian: float) -> None:
@@ -222,6 +223,13 @@ class JointStream:
             for name, channel in zip(self._joints, self._channels, strict=True)
             if channel.read_at is not None and self._passed - channel.read_at > MISSING
         ]
+
+    def do_without_missing(self) -> tuple[int, ...]:
+        """Expect no readings of the missing joints until they report again; return the joints."""
+        missing = tuple(self._joints.index(name) for name in self.missing)
+        for j in missing:
+            self._channels[j].read_at = None
+        return missing
 
     def impossible(self, now: float) -> dict[int, Series]:
         """Return the lasting series of impossible readings, by index of the joint.

@@ -59,25 +59,26 @@ class RejectionError(MessageError):
 class MuscleSample:
     """A checked message of the muscle modules. Arrays have the shape (M,).
 
+    If the robot does not measure tensions, all three tensions are the one that models assume
+    (`Actuation.assumed_tension`). A tension is NaN only where that of an isolated muscle is read
+    as NaN.
+
     Attributes:
         time: Time of reception by the caller's clock [s].
         length: l, with the length offset removed [m].
         length_read: l as the sensor measured it [m].
         tension_read: T_read [N], the reading of the tension sensor, or the motor current converted
-            to newtons. Where tension is not known, it is the tension that models assume
-            (`Actuation.assumed_tension`).
-        motor_tension: Motor-side tension T [N]; NaN where it is not known. It equals T_read for
-            tension sensors. For motor currents, it is max(0, T_read) until the friction of the
-            drives has been learned.
-        bone_tension: Bone-side tension T_end, with tendon friction removed [N]. Where tension is
-            not known, it is the tension that models assume (`Actuation.assumed_tension`).
+            to newtons.
+        motor_tension: Motor-side tension T [N]. It equals T_read for tension sensors. For motor
+            currents, it is max(0, T_read) until the friction of the drives has been learned.
+        bone_tension: Bone-side tension T_end, with tendon friction removed [N].
         sliding: Direction in which each tendon slid last: 1 when wound in, −1 when paid out.
         temperature: Plausible temperature of the module's housing [°C]; NaN where it is unknown.
         usable: Which muscles are not isolated.
         newest: The readings of the last message alone, without the median filter, (Q, M), with the
             length offset removed and motor-side tensions.
         jumped: Muscles whose new level after a jump is accepted with this message; usually none.
-        tension_spread: Standard deviation σ_T of T [N]; 0 for tension sensors.
+        tension_spread: Standard deviation σ_T of T [N]; 0 for tension sensors and assumed tensions.
         delay: How late the message is, compared with the fastest one (`Arrival.delay`) [s].
     """
 
@@ -103,14 +104,6 @@ class MuscleSample:
         together.
         """
         return self.time - self.delay
-
-    @property
-    def model_tension(self) -> Array:
-        """Motor-side tensions [N], (M,), as measured; where unknown, those that models assume."""
-        tension: Array = np.where(
-            np.isnan(self.motor_tension), self.bone_tension, self.motor_tension
-        )
-        return tension
 
     def shifted(self, offset: Array) -> MuscleSample:
         """Return the same sample with lengths reduced by `offset` [m], (M,)."""
@@ -282,14 +275,14 @@ class MuscleStream:
         length, tension = read[Row.LENGTH] - offsets.offset, read[Row.TENSION]
         sliding = self._direction.step(length)
         newest[Row.TENSION] = self._transmission.motor(newest[Row.TENSION], sliding)
-        end = self._transmission.end(tension, sliding)
+        known = self._robot.actuation.known_tension
         return MuscleSample(
             time=time,
             length=length,
             length_read=read[Row.LENGTH],
-            tension_read=self._robot.actuation.known_tension(tension),
-            motor_tension=self._transmission.motor(tension, sliding),
-            bone_tension=self._robot.actuation.known_tension(end),
+            tension_read=known(tension),
+            motor_tension=known(self._transmission.motor(tension, sliding)),
+            bone_tension=known(self._transmission.end(tension, sliding)),
             sliding=sliding,
             temperature=self._temperatures.step(read[Row.TEMPERATURE], now - delay),
             usable=self.body.used,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An arm without tension sensors: its tensions count as unknown, and some methods are excluded."""
+"""An arm without tension sensors: its tensions are assumed, and some methods are excluded."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ def loop():
     return loop
 
 
-def test_the_emulator_measures_no_tension_and_the_stream_keeps_it_unknown():
+def test_the_emulator_measures_no_tension_and_the_stream_assumes_one():
     arm = make_arm(ROBOT, 0)
     read = arm.sense()
     assert np.isnan(read.tension).all()
@@ -52,8 +52,7 @@ def test_the_emulator_measures_no_tension_and_the_stream_keeps_it_unknown():
         sample = MuscleStream(ROBOT, window=3).take(
             reading([read.length, tension, read.temperature]), 0.0
         )
-        assert np.isnan(sample.motor_tension).all()
-        np.testing.assert_array_equal(sample.model_tension, ROBOT.actuation.assumed_tension)
+        np.testing.assert_array_equal(sample.motor_tension, ROBOT.actuation.assumed_tension)
         np.testing.assert_array_equal(sample.bone_tension, ROBOT.actuation.assumed_tension)
     with pytest.raises(RejectionError):  # lengths are still checked
         MuscleStream(ROBOT).take(reading([read.length + 5.0, read.tension, read.temperature]), 0.0)

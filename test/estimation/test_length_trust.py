@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.lengths.length_trust import (
-    EVIDENCE_OF,
     TRANSITIONS,
     Evidence,
     LengthTrust,
@@ -17,7 +16,9 @@ from musculoskeletal_ae.signals.body_state import LengthOffsets, Trust
 
 M = 4
 FOUND = LengthOffsets(np.linspace(-0.08, 0.08, M), np.full(M, 1e-3))
-TAKEN = [evidence for evidence in Evidence if evidence is not Evidence.ASSUMED]
+REVOKING = [kind for kind in ConditionKind if kind.revokes is not None]
+TAKEN = [evidence for evidence in Evidence if evidence is not Evidence.ASSUMED] + REVOKING
+CALIBRATIONS = [each for each, then in TRANSITIONS.items() if then.after is Trust.UNKNOWN]
 MUSCLES = st.none() | st.sets(st.integers(0, M - 1))
 
 
@@ -28,25 +29,31 @@ def calibrated():
     return trust
 
 
-def test_every_evidence_has_a_transition_and_every_revoking_finding_is_evidence():
-    assert set(TRANSITIONS) == set(TAKEN)
-    assert set(EVIDENCE_OF) == {kind for kind in ConditionKind if kind.revokes is not None}
+def test_every_evidence_but_the_assumption_of_the_start_has_a_transition():
+    assert set(TRANSITIONS) == set(Evidence) - {Evidence.ASSUMED}
+
+
+@pytest.mark.parametrize('kind', REVOKING)
+def test_a_revoked_offset_states_the_finding_that_revoked_it(kind):
+    trust = calibrated()
+    trust.take(kind, [2])
+    assert trust.doubts == {f'revoked because {kind.text}': (2,)}
 
 
 @given(st.lists(st.tuples(st.sampled_from(TAKEN), MUSCLES)))
 def test_only_a_calibration_or_joint_sensors_end_a_revocation(events):
     trust = calibrated()
-    trust.take(Evidence.JUMPED, [2])
+    trust.take(ConditionKind.LENGTH_JUMP, [2])
     revoked = True
     for evidence, muscles in events:
         concerns = muscles is None or 2 in muscles
         trust.take(evidence, muscles)
-        is_calibration = TRANSITIONS[evidence].after is Trust.UNKNOWN
+        is_calibration = evidence in CALIBRATIONS
         revoked &= not (concerns and (is_calibration or evidence is Evidence.AGREES))
         if revoked:
             assert trust.offsets.trust[2] == Trust.REVOKED
-            assert trust.evidence[2] is Evidence.JUMPED
-            assert 2 in trust.doubts[Evidence.JUMPED]
+            assert trust.evidence[2] is ConditionKind.LENGTH_JUMP
+            assert 2 in trust.doubts['revoked because the length of a muscle has jumped']
 
 
 @given(st.lists(st.tuples(st.sampled_from(TAKEN), MUSCLES)))
@@ -63,7 +70,7 @@ def test_the_generation_rises_exactly_when_something_that_is_published_changes(e
 def test_a_revoked_offset_keeps_its_value_and_its_deviation_until_it_is_known_again():
     trust = calibrated()
     before = trust.offsets
-    trust.take(Evidence.DISAGREES)
+    trust.take(ConditionKind.LENGTHS_DISAGREE)
     assert trust.offsets.revoked == tuple(range(M))
     trust.take(Evidence.AGREES)
     np.testing.assert_array_equal(trust.offsets.rows[:3], before.rows[:3])
@@ -84,7 +91,7 @@ def test_an_offset_that_moved_in_a_repair_is_published_again_only_when_it_is_con
 def test_offsets_that_are_unknown_at_the_start_stay_unknown_until_a_calibration(evidence):
     trust = LengthTrust(M)
     trust.take(evidence, found=LengthOffsets(FOUND.offset, np.ones(M)))
-    for other in (Evidence.JUMPED, Evidence.AGREES, Evidence.CONFIRMED, Evidence.MOVED):
+    for other in (ConditionKind.LENGTH_JUMP, Evidence.AGREES, Evidence.CONFIRMED, Evidence.MOVED):
         trust.take(other)
         assert trust.offsets.not_known == tuple(range(M))
     trust.take(Evidence.CALIBRATED, found=FOUND)

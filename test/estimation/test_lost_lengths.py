@@ -162,12 +162,38 @@ def test_a_driver_that_returns_with_another_order_or_sign_is_named(robot, mae, i
     assert Step.CORRECT_WIRING in arm.core.remedy
 
 
+def test_a_wrong_sign_after_a_restart_is_named_even_if_the_length_was_near_zero(robot, calibrated):
+    arm = MovingArm(robot, calibrated)
+    arm.go(10.0, sensors=False)
+    muscle = 1
+    while not 0.004 < abs(arm.core.sample.length_read[muscle]) < 0.009:
+        arm.go(DT, sensors=False)
+    arm.time += 0.4  # the driver restarts
+    arm.sign[muscle] = -1.0
+    arm.go(4.0, sensors=False)
+    assert arm.kind is ConditionKind.MUSCLES_EXCHANGED, arm.core.cause
+    assert f'the length of {robot.muscles[muscle]} has the wrong sign' in arm.core.cause
+
+
 def test_a_jump_of_two_lengths_that_no_exchange_explains_is_one_of_lost_offsets(robot, calibrated):
     arm = MovingArm(robot, calibrated)
     arm.go(10.0, sensors=False)
     arm.off = SEVERAL * (np.arange(6) < 2)
     arm.go(2.0, sensors=False)
     assert arm.kind is ConditionKind.LENGTHS_JUMPED
+
+
+def test_lengths_that_a_restarted_driver_counts_from_zero_have_lost_their_offsets(
+    robot, calibrated
+):
+    arm = MovingArm(robot, calibrated)
+    arm.posture = robot.lower + 0.3 * (robot.upper - robot.lower)
+    arm.go(10.0, sensors=False)
+    arm.time += 1.0  # the driver restarts
+    arm.off = arm.off - arm.core.sample.length_read
+    arm.go(4.0, sensors=False)
+    assert arm.kind is ConditionKind.LENGTHS_JUMPED, arm.core.cause
+    assert arm.offsets.revoked
 
 
 def test_a_jump_without_a_network_is_not_forgotten(robot, mae):
@@ -323,6 +349,20 @@ def test_a_joint_sensor_that_is_unplugged_is_named_until_it_is_plugged_in_again(
     moved.joint_off[:] = 0.0
     moved.go(1.0)
     assert conditions_of_joints(moved) == {}
+
+
+def test_a_joint_sensor_that_was_removed_is_not_expected_until_it_reports_again(moved):
+    elbow = moved.robot.joints[1]
+    moved.joint_off = np.array([0.0, np.nan])
+    moved.go(5.0)
+    assert moved.core.confirm_joint_sensors() == (1,)
+    moved.go(5.0)
+    assert conditions_of_joints(moved) == {}
+    moved.joint_off[:] = 0.0
+    moved.go(1.0)
+    moved.joint_off = np.array([0.0, np.nan])
+    moved.go(5.0)
+    assert conditions_of_joints(moved) == {'joint_readings_missing': (elbow,)}
 
 
 def test_all_joints_are_named_if_their_driver_ends(moved):

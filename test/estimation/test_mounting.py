@@ -25,6 +25,7 @@ class Exploring:
         self.mae.anomaly = SimpleNamespace(calibrated=True)
         self.model = pin.Model(ARM.kinematics.model)
         self.model.gravity.linear = gravity
+        self.dt = 1.0  # time between two messages [s]
         self.gain = 1.0 + 0.1 * self.rng.standard_normal(ARM.muscle_count)
         self.check = MountingCheck(ARM)
         self.check.use(self.mae)
@@ -44,7 +45,7 @@ class Exploring:
         read = tension * self.gain + self.rng.normal(0.0, 5.0, len(tension))
         torque = kinematics.holding_torque(theta) + read @ jacobian
         for _ in range(times):
-            self.check.step(theta, read, torque)
+            self.check.step(theta, read, torque, self.dt)
 
 
 @pytest.mark.parametrize('angle', [45.0, 90.0, 180.0])
@@ -58,6 +59,28 @@ def test_a_turned_base_is_found_with_the_direction_of_gravity(angle, axis):
     assert tilt.angle == pytest.approx(angle, abs=20.0)
     assert tilt.direction @ gravity / 9.81 > np.cos(np.radians(25.0))
     assert 'robot.urdf' in tilt.text
+
+
+def test_a_base_that_is_turned_while_the_arm_works_is_found_and_so_is_its_return():
+    arm = Exploring(DOWN)
+    for _ in range(120):
+        arm.rest()
+    arm.gravity = arm.model.gravity.linear = -DOWN
+    for _ in range(60):
+        arm.rest()
+    assert arm.check.tilt.angle == pytest.approx(180.0, abs=20.0)
+    arm.gravity = arm.model.gravity.linear = DOWN
+    for _ in range(60):
+        arm.rest()
+    assert arm.check.tilt is None
+
+
+def test_postures_that_follow_each_other_faster_than_an_arm_moves_add_no_evidence():
+    arm = Exploring(-DOWN)
+    arm.dt = 0.005
+    for _ in range(300):
+        arm.rest()
+    assert arm.check.tilt is None
 
 
 @pytest.mark.parametrize(('payload', 'push'), [(0.0, 0.0), (3.6, 0.0), (0.0, 15.0)])

@@ -70,6 +70,12 @@ def test_only_a_jump_of_the_suspect_alone_is_explained_by_its_repair(suspects, k
     assert suspects.finding is (finding if is_repair else jump)
 
 
+def test_a_repair_of_a_muscle_that_may_be_faulty_instead_explains_its_jump_as_well(suspects):
+    suspects.take(Finding(1, ConditionKind.RESIDUAL_DISTANCE, 'd = 9', (3,)), (), 0.0)
+    assert suspects.explains(Finding(3, ConditionKind.LENGTH_JUMP, ''))
+    assert not suspects.explains(Finding(2, ConditionKind.LENGTH_JUMP, ''))
+
+
 def test_the_fault_of_an_isolated_muscle_is_known_until_the_muscle_is_restored(suspects):
     isolated = suspects.take(DISTANCE, (), 0.0)
     isolated = suspects.conclude(VerificationVerdict(Outcome.RUPTURED), isolated, 1.0)

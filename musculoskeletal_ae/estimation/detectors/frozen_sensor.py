@@ -54,7 +54,7 @@ class FrozenSensor(Detector):
         The result is None if there is no such muscle.
         """
         sample, robot = observation.sample, self._robot
-        tension, mae = sample.model_tension, self._mae
+        tension, mae = sample.motor_tension, self._mae
         readings = np.array([sample.length_read, tension])
         is_same = readings == self._last if self._last is not None else np.zeros_like(readings)
         if not robot.tension_source.is_known:  # an unknown tension does not count as frozen

@@ -14,9 +14,9 @@ by as much as the offset.
 
 A joint sensor with an offset δθ changes g as well, but like a change of posture: Δ = −G δθ, where G
 is the muscle Jacobian ∂l/∂θ. Because muscles outnumber joints, arbitrary errors of lengths rarely
-have this form. If some δθ explains most of Δ, nothing is reported here, because the joint sensors
-are false (`joint_check.py`); otherwise, the lengths are reported. If only one length disagrees with
-θ, only its muscle is reported.
+have this form. If some δθ explains most of Δ, and more of it than a wrong length of one muscle,
+nothing is reported here, because the joint sensors are false (`joint_check.py`); otherwise, the
+lengths are reported. If only one length disagrees with θ, only its muscle is reported.
 
 A healthy tendon that is shorter than l_net is stretched and has tension. If a tendon is shorter but
 has no tension, it is ruptured. Its muscle is reported, provided that the lengths of all other
@@ -238,7 +238,9 @@ class JointDisagreement(Detector):
             'length differs from that at the measured posture by '
             f'{largest.text(change, self._used, muscle)}'
         )
-        if np.linalg.norm(unexplained) <= UNEXPLAINED * np.linalg.norm(change):
+        by_muscle = np.delete(change, muscle)  # unexplained if this length is wrong
+        limit = min(UNEXPLAINED * np.linalg.norm(change), np.linalg.norm(by_muscle))
+        if np.linalg.norm(unexplained) <= limit:
             return None  # false joint sensors explain it, which `joint_check` judges
         is_alone = self._others_agree(muscle, change, largest)
         kind = ConditionKind.LENGTH_DISAGREES if is_alone else ConditionKind.LENGTHS_DISAGREE

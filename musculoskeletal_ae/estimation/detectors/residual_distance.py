@@ -16,7 +16,9 @@ T_limit, because networks have learned few tensions that are so high. While a te
 threshold does not grow, because a ruptured muscle has no tension in any posture.
 
 Suspect. An anomaly affects the residuals of all muscles. The suspect of a finding is the muscle
-without which the remaining residual is most likely. If tendons are slack, only they can be suspect.
+without which the remaining residual is most likely. Other muscles without which it is nearly as
+likely are named as well, because in one posture, muscles that span the same joints can explain an
+anomaly equally well. If tendons are slack, only they can be suspect.
 
 Slack. While a slack tendon is being wound in, its measured length is longer than the restored
 length, and messages do not count. The measured length of a ruptured tendon is shorter than the
@@ -41,6 +43,9 @@ from musculoskeletal_ae.signals.limits import LIMITS
 DISTANCE = 'distance'  # name of the threshold of d in a checkpoint
 NORM = 'norm'  # name of the threshold of A in a checkpoint
 
+#: name a muscle as well if d without it is below the threshold, and at most this multiple of d
+#: without the suspect
+EQUALLY_LIKELY = 1.5
 IN_A_ROW = 5  # number of consecutive messages above the threshold that lead to a finding
 NEAR = 0.25  # distance to a calibrated posture above which the threshold grows [joint ranges]
 WIDEST = 3.0  # largest factor by which the threshold is raised
@@ -113,7 +118,7 @@ class ResidualDistance(Detector):
         The result is None if there is nothing to report.
         """
         sample, error = observation.sample, observation.estimate.residual
-        tension, muscle_count = sample.model_tension, len(sample.motor_tension)
+        tension, muscle_count = sample.motor_tension, len(sample.motor_tension)
         distance, share = math.nan, error
         if self._statistics is not None:
             centred = error - self._statistics.mean
@@ -131,7 +136,7 @@ class ResidualDistance(Detector):
             if self._slack is not None:
                 reads_longer = share[muscle_count:] < 0.0
                 waits = bool((is_slack & self._slack.is_winding_in & reads_longer).any())
-        suspect = int(score.argmax())
+        suspect, others = int(score.argmax()), list[int]()
         evidence = ''
         if observation.lengths_known:
             evidence = self._evidence(observation, distance, slack_count > 0, waits)
@@ -142,9 +147,14 @@ class ResidualDistance(Detector):
         is_first = evidence and self._beyond == IN_A_ROW
         if is_first and self.is_calibrated and slack_count != 1:
             candidates = is_slack if slack_count else self._robot.used
-            suspect = self._least_likely(sample.bone_tension, sample.length, candidates)
+            suspect, *others = self._suspects(sample.bone_tension, sample.length, candidates)
+            if others:
+                names = ' or '.join(self._robot.muscles[muscle] for muscle in others)
+                evidence += f'; a fault of {names} would explain this as well'
         self.reading = Reading(distance, suspect)
-        return Finding(suspect, ConditionKind.RESIDUAL_DISTANCE, evidence) if evidence else None
+        if not evidence:
+            return None
+        return Finding(suspect, ConditionKind.RESIDUAL_DISTANCE, evidence, tuple(others))
 
     def unfamiliarity(self, theta: Array) -> float:
         """Return how far a posture is from the nearest one in which the network was calibrated.
@@ -193,7 +203,7 @@ class ResidualDistance(Detector):
         limit, where = self.threshold, ''
         value = self.statistic(observation, distance)
         if value > limit and not has_slack:
-            theta, tension = observation.estimate.state.theta, observation.sample.model_tension
+            theta, tension = observation.estimate.state.theta, observation.sample.motor_tension
             wider = self.limit(theta, tension)
             if wider > limit:
                 limit = wider
@@ -205,11 +215,11 @@ class ResidualDistance(Detector):
         exceeded = f'{self.symbol} = {reached} exceeded {most}{where}'
         return f'{exceeded} in {IN_A_ROW} consecutive messages'
 
-    def _least_likely(self, bone_tension: Array, length: Array, candidates: Bools) -> int:
-        """Return the index of the most suspect muscle among the candidates.
+    def _suspects(self, bone_tension: Array, length: Array, candidates: Bools) -> list[int]:
+        """Return the indices of the suspect muscles among the candidates, the most suspect first.
 
         This is the muscle whose removal makes the residual of the other muscles most likely on a
-        healthy arm.
+        healthy arm. The others are muscles whose removal does so nearly as well.
 
         Args:
             bone_tension: Bone-side tensions [N], (M,).
@@ -224,4 +234,9 @@ class ResidualDistance(Detector):
             state = reduced.estimate(bone_tension, length)
             error = residuals(state, bone_tension, length, reduced.isolated)
             distance[muscle] = reduced.anomaly.distances(error[None])[0]
-        return int(distance.argmin())
+        suspect = int(distance.argmin())
+        assert self._statistics is not None
+        usual = self._statistics.thresholds.get(DISTANCE, np.inf)
+        limit = min(usual, EQUALLY_LIKELY * distance[suspect])
+        others = [m for m in np.flatnonzero(distance < limit).tolist() if m != suspect]
+        return [suspect, *others]

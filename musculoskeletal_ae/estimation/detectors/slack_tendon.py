@@ -114,7 +114,7 @@ class SlackTendon(Detector):
         return Finding(
             muscle,
             ConditionKind.SLACK_TENDON,
-            'it has no tension although the command demands tension',
+            'it shows no tension although the command demands tension',
         )
 
     def _demand(self, observation: Observation) -> Array | None:

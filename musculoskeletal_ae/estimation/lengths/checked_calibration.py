@@ -129,7 +129,7 @@ class CheckedCalibration:
             return None
         if self.is_standing and theta is not None:
             self._measured.append(theta)
-        self._calibration.step(sample.model_tension, sample.length_read, dt, theta)
+        self._calibration.step(sample.motor_tension, sample.length_read, dt, theta)
         offsets = self.offsets
         if offsets is None:
             return None

@@ -7,11 +7,16 @@ report lost length offsets or a damaged muscle, and the advice that follows woul
 observations reveal what the driver has done:
 
 Silence. A driver that restarts is silent for a moment. The arm moves little meanwhile, so that
-putting the columns back makes their lengths continue those before the silence.
+putting the columns back makes their lengths continue those before the silence. If no other order
+and no sign does this for several lengths, and the readings do not fit the learned body, then these
+lengths have lost their offsets.
 
 Anomaly score. If muscles are exchanged, putting the two columns back restores the usual A in all
 recent messages (`signals/wiring.py`). A network that has learned the arm is exact enough for this.
 With any other network, the length calibration judges the order, because the arm moves meanwhile.
+Shortly after a silence, wrong signs are judged in this way as well: a length near 0 changes by
+little when its sign is reversed. Without a silence, no driver has restarted, and a length offset
+that has been lost could look like a wrong sign.
 """
 
 import math
@@ -21,6 +26,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
 from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import anomaly, residuals
@@ -111,29 +117,52 @@ class ExchangeCheck:
     def explain(self, finding: Finding | None, observation: Observation) -> Finding | None:
         """Return a finding of exchanged muscles or a reversed length if it explains `finding`.
 
-        The result is `finding` otherwise.
+        Lengths that have changed in a recent silence explain one by the residual. Otherwise, the
+        result is `finding`.
         """
         if finding is None or finding.kind not in EXPLAINED_BY_SILENCE:
             return finding
         if not observation.lengths_known:
             return finding
-        judgement, reason = self._judge_silence(), 'the lengths then continue those before a pause'
+        judgement, reason = None, 'the lengths then continue those before a pause'
+        if self._may_have_restarted:
+            judgement = self._judge_silence()
         is_explained = judgement is not None and judgement.is_faulty
         if not is_explained and finding.kind in EXPLAINED:
             judgement, reason = self._judge(observation), 'the lengths then fit the arm again'
         if judgement is None or not judgement.is_faulty:
-            return finding
+            is_vague = finding.kind is ConditionKind.RESIDUAL_DISTANCE
+            return (self._jumped_in_silence() if is_vague else None) or finding
         text = f'{judgement.text(self._robot.muscles)}: {reason}'
         first, *others = judgement.faulty
         return Finding(first, ConditionKind.MUSCLES_EXCHANGED, text, tuple(others))
 
+    @property
+    def _may_have_restarted(self) -> bool:
+        """Whether a silence has ended recently, in which the driver may have restarted."""
+        if self._silence is None or self._newest is None:
+            return False
+        return self._newest[0] - self._silence[0] <= RESTARTED
+
+    def _jumped_in_silence(self) -> Finding | None:
+        """Return the finding of lengths that a recent silence has changed; None for fewer than two.
+
+        A driver that counts lengths from 0 again changes all of them. An arm that has moved in the
+        silence changes them as well, but that leads to no finding that could be explained here.
+        """
+        if not self._may_have_restarted or self._silence is None or self._mae is None:
+            return None
+        _, before, after = self._silence
+        has_changed = np.abs(after - before) > DISCONTINUOUS
+        has_changed[list(self._mae.isolated)] = False
+        changed = tuple(np.flatnonzero(has_changed).tolist())
+        return finding_of(changed) if len(changed) > 1 else None
+
     def _judge_silence(self) -> Judgement | None:
-        """Return which wiring makes lengths continue over a recent silence; None without one."""
-        if self._silence is None or self._newest is None or self._mae is None:
+        """Return which wiring makes lengths continue over the last silence; None if unknown."""
+        if self._silence is None or self._mae is None:
             return None
-        resumed_at, before, after = self._silence
-        if self._newest[0] - resumed_at > RESTARTED:
-            return None
+        _, before, after = self._silence
         used = ~np.isin(np.arange(self._robot.muscle_count), self._mae.isolated)
         straight = Wiring.straight(self._robot.muscle_count)
 
@@ -156,11 +185,7 @@ class ExchangeCheck:
         return Judgement(best, tuple(wiring for _, wiring in explaining), (), least)
 
     def _judge(self, observation: Observation) -> Judgement | None:
-        """Return which exchange restores the usual A; None if that cannot be judged.
-
-        Wrong signs are not considered, because in few postures a lost length offset of one muscle
-        can look like one.
-        """
+        """Return which wiring restores the usual A; None if that cannot be judged."""
         mae, sample = self._mae, observation.sample
         if mae is None or mae.anomaly is None or not mae.anomaly.calibrated:
             return None
@@ -194,7 +219,8 @@ class ExchangeCheck:
 
         # An exchange makes both lengths jump, if they differ by enough.
         columns = sample.jumped or np.flatnonzero(used).tolist()
-        others = [(other, cost(other)) for other in single_faults(straight, columns, signs=False)]
+        faults = single_faults(straight, columns, signs=self._may_have_restarted)
+        others = [(other, cost(other)) for other in faults]
         return decide(straight, float(np.median(present[is_anomalous])), others, BETTER)
 
 

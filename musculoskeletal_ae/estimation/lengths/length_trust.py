@@ -2,10 +2,11 @@
 """Decides which length offsets may be trusted: the only place where evidence becomes trust.
 
 Detectors, the length calibration, the joint sensors, the check of a repaired muscle and a restart
-provide evidence. `TRANSITIONS` has the trust that follows from each of them. The estimator
-publishes the result on `muscle_length_zeros`, and all other nodes follow it.
+provide evidence. `TRANSITIONS` has the trust that follows from each of them. A finding revokes
+offsets if the declaration of its kind says so (`conditions.py`). The estimator publishes the result
+on `muscle_length_zeros`, and all other nodes follow it.
 
-    start ── ASSUMED ───────────────────────────► KNOWN ── JUMPED, EXCHANGED, DISAGREES ──► REVOKED
+    start ── ASSUMED ───────────────────► KNOWN ── a finding that revokes offsets ──► REVOKED
     start ── NOT_CALIBRATED, RESTARTED ─► UNKNOWN ── CALIBRATED ─► KNOWN ◄── AGREES ── REVOKED
     any ──── CALIBRATING ───────────────► UNKNOWN
     KNOWN ── MOVED, then CONFIRMED ─────► KNOWN
@@ -30,16 +31,13 @@ CONFIRMED = 0.01
 
 
 class Evidence(Enum):
-    """What decided last about the length offset of a muscle; the value is a text for users."""
+    """What decides about length offsets, besides findings; the value is a text for users."""
 
     ASSUMED = 'assumed to be 0'
     NOT_CALIBRATED = 'not calibrated since the start'
     RESTARTED = 'not calibrated since the estimator was restarted'
     CALIBRATING = 'being calibrated'
     CALIBRATED = 'calibrated'
-    JUMPED = 'revoked because the length jumped'
-    EXCHANGED = 'revoked because the driver uses another order or sign'
-    DISAGREES = 'revoked because lengths disagree with the joint sensors'
     AGREES = 'confirmed by the joint sensors'
     MOVED = 'changed while the muscle was repaired; not checked yet'
     CONFIRMED = 'checked after the repair of the muscle'
@@ -61,23 +59,12 @@ TRANSITIONS = {
     Evidence.RESTARTED: Transition(_ANY, Trust.UNKNOWN),
     Evidence.CALIBRATING: Transition(_ANY, Trust.UNKNOWN),
     Evidence.CALIBRATED: Transition(_UNKNOWN, Trust.KNOWN),
-    Evidence.JUMPED: Transition(_KNOWN, Trust.REVOKED),
-    Evidence.EXCHANGED: Transition(_KNOWN, Trust.REVOKED),
-    Evidence.DISAGREES: Transition(_KNOWN, Trust.REVOKED),
     Evidence.AGREES: Transition(_REVOKED, Trust.KNOWN),
     Evidence.MOVED: Transition(_KNOWN, Trust.KNOWN),
     Evidence.CONFIRMED: Transition(_KNOWN, Trust.KNOWN),
 }
-
-
-#: evidence that a finding provides
-EVIDENCE_OF = {
-    ConditionKind.LENGTH_JUMP: Evidence.JUMPED,
-    ConditionKind.LENGTHS_JUMPED: Evidence.JUMPED,
-    ConditionKind.MUSCLES_EXCHANGED: Evidence.EXCHANGED,
-    ConditionKind.LENGTH_DISAGREES: Evidence.DISAGREES,
-    ConditionKind.LENGTHS_DISAGREE: Evidence.DISAGREES,
-}
+#: what follows from a finding whose kind revokes length offsets
+REVOCATION = Transition(_KNOWN, Trust.REVOKED)
 
 
 class LengthTrust:
@@ -85,7 +72,8 @@ class LengthTrust:
 
     Attributes:
         offsets: The offsets and their trust, as the estimator publishes them.
-        evidence: For each muscle, the evidence that decided last.
+        evidence: For each muscle, the evidence that decided last, or the kind of the finding that
+            revoked its offset.
     """
 
     def __init__(self, muscle_count: int, first_generation: int = 1) -> None:
@@ -97,12 +85,12 @@ class LengthTrust:
                 before a restart.
         """
         self.offsets = LengthOffsets.none(muscle_count)
-        self.evidence = [Evidence.ASSUMED] * muscle_count
+        self.evidence: list[Evidence | ConditionKind] = [Evidence.ASSUMED] * muscle_count
         self._generation = first_generation
 
     def take(
         self,
-        evidence: Evidence,
+        evidence: Evidence | ConditionKind,
         muscles: Iterable[int] | None = None,
         found: LengthOffsets | None = None,
     ) -> bool:
@@ -111,11 +99,12 @@ class LengthTrust:
         Each change is a new decision with the next generation.
 
         Args:
-            evidence: The evidence.
+            evidence: The evidence, or the kind of a finding that revokes length offsets.
             muscles: Indices of the muscles that it concerns; None for all muscles.
             found: Offsets and standard deviations that replace the present ones; None to keep them.
         """
-        transition, previous = TRANSITIONS[evidence], self.offsets
+        previous = self.offsets
+        transition = REVOCATION if isinstance(evidence, ConditionKind) else TRANSITIONS[evidence]
         candidates = range(len(self.evidence)) if muscles is None else muscles
         concerned = [m for m in candidates if previous.trust[m] in transition.before]
         for muscle in concerned:
@@ -134,10 +123,16 @@ class LengthTrust:
         return True
 
     @property
-    def doubts(self) -> dict[Evidence, tuple[int, ...]]:
-        """Why offsets are not known: the evidence, with the indices of its muscles."""
-        doubts = dict[Evidence, tuple[int, ...]]()
+    def doubts(self) -> dict[str, tuple[int, ...]]:
+        """Why offsets are not known: texts for users, with the indices of the muscles."""
+        doubts = dict[str, tuple[int, ...]]()
         for muscle in self.offsets.not_known:
-            evidence = self.evidence[muscle]
-            doubts[evidence] = (*doubts.get(evidence, ()), muscle)
+            text = _text(self.evidence[muscle])
+            doubts[text] = (*doubts.get(text, ()), muscle)
         return doubts
+
+
+def _text(evidence: Evidence | ConditionKind) -> str:
+    if isinstance(evidence, ConditionKind):
+        return f'revoked because {evidence.text}'
+    return evidence.value
