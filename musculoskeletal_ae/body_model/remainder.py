@@ -116,12 +116,12 @@ class GroupRemainder:
         """Return g [m] of the group's muscles, (N, M), for θ and T of the whole body."""
         return self._covariance(theta, tension) @ self.weights
 
-    def variance(self, theta: Array, tension: Array) -> Array:
-        """Return the posterior variance of g for a known body [m²], (N, M)."""
+    def spread(self, theta: Array, tension: Array) -> Array:
+        """Return the posterior standard deviation of each g_i for a known body [m], (N,)."""
         covariance = self._covariance(theta, tension)
         known = np.square(solve_triangular(self.root, covariance.T, lower=True)).sum(axis=0)
         amplitude = _constants(self.logarithms)[0]
-        return np.tile(np.maximum(amplitude**2 - known, 0.0)[:, None], len(self.muscles))
+        return np.sqrt(np.maximum(amplitude**2 - known, 0.0))
 
     def _covariance(self, theta: Array, tension: Array) -> Array:
         inputs = np.hstack([theta[:, self.joints], tension[:, self.muscles]]) / self.scale
@@ -147,11 +147,14 @@ class Remainder:
             result[:, group.muscles] = group.at(theta, tension)
         return result if self.before is None else result + self.before.at(theta, tension)
 
-    def variance(self, theta: Array, tension: Array) -> Array:
-        """Return the posterior variance of g [m²], (N, M)."""
+    def drawn_error(self, theta: Array, tension: Array, rng: np.random.Generator) -> Array:
+        """Draw the error of g [m] (N, M) from its posterior, independently for each sample."""
         result = np.zeros((len(theta), self.muscle_count))
         for group in self.groups:
-            result[:, group.muscles] = group.variance(theta, tension)
+            spread = group.spread(theta, tension)[:, None]
+            result[:, group.muscles] = spread * rng.standard_normal(
+                (len(theta), len(group.muscles))
+            )
         return result
 
 
