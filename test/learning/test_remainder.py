@@ -10,9 +10,11 @@ from learning.conftest import Stage
 from musculoskeletal_ae.body_model.body_fit import BodyFit
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.remainder import Remainder
+from musculoskeletal_ae.body_model.synthetic import synthetic_samples
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.update import BodyUpdater
+from musculoskeletal_ae.mae.units import scale_vector
 
 AMPLITUDE = 0.015  # of the coupling [m]
 NO_MESSAGES = Healthy(np.empty((0, 18), dtype=np.float32), 0.0, 0)
@@ -89,6 +91,20 @@ def test_more_samples_of_such_a_body_reduce_the_error_to_the_noise(arm26, elasti
     few, many = (error(fitted(arm26, observed[:count]), states) for count in (15, 120))
     assert many < 0.5 * few
     assert many < 0.0005
+
+
+def test_the_network_learns_that_lengths_far_from_all_samples_are_uncertain(arm26, elastic_stage):
+    stage, _ = elastic_stage
+    observed = coupled(stage.observations(60))
+    shoulder = observed.theta[:, 0]
+    lowest, highest = shoulder.min(), np.median(shoulder)
+    body = fitted(arm26, observed[shoulder < highest])
+    data = synthetic_samples(body, np.zeros(6), 1000, np.random.default_rng(0))
+    spread = np.abs((data.entered - data.true) / scale_vector(2, 6))[:, 8:].mean(axis=1)
+    angle = data.true[:, 0] / scale_vector(2, 6)[0]
+    near = (angle > lowest) & (angle < highest)
+    far = angle > highest + 0.5 * (highest - lowest)
+    assert spread[far].mean() > 3.0 * spread[near].mean()
 
 
 def test_a_body_that_the_model_can_express_keeps_no_remainder(arm26, stage):
