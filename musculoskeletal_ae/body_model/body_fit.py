@@ -12,6 +12,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.fit import Fit, fit_body, fit_to_network
+from musculoskeletal_ae.body_model.remainder import Remainder
 from musculoskeletal_ae.body_model.synthetic import held_tensions
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.mae import Mae
@@ -43,6 +44,7 @@ class BodyFit:
         if mae is not None:
             fit_to_network(self.body, mae, seed)
             self._prior_mean = list(self.body.parameters)
+            self.body.remainder = Remainder(robot.muscle_count, before=self.body.remainder)
         self._is_prior_confirmed = False
         rng = np.random.default_rng([seed, 0x3E])
         self._probe = robot.random_postures(PROBES, rng), held_tensions(robot, PROBES, rng)
@@ -58,6 +60,7 @@ class BodyFit:
             return False
         self._is_prior_confirmed = True
         body = CalibratedBody(self.body.robot, self._prior_mean, smooth=self.body.smooth)
+        body.remainder = self.body.remainder.before or body.remainder
         (length,) = body.lengths(observed.theta, observed.tension, observed.direction)
         return bool(np.median(np.abs(observed.length - length)[observed.known]) > LEAST_CHANGE)
 

@@ -29,6 +29,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints, Singles
 from musculoskeletal_ae.body_model import springs
+from musculoskeletal_ae.body_model.remainder import Remainder
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
@@ -167,6 +168,8 @@ class CalibratedBody:
             weights[routes.first[segments] - points[0]] = routes.weight[segments]
             self.layouts.append(Layout(points, weights, own.basis.shape[1], self._has_drive))
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
+        #: what the parameters cannot express; `lengths` includes it, `linearised` does not
+        self.remainder = Remainder(robot.muscle_count)
         # The next fit starts from these values:
         #: joint-sensor offsets [rad], (D,)
         self.zero = np.zeros(robot.joint_count)
@@ -177,7 +180,7 @@ class CalibratedBody:
         self.last_postures: dict[bytes, tuple[Array, ...]] = {}
 
     def limb(self, joints: Ints, muscles: Ints) -> CalibratedBody:
-        """Return the part of the calibrated body with these joints and muscles only."""
+        """Return the part with these joints and muscles only, without its remainder."""
         of_group = [self.smooth[m] for m in muscles]
         smooth = [own._replace(frequency=own.frequency[:, joints]) for own in of_group]
         parameters = [self.parameters[m] for m in muscles]
@@ -303,13 +306,13 @@ class CalibratedBody:
                 winding in and paying out.
         """
         result = tuple(np.empty_like(tension) for _ in direction)
-        poses = self.poses(theta)
+        poses, remainder = self.poses(theta), self.remainder.at(theta, tension)
         for m, layout in enumerate(self.layouts):
             world, _ = self._world(poses, m)
             absolute = np.linalg.norm(world[:, 1:] - world[:, :-1], axis=-1) @ layout.weights
             absolute += poses.detour[:, m]
             absolute, at_zero = absolute[:-1], absolute[-1]
-            fixed = absolute - at_zero + self.parameters[m][layout.offset]
+            fixed = absolute - at_zero + self.parameters[m][layout.offset] + remainder[:, m]
             fixed += self.smooth[m].at(theta) @ self.parameters[m][layout.rest]
             elastic = self.elastic(m)
             for lengths, s in zip(result, direction, strict=True):

@@ -128,6 +128,7 @@ def _drawn_errors(
     tension = tension[rng.integers(len(tension), size=len(bodies))]
     direction = UNKNOWN_FRICTION * np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, tension.shape))
     poses, length = body.poses(theta), fit.noise * rng.standard_normal(tension.shape)
+    length += body.remainder.at(theta, tension) + body.remainder.drawn_error(theta, tension, rng)
     offset = np.zeros((BODIES, theta.shape[1]))
     for group, (muscles, root) in zip(body.robot.groups, fit.root, strict=True):
         steps = solve_triangular(root, rng.standard_normal((len(root), BODIES))).T

@@ -23,6 +23,7 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody, Poses
 from musculoskeletal_ae.body_model.postures import FIRST_NOISE, fit_jointly
 from musculoskeletal_ae.body_model.priors import PRIOR, REOPENED, MusclePrior
+from musculoskeletal_ae.body_model.remainder import learned_remainder
 from musculoskeletal_ae.gauss_newton import (
     Equations,
     RightSides,
@@ -88,7 +89,20 @@ def fit_body(
         priors.append(_reopened(body, replace(observed, theta=start), prior, m))
     means, spreads = map(list, zip(*priors, strict=True))
     is_learned = prior_mean is not None
-    return Fit(*fit_jointly(body, observed, start, means, spreads, LEAST_NOISE, is_learned))
+
+    def fitted() -> Fit:
+        return Fit(*fit_jointly(body, observed, start, means, spreads, LEAST_NOISE, is_learned))
+
+    fit = fitted()
+    own = np.isfinite(observed.theta) & (observed.spread == 0.0)
+    measured = replace(observed, theta=np.where(own, observed.theta - body.zero, fit.theta))
+    before = body.remainder.at(measured.theta, observed.tension)
+    all_known = replace(measured, theta=observed.theta - own * body.zero)
+    body.remainder = learned_remainder(body, all_known, fit.weight, priors)
+    # The constants have to agree with the new remainder, or both would explain the same lengths.
+    if np.abs(body.remainder.at(measured.theta, observed.tension) - before).max() > LEAST_NOISE:
+        fit = fitted()
+    return fit
 
 
 def _prior(body: CalibratedBody, observed: Observations, m: int) -> MusclePrior:
@@ -210,13 +224,15 @@ NETWORK_ERROR = 0.001  # smallest σ of the network's lengths [m]
 FIXED = 1e-6  # prior spread of a parameter that a fit must not change
 
 
-def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
+def fit_to_network(
+    body: CalibratedBody, mae: Mae, seed: int = 0, *, with_remainder: bool = True
+) -> None:
     """Fit a body in place to the muscle lengths of a network that has learned a real arm.
 
     The samples from which the network was learned may be missing (after `train --from-bag`, on
     another machine, or if the state was lost). With this fit as prior, learning still continues
     from the learned body and does not start again from the geometric model. An exported model of
-    the learned body is fitted in the same way.
+    the learned body is fitted in the same way, but without a remainder, which it cannot contain.
     """
     robot, rng = body.robot, np.random.default_rng([seed, 0x1B])
     theta = robot.random_postures(NETWORK_STATES, rng)
@@ -226,7 +242,7 @@ def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
     lengths = mae.lengths(theta, tension)
     read = mae.transmission.reading(tension, np.zeros(shape))
     observed = Observations(theta, read, lengths, np.zeros(shape), everything)
-    poses = body.poses(theta)
+    poses, priors = body.poses(theta), list[MusclePrior]()
     for m, layout in enumerate(body.layouts):
         mean, spread = PRIOR.mean(layout), PRIOR.spread(layout)
         # The network's lengths contain no information about friction and drive, because its input
@@ -237,5 +253,13 @@ def fit_to_network(body: CalibratedBody, mae: Mae, seed: int = 0) -> None:
             if mae.touch.drive is not None:
                 mean[layout.drive] = mae.touch.drive[:, m] / body.drive_units[:, m]
         prior = MusclePrior(mean, spread)
+        priors.append(prior)
         problem = MuscleFit(body, poses, observed, everything[:, m], prior, NETWORK_ERROR, m)
+        body.parameters[m] = problem.run()
+    if not with_remainder:
+        return
+    body.remainder = learned_remainder(body, observed, everything.astype(float), priors)
+    explained = replace(observed, length=lengths - body.remainder.at(theta, read))
+    for m, prior in enumerate(priors):
+        problem = MuscleFit(body, poses, explained, everything[:, m], prior, NETWORK_ERROR, m)
         body.parameters[m] = problem.run()

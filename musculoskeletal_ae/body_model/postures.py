@@ -26,6 +26,7 @@ groups of joints and muscles are fitted one after another. Each group uses
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -345,11 +346,15 @@ def fit_jointly(
     for n, sample in enumerate(samples):
         if sample in body.last_postures:
             theta[n], bent.theta[n], bent.stiffness[n] = body.last_postures[sample]
+    # The remainder is that of the last fit. It is taken at the measured angles where there are any.
+    posture = np.where(np.isnan(observed.theta), theta, observed.theta - own * zero)
+    remainder = body.remainder.at(posture, observed.tension)
+    of_body = replace(observed, length=observed.length - remainder)
     weight = np.zeros_like(observed.length)
     noise, root = np.empty(observed.length.shape[1]), []
     for group in body.robot.groups:
         joints, muscles = np.array(group.joints), np.array(group.muscles)
-        model = PostureModel(body, observed, joints, muscles, bent)
+        model = PostureModel(body, of_body, joints, muscles, bent)
         means, spreads = ([prior[m] for m in muscles] for prior in (mean, spread))
         fit = GroupFit(model, means, spreads, least_noise, is_learned)
         own_parameters = [body.parameters[m] for m in muscles]

@@ -37,7 +37,7 @@ def synthetic_samples(
 ) -> TrainingData:
     """Draw random samples of a body with length noise and residual friction.
 
-        target: (θ_r, T_r, l(θ_r, T_r; s = 0)),   input: (θ_r, T_r, l(θ_r, T_r; u s_r) + ε)
+        target: (θ_r, T_r, l(θ_r, T_r; s = 0)),   input: (θ_r, T_r, l(θ_r, T_r; u s_r) + ε + e_g)
 
     θ_r are random postures, T_r random tensions at the elastic elements, and s_r random directions
     of sliding. From measured tensions, an estimator can compute T_r except for a share u of the
@@ -45,6 +45,10 @@ def synthetic_samples(
     friction and the noise ε, and those in its target do not. The network therefore learns to weight
     muscles by the accuracy of their lengths when it estimates θ from T and l, as in weighted least
     squares.
+
+    e_g is drawn from the posterior of the remainder. Far from all real samples, the lengths of the
+    body are little known, and might be equal to the known lengths of a different posture. With e_g,
+    the network prefers the known posture when it estimates θ.
 
     Args:
         body: The calibrated body.
@@ -61,6 +65,7 @@ def synthetic_samples(
     read = body.transmission.reading(tension, np.zeros(shape))
     length, scattered = body.lengths(theta, read, np.zeros(shape), UNKNOWN_FRICTION * direction)
     scattered = scattered + noise * rng.standard_normal(shape)
+    scattered = scattered + body.remainder.drawn_error(theta, read, rng)
     true, entered = State(theta, tension, length), State(theta, tension, scattered)
     return TrainingData(entered.scaled(), true.scaled())
 

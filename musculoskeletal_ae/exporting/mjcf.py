@@ -121,7 +121,7 @@ def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> Report:
 def _write(robot: Robot, mae: Mae, out: Path, seed: int) -> Report:
     robot = robot.with_elasticity(mae.elasticity)
     body = CalibratedBody.of_straight_lines(robot)
-    fit_to_network(body, mae, seed)
+    fit_to_network(body, mae, seed, with_remainder=False)
     shift = np.concatenate([body.shift(m) for m in range(robot.muscle_count)])
     moved = Robot(replace(robot.description, routes=_moved(robot, shift)))
     moved = moved.with_elasticity(mae.elasticity)

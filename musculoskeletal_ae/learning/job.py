@@ -36,5 +36,8 @@ class Update(NamedTuple):
     error: float = 0.0
     seconds: float = 0.0  # duration of the update [s]
     device: str = 'cpu'  # device of the training
+    #: root mean square over the samples of what the constants of the body model cannot express, for
+    #: each length [m], (M,); empty if the preset fits no body
+    remainder: Array = np.empty(0)
     #: estimated joint-sensor offsets z [rad], (D,); empty if the preset estimates none
     sensor_offset: Array = np.empty(0)

@@ -96,4 +96,8 @@ def _update_values(robot: Robot, update: Update) -> dict[str, str]:
     if len(update.noise):
         worst = int(update.noise.argmax())
         values['length noise'] = f'{1e3 * update.noise[worst]:.2f} mm ({robot.muscles[worst]})'
+    if len(update.remainder):
+        worst = int(update.remainder.argmax())
+        size = 1e3 * update.remainder[worst]
+        values['not expressed by the body model'] = f'{size:.2f} mm ({robot.muscles[worst]})'
     return values

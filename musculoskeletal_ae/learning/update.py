@@ -96,11 +96,13 @@ class BodyUpdater(Updater):
         if job.healthy.learned is not None:
             self._mix_in_moving(data, job.healthy.learned, fit.noise)
         loss_now = self._trainer.train(data, job.steps)
+        remainder = self.body.remainder.at(fit.theta, observed.tension)
         return Update(
             self._published(self._trainer.network, 'default', self._trainer.steps, job, fit),
             loss_now,
             fit.noise,
             contradicted if len(contradicted) == 1 else (),
+            remainder=np.sqrt(np.square(remainder).mean(axis=0)),
             sensor_offset=self.body.zero.copy(),
         )
 
