@@ -12,6 +12,7 @@ import math
 import os
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -43,8 +44,11 @@ from driver.test_faults import (
 )
 from driver.test_order import CYCLE, misordered
 from musculoskeletal_ae.driver.listening import TENSION_UNITS, UNITS, Listening
-from musculoskeletal_ae.driver.verdict import FAULTS
-from musculoskeletal_ae.robot.description import with_modules
+from musculoskeletal_ae.driver.positioning import Positioning
+from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
+from musculoskeletal_ae.driver.winding import Winding
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.robot.description import TensionRange, with_modules
 from musculoskeletal_ae.robot.motors import Motors, MotorTopics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
@@ -54,6 +58,19 @@ assert neck  # a fixture
 LENGTH, TENSION, TEMPERATURE = range(3)
 MOTORS = tuple(f'motor_{m}' for m in range(M))
 CURRENT = Robot(with_modules(ROBOT.description, 'position', 'current'))
+#: a robot whose first muscle is too weak for the motion test
+WEAK = Robot(
+    replace(
+        ROBOT.description,
+        tension=TensionRange(
+            ROBOT.tension.bias,
+            *(
+                np.r_[most, each[1:]]
+                for most, each in ((35.0, ROBOT.tension.limit), (45.0, ROBOT.tension.max))
+            ),
+        ),
+    )
+)
 #: faults that have no row here
 EXCEPTIONS = {
     'several': 'needs the graph of ROS: test/nodes/test_check_driver.py',
@@ -1158,3 +1175,19 @@ def test_a_driver_that_publishes_its_topic_is_heard():
     assert fault.name == 'silent' and 'muscle_states' in fault.observation
     assert 'publish the topic' in fault.change
     assert not judged(SOUND, angles()).faults
+
+
+@pytest.mark.parametrize(
+    ('kind', 'robot', 'refused', 'advice', 'mended'),
+    [
+        (Winding, ROBOT, ((), 35.0), 'pass a higher --tension', ((), 50.0)),
+        (Winding, WEAK, ((), None), 'check only the other muscles', (tuple(range(1, M)), None)),
+        (Positioning, POSITION, ((), 1e4), 'choose a lower value', ((), 100.0)),
+    ],
+)
+def test_a_motion_test_that_was_refused_is_accepted_with_the_advised_options(
+    kind, robot, refused, advice, mended
+):
+    with pytest.raises(MusculoskeletalError, match=advice):
+        kind(Verdict(robot), *refused)
+    kind(Verdict(robot), *mended)
