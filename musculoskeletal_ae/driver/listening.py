@@ -67,7 +67,7 @@ MOST_SAMPLES = 400  # largest number of messages that are compared with the mode
 #: units in which values may have been published by mistake, in SI units or °C
 UNITS = {
     'length': {'mm': 1e-3, 'cm': 1e-2},
-    'tension': {'mN': 1e-3, 'cN': 1e-2},  # mN also stands for mA of motor currents
+    'tension': {'mN': 1e-3, 'cN': 1e-2},  # of motor currents: mA and cA
     'temperature': {'m°C': 1e-3, 'c°C': 1e-2, 'tenths of °C': 0.1},
 }
 
@@ -269,19 +269,26 @@ class Listening:
             verdict: Receives the results.
             states: Medians of the published readings, (Q, M).
         """
+        fault, units = '', list[str]()  # the first possible fault, and the units that explain it
         for what, texts, meant in _readings(states):
-            possible = (meant >= self._low) & (meant <= self._high)
-            for row, quantity in enumerate(QUANTITIES[: len(Row)]):
-                if quantity.presence is not Presence.REQUIRED:
-                    possible[row] |= np.isnan(meant[row])
-            possible[Row.TENSION] |= not self._robot.tension_source.is_known
+            if fault and what != fault:
+                break
+            possible = self._possible(meant)
             # Without a command, T must be close to T_bias in the right interpretation.
             pulls = np.median(meant[Row.TENSION] / self._robot.tension.bias)
             warm = meant[Row.TEMPERATURE][~np.isnan(meant[Row.TEMPERATURE])]
             is_usual = PULLS[0] < pulls < PULLS[1] and (
                 not len(warm) or USUAL[0] < np.median(warm) < USUAL[1]
             )
+            if 'unit' in texts:
+                # All muscles share a unit, so a single impossible value has another cause.
+                wrong = np.count_nonzero(~self._possible(states).all(axis=0))
+                is_usual = is_usual and wrong > min(1, self._robot.muscle_count - 1)
             if possible.all() and (not what or is_usual):
+                if 'unit' in texts:
+                    fault = what
+                    units.append(texts['unit'])
+                    continue
                 if what:
                     verdict.failed(self._of_source(what), **texts)
                     return False
@@ -292,11 +299,30 @@ class Listening:
                         'heat'
                     )
                 return True
+        if fault:
+            unit = ' or '.join(units)
+            if self._robot.tension_source.is_current:
+                unit = unit.replace('N', 'A')
+            verdict.failed(self._of_source(fault), unit=unit)
+            return False
         for row, m in np.argwhere(~possible).tolist():
             value, low, high = distinct(states[row, m], self._low[row, m], self._high[row, m])
             what = self._of_source(QUANTITIES[row].name)
             verdict.failed(what, m, value=f'{value}, possible {low} to {high},')
         return False
+
+    def _possible(self, states: Array) -> Bools:
+        """Return which readings are possible at rest, (Q, M); `states` are readings, (Q, M)."""
+        possible: Bools = (states >= self._low) & (states <= self._high)
+        # Friction can make single currents negative, but not all of them by so much.
+        pushes = states[Row.TENSION] < -PULLS[0] * self._robot.tension.bias
+        if self._robot.tension_source.is_current and pushes.all():
+            possible[Row.TENSION] = False
+        for row, quantity in enumerate(QUANTITIES[: len(Row)]):
+            if quantity.presence is not Presence.REQUIRED:
+                possible[row] |= np.isnan(states[row])
+        possible[Row.TENSION] |= not self._robot.tension_source.is_known
+        return possible
 
     def _of_source(self, fault: str) -> str:
         """Return the name of a fault for the quantity that the driver reports.
@@ -355,6 +381,8 @@ class Listening:
                 remaining = self._judge_lengths(other, meant, length, tension)
                 # The misfit must fall clearly, because lengths of wrong sign look much like angles
                 # of wrong sign.
+                if what == 'degrees' and not self._explains_motion(meant, length, tension):
+                    continue
                 if not other.faults and remaining < best:
                     best, explanation = remaining, (what, names)
             if explanation is not None:
@@ -378,6 +406,17 @@ class Listening:
         elif not lengths_verdict.faults:
             self._judge_joint_signs(verdict, theta, length, tension)
         verdict.add(lengths_verdict)
+
+    def _explains_motion(self, theta: Array, length: Array, tension: Array) -> bool:
+        """Return whether θ [rad], (N, D), changes enough to explain the changes of l, (N, M).
+
+        Angles in radians that are taken for degrees hardly change, although the arm moves.
+        """
+        change = np.ptp(length, axis=0)
+        least = change / (2.0 * SLOPES[1])
+        has_moved = change > MOVED
+        model = np.ptp(self._robot.muscle_lengths(theta, tension), axis=0)
+        return bool((model >= least)[has_moved].all())
 
     def _suspected_signs(self, theta: Array, length: Array, tension: Array) -> list[str]:
         """Return the joints of which a reversed sign alone would explain all wrong lengths."""

@@ -83,7 +83,7 @@ class Positioning(MotionTest):
 
     def _hold(self) -> Wait:
         yield from self._wait(RELEASE)
-        length, tension, _ = self._mean()
+        length, tension = self._mean()[:2]
         self._most = np.maximum(self._highest, tension + RISE)
         self._target[:] = length
         yield from self._wait(SETTLE)
@@ -95,7 +95,7 @@ class Positioning(MotionTest):
             self.verdict.failed('position hold', m, off=off)
 
     def _run_away(self, states: Array, start: Array) -> RunAwayError | None:  # noqa: ARG002
-        length, tension, _ = states
+        length, tension = states[:2]
         far = np.abs(length - self._target) > RUN_AWAY
         m = self._lasting((tension > self._highest + RUN_AWAY_TENSION) | far)
         if self._tested is None and (tension > self._most).any():

@@ -176,7 +176,7 @@ class Winding(MotionTest):
 
     def _run_away(self, states: Array, start: Array) -> RunAwayError | None:
         """Return the error of a muscle that exceeds its demand or shortens too far."""
-        length, tension, _ = states
+        length, tension = states[:2]
         tensions = self._robot.tension
         verified = np.minimum(np.maximum(tensions.limit, self._most), tensions.max)
         asked = np.minimum(
@@ -217,7 +217,7 @@ class Winding(MotionTest):
             return
         start, before = self._now, self._recent[-1][1][1]
         while (passed := self._now - start) < RELEASE:
-            length, tension, _ = self._recent[-1][1]
+            length, tension = self._recent[-1][1][:2]
             if passed > 0.5 * LATEST and (tension > before.max() + self._response).any():
                 break
             self._target = length + min(PAY_OUT[0] + PAY_OUT[1] * passed, 2.0 * RUN_AWAY)
@@ -232,7 +232,7 @@ class Winding(MotionTest):
         """
         start, before = self._now, self._recent[-1][1][1]
         while (passed := self._now - start) < RELEASE:
-            length, tension, _ = self._recent[-1][1]
+            length, tension = self._recent[-1][1][:2]
             if passed > 0.5 * LATEST and (tension > before.max() + self._response).any():
                 self._suspects = []
                 break
@@ -245,7 +245,7 @@ class Winding(MotionTest):
         Each of them must then follow the command of another muscle, which demands the excess, and
         no two of them the same one. If every muscle pulls, the order is therefore not wrong.
         """
-        length, tension, _ = self._recent[-1][1]
+        length, tension = self._recent[-1][1][:2]
         demand = self._demanded(length)
         excess = tension - demand
         pulls = excess > self._tolerance
@@ -426,7 +426,7 @@ class Winding(MotionTest):
                 self._target[m] -= SPEED * self._since(last)
             last = self._now
             yield from self._wait(1e-9)
-            length, tension, _ = self._recent[-1][1][:, m]
+            length, tension = self._recent[-1][1][:2, m]
             pulled = abs(tension - before.tension[m]) > answer
             answered = pulled or before.length[m] - length > 2.0 * RESPONSE[1]
             if answered and not latency and not hidden:
@@ -457,10 +457,10 @@ class Winding(MotionTest):
             detail = f'l rose by {-1e3 * wound[m]:.1f} mm while the muscle was wound in'
             verdict.failed('sign', m, detail=detail)
         verdict.passed('sign', m)
-        if (other := self._whose_tension(m, home, last)) != m:
+        if is_misplaced := (other := self._whose_tension(m, home, last)) != m:
             verdict.failed('tension place', m, other=robot.muscles[other])
         clip = robot.tension.max[m]
-        if clip <= self._highest[m]:
+        if clip <= self._highest[m] and not is_misplaced:
             beyond = max((CLIP[0] * self._scale)[m], 2.0 * CLIP[1] * clip)
             beyond = min(beyond, MOST_BEYOND * clip)
             self._most[m] = clip + beyond
@@ -470,7 +470,8 @@ class Winding(MotionTest):
             verdict.passed('clip', m)
         yield from self._go(m, home.length[m])
         yield from self._go(m, self._mean().length[m] + SLACK)
-        self._judge_law(m, home, last, self._mean())
+        if not is_misplaced:
+            self._judge_law(m, home, last, self._mean())
         yield from self._go(m, home.length[m])
         if half or whole:
             self._judge_latency(m, min(half + whole))
@@ -515,7 +516,9 @@ class Winding(MotionTest):
         other = int((got - asked).argmax())
         return other if SLOPES[0] < (got - asked)[other] / asked[m] < SLOPES[1] else m
 
-    def _find_onset(self, m: int, home: _Reading) -> Generator[None, None, float | None]:
+    def _find_onset(
+        self, m: int, home: _Reading
+    ) -> Generator[None, None, tuple[float, float] | None]:
         """Return the target [m] at which the tension of muscle m begins to rise.
 
         The target moves slowly inwards and outwards, past the negative of the measured length,
@@ -524,7 +527,8 @@ class Winding(MotionTest):
         is not read any more.
 
         Returns:
-            The target, or None without a response.
+            The target and the length at that time [m], or None without a response. The rise of T
+            that was noticed is subtracted, so that their difference is that of the zeros.
         """
         home_length, far = (
             home.length[m],
@@ -542,8 +546,10 @@ class Winding(MotionTest):
                 if (np.ptp(readings, axis=0) == 0.0).any():
                     return None
                 self._target[m] = home_length + direction * gone
-                if abs(readings[-1, 1] - home.tension[m]) > answer:
-                    return float(self._target[m])
+                rise = float(readings[-1, 1] - home.tension[m])
+                if abs(rise) > answer:
+                    onset = self._target[m] + rise / self._robot.stiffness[m]
+                    return float(onset), float(readings[-1, 0])
             yield from self._go(m, home_length)
         return None
 
@@ -575,8 +581,9 @@ class Winding(MotionTest):
         yield from self._wait(RELEASE)
         if onset is None:
             self.verdict.failed('no answer', m)
-        elif abs(onset + home.length[m]) < MIRROR_TOLERANCE:
-            what = 'mirrored' if onset < home.length[m] else 'mirrored command'
-            self.verdict.failed(what, m, at=1e3 * onset, l=1e3 * home.length[m])
-        else:
-            self.verdict.failed('other zero', m, at=1e3 * onset, l=1e3 * home.length[m])
+            return
+        at, length = onset
+        what = 'other zero'
+        if abs(at + length) < MIRROR_TOLERANCE:
+            what = 'mirrored' if at < length else 'mirrored command'
+        self.verdict.failed(what, m, at=1e3 * at, l=1e3 * length)

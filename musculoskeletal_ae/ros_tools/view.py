@@ -280,7 +280,7 @@ class View(Node):
         trouble = self.page.with_buttons(situation.trouble())
         if len(isolated := self._isolated()):
             lines.append(f'isolated: {self.robot.names(isolated)}')
-        shown = np.full((2, self.robot.muscle_count), np.nan) if states is None else states[1:]
+        shown = np.full((2, self.robot.muscle_count), np.nan) if states is None else states[1:3]
         values = error, anomaly, distance, situation.number('estimator', 'd limit')
         now, is_urgent = time.monotonic(), situation.level() == 'error'
         self.page.tell([*filter(None, lines)], trouble, shown, now, values, is_urgent)
