@@ -898,7 +898,14 @@ def wrong_network(lab: Lab, _: Rng) -> Case:
         if before is not None:
             lab.choose_network(before)
 
-    return Case('' if is_used else 'refused', mend, lasts=math.inf if is_used else 0.0)
+    def is_visible(lab: Lab) -> bool:
+        output = lab.estimator.output
+        if output is None or not is_used:
+            return False  # a refusal answers the request
+        return bool(np.abs(output.state.theta - lab.arm.theta).max() > SHOWN_ANGLE)
+
+    lasts = math.inf if is_used else 0.0
+    return Case('' if is_used else 'refused', mend, is_visible=is_visible, lasts=lasts)
 
 
 def healthy(_: Lab, __: Rng) -> Case:
