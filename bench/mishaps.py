@@ -90,8 +90,10 @@ PAGE = """\
 # Mishaps of a laboratory
 
 `python -m bench mishaps` lets {kinds} mishaps happen to arms that have learned for {learning} s and
-explore or hold, with emulator models {realities}, individuals {seeds} ({runs} runs, measured with
-{commit}). Size, moment, muscle or joint are random. An obedient operator takes the advised steps
+explore or hold, with emulator models {realities}, individuals {seeds} ({runs} runs; page
+written at {commit}, commits of the runs in the
+[results](../results.md#mishaps-of-a-laboratory)). Size, moment, muscle or joint are random. An
+obedient operator takes the advised steps
 literally, and a person repairs or checks only what a statement names. A run ends when the arm
 explores again without any condition, or when the patience of the operator ends.
 
