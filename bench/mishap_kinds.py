@@ -918,7 +918,7 @@ ORDER = r'exchang|swapp|order of|wrong column|sign|reversed|unit'
 GRAVITY = r'gravity|mounted|away from its target|distance|payload|contact'
 NETWORK = r'network|checkpoint'
 _LENGTHS = ONE_LENGTH | SEVERAL_LENGTHS | REVOKED
-_CONSEQUENCES = frozenset({'implausible_estimate', 'stale_estimate'})
+_CONSEQUENCES = frozenset({'stale_estimate'})
 
 MISHAPS: tuple[Mishap, ...] = (
     Mishap('nothing (control)', healthy, is_harmless=True),
@@ -958,7 +958,7 @@ MISHAPS: tuple[Mishap, ...] = (
            ONE_LENGTH | FROZEN | NOT_FOLLOWING, says='jumped',
            allowed=REVOKED | REJECTED),
     Mishap('encoder loses counts', lost_counts, ONE_LENGTH | NOT_FOLLOWING,
-           allowed=REVOKED | REJECTED | {'tension_above_limit', 'overload'}),
+           allowed=REVOKED | REJECTED | {'overload'}),
     Mishap('noise on tension readings', noisy_tensions, is_harmless=True, says='nois'),
     Mishap('joint sensor sticks', joint_fault(float, 'sticks'), JOINT, says=OF_JOINT),
     Mishap('joint sensor reversed', joint_fault(lambda x: -x, 'reversed'), JOINT,

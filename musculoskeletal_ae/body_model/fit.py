@@ -97,8 +97,8 @@ def fit_body(
     own = np.isfinite(observed.theta) & (observed.spread == 0.0)
     measured = replace(observed, theta=np.where(own, observed.theta - body.zero, fit.theta))
     before = body.remainder.at(measured.theta, observed.tension)
-    all_known = replace(measured, theta=observed.theta - own * body.zero)
-    body.remainder = learned_remainder(body, all_known, fit.weight, priors)
+    corrected = replace(observed, theta=observed.theta - own * body.zero)
+    body.remainder = learned_remainder(body, corrected, fit.weight, priors)
     # The constants have to agree with the new remainder, or both would explain the same lengths.
     if np.abs(body.remainder.at(measured.theta, observed.tension) - before).max() > LEAST_NOISE:
         fit = fitted()

@@ -73,7 +73,7 @@ class Lengths(NamedTuple):
         weight: Array,
         priors: Sequence[MusclePrior],
     ) -> Lengths:
-        """Return the samples of one group relative to the prior mean of its body.
+        """Return the samples of one group, with lengths relative to those of the prior mean body.
 
         Args:
             body: The fitted body of the group, without a remainder.
@@ -104,7 +104,7 @@ class GroupRemainder:
     joints: Ints
     muscles: Ints
     scale: Array  # units of the inputs: R of the joints, T_limit of the muscles, (D+M,)
-    logarithms: Array  # of a, b, c and σ, (4,)
+    logarithms: Array  # natural logarithms of a, b, c and σ in units of UNITS, (4,)
     inputs: Array  # θ and T of the samples in units of `scale`, (N, D+M)
     weights: Array  # α, (N, M): g = k(·, inputs) α
     #: error of each length that is predicted from all other samples [m], (N, M)

@@ -631,10 +631,7 @@ class Controller:
         # Without a stop cause, all inputs are available.
         assert self.mae is not None and self.sample is not None and self.estimate is not None
         sample = self.sample
-        pull = Pull(
-            np.where(sample.usable, sample.motor_tension, 0.0),
-            np.where(sample.usable, sample.bone_tension, 0.0),
-        )
+        pull = Pull(sample.motor_tension * sample.usable, sample.bone_tension * sample.usable)
         return Inputs(
             mae=self.mae,
             sample=sample,

@@ -228,7 +228,7 @@ class CommandLimiter:
             value = np.clip(value, least, limit)
         else:
             shortest = self._shortest(before, change, sample, limit, dt)
-            is_relaxed = np.where(sample.usable, sample.motor_tension, 0.0) <= limit
+            is_relaxed = sample.motor_tension * sample.usable <= limit
             shortest -= actuation.usable_lead(lead) * is_relaxed
             value = np.maximum(value, shortest)
             if rejected is not None:
@@ -248,8 +248,7 @@ class CommandLimiter:
         The result is not lowered below T_bias, so that uncertainty alone makes no tendon slack.
         """
         bias = self._robot.description.tension.bias
-        spread = np.fmax(sample.tension_spread, 0.0)  # NaN: an isolated muscle reads NaN
-        return np.maximum(limit - CONFIDENCE * spread, np.minimum(limit, bias))
+        return np.maximum(limit - CONFIDENCE * sample.tension_spread, np.minimum(limit, bias))
 
     def _relieved(self, rejected: Array, sample: MuscleSample, limit: Array) -> Array:
         """Return lower bounds of the length commands [m], (M,), due to rejected messages.
@@ -289,7 +288,7 @@ class CommandLimiter:
     ) -> Array:
         """Return the shortest length commands [m], (M,), that demand no tension above the limit."""
         robot, actuation = self._robot, self._robot.actuation
-        tension = np.where(sample.usable & actuation.knows_tension, sample.motor_tension, 0.0)
+        tension = sample.motor_tension * sample.usable * actuation.knows_tension
         rate = self._tension_rate(sample.sent_at, tension)
         depth, most = actuation.depth(tension, rate, limit), actuation.largest_depth(limit)
         per_length = actuation.tension_per_length(limit)

@@ -238,8 +238,7 @@ class Watchdog:
         elapsed = states.age(now) if states.was_used else 0.0
         states.use(now)
         self.heat.take(self._robot, sample, elapsed)
-        tension = np.where(sample.usable, sample.motor_tension, 0.0)
-        self.overload.take(tension, now, sample.delay)
+        self.overload.take(sample.motor_tension * sample.usable, now, sample.delay)
 
     def take_rejected(self, tension: Array, used: Bools, now: float, delay: float) -> None:
         """Check the filtered tensions [N], (M,), of a rejected message for overload.

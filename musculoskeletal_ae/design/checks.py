@@ -432,7 +432,7 @@ def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
     for j, (low, high) in enumerate(zip(*ends)):
         if high - low > WIDEST_RANGES[int(slides[j])]:
             wrong = 'metres, not millimetres' if slides[j] else 'radians, not degrees'
-            limits = {'low': low, 'high': high, 'unit': units[j].theta}
+            limits = {'low': low, 'high': high, 'unit': units[j].position}
             yield _finding('other_units, limits', joint=robot.joints[j], wrong=wrong, **limits)
 
 

@@ -128,7 +128,7 @@ def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Set
         )
         text = f'[{low:.{digits}f}, {high:.{digits}f}]'
         if robot.units.slides[joint]:
-            text += f' {unit.theta}'
+            text += f' {unit.position}'
         low, high = low / unit.radian, high / unit.radian
         share = (theta[:, joint] - robot.lower[joint]) / (robot.upper - robot.lower)[joint]
         theta[:, joint] = low + share * (high - low)

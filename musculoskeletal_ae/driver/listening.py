@@ -539,7 +539,7 @@ class Listening:
         j = int(beyond.argmax())
         if beyond[j] > BEYOND_JOINT:
             at, off = robot.units.to_position(np.array([theta[judged[j], j], beyond[j]]), j)
-            values = {'theta': at, 'beyond': off, 'unit': robot.units[j].theta}
+            values = {'theta': at, 'beyond': off, 'unit': robot.units[j].position}
             verdict.failed('joint', name=robot.joints[j], **values)
             return math.inf
         model = robot.muscle_lengths(theta, tension)

@@ -87,7 +87,7 @@ class Readings(NamedTuple):
         return muscle_reading(robot, **{name: getattr(self, name) for name in reported})
 
 
-#: quantities of the muscle modules that have sensor faults
+#: names of the quantities whose sensors can be emulated as faulty
 SENSED = tuple(quantity.name for quantity in QUANTITIES if quantity.name in SIZES)
 
 

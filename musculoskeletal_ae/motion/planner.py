@@ -191,7 +191,7 @@ class Planner:
         if not beyond.any():
             return points._replace(position=np.clip(points.position, low, high))
         k, j = np.argwhere(beyond)[0]
-        unit = robot.units[points.joints[j]].theta
+        unit = robot.units[points.joints[j]].position
         values = np.array([points.position[k, j], low[j], high[j]])
         values = robot.units.to_position(values, points.joints[j])
         value, least, most = distinct(*values, digits=4)

@@ -17,7 +17,7 @@ POSITION_GAIN = 10.0  # K_p [N·m/rad]
 VELOCITY_GAIN = 0.5  # K_d [N·m·s/rad]
 SMOOTHING = 0.05  # time constant of the low-pass filter on the noisy estimate [s]
 
-# Constants of gravity compensation.
+# Method `float`, which compensates gravity, adds these springs and dampers to the holding torque:
 HOLD = 15.0  # stiffness of the spring that holds the arm at θ_held [N·m/rad]
 BAND = 0.05  # largest distance of the arm from θ_held [rad]
 DAMPING = 1.0  # damping of each joint [N·m·s/rad]

@@ -175,7 +175,7 @@ class Trajectory:
         if (out > BEYOND).any():
             j = int(out.argmax())
             excess, legal = distinct(*robot.units.to_position(np.array([out[j], BEYOND]), j))
-            joint, unit = robot.joints[j], robot.units[j].theta
+            joint, unit = robot.joints[j], robot.units[j].position
             raise MessageError(
                 'leaves the joint limits',
                 f'between the points, joint {joint} exceeds its limits by {excess} {unit}; legal: '

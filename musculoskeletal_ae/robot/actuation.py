@@ -495,13 +495,12 @@ class PositionControl(Actuation):
         robot, bias = self._robot, self._whole.bias
         end = start + self.release
         if is_fresh and self.knows_tension:
-            # The tension sensor of an isolated muscle may be faulty.
-            is_known = np.isfinite(tension) & robot.used
             excess = robot.elongation(tension) - robot.elongation(bias)
             measured = length + np.maximum(excess, 0.0)
             # Where the tension does not exceed T_bias, the module keeps its last command.
             measured = np.where(tension > bias, np.maximum(measured, last), last)
-            end = np.where(is_known, measured, end)
+            # The tension sensor of an isolated muscle may be faulty.
+            end = np.where(robot.used, measured, end)
         return np.minimum(end, longest)
 
     def rise(self, muscle: int, length: float, command: float, tension: float) -> float:  # noqa: ARG002

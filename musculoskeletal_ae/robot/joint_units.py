@@ -33,18 +33,18 @@ class JointUnit(NamedTuple):
     """Units of one joint's position, torque and stiffness outside the core."""
 
     radian: float  # position of the joint at θ = 1 rad
-    theta: str
+    position: str
     torque: str
     stiffness: str
 
     def position_text(self, theta: float, form: str = '.2f') -> str:
         """Return the joint's position with its unit, for θ [rad]; `form` is a format."""
-        return f'{theta * self.radian:{form}} {self.theta}'
+        return f'{theta * self.radian:{form}} {self.position}'
 
     def range_text(self, low: float, high: float, form: str = '.2f') -> str:
         """Return a range of positions with its unit, such as '[0.00, 0.05] m', for θ [rad]."""
         low, high = low * self.radian, high * self.radian
-        return f'[{low:{form}}, {high:{form}}] {self.theta}'
+        return f'[{low:{form}}, {high:{form}}] {self.position}'
 
     def torque_text(self, torque: float, form: str = '.2f') -> str:
         """Return a joint torque, or the force on a prismatic joint, for a torque in [N·m]."""
@@ -132,4 +132,4 @@ class JointUnits:
     @property
     def position_unit(self) -> str:
         """Units of positions in a list of all joints, such as 'rad or m'."""
-        return ' or '.join(sorted({unit.theta for unit in self}, reverse=True))
+        return ' or '.join(sorted({unit.position for unit in self}, reverse=True))

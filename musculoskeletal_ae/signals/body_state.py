@@ -2,8 +2,9 @@
 """The body state: length offsets, isolated muscles and the anomaly as one immutable value.
 
 The estimator owns the body state. It publishes each change as a whole on the latched topic
-`body_state`, with the number of the change, and no other node changes it. All other nodes use the
-newest message. It states everything that they need, so that they compare it with no other message.
+`body_state`, with the number of the change. All other nodes use the newest message. It states
+everything that they need, so that they compare it with no other message. Before the first message,
+they assume a healthy body; only the learner assumes the isolated muscles of its saved network.
 """
 
 from __future__ import annotations

@@ -128,7 +128,7 @@ def check_posture(robot: Robot, theta: Array, outside: float) -> None:
     if not (share > outside).any():
         return
     j = int(np.nanargmax(share))
-    margin, unit = outside * (robot.upper - robot.lower)[j], robot.units[j].theta
+    margin, unit = outside * (robot.upper - robot.lower)[j], robot.units[j].position
     values = np.array([theta[j], robot.lower[j] - margin, robot.upper[j] + margin])
     value, least, most = distinct(*robot.units.to_position(values, j))
     raise MessageError(

@@ -60,8 +60,8 @@ class MuscleSample:
     """A checked message of the muscle modules. Arrays have the shape (M,).
 
     If the robot does not measure tensions, all three tensions are the one that models assume
-    (`Actuation.assumed_tension`). A tension is NaN only where that of an isolated muscle is read
-    as NaN.
+    (`Actuation.assumed_tension`). Lengths and tensions of isolated muscles are 0 where the sensor
+    reads NaN, so that none of them is NaN.
 
     Attributes:
         time: Time of reception by the caller's clock [s].

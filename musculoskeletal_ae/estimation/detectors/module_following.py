@@ -98,8 +98,6 @@ class ModuleFollowing(Detector):
         growth = self._growth(observation, np.abs(self._difference), correcting)
         is_full = correcting > FULL_SPEED * self._robot.actuation.speed
         growth = np.where(is_full | ~self._robot.used, -1.0, np.clip(growth, -1.0, 1.0))
-        # An unknown tension is no evidence.
-        growth = np.nan_to_num(growth, nan=-1.0)
         self._evidence = np.maximum(self._evidence + growth * dt, 0.0)
         if self._evidence.max() < FAULTY:
             return None
@@ -132,10 +130,11 @@ class ModuleFollowing(Detector):
         limit, demand = self._complete_robot.tension.limit, self._reference(observation.demand)
         excess = away - limit * correcting / CORRECTING
         allowed = ALLOWED * limit + ALLOWED_SHARE * demand
-        spread = np.fmax(observation.sample.tension_spread, 0.0)
         # Slack tendons, which even a slow winch may take up, are left to `slack_tendon.py`.
         is_slack = observation.sample.motor_tension < LIMITS.slack_share * demand
-        growth: Array = (excess - allowed - SURE * spread) / (CLEAR * limit)
+        growth: Array = (excess - allowed - SURE * observation.sample.tension_spread) / (
+            CLEAR * limit
+        )
         return np.where(is_slack, -1.0, growth)
 
     def _text(self, observation: Observation, muscle: int) -> str:

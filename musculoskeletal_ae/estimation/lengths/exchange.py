@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decides whether a finding is explained by a driver that exchanges muscles or reverses a length.
+"""Decides whether a finding is explained by a driver that has restarted or has another wiring.
 
 If a driver restarts with two muscles exchanged, in readings and commands, their lengths jump or no
 longer fit the rest of the arm. The same applies if it reverses the sign of a length. Detectors then
@@ -68,7 +68,7 @@ EXPLAINED_BY_SILENCE = EXPLAINED | {ConditionKind.LENGTH_JUMP}
 
 
 class ExchangeCheck:
-    """Keeps recent messages, and replaces a finding that the driver's order or signs explain."""
+    """Replaces a finding by the fault of the driver that explains it: order, sign or offsets."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
@@ -117,8 +117,9 @@ class ExchangeCheck:
     def explain(self, finding: Finding | None, observation: Observation) -> Finding | None:
         """Return a finding of exchanged muscles or a reversed length if it explains `finding`.
 
-        Lengths that have changed in a recent silence explain one by the residual. Otherwise, the
-        result is `finding`.
+        If neither does, and `finding` only states that the readings do not fit the learned body,
+        several lengths that have changed in a recent silence explain it: they have lost their
+        offsets. Otherwise, the result is `finding`.
         """
         if finding is None or finding.kind not in EXPLAINED_BY_SILENCE:
             return finding
