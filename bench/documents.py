@@ -60,11 +60,13 @@ stop() {{ # SCRIPT: ends the command in the background that runs this script
 }}
 trap 'for script in "${{!running[@]}}"; do stop "$script"; done' EXIT
 ask() {{ # COMMAND: fails if the command fails, does not end, or prints a refusal
-  # As README says, a command is repeated while the daemon of `ros2` has not discovered the topic.
+  # As the pages say, a command is repeated while the daemon of `ros2` has not discovered the topic,
+  # and after 10 s if a muscle was being verified.
   local status
   for _ in 1 2 3; do
     eval "timeout {ANSWER_PATIENCE} $1" | tee answer.log
     status=${{PIPESTATUS[0]}}
+    if grep -q 'being verified' answer.log; then sleep 10; continue; fi
     grep -q 'does not appear to be published yet' answer.log || break
   done
   [ "$status" = 0 ] &&
