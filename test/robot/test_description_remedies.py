@@ -3,18 +3,22 @@
 
 A row has the edits that cause the fault, a regular expression for the advice, and the edits that
 follow the advice, each of which is made in a directory of its own. An edit gets the directory and
-the match of the advice. After each of them, the directory can be read.
+the match of the advice. After each of them, the directory can be read. `Members` is an edit for
+each member of the legal set, which is the first group of the advice.
 """
 
 import re
 import shutil
 import subprocess
 from collections.abc import Callable
+from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 import yaml
+from remedies import Members, check_remedy
 from robots import chain, copy_robot, read_muscles, write_muscles
 
 from musculoskeletal_ae.design.checks import read_declared_actions
@@ -30,12 +34,6 @@ class Row(NamedTuple):
     breaks: tuple[Edit, ...]
     advice: str
     mends: tuple[object, ...]
-
-
-class Each(NamedTuple):
-    """Edits that use each member of the legal set, which is the first group of the advice."""
-
-    edit: Callable[[str], Edit]
 
 
 def of_muscles(change):
@@ -186,7 +184,7 @@ MUSCLES = {
     ),
     'wrong word': Row(
         (at(['actuation'], 'torque'),), 'expected one of (.*), got',
-        (Each(lambda word: at(['actuation'], word)),),
+        (Members(lambda word: at(['actuation'], word)),),
     ),
     'missing key': Row(
         (without('muscles', 0, 'name'),), "key 'name' is missing",
@@ -254,7 +252,7 @@ MUSCLES = {
     ),
     'unknown link': Row(
         (at((*ROUTE, 0, 'link'), 'chest'),), 'links of robot.urdf: (.*)$',
-        (Each(lambda name: at((*ROUTE, 0, 'link'), name)),),
+        (Members(lambda name: at((*ROUTE, 0, 'link'), name)),),
     ),
     'one point': Row(
         (of_muscles(lambda document, _: document['muscles'][0]['route'].__setitem__(
@@ -264,14 +262,14 @@ MUSCLES = {
     'unknown joint': Row(
         (WHEEL, at(['joints'], ['knee'])),
         'unknown joint .*; revolute and prismatic joints of robot.urdf: (.*)$',
-        (Each(lambda name: at(['joints'], [name])),),
+        (Members(lambda name: at(['joints'], [name])),),
     ),
     'unknown joint beside a mimic': Row(
         (added(link('f'), joint('finger', 'hand', 'f', 'revolute',
                                 f'{LIMIT}<mimic joint="elbow"/>')),
          at(['joints'], ['knee'])),
         'unknown joint .*; revolute and prismatic joints of robot.urdf: (.*)$',
-        (Each(lambda name: at(['joints'], [name])),),
+        (Members(lambda name: at(['joints'], [name])),),
     ),
     'continuous joint': Row(
         (WHEEL, at(['joints'], [*JOINTS, 'wheel'])),
@@ -298,7 +296,7 @@ MUSCLES = {
     'master that is missing': Row(
         (added(*OTHER_FINGER), at(['couplings'], [{'joint': 'finger', 'master': 'knee'}])),
         "unknown joint 'knee'; revolute and prismatic joints of robot.urdf: (shoulder, elbow)",
-        (Each(lambda name: at(['couplings', 0, 'master'], name)),),
+        (Members(lambda name: at(['couplings', 0, 'master'], name)),),
     ),
     'loop of couplings': Row(
         (added(*OTHER_FINGER, link('g'), joint('tip', 'f', 'g', 'revolute', LIMIT)),
@@ -326,7 +324,7 @@ MUSCLES = {
     ),
     'end effector at rest': Row(
         (at(['end_effector'], 'torso'),), r'expected a link that the joints move \((.*)\), got',
-        (Each(lambda name: at(['end_effector'], name)),),
+        (Members(lambda name: at(['end_effector'], name)),),
     ),
     'order of tensions': Row(
         (at(['tension'], {'bias': 50.0, 'limit': 40.0, 'max': 60.0}),),
@@ -334,7 +332,7 @@ MUSCLES = {
     ),
     'joint of a spring': Row(
         (at(['joint_elasticity'], [{'joint': 'knee', 'stiffness': 1.0}]),), 'legal: (.*)$',
-        (Each(lambda name: at(['joint_elasticity', 0, 'joint'], name)),),
+        (Members(lambda name: at(['joint_elasticity', 0, 'joint'], name)),),
     ),
     'spring at a joint that follows': Row(
         (added(*OTHER_FINGER), at(['couplings'], [{'joint': 'finger', 'master': 'elbow'}]),
@@ -459,7 +457,7 @@ URDF = {
     ),
     'kind of joint': Row(
         (in_urdf('type="fixed"', 'type="hinge"'),), 'expected one of (.*), got',
-        (Each(lambda kind: in_urdf('type="hinge">', f'type="{kind}">{LIMIT}')),),
+        (Members(lambda kind: in_urdf('type="hinge">', f'type="{kind}">{LIMIT}')),),
     ),
     'axis': Row(
         (in_urdf('<axis xyz="0 1 0"/>', '<axis xyz="0 0 0"/>'),), 'expected a nonzero vector',
@@ -483,7 +481,7 @@ URDF = {
     'no mass': Row(
         (in_urdf('<mass value="0.8"/>', ''),),
         'mass: expected value; remove <inertial> of a link without mass',
-        (lambda directory, _: in_pattern(directory, r'(<link name="forearm">)\s*<inertial>.*?'
+        (lambda directory, _=None: in_pattern(directory, r'(<link name="forearm">)\s*<inertial>.*?'
                                          '</inertial>'),),
     ),
 }  # fmt: skip
@@ -491,6 +489,11 @@ URDF = {
 
 def copy_urdf(directory, _=None):
     copy_robot('arm26', directory)
+
+
+def in_broken(edit, match):
+    """Return an edit of a directory with a match of the advice."""
+    return lambda directory: edit(directory, match)
 
 
 def in_pattern(directory, pattern):
@@ -503,7 +506,7 @@ def in_pattern(directory, pattern):
 MOTORS = {
     'unknown muscle': Row(
         (motors(motors={'tail': {}}),), 'unknown muscle .*; legal: (.*); doc/howto',
-        (Each(lambda name: motors(motors={name: {}})),),
+        (Members(lambda name: motors(motors={name: {}})),),
     ),
     'motor of two muscles': Row(
         (motors(motors={'brachialis': {'joint': 'm'}, 'biceps_long': {'joint': 'm'}}),),
@@ -517,7 +520,7 @@ MOTORS = {
     ),
     'direction': Row(
         (motors(direction=2.0),), 'expected (1 or -1)',
-        (Each(lambda value: motors(direction=float(value))),),
+        (Members(lambda value: motors(direction=float(value))),),
     ),
     'no tension for an effort': Row(
         (motors(tension_per_effort=0.0),), 'expected a number other than 0',
@@ -526,7 +529,7 @@ MOTORS = {
     'name of a topic': Row(
         (motors(state_topic='motor states'),),
         'legal: words of letters, digits and _ that are joined by /, as in (joint_states)',
-        (Each(lambda name: motors(state_topic=name)), motors(state_topic='a_1/b2')),
+        (Members(lambda name: motors(state_topic=name)), motors(state_topic='a_1/b2')),
     ),
     'unknown key': Row(
         (motors(radius=0.01),), "unknown key 'radius'; legal keys: (.*); doc/howto",
@@ -547,7 +550,7 @@ ACTIONS = {
     'word': Row(
         (content('moment_arms.csv', 'muscle,joint,sign\nbrachialis,elbow,down\n'),),
         r'legal: (.*)$',
-        (Each(lambda sign: content('moment_arms.csv',
+        (Members(lambda sign: content('moment_arms.csv',
                                    f'muscle,joint,sign\nbrachialis,elbow,{sign}\n')),),
     ),
     'twice': Row(
@@ -559,7 +562,7 @@ ACTIONS = {
 
 FILES = {
     'no muscles.yaml': Row(
-        (lambda directory, _: (directory / 'muscles.yaml').unlink(),),
+        (lambda directory, _=None: (directory / 'muscles.yaml').unlink(),),
         'a robot directory contains robot.urdf and muscles.yaml', (copy_urdf,),
     ),
     'huge file': Row(
@@ -569,7 +572,7 @@ FILES = {
             'muscles.yaml', '#' * (1 << 19), '#' * (int(match[1]) // 2))(directory),),
     ),
     'no UTF-8': Row(
-        (lambda directory, _: (directory / 'muscles.yaml').write_bytes(b'# \xe4'),),
+        (lambda directory, _=None: (directory / 'muscles.yaml').write_bytes(b'# \xe4'),),
         'is not UTF-8 text', (copy_urdf,),
     ),
     'many aliases': Row(
@@ -594,35 +597,27 @@ ROWS = {
 }  # fmt: skip
 
 
-def use(directory):
-    read_declared_actions(load_description(directory))
-
-
 @pytest.mark.parametrize('name', ROWS)
 def test_a_directory_can_be_read_after_the_advice_was_followed(name, tmp_path):
     row = ROWS[name]
 
-    def broken(number):
-        directory = copy_robot('arm26', tmp_path / f'arm{number}')
+    numbers = count()
+
+    def broken():
+        directory = copy_robot('arm26', tmp_path / f'arm{next(numbers)}')
         (directory / 'moment_arms.csv').unlink(missing_ok=True)
         without('stiffness')(directory)  # the default
         for edit in row.breaks:
             edit(directory, None)
         return directory
 
-    directory = broken(0)
-    with pytest.raises(RobotDescriptionError) as refused:
-        use(directory)
-    match = re.search(row.advice, str(refused.value), re.DOTALL)
-    assert match, str(refused.value)
-    edits = []
-    for mend in row.mends:
-        words = re.split(r', | or ', match[1]) if isinstance(mend, Each) else ()
-        edits += [mend.edit(word) for word in words] if words else [mend]
-    for number, edit in enumerate(edits, 1):
-        directory = broken(number)
-        edit(directory, match)
-        use(directory)
+    def use(edit):
+        directory = broken()
+        edit(directory)
+        read_declared_actions(load_description(directory))
+
+    ways = [mend if isinstance(mend, Members) else partial(in_broken, mend) for mend in row.mends]
+    check_remedy(use, in_order(), row.advice, ways, RobotDescriptionError)
 
 
 def test_a_robot_that_is_not_there_can_be_chosen_as_the_message_says(tmp_path):
