@@ -131,11 +131,11 @@ def _preprocessor_parts(root: ET.Element) -> Iterator[tuple[str, str]]:
     """Yield elements and attributes that a preprocessor has to replace, each with its remedy."""
     for element in root.iter():
         namespace, _, name = element.tag.rpartition('}')
-        part = f'element {name!r} of {namespace.strip("{")}'
+        described = f'element {name!r} of {namespace.strip("{")}'
         if 'XInclude' in namespace:
-            yield part, 'replace it by the elements of the file that it names'
+            yield described, 'replace it by the elements of the file that it names'
         if 'xacro' in namespace:
-            yield part, EXPAND
+            yield described, EXPAND
     for part in root:
         if part.tag in PREPROCESSED:
             prefix = f'write it as <xacro:{part.tag}>, with xmlns:xacro="{XACRO}" in <robot>'
