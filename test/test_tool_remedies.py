@@ -199,12 +199,12 @@ def test_a_page_gets_its_table_after_the_markers_were_added(tmp_path):
 def test_a_report_is_written_to_an_empty_folder_as_the_refusal_says(tmp_path):
     damaged, empty = tmp_path / 'damaged', tmp_path / 'empty'
     copytree(ROOT / 'doc/results/control', empty / 'control')  # what a run writes there
-    (damaged / 'detection').mkdir(parents=True)
+    (damaged / 'control').mkdir(parents=True)
     about = (
         '{"about": {"robot": "arm26", "preset": "default", "reality": "kin", "minutes": 1.0, '
         '"quick": true, "seeds": [0]}, "seeds": {"0": {}}}'
     )
-    (damaged / 'detection' / 'result.json').write_text(about)
+    (damaged / 'control' / 'result.json').write_text(about)
     check_remedy(write_report, damaged, 'use an empty output folder', [empty])
 
 
