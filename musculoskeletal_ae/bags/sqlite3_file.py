@@ -21,17 +21,24 @@ from rosbags.rosbag2 import Reader
 
 from musculoskeletal_ae.bags.message_types import MSG
 from musculoskeletal_ae.bags.storage import (
+    DAMAGED,
     LATEST,
     BagMessage,
     BagTopic,
     absolute,
     add_topic,
+    open_file,
     reading,
     topic_problem,
 )
 from musculoskeletal_ae.exceptions import BagError
 
 MAGIC = b'SQLite format 3\0'  # first bytes of a file
+RECOVER = f'{DAMAGED}, or save what can be read with `record --recover BAG`'
+MESSAGES = 'messages'  # table of the messages
+MOST_ROWS = 1 << 40  # give up the search for a readable row after this many ids
+_ROWS = 'SELECT id, topic_id, timestamp, data FROM messages WHERE id >= ? ORDER BY id'
+_INSERT = 'INSERT INTO messages (id, topic_id, timestamp, data) VALUES (?, ?, ?, ?)'
 _LOGS = '-wal', '-journal'  # ends of the names of sqlite's logs of changes
 _DEFINITION_ENCODINGS = {
     MessageDefinitionFormat.NONE: '',
@@ -55,11 +62,11 @@ class Sqlite3File:
         self.topics: dict[str, BagTopic] = {}
         self.start, self.end = LATEST, 0
         self.unfinished = ''
-        if logs := [log for log in map(self._log, _LOGS) if log.exists() and log.stat().st_size]:
+        if logs := logs_of(path):
             names = ' and '.join(log.name for log in logs)
             self.unfinished = f'{path.name} was not closed; {names} was read as well'
             self._apply(logs)
-        with reading(path), Reader(self._read) as reader:
+        with reading(path, RECOVER), Reader(self._read) as reader:
             self._check_integrity()
             for connection in reader.connections:
                 assert isinstance(connection.ext, ConnectionExtRosbag2)
@@ -79,9 +86,6 @@ class Sqlite3File:
             self.start = min(self.start, message.log_time)
             self.end = max(self.end, message.log_time)
 
-    def _log(self, end: str) -> Path:
-        return self.path.with_name(f'{self.path.name}{end}')
-
     def _apply(self, logs: list[Path]) -> None:
         """Let sqlite apply its logs to a copy of the file, and read this copy from now on."""
         try:
@@ -98,8 +102,7 @@ class Sqlite3File:
             connection.execute('PRAGMA journal_mode=DELETE')  # moves the log into the file
 
     def _check_integrity(self) -> None:
-        address = f'{self._read.absolute().as_uri()}?mode=ro&immutable=1'
-        with closing(sqlite3.connect(address, uri=True)) as connection:
+        with _read_only(self._read) as connection:
             ((result,),) = connection.execute('PRAGMA integrity_check(1)')
         if result != 'ok':
             raise ValueError(result)
@@ -117,3 +120,100 @@ class Sqlite3File:
                     raise ValueError('a row in its table of messages is not a valid message')
                 if start <= time <= stop:
                     yield BagMessage(absolute(connection.topic), time, 0, data, self.path)
+
+
+def is_damaged(path: Path) -> bool:
+    """Return whether a file begins as a sqlite3 file, but cannot be read as a whole."""
+    with open_file(path) as stream:
+        if stream.read(len(MAGIC)) != MAGIC:
+            return False
+    try:
+        Sqlite3File(path)
+    except BagError:
+        return True
+    return False
+
+
+def logs_of(path: Path) -> list[Path]:
+    """Return the logs of changes that a recorder has left beside a file."""
+    logs = (path.with_name(f'{path.name}{end}') for end in _LOGS)
+    return [log for log in logs if log.exists() and log.stat().st_size]
+
+
+def _read_only(path: Path) -> closing[sqlite3.Connection]:
+    """Return a connection to a file that sqlite neither changes nor locks."""
+    address = f'{path.absolute().as_uri()}?mode=ro&immutable=1'
+    return closing(sqlite3.connect(address, uri=True))
+
+
+def salvage(path: Path, target: Path) -> int:
+    """Copy the rows of a damaged file that sqlite can read to a new file.
+
+    Rows are read in the order of their ids. After a row that cannot be read, the next readable id
+    is searched with steps that double, and then by bisection, because a damaged page contains
+    successive ids. A row whose values have another type is left out. Damage within the data of a
+    message cannot be noticed, because the format has no checksums.
+
+    Args:
+        path: The damaged file, which stays as it is.
+        target: The new file.
+
+    Returns:
+        The number of copied messages.
+
+    Raises:
+        BagError: If the topics cannot be read.
+    """
+    with reading(path), _read_only(path) as damaged, closing(sqlite3.connect(target)) as copy:
+        tables = damaged.execute(
+            "SELECT name, sql FROM sqlite_master WHERE type = 'table' AND sql IS NOT NULL"
+        ).fetchall()
+        for name, definition in tables:
+            copy.execute(definition)
+            if name != MESSAGES:
+                rows = damaged.execute(f'SELECT * FROM "{name}"').fetchall()  # noqa: S608
+                for row in rows:
+                    marks = ', '.join('?' * len(row))
+                    copy.execute(f'INSERT INTO "{name}" VALUES ({marks})', row)  # noqa: S608
+        count, place = 0, _next_readable(damaged, 1)
+        while place is not None:
+            try:
+                for row in damaged.execute(_ROWS, (place,)):
+                    if _is_message(row):
+                        copy.execute(_INSERT, row)
+                        count += 1
+                    place = row[0] + 1
+                break
+            except sqlite3.DatabaseError:
+                place = _next_readable(damaged, place + 1)
+        copy.commit()
+    return count
+
+
+def _next_readable(connection: sqlite3.Connection, place: int) -> int | None:
+    """Return an id from `place` on whose row can be read; None if there is none."""
+    if _is_readable(connection, place):
+        return place
+    step = 1
+    while not _is_readable(connection, place + step):
+        step *= 2
+        if step > MOST_ROWS:
+            return None
+    low, high = place + step // 2, place + step
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if _is_readable(connection, middle) else (middle, high)
+    return high
+
+
+def _is_readable(connection: sqlite3.Connection, place: int) -> bool:
+    """Return whether the first row from an id on can be read; False if there is none."""
+    try:
+        return connection.execute(f'{_ROWS} LIMIT 1', (place,)).fetchone() is not None
+    except sqlite3.DatabaseError:
+        return False
+
+
+def _is_message(row: tuple[object, ...]) -> bool:
+    types = (int, int, int, bytes)
+    return len(row) == len(types) and all(map(isinstance, row, types))

@@ -46,8 +46,8 @@ _LONGEST_NAME = 256  # largest length of a topic's name [characters]
 
 
 @contextmanager
-def reading(file: Path) -> Iterator[None]:
-    """Turn every exception that reading a recording raises into a BagError.
+def reading(file: Path, remedy: str = DAMAGED) -> Iterator[None]:
+    """Turn every exception that reading a recording raises into a BagError with this remedy.
 
     With damaged files, the libraries raise almost any type of exception, from struct.error to
     MemoryError.
@@ -59,7 +59,7 @@ def reading(file: Path) -> Iterator[None]:
     except Exception as error:
         reason = ' '.join(str(error).split())[:300]
         problem = f'cannot be read as a recording ({reason or type(error).__name__})'
-        raise BagError(file, problem, DAMAGED) from error
+        raise BagError(file, problem, remedy) from error
 
 
 @dataclass

@@ -6,12 +6,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 from mcap.records import Schema
 from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Qos
 
-from musculoskeletal_ae.bags import message_types, metadata
+from musculoskeletal_ae.bags import message_types, metadata, sqlite3_file
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import EMPTY, BagTopic
 from musculoskeletal_ae.exceptions import BagError
@@ -162,23 +164,51 @@ class BagWriter:
             raise BagError(self.directory, problem, 'choose another directory') from error
 
 
-def recover(path: Path, target: Path, compression: str = 'zstd') -> tuple[int, list[str]]:
-    """Write all readable messages of a recording to a new, finished bag.
+class Recovered(NamedTuple):
+    """The result of a recovery."""
 
-    Returns:
-        The number of messages in the new bag, and the names of the topics that were left out
-        because their messages are not encoded in CDR.
+    message_count: int  # number of messages in the new bag
+    left_out: list[str]  # topics that were left out because their messages are not in CDR
+    damaged: list[str]  # files with messages that cannot be read
+
+
+def recover(path: Path, target: Path, compression: str = 'zstd') -> Recovered:
+    """Write all readable messages of a recording to a new, finished bag.
 
     Raises:
         BagError: If no message can be read, or a bag cannot be read or written.
     """
-    bag = Bag.open(path)
-    if not bag.message_count:
-        raise BagError(path, *EMPTY)
-    with BagWriter(target, compression) as writer:
-        for name, topic in bag.topics.items():
-            if topic.encoding == message_types.CDR:
-                writer.add_topic(name, topic.type, topic.qos, topic.schema)
-        for message in bag.messages(writer.topics):
-            writer.write(message.topic, message.log_time, message.publish_time, message.data)
-    return writer.message_count, [name for name in bag.topics if name not in writer.topics]
+    with TemporaryDirectory(prefix='musculoskeletal_ae-') as folder:
+        bag, damaged = _open_damaged(path, Path(folder))
+        if not bag.message_count:
+            raise BagError(path, *EMPTY)
+        with BagWriter(target, compression) as writer:
+            for name, topic in bag.topics.items():
+                if topic.encoding == message_types.CDR:
+                    writer.add_topic(name, topic.type, topic.qos, topic.schema)
+            for message in bag.messages(writer.topics):
+                writer.write(message.topic, message.log_time, message.publish_time, message.data)
+    left_out = [name for name in bag.topics if name not in writer.topics]
+    return Recovered(writer.message_count, left_out, damaged)
+
+
+def _open_damaged(path: Path, folder: Path) -> tuple[Bag, list[str]]:
+    """Open a recording; return it with the names of its files that are damaged.
+
+    Of a damaged sqlite3 file, a copy of its readable rows in `folder` is read instead.
+    """
+    try:
+        return Bag.open(path), []
+    except BagError:
+        files = metadata.read_metadata(path).files if path.is_dir() else [path]
+        damaged = []
+        for file in files:
+            if sqlite3_file.is_damaged(file):
+                sqlite3_file.salvage(file, folder / file.name)
+                damaged.append(file.name)
+                continue
+            for each in (file, *sqlite3_file.logs_of(file)):
+                (folder / each.name).symlink_to(each.absolute())
+        if not damaged:
+            raise
+        return Bag.open(folder), damaged

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +20,14 @@ BY_TENSION = ('tension', 'float')  # methods that command tensions; all others c
 MOST_STIFFNESS = 1000.0  # largest desired stiffness of a joint [N·m/rad]
 
 
+def _most_stiffness(radian: float) -> float:
+    """Return the largest desired stiffness of a joint in its own unit, of which `radian` is 1 rad.
+
+    It is a whole number, so that messages state the limit exactly.
+    """
+    return float(math.ceil(MOST_STIFFNESS / radian**2))
+
+
 @dataclass(frozen=True)
 class Settings(CheckedSettings):
     """Settings of control; `Controller.configure` applies changed settings."""
@@ -33,7 +42,7 @@ class Settings(CheckedSettings):
         'joints (0 or []: unconstrained)',
         'N·m/rad or N/m',
         0.0,
-        MOST_STIFFNESS / SLIDE.radian**2,  # the largest value for prismatic joints [N/m]
+        _most_stiffness(SLIDE.radian),  # the largest value for prismatic joints [N/m]
     )
     first_duration: float = settable(
         5.0,
@@ -96,7 +105,7 @@ class Settings(CheckedSettings):
         Raises:
             MusculoskeletalError: If `joint_stiffness` has the wrong size or a value out of range.
         """
-        values, most = self.joint_stiffness, [MOST_STIFFNESS / each.radian**2 for each in units]
+        values, most = self.joint_stiffness, [_most_stiffness(each.radian) for each in units]
         if values in ((), (0.0,)):
             return np.zeros(len(most))
         if len(values) != len(most) or not all(0.0 <= v <= high for v, high in zip(values, most)):

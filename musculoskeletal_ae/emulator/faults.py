@@ -141,15 +141,15 @@ def read_fault(line: str, robot: Robot) -> Fault:
         except ValueError:
             pass
     if not smallest <= size <= largest:
-        legal = f'sizes from {smallest:g} to {largest:g} {unit}' if largest else 'no size'
+        legal = f'sizes from {smallest:g} to {largest:g} {unit}'
         raise MusculoskeletalError(f'{line[:80]!r}; legal: {legal}')
     if words and not kind.of_muscle:
-        legal = f'{name}[:SIZE], which affects all readings'
+        legal = f'{name}[:SIZE], without the name of a muscle or joint'
         raise MusculoskeletalError(f'{line[:80]!r}; legal: {legal}')
     if quantities == ('theta',):
-        if unknown := set(words) - set(robot.joints):
-            legal = f'joints: {", ".join(robot.joints)}'
-            raise MusculoskeletalError(f'{line[:80]!r}: unknown joint {unknown}; legal: {legal}')
+        if unknown := [word for word in words if word not in robot.joints]:
+            problem = f'{line[:80]!r}: unknown joint {unknown[0]!r}'
+            raise MusculoskeletalError(f'{problem}; legal: {", ".join(robot.joints)}')
         joints = [robot.joints.index(word) for word in words] or range(robot.joint_count)
         return Fault(name, quantities, np.array(joints), size)
     muscles = robot.muscle_indices([':'.join(words)] if words else robot.muscles)

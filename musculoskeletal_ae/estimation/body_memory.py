@@ -14,6 +14,7 @@ The other nodes would have to conclude from the change that this is wrong.
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -28,6 +29,7 @@ from musculoskeletal_ae.signals.body_state import MOST_OFFSET, BodyState, Length
 
 FILE = 'estimator.offsets'
 LARGEST = 1_000_000  # size limit of the file [bytes]
+RETRY_INTERVAL = 2.0  # time between attempts to write [s]
 
 
 class SavedBody(NamedTuple):
@@ -60,6 +62,8 @@ class BodyMemory:
         self._saved: tuple[LengthOffsets, tuple[int, ...]] | None = None  # what the file contains
         self.found: SavedBody | None = None
         self._has_file = False
+        self._noted: BodyState | None = None  # the body state of the last call of `note`
+        self._next_attempt = 0.0
         self.problem = ''
         # A NUL in the path raises a ValueError, and an unknown home directory a RuntimeError.
         with suppress(OSError, ValueError, RuntimeError):
@@ -87,29 +91,33 @@ class BodyMemory:
         return nothing
 
     def note(self, body: BodyState) -> None:
-        """Save the body state that holds from now on.
+        """Save the present body state if it has changed.
 
-        Provisional offsets of a calibration are not saved.
+        Provisional offsets of a calibration are not saved. If writing fails, `problem` states the
+        reason, and a later call tries again.
         """
+        is_noted = body is self._noted and not self.problem
+        if self._file is None or is_noted or time.monotonic() < self._next_attempt:
+            return
+        self._noted = body
         offsets = body.offsets
         is_decided = offsets.known or bool(offsets.revoked)
         if self._saved is not None and not (is_decided or self._was_decided):
             offsets, _ = self._saved
-        self._was_decided = is_decided
         is_healthy = _are_zero(offsets) and not body.isolated
         is_known = self._saved == (offsets, body.isolated)
-        if self._file is None or is_known or (is_healthy and not self._has_file):
-            return
-        self._saved = offsets, body.isolated
-        try:
-            self._save(self._file, offsets, body)
-            self._has_file = True
-            self.problem = ''
-        except OSError as error:
-            self.problem = (
-                'length offsets and isolated muscles cannot be saved, so a restarted estimator '
-                f'will not know them: {error}'
-            )
+        if not (is_known or (is_healthy and not self._has_file)):
+            try:
+                self._save(self._file, offsets, body)
+            except OSError as error:
+                self._next_attempt = time.monotonic() + RETRY_INTERVAL
+                self.problem = (
+                    'length offsets and isolated muscles cannot be saved, so a restarted estimator '
+                    f'will not know them: {error}'
+                )
+                return
+            self._saved, self._has_file = (offsets, body.isolated), True
+        self._was_decided, self.problem = is_decided, ''
 
     def _save(self, file: Path, offsets: LengthOffsets, body: BodyState) -> None:
         by_name = dict(zip(self._muscles, offsets.offset.tolist(), strict=True))

@@ -4,7 +4,7 @@
 A muscle must not be used again while one of these problems is present:
 
     the length has just jumped      its new level is not accepted yet
-    a reading is NaN                the sensor is faulty
+    a reading is NaN                the sensor is faulty (`MuscleSample.missing`)
     T < slack_share · T_ref         the tendon is slack although the command demands tension T_ref
     |l − l'| > limit                the length does not fit the posture
 
@@ -47,7 +47,7 @@ class RepairCheck(NamedTuple):
         name, tension = robot.muscles[muscle], float(sample.motor_tension[muscle])
         if muscle in self.jumping:
             return f'the length of {name} has just jumped; wait for {LIMITS.settled:g} s'
-        if np.isnan(sample.length[muscle]) or np.isnan(tension):
+        if muscle in sample.missing:
             return f'{name}: a sensor reports NaN instead of a number; repair it'
         bias = float(robot.tension.bias[muscle])
         demanded = 0.0 if demand is None else float(demand[muscle])
@@ -71,7 +71,8 @@ class RepairCheck(NamedTuple):
 
         Its tendon is then not ruptured. Unless its winch is still moving, the length has an offset.
         """
-        is_settled = muscle not in self.jumping and not self._is_slack(muscle)
+        is_doubtful = muscle in self.jumping or muscle in self.sample.missing
+        is_settled = not is_doubtful and not self._is_slack(muscle)
         return is_settled and abs(self._length_error(muscle)) > self.limit
 
     def _is_slack(self, muscle: int) -> bool:

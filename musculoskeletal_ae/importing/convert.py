@@ -75,11 +75,6 @@ def read_source(file: Path) -> Source:
         problem = f'the root element {root.tag[:60]!r} is unknown; legal: {", ".join(READERS)}'
         remedy = 'to import an SDF, pass the path of the cardsflow.xml in its directory instead'
         raise refuse(file, f'{problem}; {remedy}')
-    if any('/xacro}' in element.tag for element in root.iter()):
-        raise refuse(
-            file,
-            'this is a xacro, not a URDF; expand it to a new file first:  xacro FILE > NEW.urdf',
-        )
     try:
         source = READERS[root.tag](file, root)
         source.couplings = resolved(source.couplings)

@@ -255,11 +255,11 @@ class Estimator(Shell):
     def _publish_body(self) -> None:
         """Publish the body state if it has changed, and act on the change."""
         body, before, suspects = self.core.body, self.body, self.core.suspects
+        self.memory.note(body)
         if body is before:
             return
         self.body = body
         self.bodies.publish(array_message(body.rows, 'quantity', 'muscle'))
-        self.memory.note(body)
         self.candidates.validator.isolated = body.isolated
         if body.offsets != before.offsets:
             self.candidates.validator.forget()

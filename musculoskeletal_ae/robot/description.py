@@ -8,7 +8,7 @@ it again.
 
 import math
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -201,8 +201,8 @@ class RobotDescription:
 
 def refusal(file: Path, problem: str) -> RobotDescriptionError:
     """Return an error which states that a file of a robot directory cannot be read, and why."""
-    remedy = 'a robot directory contains robot.urdf and muscles.yaml'
-    return RobotDescriptionError(f'{file}: {problem}; {remedy}')
+    remedy = '' if file.exists() else '; a robot directory contains robot.urdf and muscles.yaml'
+    return RobotDescriptionError(f'{file}: {problem}{remedy}')
 
 
 def load_description(robot: str | Path) -> RobotDescription:
@@ -223,8 +223,9 @@ def load_description(robot: str | Path) -> RobotDescription:
         return RobotDescriptionError(f'{muscle_file}: {_with_muscle_name(problem, document)}')
 
     content = convert(document, MuscleFile, fail)
-    _check_joints(content.joints, model, fail)
-    couplings = _read_couplings(content, read_mimics(tree), model, urdf_file, fail)
+    mimics = read_mimics(tree)
+    _check_joints(content.joints, mimics, model, fail)
+    couplings = _read_couplings(content, mimics, model, urdf_file, fail)
     links = [str(frame.name) for frame in body_frames(model)]
     elastic_default = series_elastic.DEFAULT | _entries(content.series_elastic)
     tension_default = _read_tension('$.tension', content.tension, TENSION_DEFAULT, fail)
@@ -297,13 +298,16 @@ def _columns(rows: list[dict[str, float]]) -> dict[str, Array]:
     return {key: np.array([row[key] for row in rows]) for key in rows[0]}
 
 
-def _check_joints(joints: tuple[str, ...], model: pin.Model, fail: Fail) -> None:
+def _check_joints(
+    joints: tuple[str, ...], mimics: Container[str], model: pin.Model, fail: Fail
+) -> None:
     """Raise an error if a joint in `joints` of muscles.yaml is not legal.
 
-    It has to be a revolute or prismatic joint of robot.urdf with finite limits.
+    It has to be a revolute or prismatic joint of robot.urdf with finite limits. `mimics` are the
+    joints that follow another one by a <mimic>.
     """
     for i, name in enumerate(joints):
-        if problem := _joint_problem(name, model):
+        if problem := _joint_problem(name, model, mimics):
             raise fail(f'$.joints[{i}]: {problem}')
         limits = model.lowerPositionLimit, model.upperPositionLimit
         index = model.joints[model.getJointId(name)].idx_q
@@ -315,14 +319,19 @@ def _check_joints(joints: tuple[str, ...], model: pin.Model, fail: Fail) -> None
             raise fail(f'$.joints[{i}]: {limits_text}; {expected}')
 
 
-def _joint_problem(name: str, model: pin.Model) -> str:
-    """Check whether a joint is suitable for `joints` or a coupling; return the problem, or ''."""
-    movable = list(model.names)[1:]
-    if name not in movable:
-        return f'unknown joint {name!r}; movable joints of robot.urdf: {", ".join(movable)}'
-    joint = model.joints[model.getJointId(name)]
-    if joint.shortname() in REVOLUTE + PRISMATIC:
+def _joint_problem(name: str, model: pin.Model, followers: Container[str] = ()) -> str:
+    """Check whether a joint is suitable for `joints` or a coupling; return the problem, or ''.
+
+    `followers` are joints that the text about an unknown joint does not list as legal.
+    """
+    movable = {str(n): joint.shortname() for n, joint in [*zip(model.names, model.joints)][1:]}
+    suitable = [n for n, kind in movable.items() if kind in REVOLUTE + PRISMATIC]
+    if name in suitable:
         return ''
+    if name not in movable:
+        legal = ', '.join(n for n in suitable if n not in followers) or 'none'
+        return f'unknown joint {name!r}; revolute and prismatic joints of robot.urdf: {legal}'
+    joint = model.joints[model.getJointId(name)]
     kind = OTHER_JOINTS.get(joint.nv, joint.shortname())
     legal = 'revolute or prismatic joints with one degree of freedom and limits'
     return f'joint {name!r} is {kind}; legal: {legal} (a continuous joint has no limits)'
@@ -366,7 +375,7 @@ def _read_couplings(
     except ValueError as error:
         raise refused(next(iter(listed or mimics)), str(error)) from error
     for slave, coupling in list(couplings.items()):
-        problem = _joint_problem(slave, model) or _joint_problem(coupling.master, model)
+        problem = _joint_problem(slave, model) or _joint_problem(coupling.master, model, couplings)
         if not problem:
             continue
         is_elsewhere = coupling.master not in content.joints and model.existJointName(
@@ -410,11 +419,12 @@ def _read_joint_elasticity(
     for i, j in np.argwhere(np.triu(stiffness, 1)).tolist():
         most = math.sqrt(stiffness[i, i] * stiffness[j, j])
         if abs(stiffness[i, j]) > most * (1.0 - LEAST_EIGENVALUE):
-            size, limit = distinct(abs(stiffness[i, j]), most)
             pair = f'{joints[i]!r} and {joints[j]!r}'
-            legal = f'at most {limit}, the geometric mean of their own stiffnesses'
+            # The limit has enough digits to be accepted as it is printed.
+            legal = f'at most {most:.10g}, the geometric mean of their own stiffnesses'
             raise fail(
-                f'$.joint_elasticity: the coupling of {pair} has the size {size}; legal: {legal}, '
+                f'$.joint_elasticity: the coupling of {pair} has the size '
+                f'{abs(stiffness[i, j]):.10g}; legal: {legal}, '
                 'because springs only store energy'
             )
     if joints and (values := np.linalg.eigvalsh(stiffness))[0] < LEAST_EIGENVALUE * values[-1]:

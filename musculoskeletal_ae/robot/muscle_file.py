@@ -96,7 +96,8 @@ class RouteEntry(Strict, frozen=True):
         axis = np.array(self.axis)
         length = float(np.linalg.norm(axis))
         if length < SHORTEST_AXIS:
-            raise ValueError(f'axis: expected a nonzero vector, got {list(self.axis)}')
+            legal = f'a vector of at least the length {SHORTEST_AXIS:g}'
+            raise ValueError(f'axis: expected {legal}, got {list(self.axis)}')
         if self.side is not None and self.side_link in (None, self.link):
             out = np.array(self.side) - np.array(self.xyz)
             beside = np.linalg.norm(np.cross(axis / length, out))

@@ -22,8 +22,10 @@ from musculoskeletal_ae.robot.joint_tree import Coupling
 MOST_PARTS = 2000
 #: largest depth of nested elements; the parser that MuJoCo and pinocchio use has the same limit
 DEEPEST = 500
-#: elements below <robot> that only a preprocessor understands, besides xacro's own elements
+#: elements below <robot> that xacro understands only with its prefix
 PREPROCESSED = 'include', 'macro', 'property'
+XACRO = 'http://www.ros.org/wiki/xacro'  # namespace of the elements of xacro
+EXPAND = 'expand it to a new file first:  xacro FILE > NEW.urdf'
 LARGEST = 1e6  # largest absolute value of any number except efforts and velocities [SI units]
 
 LIMITED = 'revolute', 'prismatic'  # types of joints that need limits
@@ -121,25 +123,28 @@ def read_mimics(root: ET.Element) -> dict[str, Coupling]:
 
 def _check_expanded(file: Path, root: ET.Element) -> None:
     """Reject a file that still contains macros, which the URDF parser would ignore."""
-    for problem in _preprocessor_parts(root):
-        remedy = 'expand it to a new file first:  xacro FILE > NEW.urdf'
-        raise RobotDescriptionError(f'{file}: this is a xacro, not a URDF ({problem}); {remedy}')
+    for problem, remedy in _preprocessor_parts(root):
+        raise RobotDescriptionError(f'{file}: this is not a finished URDF ({problem}); {remedy}')
 
 
-def _preprocessor_parts(root: ET.Element) -> Iterator[str]:
-    """Yield descriptions of elements and attributes that a preprocessor has to replace."""
+def _preprocessor_parts(root: ET.Element) -> Iterator[tuple[str, str]]:
+    """Yield elements and attributes that a preprocessor has to replace, each with its remedy."""
     for element in root.iter():
         namespace, _, name = element.tag.rpartition('}')
-        if 'xacro' in namespace or 'XInclude' in namespace:
-            yield f'element {name!r} of {namespace.strip("{")}'
+        described = f'element {name!r} of {namespace.strip("{")}'
+        if 'XInclude' in namespace:
+            yield described, 'replace it by the elements of the file that it names'
+        if 'xacro' in namespace:
+            yield described, EXPAND
     for part in root:
         if part.tag in PREPROCESSED:
-            yield f'element {part.tag!r}'
+            prefix = f'write it as <xacro:{part.tag}>, with xmlns:xacro="{XACRO}" in <robot>'
+            yield f'element {part.tag!r} of xacro without a prefix', f'{prefix}, and {EXPAND}'
         if part.tag in ('link', 'joint'):
             for element in part.iter():
                 for attribute, value in element.items():
                     if '${' in value or '$(' in value:
-                        yield f'{element.tag} {attribute} {value!r:.100}'
+                        yield f'{element.tag} {attribute} {value!r:.100}', EXPAND
 
 
 def _limit_mimics(parts: list[ET.Element]) -> bool:
@@ -166,30 +171,47 @@ def _limit_mimics(parts: list[ET.Element]) -> bool:
 def _check_tree(file: Path, parts: list[ET.Element]) -> None:
     """Reject links and joints that do not form a tree.
 
-    Pinocchio's parser would only report them on stderr. If several joints have the same child, it
-    would use the last one.
+    Pinocchio's parser would only report them on stderr, or leave them out. If several joints have
+    the same child, it would use the last one.
     """
-    links, held = {part.get('name') for part in parts if part.tag == 'link'}, set[str | None]()
+    links = {part.get('name', '') for part in parts if part.tag == 'link'}
     for (tag, name), count in Counter((part.tag, part.get('name')) for part in parts).items():
         if not name or count > 1:
             problem = f'comes {count} times' if name else 'has no name'
             raise RobotDescriptionError(f'{file}: {tag} {name!r} {problem}; expected unique names')
+    children: dict[str, list[str]] = {link: [] for link in links}
+    held = set[str]()
     for part in parts:
         if part.tag == 'joint':
             where = f'{file}: joint {part.get("name")!r}'
             _check_joint(where, part)
-            for end in ('parent', 'child'):
-                element = part.find(end)
-                link = '' if element is None else element.get('link', '')
-                if link not in links or (end == 'child' and link in held):
-                    got = f'{link!r}, the child of another joint' if link in held else repr(link)
-                    expected = 'expected a link of this file, which is the child of one joint only'
-                    raise RobotDescriptionError(f'{where}: {end}: {expected}; got {got}')
-            held.add(link)
-    if len(roots := sorted(map(str, links - held))) != 1:
+            parent, child = (_link_at(where, part, end, links) for end in ('parent', 'child'))
+            if child in held:
+                expected = 'expected a link that is the child of no other joint'
+                raise RobotDescriptionError(f'{where}: child: {expected}, got {child!r}')
+            held.add(child)
+            children[parent].append(child)
+    if len(roots := sorted(links - held)) != 1:
         got = ', '.join(roots) or 'none'
         expected = 'expected exactly one root link, which is the child of no joint'
         raise RobotDescriptionError(f'{file}: {expected}; got {got}')
+    reached = [*roots]
+    for link in reached:
+        reached += children[link]
+    if lost := sorted(links - {*reached}):
+        expected = f'expected links that descend from the root link {roots[0]!r}'
+        problem = f'a loop of joints holds {", ".join(lost)}; correct the parent of one of them'
+        raise RobotDescriptionError(f'{file}: {expected}; {problem}')
+
+
+def _link_at(where: str, joint: ET.Element, end: str, links: set[str]) -> str:
+    """Return the link that is the parent or child of a joint; it has to be one of `links`."""
+    element = joint.find(end)
+    link = '' if element is None else element.get('link', '')
+    if link not in links:
+        legal = f'a link of this file ({", ".join(sorted(links))})'
+        raise RobotDescriptionError(f'{where}: {end}: expected {legal}, got {link!r}')
+    return link
 
 
 def _check_joint(where: str, joint: ET.Element) -> None:

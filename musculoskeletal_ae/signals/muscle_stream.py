@@ -78,6 +78,7 @@ class MuscleSample:
         newest: The readings of the last message alone, without the median filter, (Q, M), with the
             length offset removed and motor-side tensions.
         jumped: Muscles whose new level after a jump is accepted with this message; usually none.
+        missing: Isolated muscles whose length or tension is NaN in this message.
         tension_spread: Standard deviation σ_T of T [N]; 0 for tension sensors and assumed tensions.
         delay: How late the message is, compared with the fastest one (`Arrival.delay`) [s].
     """
@@ -93,6 +94,7 @@ class MuscleSample:
     usable: Bools
     newest: Array
     jumped: tuple[int, ...] = ()
+    missing: tuple[int, ...] = ()
     tension_spread: Array | float = 0.0
     delay: float = 0.0
 
@@ -246,6 +248,7 @@ class MuscleStream:
                 message,
                 muscle_count,
                 self.body.isolated,
+                unknown=np.nan,
                 source=self._robot.tension_source,
                 names=self._robot.muscles,
             )
@@ -259,6 +262,7 @@ class MuscleStream:
             raise RejectionError(error.reason, str(error).partition(': ')[2], raw, pull) from error
         now = time if now is None else now
         self._delay = delay
+        missing = self._fill_in(states) if self.body.isolated else ()
         offsets = self.body.offsets
         newest = states.copy()
         newest[Row.LENGTH] -= offsets.offset
@@ -289,9 +293,18 @@ class MuscleStream:
             usable=self.body.used,
             newest=newest,
             jumped=verdict.displaced,
+            missing=missing,
             tension_spread=self._transmission.spread(tension, sliding),
             delay=delay,
         )
+
+    def _fill_in(self, states: Array) -> tuple[int, ...]:
+        """Replace NaN in lengths and tensions of isolated muscles by 0; return these muscles."""
+        lacking = np.isnan(states)
+        lacking[Row.TENSION] &= self._robot.tension_source.is_known
+        lacking[Row.TEMPERATURE] = False  # may be NaN
+        states[lacking] = 0.0
+        return tuple(np.flatnonzero(lacking.any(axis=0)).tolist())
 
     def _judge(self, read: Array, states: Array, now: float) -> JumpVerdict:
         """Check all values for plausible levels, and the lengths for jumps.

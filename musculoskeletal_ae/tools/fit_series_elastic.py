@@ -89,7 +89,10 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
     if np.ptp(tension) <= 0.0 or np.ptp(absolute_length) <= 0.0:
         raise ValueError('a testbed table needs several tensions at several muscle lengths')
     if elongation @ (tension - tension.mean()) <= 0.0:
-        raise ValueError('elongation does not grow with tension; check the sign of elongation')
+        raise ValueError(
+            'elongation does not grow with tension; check its sign, and that each row has the '
+            'elongation at its own tension'
+        )
 
     def model(log_constants: Array) -> SeriesElastic:
         return SeriesElastic(*np.exp(log_constants)[:, None])
@@ -124,8 +127,11 @@ def read_table(file: Path) -> Array:
             legal = f'absolute_length > 0, at most {LONGEST:g} m'
             problem = f'row {number}: expected {legal}, got {line!r}'
             raise _refusal(file, f'{problem}; divide lengths in mm by 1000')
-        if not LEAST_ELONGATION <= values[2] < values[1]:
-            problem = f'row {number}: expected elongation from 0 to absolute_length, got {line!r}'
+        if values[2] < LEAST_ELONGATION:
+            problem = f'row {number}: expected elongation >= 0 [m], got {line!r}'
+            raise _refusal(file, f'{problem}; state how much longer the muscle is than at 0 N')
+        if values[2] >= values[1]:
+            problem = f'row {number}: expected elongation below absolute_length, got {line!r}'
             raise _refusal(file, f'{problem}; divide lengths in mm by 1000')
         rows.append(values)
     return np.array(rows, dtype=float).reshape(-1, len(COLUMNS))

@@ -90,6 +90,32 @@ def test_messages_in_the_log_of_sqlite_are_recovered(tmp_path, content, capsys):
     assert {each.name: each.read_bytes() for each in (tmp_path / 'killed').iterdir()} == before
 
 
+@pytest.mark.parametrize('share', [0.3, 0.5, 0.7])
+def test_messages_beside_a_damaged_page_of_sqlite_are_recovered_with_a_warning(
+    share, tmp_path, content, capsys
+):
+    many = [
+        each._replace(log_time=each.log_time + n * 10**9) for n in range(20) for each in content
+    ]
+    samples.write_rosbags(tmp_path / 'bag', many, StoragePlugin.SQLITE3)
+    (file,) = (tmp_path / 'bag').glob('*.db3')
+    data = bytearray(file.read_bytes())
+    size = int.from_bytes(data[16:18], 'big')  # of a page
+    leaves = [place for place in range(0, len(data), size) if data[place] == 13]  # of tables
+    damaged = leaves[int(share * len(leaves))]
+    data[damaged : damaged + size] = bytes(size)
+    file.write_bytes(data)
+    with pytest.raises(BagError, match='or save what can be read with `record --recover BAG`'):
+        Bag.open(tmp_path / 'bag')
+    assert recover(tmp_path / 'bag') == 0
+    assert f'{file.name} is damaged: messages that cannot be read are' in capsys.readouterr().err
+    bag = Bag.open(tmp_path / 'bag_recovered')
+    written = {(sample.topic, sample.log_time, sample.data) for sample in many}
+    found = [(message.topic, message.log_time, message.data) for message in bag.messages()]
+    assert set(found) <= written and 0.95 * len(many) < len(found) < len(many)
+    assert file.read_bytes() == data
+
+
 @pytest.mark.parametrize('namespace', [None, '/left_arm'])
 def test_of_a_recording_without_a_complete_message_nothing_is_promised(
     namespace, tmp_path, content

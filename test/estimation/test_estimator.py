@@ -187,6 +187,25 @@ def test_a_muscle_without_numbers_is_isolated_only_if_it_lacks_them_in_all_messa
     assert not core.cause  # missing numbers need no verification, so the arm does not stop
 
 
+@pytest.mark.parametrize('row', [0, 1])
+def test_an_isolated_muscle_whose_sensor_reads_nan_is_used_again_after_its_repair(
+    robot, mae, healthy, row
+):
+    """Without the check, a reading of 0 in place of NaN would pass for a slack tendon."""
+    core, sound, broken = Estimator(robot), states(healthy), states(healthy)
+    broken[row, 2] = np.nan
+    core.use(mae)
+    core.isolate([2])
+    core.take(message_of(broken), 0.0, 0.0)
+    with pytest.raises(MusculoskeletalError, match='a sensor reports NaN instead of a number; re'):
+        core.restore([2])
+    assert core.body.isolated == (2,)
+    for n in range(1, 10):
+        core.take(reading(sound), 0.01 * n, 0.01 * n)
+    core.restore([2])
+    assert core.body.isolated == ()
+
+
 def test_a_marker_pose_gives_the_joint_angles_that_reach_it(stepped, robot, healthy):
     stepped.step(healthy)
     theta = robot.lower + 0.4 * (robot.upper - robot.lower)

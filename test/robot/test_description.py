@@ -130,7 +130,11 @@ BAD_URDF = {
         ["joint 'shoulder'", 'missing: lower, upper, velocity'],
     ),
     'joint type': ('type="revolute"', 'type="hinge"', ["joint 'shoulder'", 'prismatic', 'hinge']),
-    'two joints above': ('child link="hand"', 'child link="forearm"', ["'forearm'", 'another']),
+    'two joints above': (
+        'child link="hand"',
+        'child link="forearm"',
+        ["'forearm'", 'no other joint'],
+    ),
     'link twice': ('<link name="hand"', '<link name="torso"', ["link 'torso' comes 2 times"]),
     'two roots': ('<link name="hand"', '<link name="x"/><link name="hand"', ['torso, x']),
 }

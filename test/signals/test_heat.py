@@ -253,3 +253,15 @@ def test_an_intermittent_thermometer_does_not_disturb_the_other_muscles():
     # The winding temperature of the muscle with the intermittent thermometer is still estimated.
     flaky.heat.step(TENSION.limit, read[0] + 24.0, 0.25)
     assert flaky.heat.core[1] > AIR + 40.0
+
+
+def test_a_changed_module_is_accepted_by_a_reset_of_the_estimator(trained):
+    motors = ObservedMotors(trained['default'], seed=1, most=0.6 * TENSION.limit)
+    motors.learn()
+    motors.wound.loss[2] *= 2.2
+    motors.run_until_changed()
+    present = [each.identifier for each in motors.core.conditions(motors.now)]
+    assert 'module_changed' in present or 'thermal_drift' in present
+    motors.core.reset()
+    motors.run(60.0)
+    assert motors.core.report(motors.now).level == 'ok'

@@ -247,5 +247,5 @@ def stated_theta(robot: Robot, posture: tuple[float, ...]) -> Array | None:
     if theta.shape == low.shape and ((theta >= low) & (theta <= high)).all():
         return theta
     limits = zip(units, units.to_position(robot.lower), units.to_position(robot.upper))
-    legal = ', '.join(f'{low:.2f} to {high:.2f} {unit.position}' for unit, low, high in limits)
+    legal = ', '.join(f'{low:.6g} to {high:.6g} {unit.position}' for unit, low, high in limits)
     raise MusculoskeletalError(f'zero_posture is {list(posture)}; legal: an empty list, or {legal}')
