@@ -323,14 +323,14 @@ class Lab:
         except MusculoskeletalError as error:
             self.rejected_networks.append(str(error))
             return False
-        self._use(mae)
+        self._use(mae, self.validator.weakness(mae))
         return True
 
     def _reject(self, mae: Mae, reason: str) -> None:
         self._to_learner.append(lambda: self.learner.note_rejected(mae.version, reason))
 
-    def _use(self, mae: Mae) -> None:
-        self.estimator.use(mae)
+    def _use(self, mae: Mae, unsuitable_because: str = '') -> None:
+        self.estimator.use(mae, unsuitable_because)
         self.validator.take(mae, self.now)
         self.controller.use(mae)
         self._to_learner.append(lambda: self.learner.note_accepted(mae))

@@ -446,6 +446,15 @@ class ConditionKind(Enum):
         'gravity, as the tensions show it, is not as in robot.urdf',
         (Step.CORRECT_MOUNTING, Step.RESET_ESTIMATOR),
     )
+    UNSUITABLE_NETWORK = Declaration(
+        'unsuitable_network',
+        'estimator',
+        'warn',
+        'the network that the parameter checkpoint names explains the last 10 s clearly worse than '
+        'the network before it, which had learned',
+        'the chosen network fits this arm worse than the one before',
+        (Step.CHECK_CHECKPOINT,),
+    )
 
     # -- why the arm stands still ---------------------------------------------------------------
 
@@ -634,7 +643,7 @@ class ConditionKind(Enum):
         'controller',
         'warn',
         'for 5 s after the end of a motion, a joint has rested more than 0.5 rad away from its '
-        'target, according to the estimate',
+        'target, or 0.25 rad further away than it already was, according to the estimate',
         'the arm is not at its target',
         (Step.CHECK_LOAD,),
     )

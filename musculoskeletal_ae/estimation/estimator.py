@@ -100,6 +100,8 @@ class Estimator:
         calibration: The running length calibration, or None.
         contact: The contact estimator.
         mounting: Checks the direction of gravity.
+        unsuitable_because: Why the network in use fits this arm worse than the one before; '' if it
+            does not.
         sample: The last sample; None before the first.
         output: Results of the last message with an estimate; None before the first, and from the
             start of a length calibration until its first estimate.
@@ -132,6 +134,7 @@ class Estimator:
         self.calibration: CheckedCalibration | None = None
         self.contact = ContactEstimator(robot)
         self.mounting = MountingCheck(robot)
+        self.unsuitable_because = ''
         self.sample: MuscleSample | None = None
         self.output: Output | None = None
         self.measured: Array | None = None
@@ -184,16 +187,22 @@ class Estimator:
         """Use these settings from the next message on."""
         self.suspects.settings = settings
 
-    def use(self, mae: Mae) -> None:
+    def use(self, mae: Mae, unsuitable_because: str = '') -> None:
         """Use another network and its healthy statistics, without the isolated muscles.
 
         A running length calibration starts again, because its estimate depends on the network.
+
+        Args:
+            mae: The network.
+            unsuitable_because: Why it fits this arm worse than the network before; '' if it does
+                not.
 
         Raises:
             numpy.linalg.LinAlgError: If the network's statistics are singular; the previous network
                 then stays in use.
         """
         reduced = mae.without(self.body.isolated)
+        self.unsuitable_because = unsuitable_because
         self.health.use(reduced)
         self.joint_check.use(reduced)
         self.contact.use(reduced)
@@ -214,7 +223,7 @@ class Estimator:
         self.suspects.on_isolated(isolated)
         self._update_body(isolated=isolated)
         if isolated != before and self.state.complete_mae is not None:
-            self.use(self.state.complete_mae)
+            self.use(self.state.complete_mae, self.unsuitable_because)
         self.health.reset()
 
     def distrust_lengths(self, evidence: Evidence, offset: Array | None = None) -> None:

@@ -41,12 +41,13 @@ class Candidates:
         queue: Queue in which the candidates from the topic wait; it validates them in small steps.
     """
 
-    def __init__(self, node: Shell, use: Callable[[Mae], None]) -> None:
+    def __init__(self, node: Shell, use: Callable[[Mae, str], None]) -> None:
         """Start without a network.
 
         Args:
             node: The estimator.
-            use: Called with each network that the estimator is to use from now on.
+            use: Called with each network that the estimator is to use from now on, and with the
+                reason why it fits this arm worse than the one before, or '' if it does not.
         """
         self._node, self._use = node, use
         self.validator = CheckpointValidator(node.robot)
@@ -80,7 +81,7 @@ class Candidates:
                 f'checkpoint version {in_use.version}: {reason}; returned to checkpoint version '
                 f'{before.version}'
             )
-            self._use(before)
+            self._use(before, '')
             self._publish(before)
             self._reject(in_use, reason)
         if waiting is not None:
@@ -109,12 +110,14 @@ class Candidates:
 
     def _use_file(self, mae: Mae) -> None:
         self.validator.check(mae, is_chosen=True)
-        self._accept(mae)
+        self._accept(mae, unsuitable_because=self.validator.weakness(mae))
         self._node.needed.remove(CANDIDATES)
 
-    def _accept(self, mae: Mae, message: UInt8MultiArray | None = None) -> None:
+    def _accept(
+        self, mae: Mae, message: UInt8MultiArray | None = None, unsuitable_because: str = ''
+    ) -> None:
         try:
-            self._use(mae)
+            self._use(mae, unsuitable_because)
         except (np.linalg.LinAlgError, FloatingPointError) as error:
             raise CheckpointError(f'the network cannot be evaluated ({error})') from error
         self.validator.take(mae, time.monotonic())

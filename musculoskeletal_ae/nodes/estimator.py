@@ -121,8 +121,8 @@ class Estimator(Shell):
 
     # -- parameters and services ----------------------------------------------------------------
 
-    def _use(self, mae: Mae) -> None:
-        self.core.use(mae)
+    def _use(self, mae: Mae, unsuitable_because: str) -> None:
+        self.core.use(mae, unsuitable_because)
         if Evidence.NOT_CALIBRATED in self.core.trust.evidence:  # it waits for the first network
             self.core.calibrate_lengths(self.posture)
             self._publish_body()

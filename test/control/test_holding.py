@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from control_bench import REST, Bench
 
-from musculoskeletal_ae.control.holding import AWAY, LASTING, POSSIBLE_CAUSES
+from musculoskeletal_ae.control.holding import AWAY, CARRIED, LASTING, POSSIBLE_CAUSES
 
 SELDOM = 0.05
 
@@ -34,6 +34,19 @@ def test_an_arm_away_from_its_target_is_reported_with_joint_distance_and_causes(
     bench.theta = REST + np.array([0.0, 1.4 * AWAY])
     bench.step()
     assert bench.report().level == 'ok'
+
+
+def test_an_arm_that_is_carried_away_from_where_it_rested_is_reported():
+    bench = resting(np.array([0.0, 0.1]), target_duration=0.2)
+    bench.theta = REST + np.array([0.0, -0.9 * CARRIED])
+    bench.step(round(1.2 * LASTING / SELDOM))
+    assert bench.report().message == 'holding'
+    bench.theta = REST + np.array([0.0, -1.1 * CARRIED])
+    bench.step(round(1.2 * LASTING / SELDOM))
+    assert 'not at its target: elbow 0.37 rad away' in bench.report().message
+    bench.target(bench.theta)
+    bench.step(round(2.0 * LASTING / SELDOM))
+    assert bench.report().message == 'holding'
 
 
 def test_friction_and_wanted_torques_are_no_reason_to_warn():

@@ -262,6 +262,23 @@ def test_joint_sensors_decide_how_far_a_network_may_move_the_posture(trained):
     gate.check(mae, is_chosen=True)
 
 
+@pytest.mark.parametrize('measures', [True, False])
+def test_a_chosen_network_that_fits_worse_is_used_and_called_so(trained, measures):
+    gate, mae = CheckpointValidator(ROBOT), trained['default']
+    learned = replace(mae, covariance=np.eye(ROBOT.joint_count))
+    assert gate.weakness(_turned(mae, 0.2)) == ''
+    gate.take(learned, 0.0)
+    assert gate.weakness(_turned(mae, 0.2)) == ''  # nothing is known yet
+    send_messages_of_the_model(gate, measures)
+    assert gate.weakness(replace(learned, version=9)) == ''
+    weight, bias = mae.decoder[-1]
+    off = replace(mae, decoder=(*mae.decoder[:-1], (weight, bias + 0.3 * np.eye(len(bias))[-1])))
+    other = _turned(mae, 0.2) if measures else off  # without sensors, a wrong length tells
+    gate.check(other, is_chosen=True)
+    text = gate.weakness(other)
+    assert ('from its sensor' if measures else 'explains the length of') in text
+
+
 def test_a_network_without_a_calibrated_detector_takes_over_with_that_in_use(trained):
     gate, mae = CheckpointValidator(ROBOT), trained['default']
     gate.take(calibrated(mae), 0.0)

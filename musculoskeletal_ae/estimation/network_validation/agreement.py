@@ -37,6 +37,8 @@ from musculoskeletal_ae.robot.robot import Robot
 ANGLE_FLOOR = 0.35  # error of a joint that is always permitted [rad]
 LENGTH_FLOOR = 0.06  # error of a length that is always permitted [m]
 ANGLE_WORSE = 1.5  # largest error relative to the error of the network in use
+#: a network that a user has chosen is called worse than the one in use from this error on [rad]
+ANGLE_CLEAR = 0.1
 # Limits relative to the network in use. The first update of an initial network changed θ by up to
 # 0.56 rad and lengths by up to 0.05 m; an update of a learned network changed θ by up to 0.31 rad.
 ANGLE_MOVED = 0.45  # largest difference of θ from a learned network [rad]
@@ -101,13 +103,41 @@ class AgreementCheck:
             theta, tension = self._postures.theta, self._postures.tension
             length = self._in_use.lengths(theta, tension)
             return self._with_network(mae, mae.estimate(tension, length).theta, theta, tension)
-        new = mae.estimate(*self._messages.readings(mae)).theta
-        tension, length = self._messages.readings(self._in_use)
-        old = self._in_use.estimate(tension, length).theta
-        measured_rows = np.flatnonzero(np.isfinite(self._messages.theta).all(axis=1))
-        if len(measured_rows) >= LEAST:
-            return self._with_sensors(mae, new, old, measured_rows)
+        new, old, rows = self._estimates(mae)
+        if len(rows) >= LEAST:
+            return self._with_sensors(mae, new, old, rows)
+        tension, _ = self._messages.readings(self._in_use)
         return self._with_network(mae, new, old, tension)
+
+    def worse_angle(self, mae: Mae) -> str | None:
+        """Return a text on the joint that a network estimates clearly worse than the one in use.
+
+        Returns:
+            The joint with both errors; '' if no error is above ANGLE_CLEAR and ANGLE_WORSE times
+            that of the network in use. None if the joint sensors did not measure the postures.
+        """
+        new, old, rows = self._estimates(mae)
+        if len(rows) < LEAST:
+            return None
+        measured = self._messages.theta[rows]
+        error, in_use = (_median(theta[rows] - measured) for theta in (new, old))
+        worst = int((error / np.fmax(ANGLE_CLEAR, ANGLE_WORSE * in_use)).argmax())
+        if not error[worst] > max(ANGLE_CLEAR, ANGLE_WORSE * in_use[worst]):
+            return ''
+        unit = self._robot.units[worst]
+        return (
+            f'it estimates {self._robot.joints[worst]} {unit.position_text(error[worst])} away '
+            f'from its sensor, the network before {unit.position_text(in_use[worst])}'
+        )
+
+    def _estimates(self, mae: Mae) -> tuple[Array, Array, Ints]:
+        """Return θ by a candidate and by the network in use [rad], (N, D), for recent messages.
+
+        The indices of the messages in which all joints were measured come third.
+        """
+        new = mae.estimate(*self._messages.readings(mae)).theta
+        old = self._in_use.estimate(*self._messages.readings(self._in_use)).theta
+        return new, old, np.flatnonzero(np.isfinite(self._messages.theta).all(axis=1))
 
     def _with_network(self, mae: Mae, new: Array, old: Array, tension: Array) -> list[Comparison]:
         """Compare a candidate with the network in use.

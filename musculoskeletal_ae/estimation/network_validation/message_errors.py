@@ -18,6 +18,8 @@ from musculoskeletal_ae.mae.mae import Mae
 WORSE = 2.0  # largest permitted error, relative to the error of the network in use
 #: error that is always permitted: of T [N] and of l [m]
 FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}
+#: a network is called worse than the one in use from this error of a length on [m]
+CLEAR = 0.01
 
 
 def message_errors(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> dict[str, Array]:
@@ -42,6 +44,31 @@ def message_errors(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) 
     for error, part in zip(errors.values(), parts, strict=True):
         error[used] = np.median(np.abs(part[:, used]), axis=0)
     return errors
+
+
+def worse_length(
+    errors: dict[str, Array], in_use: dict[str, Array], muscles: tuple[str, ...]
+) -> str:
+    """Return a text on the muscle whose length a network explains clearly worse than another.
+
+    Args:
+        errors: Errors of the network.
+        in_use: Errors of the network in use.
+        muscles: Names of the muscles.
+
+    Returns:
+        The muscle with both errors; '' if no error is above CLEAR and WORSE times that of the
+        network in use.
+    """
+    name = 'l by ① at θ of ②'
+    error, before = errors[name], in_use[name]
+    worst = int((error / np.fmax(CLEAR, WORSE * before)).argmax())
+    if not error[worst] > max(CLEAR, WORSE * before[worst]):
+        return ''
+    return (
+        f'it explains the length of {muscles[worst]} to {1e3 * error[worst]:.0f} mm, the network '
+        f'before to {1e3 * before[worst]:.0f} mm'
+    )
 
 
 def faults(

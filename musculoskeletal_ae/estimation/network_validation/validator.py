@@ -12,9 +12,11 @@ Four checks compare a candidate with the geometric model, the arm and the networ
 
 The first network is only subject to the first and the last check, because its error on a body that
 differs from its model cannot be predicted. A network that a user has chosen is not subject to
-the third check. All limits leave a margin to the values of healthy networks: initial and learned
-networks of both presets, on arm26 and musashi_left_arm, with both emulator models. `python -m
-bench gate` prints these values, and the values of networks that must be rejected.
+the third check; where it is clearly worse than the network in use, `weakness` says so.
+
+All limits leave a margin to the values of healthy networks: initial and learned networks of both
+presets, on arm26 and musashi_left_arm, with both emulator models. `python -m bench gate` prints
+these values, and the values of networks that must be rejected.
 
 A candidate without a calibrated detector inherits the detector in use, which would otherwise be
 switched off. A muscle that was repaired within the last 600 s (RELEARNING_TIME) may be relearned,
@@ -194,6 +196,25 @@ class CheckpointValidator:
         in_use = self.mae.without(self.isolated)
         check = AgreementCheck(self._robot, self.postures, self._messages, in_use, self.isolated)
         return check.comparisons(mae)
+
+    def weakness(self, mae: Mae) -> str:
+        """Say in what a network is clearly worse on recent messages than a learned one in use.
+
+        Joint sensors tell, or else the lengths that each network computes at its own estimate.
+
+        Returns:
+            The quantity, its error and that of the network in use; '' if it is not clearly worse,
+            or if nothing is known about it.
+        """
+        if self.mae is None or self.mae.covariance is None or not self._messages.are_enough:
+            return ''
+        in_use = self.mae.without(self.isolated)
+        mae = mae.without(self.isolated)
+        check = AgreementCheck(self._robot, self.postures, self._messages, in_use, self.isolated)
+        if (text := check.worse_angle(mae)) is not None:
+            return text
+        errors, before = self.message_errors(mae), self.message_errors(in_use)
+        return message_errors.worse_length(errors, before, self._robot.muscles)
 
     def detector_measures(self, mae: Mae) -> Iterator[float]:
         """Yield ratios of a network's anomaly statistic to its threshold on recent messages.
