@@ -75,6 +75,7 @@ PLACES = {
     Kind.OFFSETS_NOT_SAVED: [f'{HERE}: test_offsets_are_saved_once_the_directory_can_be_written'],
     Kind.OTHER_MOUNTING: ['mishap: mounted upside down',
                           'estimation/test_mounting.py: test_a_base_that_is_turned_while'],
+    Kind.UNSUITABLE_NETWORK: ['mishap: network of another individual'],
     Kind.OPERATOR: ['nodes/test_controller_stops.py: test_a_stop_pays_out_is_reported'],
     Kind.RESTARTED: ['nodes/test_controller_stops.py: test_after_a_killed_controller_or_a_stop'],
     Kind.CONTROL_FAULT: ['control/test_controller.py: test_an_exception_in_the_controller_stops'],
