@@ -58,7 +58,7 @@ def estimates() -> str:
     estimation, foreign = results['estimation'], results['robustness']['foreign']
     ours = recorded.pop(PACKAGE)
     lines = [
-        '| | best other method that was measured | this package | measured by |',
+        '| | best rival in the same measurement | this package | measured by |',
         '|---|---|---|---|',
     ]
 
