@@ -7,8 +7,8 @@
 - `reference/parameters.md`: the parameters of all nodes
 - `reference/command_line.md`: `--help` of all scripts and executables
 - `reference/stops.md`: modes and stop causes
-- the tables of results in `README.md` and `doc/results.md`, and that of conditions in
-  `reference/diagnostics.md`
+- the tables of results in `README.md`, `results.md` and `explanation/how_it_compares.md`, and that
+  of conditions in `reference/diagnostics.md`
 - `images/elastic_unit.png`: the series elastic element; `images/muscles.png`: an arm
 - the charts of the results in `results/`
 """
@@ -22,6 +22,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import comparison
 import numpy as np
 import pages
 
@@ -34,7 +35,12 @@ from musculoskeletal_ae.robot.robot import Robot
 FOLDER = Path(__file__).resolve().parent
 PACKAGE = FOLDER.parent / 'musculoskeletal_ae'
 README = FOLDER.parent / 'README.md'
-DOCUMENTS = README, FOLDER / 'results.md', FOLDER / 'reference' / 'diagnostics.md'
+DOCUMENTS = (
+    README,
+    FOLDER / 'explanation' / 'how_it_compares.md',
+    FOLDER / 'results.md',
+    FOLDER / 'reference' / 'diagnostics.md',
+)
 #: what a program in Python builds on, module by module
 MODULES = {
     'robot/robot.py': ['Robot'],
@@ -213,15 +219,7 @@ def command_line() -> str:
     return '\n'.join(lines).rstrip() + '\n'
 
 
-#: rows of README's table: key of `experiment robustness`, and label
-ESTIMATES = {
-    'before_rad': 'before learning',
-    'least_squares_rad': 'least squares on the geometric model (no learning)',
-    'paper_after_rad': 'preset `paper`, after learning',
-    'after_rad': '**preset `default`, after learning**',
-    'joint_sensors_rad': 'the joint sensors that it learned from',
-}
-#: of README: what, a text with numbers of an experiment's result.json, and the experiment
+#: of doc/results.md: what, a text with numbers of an experiment's result.json, and the experiment
 CAPABILITIES = (
     (
         'joint-angle error after learning without joint sensors',
@@ -266,22 +264,8 @@ CAPABILITIES = (
 )
 
 
-def estimates_table() -> str:
-    """Return the table of errors in README."""
-    result = read(FOLDER / 'results')['robustness']
-    about = result['about']
-    lines = ['| | emulator `kin` | emulator `foreign` |', '|---|---|---|']
-    for key, label in ESTIMATES.items():
-        cells = [f'{result[reality][key]:.3f}' for reality in ('kin', 'foreign')]
-        if key == 'after_rad':
-            cells = [f'**{cell}**' for cell in cells]
-        lines.append(f'| {label} | {" | ".join(cells)} |')
-    lines += ['', f'`experiment robustness`, means over {individuals(about["seeds"])}.']
-    return '\n'.join(lines)
-
-
 def capabilities_table() -> str:
-    """Return the table of capabilities in README."""
+    """Return the table of capabilities in doc/results.md."""
     results = read(FOLDER / 'results')
     lines = ['| capability on `kin` | result | experiment |', '|---|---|---|']
     for what, text, name in CAPABILITIES:
@@ -308,7 +292,8 @@ def recordings_tables() -> str:
 
 
 TABLES = {
-    'estimates': estimates_table,
+    'estimates': comparison.estimates,
+    'methods': comparison.methods,
     'capabilities': capabilities_table,
     'recordings': recordings_tables,
     'conditions': pages.conditions,

@@ -70,6 +70,20 @@ def test_links_between_documents_lead_somewhere():
     assert not broken
 
 
+def test_every_page_is_at_most_two_clicks_from_the_readme():
+    reached = {ROOT / 'README.md'}
+    for _ in range(2):
+        links = {
+            Path(os.path.normpath(page.parent / target.partition('#')[0]))
+            for page in reached
+            for target in re.findall(r'\]\(([^)\s]+)\)', page.read_text('utf-8'))
+            if not re.match('[a-z]+:', target) and not target.startswith('#')
+        }
+        reached |= {page for page in links if page.suffix == '.md'}
+    pages = {page for page in DOC.rglob('*.md') if 'modules' not in page.parts}  # made by Sphinx
+    assert pages - reached == {DOC / 'results' / 'recordings' / 'tables.md'}
+
+
 def test_the_files_that_documents_and_docstrings_name_exist():
     package = ROOT / 'musculoskeletal_ae'
     files = [*DOC.glob('explanation/*.md'), ROOT / 'CONTRIBUTING.md', *package.rglob('*.py')]
@@ -98,9 +112,12 @@ def test_the_table_of_each_folder_names_its_own_files():
     assert not missing
 
 
-def test_the_python_of_the_readme_estimates_without_ros(trained_file, tmp_path):
-    (lines,) = re.findall(r'```python\n(.*?)```', (ROOT / 'README.md').read_text('utf-8'), re.S)
-    (tmp_path / 'learned.safetensors').write_bytes(Path(trained_file).read_bytes())
+def test_the_python_of_the_tutorial_estimates_without_ros(trained_file, tmp_path):
+    page = (DOC / 'tutorials' / 'python_without_ros.md').read_text('utf-8')
+    (block,) = re.findall(r'```python\n(.*?)```', page, re.S)
+    # The rest of the block applies the function to a recording of another robot.
+    lines = block.partition('recording = ')[0].replace('musashi_left_arm', 'arm26')
+    (tmp_path / 'arm.safetensors').write_bytes(Path(trained_file).read_bytes())
     robot = Robot.load('arm26')
     theta = 0.5 * (robot.lower + robot.upper)
     tension = np.full(robot.muscle_count, 80.0)
@@ -140,6 +157,22 @@ def test_commands_of_a_page_are_read_as_a_reader_would_run_them(tmp_path):
         ('ros2 topic pub "{a: 1, b: 2}"', False, ''),
         ('one  two', False, 'needs hardware'),
     ]
+
+
+INSTALLED = ROOT / '.venv' / '.installed'
+
+
+@pytest.mark.skipif(
+    not INSTALLED.exists() or not INSTALLED.read_text('utf-8').splitlines()[0].endswith(f' {ROOT}'),
+    reason='.venv was not installed by the scripts of this repository',
+)
+def test_a_terminal_that_the_documents_prepare_runs_the_executables():
+    program = '. ./terminal.sh >&2 && "$bin/render" --help'
+    done = subprocess.run(
+        ['bash', '-c', program], cwd=ROOT, capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    assert 'usage' in done.stdout.lower()
 
 
 def test_options_and_executables_that_the_documents_name_exist():

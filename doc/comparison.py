@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables that compare this package with other methods, from the committed results.
+
+The methods of the recordings are those of `results/recordings/result.json`. A model that
+`bench recordings` adds there appears in `methods` by itself.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from musculoskeletal_ae.experiments.results import Results, read
+
+RESULTS = Path(__file__).resolve().parent / 'results'
+PACKAGE = 'this package, lengths'
+MISSING = '–'
+#: columns of recordings: heading, recording, and the splits whose mean error is shown
+RECORDED = (
+    (
+        'soft neck, new payloads',
+        'soft_neck',
+        ('0 g, 1000 g → 500 g', '0 g, 500 g → 1000 g', '500 g, 1000 g → 0 g'),
+    ),
+    ('soft arm, 22 rests', 'soft_arm', ('0 g → other files, 0 g',)),
+    ('soft arm, 75 rests', 'soft_arm', ('0 g, 500 g → 200 g, 300 g',)),
+    ('continuum robot, 20 rests', 'continuum_stand', ('20 poses → all others',)),
+    ('continuum robot, 100 rests', 'continuum_stand', ('100 poses → all others',)),
+)
+
+
+def recorded_errors() -> dict[str, list[float | None]]:
+    """Return the error [rad] of each model in each column of RECORDED.
+
+    Models that use all rows instead of the rest samples, and those that take efforts for tensions,
+    are left out. An error is None if it was not measured in each of the column's splits.
+    """
+    document = json.loads((RESULTS / 'recordings' / 'result.json').read_text('utf-8'))
+    errors: dict[tuple[str, str, str], float] = {
+        (row['model'], row['recording'], row['split']): row['error_rad']
+        for row in document['errors']
+    }
+    names = dict.fromkeys(row['model'] for row in document['errors'])
+    shown = [name for name in names if 'all rows' not in name and 'effort' not in name]
+    return {
+        name: [
+            None
+            if any((name, recording, split) not in errors for split in splits)
+            else sum(errors[name, recording, split] for split in splits) / len(splits)
+            for _, recording, splits in RECORDED
+        ]
+        for name in shown
+    }
+
+
+def estimates() -> str:
+    """Return the table of README: the best other method beside this package."""
+    results, recorded = read(RESULTS), recorded_errors()
+    estimation, foreign = results['estimation'], results['robustness']['foreign']
+    ours = recorded.pop(PACKAGE)
+    lines = [
+        '| | best rival in the same measurement | this package | measured by |',
+        '|---|---|---|---|',
+    ]
+
+    def add(case: str, other: float, method: str, own: float, command: str) -> None:
+        cells = [f'{other:.3f}', f'{own:.3f}']
+        best = min(range(2), key=lambda place: float(cells[place]))
+        cells[best] = f'**{cells[best]}**'
+        lines.append(f'| {case} | {cells[0]}: {method} | {cells[1]} | `{command}` |')
+
+    add(
+        'angles of the easy emulated arm [rad]',
+        estimation['baselines']['polynomial mapping, EKF']['after_rad'],
+        'polynomials with a Kalman filter',
+        estimation['after_held_out_rad'],
+        'experiment estimation',
+    )
+    add(
+        'angles of the hard emulated arm [rad]',
+        foreign['paper_after_rad'],
+        'network of the paper',
+        foreign['after_rad'],
+        'experiment robustness',
+    )
+    for place, what in (
+        (0, 'bend of a real soft neck, with payloads that were not learned [rad]'),
+        (1, 'bend of a real soft arm, in files that were not learned [rad]'),
+        (4, 'bend of a real continuum robot with slack tendons [rad]'),
+    ):
+        measured = {name: row[place] for name, row in recorded.items()}
+        error, method = min((e, name) for name, e in measured.items() if e is not None)
+        own = ours[place]
+        assert own is not None, f'{PACKAGE} has no error for {RECORDED[place][0]}'
+        add(what, error, method.removesuffix(', lengths'), own, 'python -m bench recordings')
+    ruptures = [_ruptures(estimation, preset) for preset in ('paper_', '')]
+    lines.append(
+        '| ruptures of loaded muscles, easy emulated arm: muscle named | '
+        f'{ruptures[0]}: anomaly score of the paper | **{ruptures[1]}** | '
+        '`experiment estimation` |'
+    )
+    return '\n'.join(lines)
+
+
+def _ruptures(estimation: dict[str, Any], preset: str) -> str:
+    """Return how many ruptures a preset named, and how fast; '' is preset `default`."""
+    counted = estimation['counted_cuts']
+    named = round(estimation[f'{preset}named_share'] * counted)
+    alarms = estimation[f'{preset}false_alarms']
+    seconds = estimation[f'{preset}detection_s']
+    return f'{named} of {counted} after {seconds:.2f} s; {alarms} false alarms in 1 h'
+
+
+def methods() -> str:
+    """Return the table of all methods on all kinds of data."""
+    results, recorded = read(RESULTS), recorded_errors()
+    headings = ['`kin`', '`foreign`', *(heading for heading, *_ in RECORDED)]
+    rows = {**_emulated(results), **{name: [None, None, *row] for name, row in recorded.items()}}
+    rows['this package'] = [*rows['this package'][:2], *recorded[PACKAGE]]
+    del rows[PACKAGE]
+    rows['this package'] = rows.pop('this package')  # the last row
+    best = [
+        min(f'{row[place]:.3f}' for row in rows.values() if row[place] is not None)
+        for place in range(len(headings))
+    ]
+    lines = [f'| | {" | ".join(headings)} |', '|---' * (len(headings) + 1) + '|']
+    for name, row in rows.items():
+        cells = []
+        for error, least in zip(row, best):
+            cell = MISSING if error is None else f'{error:.3f}' if error < 1.0 else '> 1'
+            cells.append(f'**{cell}**' if cell == least else cell)
+        lines.append(f'| {name.removesuffix(", lengths")} | {" | ".join(cells)} |')
+    return '\n'.join(lines)
+
+
+def _emulated(results: Results) -> dict[str, list[float | None]]:
+    """Return each method's errors [rad] on `kin`, on `foreign` and, as None, on the recordings."""
+    kin, foreign = (results['robustness'][reality] for reality in ('kin', 'foreign'))
+    baselines = results['estimation']['baselines']
+
+    def after(baseline: str) -> float:
+        error: float = baselines[baseline]['after_rad']
+        return error
+
+    emulated: dict[str, tuple[float, float | None]] = {
+        'geometric model, least squares, without learning': (
+            after('geometric model, least squares'),
+            foreign['least_squares_rad'],
+        ),
+        'true routes and springs, least squares': (kin['oracle_rad'], foreign['oracle_rad']),
+        'search in a table of the rest samples': (after('table search'), None),
+        'polynomials with an EKF': (after('polynomial mapping, EKF'), None),
+        'network trained further on the measurements (preset `paper`)': (
+            kin['paper_after_rad'],
+            foreign['paper_after_rad'],
+        ),
+        'this package': (kin['after_rad'], foreign['after_rad']),
+        'the joint sensors themselves': (
+            kin['joint_sensors_rad'],
+            foreign['joint_sensors_rad'],
+        ),
+    }
+    return {name: [*errors, *[None] * len(RECORDED)] for name, errors in emulated.items()}
