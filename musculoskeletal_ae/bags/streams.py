@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LATEST
@@ -50,10 +50,10 @@ class Pairs(NamedTuple):
     tension: Array  # T [N], (P, M)
     isolated: Ints  # 1 for isolated muscles, 0 for others, -1 if not recorded, (P, M)
 
-    def first(self, count: int) -> 'Pairs':
-        """Return the first `count` pairs."""
+    def at(self, rows: Ints | Bools | slice) -> 'Pairs':
+        """Return the pairs in some rows."""
         time, theta, length, tension, isolated = self
-        return Pairs(time[:count], theta[:count], length[:count], tension[:count], isolated[:count])
+        return Pairs(time[rows], theta[rows], length[rows], tension[rows], isolated[rows])
 
 
 class Streams(NamedTuple):

@@ -124,6 +124,27 @@ class JointUnits:
         """Return springs and dampers in the units of the joints: the inverse."""
         return elasticity.scaled(1.0 / self.radian)
 
+    def error_text(self, error: Array, form: str = '.4f') -> str:
+        """Return the mean size of errors, apart for each unit, such as '0.0123 rad and 1.230 mm'.
+
+        This is the mean over all rows of the 2-norm over the revolute joints, and of that over the
+        prismatic joints. Unknown errors are left out.
+
+        Args:
+            error: Errors of θ [rad], (N, D) or (D,); NaN where they are unknown.
+            form: Format of the number in [rad].
+        """
+        rows, parts = np.atleast_2d(error), []
+        for unit in dict.fromkeys(self._units):
+            off = rows[:, [each is unit for each in self._units]]
+            off = off[np.isfinite(off).any(axis=1)]
+            if not len(off):
+                continue
+            mean = float(np.linalg.norm(np.nan_to_num(off), axis=1).mean())
+            is_turn = unit is TURN
+            parts.append(f'{mean:{form}} rad' if is_turn else f'{1e3 * RACK * mean:.3f} mm')
+        return ' and '.join(parts) or 'unknown'
+
     @property
     def distance_unit(self) -> str:
         """Unit of a distance ‖Δθ‖ between postures, for texts."""

@@ -18,15 +18,17 @@ from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Finding
 from musculoskeletal_ae.estimation.health import HealthMonitor
+from musculoskeletal_ae.learning import recordings
 from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.recordings import error, learn
 from musculoskeletal_ae.mae.checkpoint import load
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.process_signals import INTERRUPTED
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.tools import bag_learning, model_training, network_cache
-from musculoskeletal_ae.tools.bag_learning import anomaly_in, error, learn, read, repetition
+from musculoskeletal_ae.tools import model_training, network_cache, recording_learning
 from musculoskeletal_ae.tools.network_cache import network_file
+from musculoskeletal_ae.tools.recording_learning import anomaly_in, read, repetition
 from musculoskeletal_ae.tools.train import main
 
 BAGS = Path(__file__).resolve().parents[2] / 'bags'
@@ -175,7 +177,7 @@ def test_progress_and_wrong_joint_sensors_are_reported(
 
     monkeypatch.setattr(progress_bar, 'REPORT_INTERVAL', 0.0)
     monkeypatch.setattr(model_training, 'initial_mae', trained)
-    monkeypatch.setattr(bag_learning, 'read', lambda *_: recording)
+    monkeypatch.setattr(recording_learning, 'read', lambda *_: recording)
     out = str(tmp_path / 'out.safetensors')
     assert main(['--robot', 'arm26', '--from-bag', 'BAG', '--out', out, '--quick']) == 1
     printed = capsys.readouterr()
@@ -205,8 +207,8 @@ def test_estimated_joint_sensor_offsets_are_shown_and_the_error_without_them(
         learner.trainer.body.zero[:] = [0.03, 0.0]
         learner.scheduler.updates = 1
 
-    monkeypatch.setattr(bag_learning, 'read', lambda *_: recording)
-    monkeypatch.setattr(bag_learning, 'learn', learned)
+    monkeypatch.setattr(recording_learning, 'read', lambda *_: recording)
+    monkeypatch.setattr(recording_learning, 'learn_table', learned)
     arguments = ['--robot', 'arm26', '--from-bag', 'BAG', '--out', str(tmp_path / 'x.safetensors')]
     assert main([*arguments, '--checkpoint', trained_file]) == 0
     printed = capsys.readouterr().out
@@ -230,8 +232,8 @@ def test_ctrl_c_keeps_what_was_learned_and_leaves_the_earlier_network(
         learner.scheduler.updates = 3
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(bag_learning, 'read', lambda *_: recording)
-    monkeypatch.setattr(bag_learning, 'learn', interrupted)
+    monkeypatch.setattr(recording_learning, 'read', lambda *_: recording)
+    monkeypatch.setattr(recording_learning, 'learn_table', interrupted)
     out, kept = tmp_path / 'out.safetensors', tmp_path / 'out.interrupted.safetensors'
     out.write_text('an earlier network')
     arguments = ['--robot', 'arm26', '--from-bag', 'BAG', '--out', str(out)]
@@ -274,13 +276,14 @@ def test_an_anomaly_in_a_held_out_recording_is_reported_with_the_error_before_it
     length, nobody = initial.lengths(theta, tension), np.zeros(tension.shape, dtype=int)
     recording = Pairs(0.01 * np.arange(count), theta, length, tension, nobody)
     assert anomaly_in(arm26, recording, initial, 'default') == ''
-    monkeypatch.setattr(bag_learning, 'HealthMonitor', Monitor)
+    monkeypatch.setattr(recordings, 'HealthMonitor', Monitor)
+    monkeypatch.setattr(recording_learning, 'HealthMonitor', Monitor)
     learner = Learner(arm26, initial)
     assert 'learning stopped 3.0 s after the start: an anomaly' in learn(learner, recording)
     text = anomaly_in(arm26, recording, initial, 'default')
     found = f'({arm26.muscles[2]}: {ConditionKind.SLACK_TENDON.identifier})'
     assert f'{found} begins 3.0 s after the start' in text
-    assert f'until then the error is {error(initial, recording.first(300)):.4f} rad' in text
+    assert f'until then the error is {error(initial, recording.at(slice(300))):.4f} rad' in text
 
 
 def test_a_held_out_recording_of_the_learned_postures_is_reported(arm26):
@@ -319,8 +322,8 @@ def learned_from_bag(arm26, initial, monkeypatch, tmp_path):
 
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
     monkeypatch.setattr(model_training, 'initial_mae', trained)
-    monkeypatch.setattr(bag_learning, 'read', lambda *_: recording)
-    monkeypatch.setattr(bag_learning, 'learn', learned)
+    monkeypatch.setattr(recording_learning, 'read', lambda *_: recording)
+    monkeypatch.setattr(recording_learning, 'learn_table', learned)
 
     def run(*options):
         out = str(tmp_path / 'out.safetensors')
