@@ -45,15 +45,25 @@ def learn_table(
     `progress` is called with the seconds or updates since its last call (`work`).
 
     Returns:
-        A warning if learning stopped before the end of the table, or ''.
+        A warning if learning stopped before the end of the table or has learned nothing, or ''.
     """
     if table.at_rest:
         learn_rests(learner, table.rows, progress)
-        return ''
-    for segment in table.segments():
-        if stop := learn(learner, segment, progress):
-            return stop
-    return ''
+    else:
+        for segment in table.segments():
+            if stop := learn(learner, segment, progress):
+                return stop
+    return unchanged(learner)
+
+
+def unchanged(learner: Learner) -> str:
+    """Return why the learner's network has not changed so far; '' if it has learned."""
+    if learner.last_update is not None:
+        return learner.last_update.unchanged
+    return (
+        f'{len(learner.samples)} different resting postures, and preset '
+        f'{learner.trainer.preset.name} learns from at least {learner.scheduler.least_samples}'
+    )
 
 
 def work(table: Table) -> float:

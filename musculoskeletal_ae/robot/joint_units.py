@@ -124,26 +124,38 @@ class JointUnits:
         """Return springs and dampers in the units of the joints: the inverse."""
         return elasticity.scaled(1.0 / self.radian)
 
-    def error_text(self, error: Array, form: str = '.4f') -> str:
-        """Return the mean size of errors, apart for each unit, such as '0.0123 rad and 1.230 mm'.
-
-        This is the mean over all rows of the 2-norm over the revolute joints, and of that over the
-        prismatic joints. Unknown errors are left out.
+    def mean_errors(self, error: Array) -> Array:
+        """Return the mean 2-norms of errors over the revolute and over the prismatic joints [rad].
 
         Args:
             error: Errors of θ [rad], (N, D) or (D,); NaN where they are unknown.
+
+        Returns:
+            The means over all rows with known errors, (2,); NaN if there is none.
+        """
+        means = np.full(2, np.nan)
+        for kind, joints in enumerate((~self.slides, self.slides)):
+            off = np.atleast_2d(error)[:, joints]
+            off = off[np.isfinite(off).any(axis=1)]
+            if len(off):
+                means[kind] = np.linalg.norm(np.nan_to_num(off), axis=1).mean()
+        return means
+
+    def errors_text(self, means: Array, form: str = '.4f') -> str:
+        """Return the means of `mean_errors` as text, such as '0.0123 rad and 1.20 mm', or ''.
+
+        Args:
+            means: The means, (2,).
             form: Format of the number in [rad].
         """
-        rows, parts = np.atleast_2d(error), []
-        for unit in dict.fromkeys(self._units):
-            off = rows[:, [each is unit for each in self._units]]
-            off = off[np.isfinite(off).any(axis=1)]
-            if not len(off):
-                continue
-            mean = float(np.linalg.norm(np.nan_to_num(off), axis=1).mean())
-            is_turn = unit is TURN
-            parts.append(f'{mean:{form}} rad' if is_turn else f'{1e3 * RACK * mean:.3f} mm')
-        return ' and '.join(parts) or 'unknown'
+        turn, slide = means
+        parts = [] if np.isnan(turn) else [f'{turn:{form}} rad']
+        parts += [] if np.isnan(slide) else [f'{1e3 * RACK * slide:.2f} mm']
+        return ' and '.join(parts)
+
+    def error_text(self, error: Array, form: str = '.4f') -> str:
+        """Return the mean size of errors of θ as text; arguments as of the two methods above."""
+        return self.errors_text(self.mean_errors(error), form)
 
     @property
     def distance_unit(self) -> str:

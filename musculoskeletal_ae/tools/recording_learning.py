@@ -33,6 +33,7 @@ from musculoskeletal_ae.learning.recordings import (
     learn_table,
     sample_of,
     table_errors,
+    unchanged,
     work,
 )
 from musculoskeletal_ae.learning.rest import REST_TIME
@@ -94,14 +95,15 @@ def train(args: Namespace) -> None:
         for source in sources:
             if source.is_held_out:
                 continue
-            if stop := _learn_and_show(learner, source):
+            stop = _learn_and_show(learner, source)
+            if stop and stop != unchanged(learner):  # otherwise, the error below says so
                 warnings.append(f'{source.name}: {stop}')
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(_keep(learner, args)) from interrupt
     for reason, count in learner.collector.rejected.items():
         if at_rest:
             warnings.append(f'{count} rows were not learned: {reason}')
-    if not learner.updates:
+    if not learner.updates or (learner.last_update and learner.last_update.unchanged):
         _warn(warnings)
         why = _nothing_learned(learner, at_rest)
         raise MusculoskeletalError(f'{why}; {args.out} was not written')
@@ -312,10 +314,9 @@ def _nothing_learned(learner: Learner, at_rest: bool) -> str:
     """Return why no update took place, and what to record instead."""
     rest = '' if at_rest else f' and rests in each for at least {REST_TIME:g} s'
     return (
-        'nothing was learned (0 updates). Different resting postures in the recordings: '
-        f'{len(learner.samples)}; learning begins with {learner.scheduler.least_samples}. '
-        f'Record some minutes in which the healthy arm moves from posture to posture{rest}, as '
-        'with controller/explore'
+        f'nothing was learned ({learner.updates} updates): {unchanged(learner)}. Record some '
+        f'minutes in which the healthy arm moves from posture to posture{rest}, as with '
+        'controller/explore'
     )
 
 

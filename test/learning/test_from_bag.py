@@ -185,8 +185,8 @@ def test_progress_and_wrong_joint_sensors_are_reported(
     assert 'learning from BAG, a recording of 20 s\n' in printed.err
     assert re.search(r'learning from BAG: \d+ %, [01] samples, 0 updates', printed.err)
     *_, warning, failed = printed.err.splitlines()
-    assert failed.startswith('error: nothing was learned (0 updates). Different resting postures')
-    assert 'in the recordings: 1; learning begins with 2. Record' in failed
+    assert failed.startswith('error: nothing was learned (0 updates): 1 different resting posture')
+    assert 'preset default learns from at least 2. Record' in failed
     assert failed.endswith(f'{out} was not written')
     assert not Path(out).exists()
     assert warning.startswith('warning: BAG: ')

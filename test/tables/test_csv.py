@@ -239,6 +239,18 @@ def test_wrong_units_and_signs_are_named_before_the_training(arm26, trained, tmp
     assert expected in capsys.readouterr().err
 
 
+def test_preset_paper_says_that_it_does_not_learn_from_20_postures(
+    arm26, trained_files, tmp_path, capsys
+):
+    file = write(tmp_path / 'a.csv', headers(arm26), readings(arm26, 25))  # 20 are learned
+    out = tmp_path / 'out.safetensors'
+    options = ['--checkpoint', str(trained_files['paper']), '--out', str(out), '--preset', 'paper']
+    assert main(['--robot', 'arm26', '--from-csv', str(file), *options]) == 1
+    expected = '20 different resting postures, and preset paper learns from at least 21'
+    assert expected in capsys.readouterr().err
+    assert not out.exists()
+
+
 def test_files_of_a_robot_without_tension_sensors_need_no_tensions(tmp_path, arm26):
     directory = tmp_path / 'robot'
     directory.mkdir()
