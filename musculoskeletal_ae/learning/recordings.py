@@ -7,6 +7,7 @@ Successive readings pass through the learner message by message, as on a running
 postures are stored as samples at once; the learner then makes UPDATES updates.
 """
 
+import math
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -21,10 +22,13 @@ from musculoskeletal_ae.estimation.finding import Finding, observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.exceptions import GateError
+from musculoskeletal_ae.learning.calibration import Reservoir
+from musculoskeletal_ae.learning.collector import SampleCollector
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.samples import Sample
+from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.scheduler import LEAST_INTERVAL
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly
 from musculoskeletal_ae.signals.friction import directions
 from musculoskeletal_ae.signals.joint_stream import JointStream
@@ -35,6 +39,8 @@ from musculoskeletal_ae.tables.table import Table
 #: Number of updates from a table of resting postures, and training steps in each of them. On a
 #: running arm, each rest causes an update of fewer steps.
 UPDATES, REST_STEPS = 8, 400
+#: Recordings with fewer different resting postures are learned from slow moments of the motion.
+LEAST_RESTS = 20
 
 
 def learn_table(
@@ -64,6 +70,43 @@ def unchanged(learner: Learner) -> str:
         f'{len(learner.samples)} different resting postures, and preset '
         f'{learner.trainer.preset.name} learns from at least {learner.scheduler.least_samples}'
     )
+
+
+def count_postures(
+    robot: Robot,
+    recording: Pairs,
+    progress: Callable[[], None] = lambda: None,
+    *,
+    from_motion: bool = False,
+    enough: float = math.inf,
+) -> int:
+    """Return how many different postures a learner would learn from a recording.
+
+    Args:
+        robot: The recorded robot.
+        recording: Successive readings.
+        progress: Called after each reading.
+        from_motion: Whether to count slow moments of a moving arm instead of rests.
+        enough: Number of postures at which counting ends.
+    """
+    samples, healthy = SampleStore(), Reservoir(robot.muscle_count)
+    collector = SampleCollector(robot, samples, healthy, from_motion=from_motion)
+    isolated: tuple[int, ...] = ()
+    for time, theta, length, tension, row in zip(*recording, strict=True):
+        newest = tuple(np.flatnonzero(row == 1).tolist())
+        if newest != isolated:
+            isolated = newest
+            collector.use_body(collector.body.with_isolated(isolated))
+        collector.joints(time, theta)
+        paired = None
+        with suppress(RejectionError):
+            paired = collector.take(time, muscle_reading(robot, length=length, tension=tension))
+        if paired is not None:
+            collector.collect(paired)
+        progress()
+        if samples.accepted >= enough:
+            break
+    return samples.accepted
 
 
 def work(table: Table) -> float:

@@ -26,7 +26,9 @@ from musculoskeletal_ae.exceptions import (
 )
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.recordings import (
+    LEAST_RESTS,
     REST_STEPS,
+    count_postures,
     errors,
     finding_in,
     isolated_in,
@@ -41,6 +43,7 @@ from musculoskeletal_ae.learning.scheduler import STEPS
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import DEFAULT_SEED
+from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.process_signals import STOP, Reaction
 from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
@@ -85,11 +88,12 @@ def train(args: Namespace) -> None:
     sources = _csv_sources(robot, args) if args.from_csv else _bag_sources(robot, args)
     warnings = list(_warnings(robot, sources, bool(args.from_csv)))
     _warn(warnings)  # also before the training, because the user may want to stop here
+    at_rest = any(source.table.at_rest for source in sources)
+    from_motion = not at_rest and _learns_from_motion(robot, sources, args.preset)
     mae = _initial_network(robot, args)
     CheckpointValidator(robot).check(mae)
-    at_rest = any(source.table.at_rest for source in sources)
     steps = REST_STEPS if at_rest else STEPS
-    learner = Learner(robot, mae, args.preset, args.seed, steps=steps)
+    learner = Learner(robot, mae, args.preset, args.seed, steps=steps, from_motion=from_motion)
     before = [table_errors(mae, source.table) for source in sources]
     try:
         for source in sources:
@@ -295,6 +299,51 @@ def _initial_network(robot: Robot, args: Namespace) -> Mae:
     except OSError as error:
         _warn([f'the initial network was not cached: {error}'])
     return mae
+
+
+def _learns_from_motion(robot: Robot, sources: list[Source], preset: str) -> bool:
+    """Return whether to learn from slow moments of a motion, because there are too few rests.
+
+    Raises:
+        MusculoskeletalError: If there are too few of both, before anything is trained.
+    """
+    least = preset_named(preset).least_samples
+    wanted = max(LEAST_RESTS, least)
+    rests = _count(robot, sources, wanted, from_motion=False)
+    if rests >= wanted:
+        return False
+    moments = _count(robot, sources, wanted, from_motion=True)
+    if least <= rests >= moments:
+        return False
+    few = f'the recordings have {rests} different resting postures'
+    if moments >= least:
+        text = (
+            f'{few}, fewer than {wanted}. The slowest moment of each second is learned instead. If '
+            'joints and muscles are not measured at the same time, fast motion makes the error '
+            f'larger; an arm that rests in each posture for {REST_TIME:g} s avoids this'
+        )
+        _warn([text])
+        return True
+    raise MusculoskeletalError(
+        f'nothing can be learned: {few} and {moments} different slow moments; preset {preset} '
+        f'learns from at least {least}. Record some minutes in which the healthy arm moves from '
+        'posture to posture, as with controller/explore'
+    )
+
+
+def _count(robot: Robot, sources: list[Source], enough: int, *, from_motion: bool) -> int:
+    """Return how many postures would be learned, counted up to `enough`."""
+    count = 0
+    learned = [source for source in sources if not source.is_held_out]
+    what = 'slow moments' if from_motion else 'resting postures'
+    with ProgressBar(f'counting {what}', sum(len(source.table) for source in learned)) as bar:
+        for segment in (each for source in learned for each in source.table.segments()):
+            left = enough - count
+            if left > 0:
+                count += count_postures(
+                    robot, segment, bar.add, from_motion=from_motion, enough=left
+                )
+    return count
 
 
 def _learn_and_show(learner: Learner, source: Source) -> str:
