@@ -197,13 +197,14 @@ def arm_with_motors(folder: Path, **content: Any) -> Path:
     return directory
 
 
-def write_platform(directory: Path, height: float = 0.05) -> Path:
+def write_platform(directory: Path, height: float = 0.05, pulley: float = 0.0) -> Path:
     """Write a platform that hangs on four tendons, and return its directory.
 
     Args:
         directory: Directory to create.
         height: Height of the attachments above the origin of the platform [m]; its centre of mass
             is 0.05 m below the origin.
+        pulley: Radius of swivelling pulleys at the frame [m]; with 0, tendons begin at points.
     """
     directory.mkdir()
     parent, lines = 'frame', ['<robot name="platform"><link name="frame"/>']
@@ -235,6 +236,11 @@ def write_platform(directory: Path, height: float = 0.05) -> Path:
         }
         for i, (a, b) in enumerate(((1, 1), (1, -1), (-1, -1), (-1, 1)), 1)
     ]
+    for muscle in muscles if pulley else ():
+        x, y, z = muscle['route'][0]['xyz']
+        entry = {'wrap': 'pulley', 'link': 'frame', 'xyz': [x, y, z], 'radius': pulley}
+        muscle['route'].insert(1, {**entry, 'axis': [x, 0.0, 0.0]})
+        muscle['route'][0]['xyz'] = [0.8 * x, y, z]
     document = {
         'joints': ['x', 'y', 'z', 'roll', 'pitch', 'yaw'],
         'muscles': muscles,

@@ -35,7 +35,7 @@ from musculoskeletal_ae.design.route_jumps import jumping_muscles
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_csv, read_table
 from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
-from musculoskeletal_ae.robot.description import RobotDescription, Wrap, refusal, shown
+from musculoskeletal_ae.robot.description import RobotDescription, Wrap, refusal, shown, written
 from musculoskeletal_ae.robot.joint_units import SLIDE
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
@@ -513,8 +513,7 @@ def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
 def _idle_objects(robot: Robot, theta: Array) -> Iterator[Finding]:
     """Yield a warning about objects of routes that the tendon touches in none of the postures."""
     described = [
-        f'{muscle} ({"sphere" if item.axis is None else "cylinder"} of '
-        f'{round(1e3 * item.radius, 1):g} mm on {item.link})'
+        f'{muscle} ({written(item)["wrap"]} of {round(1e3 * item.radius, 1):g} mm on {item.link})'
         for muscle, route in zip(robot.muscles, robot.description.routes, strict=True)
         for item in route
         if isinstance(item, Wrap)

@@ -64,7 +64,7 @@ class RouteEntry(Strict, frozen=True):
 
     link: Name
     xyz: Vector
-    wrap: Literal['sphere', 'cylinder'] | None = None
+    wrap: Literal['sphere', 'cylinder', 'pulley'] | None = None
     axis: Vector | None = None
     radius: Positive | None = None
     side: Vector | None = None
@@ -77,7 +77,7 @@ class RouteEntry(Strict, frozen=True):
         if self.wrap is None:
             of_wraps = self.axis, self.radius, self.side, self.side_link
             if any(value is not None for value in of_wraps):
-                legal = 'need `wrap: sphere` or `wrap: cylinder`'
+                legal = 'need `wrap: sphere`, `wrap: cylinder` or `wrap: pulley`'
                 raise ValueError(f'axis, radius, side and side_link {legal}')
             return
         if self.divisor is not None:
@@ -97,6 +97,10 @@ class RouteEntry(Strict, frozen=True):
         length = float(np.linalg.norm(axis))
         if length < SHORTEST_AXIS:
             raise ValueError(f'axis: expected a nonzero vector, got {list(self.axis)}')
+        if self.wrap == 'pulley' and self.side is not None:
+            raise ValueError(
+                "unknown key 'side'; legal for a pulley: link, xyz, wrap, axis, radius"
+            )
         if self.side is not None and self.side_link in (None, self.link):
             out = np.array(self.side) - np.array(self.xyz)
             beside = np.linalg.norm(np.cross(axis / length, out))
