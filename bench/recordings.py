@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bench.recordings_baselines import baselines
 from bench.recordings_learn import (
     Model,
     Statics,
@@ -37,7 +38,15 @@ from bench.recordings_learn import (
     payload_share,
     polynomial,
 )
-from bench.recordings_read import Files, Recording, Repository, Run, fitted, repositories
+from bench.recordings_read import (
+    Files,
+    Recording,
+    Repository,
+    Run,
+    SoftLink,
+    fitted,
+    repositories,
+)
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
@@ -71,11 +80,6 @@ class Split(NamedTuple):
     full: Run | None = None
 
 
-def _rows(run: Run, rows: Any) -> Run:
-    parts = {'length': run.length[rows], 'effort': run.effort[rows], 'theta': run.theta[rows]}
-    return replace(run, rests=run.rests[:0], **parts)
-
-
 def neck_splits(recording: Recording) -> Iterator[Split]:
     """Yield splits of the recording of the soft neck, a link that three tendons bend.
 
@@ -88,7 +92,7 @@ def neck_splits(recording: Recording) -> Iterator[Split]:
     # between. A pose extends from the end of the previous rest to the end of its own rest.
     pose = np.searchsorted(none.rests[:, 1], np.arange(len(none.length)), side='right')
     others = (pose % 2 == 1) & (pose < len(none.rests))
-    yield Split('0 g → other poses, 0 g', own, _rows(none, others), [], _rows(none, ~others))
+    yield Split('0 g → other poses, 0 g', own, none.at(others), [], none.at(~others))
     for test in (half, whole):
         yield Split(f'0 g → {test.name}', own, test, [], none)
     for first, second, test in ((none, whole, half), (none, half, whole), (half, whole, none)):
@@ -121,13 +125,28 @@ def stand_splits(recording: Recording) -> Iterator[Split]:
     order = np.random.default_rng(0).permutation(len(run.length))
     for count in (20, 100):
         name = f'{count} poses → all others'
-        yield Split(name, _rows(run, order[:count]), _rows(run, order[count:]), [])
+        yield Split(name, run.at(order[:count]), run.at(order[count:]), [])
+
+
+def platform_splits(recording: Recording) -> Iterator[Split]:
+    """Yield splits of the recordings of the cable platform.
+
+    The training data are 20, 50 or all rests of one run. The test data are all rows of the others.
+    """
+    first, *others = recording.runs
+    rests, test = first.at_rest(), joined(others)
+    order = np.random.default_rng(0).permutation(len(rests.length))
+    for count in (20, 50, len(order)):
+        which = 'all' if count == len(order) else count
+        training = rests.at(order[:count])
+        yield Split(f'{which} rests of one run → other runs', training, test, [])
 
 
 SPLITS: dict[str, Callable[[Recording], Iterator[Split]]] = {
     'soft_neck': neck_splits,
     'soft_arm': arm_splits,
     'continuum_stand': stand_splits,
+    'cable_platform': platform_splits,
 }
 
 
@@ -148,8 +167,10 @@ def models(
             for degree in (1, 2, 3):
                 fit = polynomial(split.full, degree, with_effort)
                 yield f'polynomial of degree {degree}, {what}{ALL_ROWS}', fit
-    link, at_zero = recording.link, np.zeros(3)
-    if link.name == 'continuum_stand':
+        for label, model in baselines(split.training, with_effort):
+            yield f'{label}, {what}', model
+    link, at_zero = recording.link, np.zeros(split.training.length.shape[1])
+    if isinstance(link, SoftLink) and link.name == 'continuum_stand':
         link, at_zero = fitted(link, split.training)
 
     def shifted(run: Run) -> Run:
@@ -164,6 +185,9 @@ def models(
             learned[key] = package(link, directory, shifted(split.training), with_effort)
         what = 'lengths and efforts' if with_effort else 'lengths'
         yield f'this package, {what}', of_shifted(learned[key])
+    if not isinstance(link, SoftLink):
+        geometric = package(link, directory, split.training, updates=0)
+        yield 'network of the geometric model, lengths', geometric
     if split.rests:
         robot = Robot.load(link.write(directory))
         yield 'statics with learned springs, payload known', Statics(robot, split.rests).posture
@@ -187,6 +211,8 @@ def learn(repository: Repository, files: Files) -> tuple[list[Result], dict[str,
 def observations(recording: Recording) -> dict[str, Any]:
     """Return quantities by name that describe a recording without a model of θ, such as slopes."""
     shown: dict[str, Any] = {}
+    if not isinstance(recording.link, SoftLink):
+        return shown
     azimuths = np.array(recording.link.azimuths)
     if recording.link.name == 'soft_neck':
         none, half, whole = recording.runs

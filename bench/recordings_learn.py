@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares
 
-from bench.recordings_read import Run, SoftLink
+from bench.recordings_read import Body, Run, SoftLink
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.job import Job
@@ -35,7 +35,7 @@ Model = Callable[[Run], Array]  # returns θ [rad], (N, D)
 
 def error(model: Model, run: Run) -> float:
     """Return the mean distance of the estimated θ from the measured one [rad]."""
-    return float(np.linalg.norm(model(run) - run.theta, axis=1).mean())
+    return float(np.linalg.norm(np.nan_to_num(model(run) - run.theta), axis=1).mean())
 
 
 def joined(runs: list[Run]) -> Run:
@@ -47,8 +47,11 @@ def joined(runs: list[Run]) -> Run:
     return Run('', float('nan'), length, effort, theta, runs[0].rests[:0])
 
 
-def polynomial(training: Run, degree: int, with_effort: bool) -> Model:
-    """Return the least-squares polynomial for θ, of lengths or of lengths and efforts."""
+def polynomial(training: Run, degree: int, with_effort: bool, ridge: float = 0.0) -> Model:
+    """Return the least-squares polynomial for θ, of lengths or of lengths and efforts.
+
+    `ridge` is the penalty of each squared coefficient, except the constant, as a share of the rows.
+    """
 
     def inputs(run: Run) -> Array:
         return np.hstack([run.length, run.effort]) if with_effort else run.length
@@ -65,18 +68,31 @@ def polynomial(training: Run, degree: int, with_effort: bool) -> Model:
         ]
         return np.stack(columns, axis=1)
 
-    weight = np.linalg.lstsq(terms(training), training.theta, rcond=1e-10)[0]
+    rows, theta = terms(training), np.nan_to_num(training.theta)
+    if ridge:
+        penalty = np.full(rows.shape[1], np.sqrt(ridge * len(rows)))
+        penalty[0] = 0.0
+        rows, theta = (
+            np.vstack([rows, np.diag(penalty)]),
+            np.pad(theta, ((0, len(penalty)), (0, 0))),
+        )
+    weight = np.linalg.lstsq(rows, theta, rcond=1e-10)[0]
     return lambda run: np.asarray(terms(run) @ weight)
 
 
-def tensions(robot: Robot, training: Run, with_effort: bool) -> Callable[[Run], Array]:
+def tensions(
+    robot: Robot, training: Run, with_effort: bool, measures_tension: bool = False
+) -> Callable[[Run], Array]:
     """Return a function that computes the tensions of a run [N], (N, M).
 
-    With efforts, a tension is T_bias plus a multiple of the effort of the motor. Without, it is the
-    tension that the robot assumes for muscles without a tension sensor.
+    Efforts may be measured tensions. Otherwise, a tension is T_bias plus a multiple of the effort
+    of the motor. Without efforts, it is the tension that the robot assumes for muscles without a
+    tension sensor.
     """
     if not with_effort:
         return lambda run: np.tile(robot.actuation.assumed_tension, (len(run.length), 1))
+    if measures_tension:
+        return lambda run: np.clip(run.effort, 0.0, robot.tension.max)
     strong = np.quantile(np.abs(training.effort), 0.95)
 
     def scaled(run: Run) -> Array:
@@ -87,21 +103,28 @@ def tensions(robot: Robot, training: Run, with_effort: bool) -> Callable[[Run], 
 
 
 def package(
-    link: SoftLink, directory: Path, training: Run, with_effort: bool = False, seed: int = 0
+    link: Body,
+    directory: Path,
+    training: Run,
+    with_effort: bool = False,
+    seed: int = 0,
+    updates: int = UPDATES,
 ) -> Model:
     """Return a model that estimates θ by a network of this package.
 
     The body model is calibrated with the rest samples in `training`, and the network learns this
     body model. With efforts, the model uses the efforts as tensions. Without, tensions are unknown.
+    Without updates, the network is that of the geometric model.
     """
     robot = Robot.load(link.write(directory, 'sensor' if with_effort else 'none'))
-    tension = tensions(robot, training, with_effort)
+    tension = tensions(robot, training, with_effort, not isinstance(link, SoftLink))
     pulls = tension(training)
     known, still = np.ones(pulls.shape, dtype=bool), np.zeros_like(pulls)
     observed = Observations(training.theta, pulls, training.length, still, known)
-    updater = BodyUpdater(robot, initial_mae(robot, steps=INITIAL_STEPS, seed=seed).mae, seed)
+    mae = initial_mae(robot, steps=INITIAL_STEPS, seed=seed).mae
+    updater = BodyUpdater(robot, mae, seed)
     nothing = Healthy(np.empty((0, 3 * robot.muscle_count), dtype=np.float32), 0.0, 0)
-    for _ in range(UPDATES):
+    for _ in range(updates):
         mae = updater.update(Job(observed, nothing, True, STEPS)).mae
 
     return lambda run: mae.estimate(tension(run), run.length).theta

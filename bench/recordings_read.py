@@ -14,6 +14,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 import yaml
@@ -52,8 +53,13 @@ class Run:
     #: l, length of tendon paid out since the start [m], (N, M); `continuum_stand` scales it by 10
     length: Array
     effort: Array  # effort of the motors in units of the recording, (N, M); (N, 0) if it is unknown
-    theta: Array  # θ, which an independent sensor measured [rad], (N, D)
+    theta: Array  # θ, which an independent sensor measured [rad], (N, D); NaN if it was not
     rests: Ints  # first row of each rest, and the row after its last row, (R, 2)
+
+    def at(self, rows: Any) -> Run:
+        """Return a run with some of the rows, and without rests."""
+        parts = {part: getattr(self, part)[rows] for part in ('length', 'effort', 'theta')}
+        return replace(self, rests=self.rests[:0], **parts)
 
     def at_rest(self, rows: slice = slice(None)) -> Run:
         """Return a run with one row for each rest: the means of lengths, efforts and θ in it."""
@@ -63,6 +69,17 @@ class Run:
             for part in (self.length, self.effort, self.theta)
         )
         return replace(self, length=length, effort=effort, theta=theta, rests=spans[:0])
+
+
+class Body(Protocol):
+    """A recorded robot, of which a robot directory can be written."""
+
+    @property
+    def name(self) -> str:
+        """Name of the robot."""
+
+    def write(self, directory: Path, tension_source: str = 'none') -> Path:
+        """Write the robot directory and return its path."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +120,7 @@ class SoftLink:
 class Recording:
     """The runs of a repository."""
 
-    link: SoftLink
+    link: Body
     runs: list[Run]
 
 
@@ -143,15 +160,19 @@ class Files:
         return sorted(name for name in listed if re.fullmatch(pattern, name))
 
     def text(self, name: str) -> str:
-        """Return the text of a file.
+        """Return the text of a file; errors as of `data`."""
+        return self.data(name).decode(errors='replace')
+
+    def data(self, name: str) -> bytes:
+        """Return the content of a file.
 
         Raises:
             MusculoskeletalError: If the clone lacks it.
         """
         if self._is_bare:
-            return self._git('show', f'HEAD:{name}').decode(errors='replace')
+            return self._git('show', f'HEAD:{name}')
         try:
-            return (self._path / name).read_text(encoding='utf-8', errors='replace')
+            return (self._path / name).read_bytes()
         except OSError as error:
             raise self._lacks(name) from error
 
@@ -287,6 +308,8 @@ def fitted(link: SoftLink, training: Run) -> tuple[SoftLink, Array]:
 
 def repositories() -> Iterator[Repository]:
     """Yield the repositories, in the order of the table."""
+    from bench.recordings_platform import cable_platform
+
     yield Repository(
         'HUMASoft/Data-and-Results', 'soft_neck', 'LGPL-3.0',
         'soft neck, 3 tendons, motor encoders, IMU; 0, 500 and 1000 g', soft_neck,
@@ -298,4 +321,9 @@ def repositories() -> Iterator[Repository]:
     yield Repository(
         'ARM-Lab/Learning-Based-Position-Control-for-Continuum-Robots', 'continuum_stand', 'MIT',
         'continuum robot, 3 tendons, commanded shortenings, tracked tip; no load', continuum_stand,
+    )  # fmt: skip
+    yield Repository(
+        'fzoffoli/UACDPR_SelfCalibration', 'cable_platform', 'no licence file',
+        'platform on 4 cables, cable lengths and tensions, inclinometer; errors of the orientation',
+        cable_platform,
     )  # fmt: skip

@@ -195,3 +195,59 @@ def arm_with_motors(folder: Path, **content: Any) -> Path:
     shutil.copytree(find_robot('arm26'), directory)
     (directory / FILE).write_text(yaml.safe_dump(content), encoding='utf-8')
     return directory
+
+
+def write_platform(directory: Path, height: float = 0.05, pulley: float = 0.0) -> Path:
+    """Write a platform that hangs on four tendons, and return its directory.
+
+    Args:
+        directory: Directory to create.
+        height: Height of the attachments above the origin of the platform [m]; its centre of mass
+            is 0.05 m below the origin.
+        pulley: Radius of swivelling pulleys at the frame [m]; with 0, tendons begin at points.
+    """
+    directory.mkdir()
+    parent, lines = 'frame', ['<robot name="platform"><link name="frame"/>']
+    for name, axis in zip(
+        ('x', 'y', 'z', 'roll', 'pitch', 'yaw'), 2 * ('1 0 0', '0 1 0', '0 0 1'), strict=True
+    ):
+        child = 'platform' if name == 'yaw' else f'after_{name}'
+        kind, limit = ('prismatic', 0.25) if name in 'xyz' else ('revolute', 0.3)
+        lines.append(
+            f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+            f'<axis xyz="{axis}"/><limit lower="{-limit}" upper="{limit}" effort="500" '
+            'velocity="2"/></joint>'
+        )
+        parent = child
+        if name != 'yaw':
+            lines.append(f'<link name="{child}"/>')
+    lines.append(
+        '<link name="platform"><inertial><origin xyz="0 0 -0.05"/><mass value="7.0"/><inertia '
+        'ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.15"/></inertial></link></robot>'
+    )
+    (directory / 'robot.urdf').write_text('\n'.join(lines))
+    muscles = [
+        {
+            'name': f'tendon_{i}',
+            'route': [
+                {'link': 'frame', 'xyz': [1.0 * a, 1.0 * b, 1.2]},
+                {'link': 'platform', 'xyz': [0.15 * a, 0.15 * b, height]},
+            ],
+        }
+        for i, (a, b) in enumerate(((1, 1), (1, -1), (-1, -1), (-1, 1)), 1)
+    ]
+    for muscle in muscles if pulley else ():
+        x, y, z = muscle['route'][0]['xyz']
+        entry = {'wrap': 'pulley', 'link': 'frame', 'xyz': [x, y, z], 'radius': pulley}
+        muscle['route'].insert(1, {**entry, 'axis': [x, 0.0, 0.0]})
+        muscle['route'][0]['xyz'] = [0.8 * x, y, z]
+    document = {
+        'joints': ['x', 'y', 'z', 'roll', 'pitch', 'yaw'],
+        'muscles': muscles,
+        'end_effector': 'platform',
+        'actuation': 'position',
+        'tension': {'bias': 5.0, 'limit': 150.0, 'max': 300.0},
+        'series_elastic': {'force': 100.0, 'rate': 1000.0, 'wire_stretch': 1e-5},
+    }
+    (directory / 'muscles.yaml').write_text(yaml.safe_dump(document, sort_keys=False))
+    return directory

@@ -6,9 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from bench.recordings import Result, main, table
+from bench.recordings_baselines import baselines
 from bench.recordings_learn import Statics, effort_slope, error, joined, polynomial
+from bench.recordings_platform import (
+    ATTACHED,
+    ENTRY,
+    HEIGHT,
+    PULLEY,
+    Platform,
+    cable_length,
+    cable_platform,
+)
 from bench.recordings_read import Files, Run, SoftLink, fitted, soft_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
@@ -97,3 +108,49 @@ def test_the_table_marks_the_best_model_of_each_split():
     lines = table([Result('r', split, 9, model, off) for split, model, off in errors]).split('\n')
     assert lines[2:4] == ['| x | **0.100** | – |', '| y | 0.200 | **0.300** |']
     assert lines[4].endswith('| – | 0.200 |')
+
+
+def test_the_cable_of_a_swivelling_pulley_is_a_tangent_arc_and_a_straight_line():
+    entry = ENTRY[0]
+    for end in (np.array([0.0, 0.1, 0.9]), np.array([-0.4, 0.5, 0.4])):
+        out = end - entry
+        out[0] = 0.0
+        out /= np.linalg.norm(out)
+        forward, centre = np.array([1.0, 0.0, 0.0]), entry + PULLEY * out
+        turns = np.linspace(0.0, np.pi, 200_001)[:, None]
+        leaves = centre + PULLEY * (np.sin(turns) * forward - np.cos(turns) * out)
+        straight = end - leaves
+        along = np.cos(turns) * forward + np.sin(turns) * out
+        # The cable leaves the pulley where it points to the end.
+        angle = (straight * along).sum(axis=1) / np.linalg.norm(straight, axis=1)
+        at = int(angle.argmax())
+        expected = PULLEY * turns[at, 0] + np.linalg.norm(straight[at])
+        assert cable_length(entry, end) == pytest.approx(expected, abs=1e-6)
+
+
+def test_runs_of_the_platform_have_lengths_relative_to_its_middle(tmp_path):
+    (tmp_path / '.git').mkdir()
+    still, count = np.zeros((3, 40)), 40
+    middle = [cable_length(a, b + [0.0, 0.0, HEIGHT]) for a, b in zip(ENTRY, ATTACHED)]
+    length = np.tile(np.array(middle)[:, None], (1, count))
+    length[:, 20:] += np.linspace(0.0, 0.5, 20)  # moves after two seconds
+    content = {'epsilon': still, 'cable_length': length, 'tensions': np.full((4, count), 50.0)}
+    for name in ('sc_27_final', 'sc_27_medium_a', 'sc_8_final', 'sc_8_medium_a'):
+        savemat(tmp_path / f'{name}_parsed.mat', {'st': content})
+    run = cable_platform(Files(tmp_path)).runs[0]
+    np.testing.assert_allclose(run.length[:20], 0.0, atol=1e-12)
+    assert np.isnan(run.theta[:, :3]).all() and (run.theta[:, 3:] == 0.0).all()
+    assert len(run.rests) == 3
+    robot = Robot.load(Platform().write(tmp_path / 'robot'))
+    assert (robot.joint_count, robot.muscle_count) == (6, 4)
+
+
+def test_baselines_estimate_a_smooth_function():
+    rng = np.random.default_rng(0)
+    length = rng.uniform(-1.0, 1.0, (120, 2))
+    theta = np.stack([np.sin(2.0 * length[:, 0]), length[:, 0] * length[:, 1]], axis=1)
+    run = Run('', 0.0, length, np.zeros((120, 0)), theta, np.zeros((0, 2), int))
+    training, test = run.at(slice(0, 60)), run.at(slice(60, None))
+    linear = error(polynomial(training, 1, False), test)
+    for _, model in baselines(training, False):
+        assert error(model, test) < 0.2 * linear

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
@@ -20,16 +19,12 @@ from musculoskeletal_ae.bags.streams import Pairs, Streams, read_streams
 from musculoskeletal_ae.bags.timed_messages import find_pauses
 from musculoskeletal_ae.bags.topics import interface_topics
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError, printable
-from musculoskeletal_ae.learning.calibration import Reservoir
-from musculoskeletal_ae.learning.collector import SampleCollector
-from musculoskeletal_ae.learning.samples import SampleStore
+from musculoskeletal_ae.learning.recordings import LEAST_RESTS, count_postures
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.motors import NO_MOTORS, motor_topics
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_readings import muscle_reading
-from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.signals.wiring import Wiring, judge
 
 MOST_REJECTED = 0.1  # largest share of rejected messages of a topic that is no fault
@@ -100,39 +95,33 @@ def check_bag(path: Path, robot: str | None = None, namespace: str | None = None
 
 
 def motion_text(robot: Robot, recording: Pairs) -> str:
-    """Return a text that tells the user how many different resting postures a recording contains.
+    """Return a text that tells the user how many different postures can be learned.
 
-    `train --from-bag` learns from these postures. If they are too few, the text also says what to
-    record.
+    `train --from-bag` learns from resting postures or, if there are few, from slow moments of the
+    motion. If both are too few, the text also says what to record.
     """
-    samples = _resting_postures(robot, recording)
+    rests = _postures(robot, recording, 'resting postures')
     least = preset_named('default').least_samples
-    text = f'different resting postures to learn from: {samples}'
-    if samples >= least:
+    text = f'different resting postures to learn from: {rests}'
+    if rests >= LEAST_RESTS:
+        return f'{text} (at least {least} are needed; the more, the smaller the error)'
+    moments = _postures(robot, recording, 'slow moments', from_motion=True)
+    if moments >= max(least, rests + 1):
+        return (
+            f'{text}; as they are fewer than {LEAST_RESTS}, `train --from-bag` learns from '
+            f'{moments} slow moments of the motion instead'
+        )
+    if rests >= least:
         return f'{text} (at least {least} are needed; the more, the smaller the error)'
     return (
         f'{text}; too little motion for `train --from-bag`, which needs at least {least}. Record '
-        'an arm that moves from posture to posture and rests in each, as with controller/explore'
+        'an arm that moves from posture to posture, as with controller/explore'
     )
 
 
-def _resting_postures(robot: Robot, recording: Pairs) -> int:
-    collector = SampleCollector(robot, samples := SampleStore(), Reservoir(robot.muscle_count, 0))
-    isolated: tuple[int, ...] = ()
-    with ProgressBar('counting resting postures', len(recording.time)) as bar:
-        for time, theta, length, tension, row in zip(*recording, strict=True):
-            newest = tuple(np.flatnonzero(row == 1).tolist())
-            if newest != isolated:
-                isolated = newest
-                collector.use_body(collector.body.with_isolated(isolated))
-            collector.joints(time, theta)
-            paired = None
-            with suppress(RejectionError):
-                paired = collector.take(time, muscle_reading(robot, length=length, tension=tension))
-            if paired is not None:
-                collector.collect(paired)
-            bar.add()
-    return samples.accepted
+def _postures(robot: Robot, recording: Pairs, what: str, *, from_motion: bool = False) -> int:
+    with ProgressBar(f'counting {what}', len(recording.time)) as bar:
+        return count_postures(robot, recording, bar.add, from_motion=from_motion)
 
 
 def recorded_wiring(pairs: Pairs, robot: Robot) -> Wiring:

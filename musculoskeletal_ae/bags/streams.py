@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LATEST
@@ -21,6 +21,7 @@ from musculoskeletal_ae.bags.topics import EARLIER, interface_topics
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.message_reading import (
     joints_not_finite,
+    muscle_rows,
     read_array,
     read_names,
     read_posture,
@@ -30,6 +31,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
 from musculoskeletal_ae.signals.joint_series import JointSeries, judge_series
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
+from musculoskeletal_ae.signals.muscle_readings import Row
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream
 from musculoskeletal_ae.signals.pairing import Pairing
 
@@ -50,10 +52,10 @@ class Pairs(NamedTuple):
     tension: Array  # T [N], (P, M)
     isolated: Ints  # 1 for isolated muscles, 0 for others, -1 if not recorded, (P, M)
 
-    def first(self, count: int) -> 'Pairs':
-        """Return the first `count` pairs."""
+    def at(self, rows: Ints | Bools | slice) -> 'Pairs':
+        """Return the pairs in some rows."""
         time, theta, length, tension, isolated = self
-        return Pairs(time[:count], theta[:count], length[:count], tension[:count], isolated[:count])
+        return Pairs(time[rows], theta[rows], length[rows], tension[rows], isolated[rows])
 
 
 class Streams(NamedTuple):
@@ -149,6 +151,8 @@ class _ArmStreams:
         self._interface = MotorInterface(robot.description.motors)
         self._muscle_stream = MuscleStream(robot)
         self.had_offsets: list[bool] = []
+        #: lowest and highest recorded value of each tension, (M,) each, if they are not used
+        self._unused_tension = np.array([np.inf, -np.inf])[:, None] * np.ones(robot.muscle_count)
         muscles = robot.muscle_count
         self._bodies: list[BodyState] = []
         self._body = _Stream((ROWS, muscles), self._body_rows)
@@ -175,9 +179,28 @@ class _ArmStreams:
         now = arrival.received_at
         stream.use_body(self._body_at(now, stream.body))
         reading = self._interface.reading(message)
+        if not self._robot.tension_source.is_known:
+            self._note_unused_tension(reading)
         sample = stream.take(reading, now, delay=arrival.delay)
         self.had_offsets.append(stream.body.offsets.known)
         return np.array([sample.length, sample.tension_read, sample.temperature])
+
+    def _note_unused_tension(self, reading: Any) -> None:
+        tension = muscle_rows(reading, self._robot.muscle_count)[Row.TENSION]
+        low, high = self._unused_tension
+        self._unused_tension[:] = np.fmin(low, tension), np.fmax(high, tension)
+
+    @property
+    def tension_note(self) -> str:
+        """A remark for the user if recorded tensions are not used, or ''."""
+        low, high = self._unused_tension
+        if not (high > low).any():
+            return ''
+        return (
+            f'muscle_states has tensions from {low.min():.1f} to {high.max():.1f} N, which are not '
+            'used because muscles.yaml says tension_source: none; if they were measured, set '
+            'tension_source: sensor'
+        )
 
     def _command(self, message: Any, _: Arrival) -> Array:
         return read_array(message, 1, self._robot.muscle_count)
@@ -296,7 +319,7 @@ def read_streams(
     # joints may have no sensors.
     optional = f'{recorded.get("joint_states")} as joint_states'
     _check_fit(bag, {key: each for key, each in used.items() if key != optional}, warnings)
-    notes = (messages.note,) if messages.note else ()
+    notes = tuple(filter(None, (messages.note, arm.tension_note)))
     joints, states, lengths, tensions, *_ = (stream.series() for stream in arm.by_topic.values())
     is_known = np.array(arm.had_offsets, dtype=bool)
     if not is_known.all():

@@ -14,6 +14,9 @@ doc/explanation/method.md ("An arm must be holdable") defines a sound arm. A joi
 its own may have muscles on one side only, if these muscles can hold the joint. The report also
 shows the one-sided stiffness, for information only. In it, muscles at the tension that their
 modules maintain (T_bias, or 0 for position-controlled modules) count as slack.
+
+A suspended robot, such as a platform that hangs on four tendons, is judged in its equilibria only
+(`equilibria.py`), and need only be stable there.
 """
 
 from __future__ import annotations
@@ -27,11 +30,12 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.design.equilibria import Equilibria, equilibria, is_suspended
 from musculoskeletal_ae.design.route_jumps import jumping_muscles
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_csv, read_table
 from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
-from musculoskeletal_ae.robot.description import RobotDescription, Wrap, refusal, shown
+from musculoskeletal_ae.robot.description import RobotDescription, Wrap, refusal, shown, written
 from musculoskeletal_ae.robot.joint_units import SLIDE
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
@@ -163,7 +167,12 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
         RobotDescriptionError: If the directory's `moment_arms.csv` is not valid.
     """
     theta = robot.random_postures(postures, np.random.default_rng(seed))
-    result = judge(Setting.of(robot, theta))
+    if is_suspended(robot):
+        found = equilibria(robot, theta)
+        theta = found.theta
+        result = _judge_suspended(Setting.of(robot, theta), found)
+    else:
+        result = judge(Setting.of(robot, theta))
     arms = result.moment_arms
     if wrong_unit := tuple(_millimetres(arms)):
         return replace(result, faults=wrong_unit, warnings=())
@@ -199,17 +208,34 @@ def judge(setting: Setting) -> RobotCheck:
 
 def measure(setting: Setting) -> RobotCheck:
     """Compute tensions, stiffness and moment arms in given postures, without any finding."""
-    robot, theta, jacobian, hessian, torque, *_ = setting
-    bias, limit, arms = robot.tension.bias, robot.tension.limit, -jacobian
-    tension, missing = np.full(arms.shape[:2], np.nan), np.zeros(torque.shape)
+    robot, _, jacobian, _, torque, *_ = setting
+    bias, limit = robot.tension.bias, robot.tension.limit
+    tension, missing = np.full(jacobian.shape[:2], np.nan), np.zeros(torque.shape)
     load = float(robot.joint_load(setting.weight, jacobian).max())
     required = min(REQUIRED_STIFFNESS, STIFFNESS_PER_LOAD * load)
-    longest = np.abs(arms).max(axis=(0, 1))
-    matters = np.clip(COUNTED_ARM_SHARE * longest, LEAST_COUNTED_ARM, COUNTED_ARM)
     for n, (at, weight) in enumerate(zip(jacobian, torque, strict=True)):
         exertion = least_tension(at, weight, bias, limit, DESIRED_SHARE * limit)
         missing[n] = exertion.missing_torque
         tension[n] = np.nan if missing[n].any() else exertion.tension
+    return _at_tensions(setting, tension, missing, required, setting.springs)
+
+
+def _at_tensions(
+    setting: Setting, tension: Array, missing: Array, required: float, passive: Array
+) -> RobotCheck:
+    """Return the check of postures in which the holding tensions are known, without any finding.
+
+    Args:
+        setting: The robot and the postures.
+        tension: Holding tensions [N], (N, M); NaN where the posture is not held.
+        missing: Torque that the muscles lack [N·m], (N, D).
+        required: Required stiffness [N·m/rad].
+        passive: Stiffness that does not come from the muscles [N·m/rad], (D, D) or (N, D, D).
+    """
+    robot, theta, jacobian, hessian, *_ = setting
+    arms = -jacobian
+    longest = np.abs(arms).max(axis=(0, 1))
+    matters = np.clip(COUNTED_ARM_SHARE * longest, LEAST_COUNTED_ARM, COUNTED_ARM)
     held = np.isfinite(tension[:, 0])
     stiffness, one_sided = np.full((2, len(theta)), np.nan)
     k = robot.muscle_stiffness(theta[held], tension[held])
@@ -217,8 +243,9 @@ def measure(setting: Setting) -> RobotCheck:
     # as taut.
     is_taut = tension[held] > robot.actuation.kept_tension + SLACK_MARGIN
     taut = np.where(is_taut, k, 0.0)
+    passive = passive if passive.ndim == 2 else passive[held]
     full, sided = (
-        setting.springs + joint_stiffness(jacobian[held], hessian[held], x, tension[held])
+        passive + joint_stiffness(jacobian[held], hessian[held], x, tension[held])
         for x in (k, taut)
     )
     values, vectors = np.linalg.eigh(full)
@@ -227,6 +254,30 @@ def measure(setting: Setting) -> RobotCheck:
     return RobotCheck(
         setting, arms, tension, missing, stiffness, one_sided, required, matters, softest
     )
+
+
+def _judge_suspended(setting: Setting, found: Equilibria) -> RobotCheck:
+    """Check a suspended robot in its equilibria, which need only be stable (`equilibria`)."""
+    robot = setting.robot
+    symmetric = 0.5 * (found.gradient + found.gradient.swapaxes(-1, -2))
+    result = _at_tensions(setting, found.tension, found.missing, 0.0, symmetric)
+    arms, held, stable = result.moment_arms, result.held, result.stiff
+    fields = {
+        'joints': robot.joint_count, 'muscles': robot.muscle_count, 'count': len(held),
+        'required': 100 * REQUIRED_SHARE, 'bias': shown(robot.tension.bias),
+        'limit': shown(robot.tension.limit),
+    }  # fmt: skip
+    faults = [
+        *_wrong_signs(robot, arms),
+        *_one_way_joints(robot, arms, result.matters, is_suspended=True),
+        *_useless_muscles(robot, arms, result.matters),
+    ]
+    if held.mean() < REQUIRED_SHARE:
+        faults.append(_finding('no_equilibrium', share=100 * held.mean(), **fields))
+    elif stable.mean() < REQUIRED_SHARE:
+        faults.append(_finding('unstable', share=100 * stable.mean(), **fields))
+    warnings = _finding('suspended', **fields), *_flipping_muscles(robot, arms)
+    return replace(result, faults=tuple(faults), warnings=warnings)
 
 
 class ArmTerms(NamedTuple):
@@ -347,10 +398,13 @@ def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
             )  # fmt: skip
 
 
-def _one_way_joints(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[Finding]:
+def _one_way_joints(
+    robot: Robot, moment_arms: Array, matters: Array, *, is_suspended: bool = False
+) -> Iterator[Finding]:
     """Yield a fault for each joint that lacks necessary muscles in too many postures.
 
-    A joint needs muscles on both sides, or on one side if it has a spring of its own.
+    A joint needs muscles on both sides, or on one side if it has a spring of its own. The joints of
+    a suspended robot need any muscle.
     """
     lacks = {
         '+': np.max(moment_arms, axis=1) <= matters,
@@ -367,6 +421,8 @@ def _one_way_joints(robot: Robot, moment_arms: Array, matters: Array) -> Iterato
             for sign, lacking in lacks.items()
             if lacking[:, joint].any()
         )
+        if is_suspended and (longest[:, joint] > matters[joint]).any():
+            continue
         terms = arm_terms(robot, joint)
         decimals = terms.decimals(longest[:, joint].max())
         acting = ', '.join(
@@ -457,8 +513,7 @@ def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
 def _idle_objects(robot: Robot, theta: Array) -> Iterator[Finding]:
     """Yield a warning about objects of routes that the tendon touches in none of the postures."""
     described = [
-        f'{muscle} ({"sphere" if item.axis is None else "cylinder"} of '
-        f'{round(1e3 * item.radius, 1):g} mm on {item.link})'
+        f'{muscle} ({written(item)["wrap"]} of {round(1e3 * item.radius, 1):g} mm on {item.link})'
         for muscle, route in zip(robot.muscles, robot.description.routes, strict=True)
         for item in route
         if isinstance(item, Wrap)

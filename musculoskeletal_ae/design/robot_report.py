@@ -87,6 +87,8 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
     share = f'{100 * REQUIRED_SHARE:.0f} %'
     need = (
         f'the muscles must hold the arm in {share} of postures; it must be stiff enough in {share}'
+        if result.required
+        else f'an equilibrium must be found in {share} of trials; {share} must be stable'
     )
     required = required_stiffness(robot, result.required)
     desired = DESIRED_SHARE * robot.tension.limit
@@ -99,7 +101,8 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
         '',
         f'{need}; a posture that is not held counts as not stiff',
         f'held with {tension}, nearest to {shown(desired)} N:  {100 * held.mean():.1f} %',
-        f'stiffness >= {required}:  {100 * result.stiff.mean():.1f} %',
+        (f'stiffness >= {required}' if result.required else 'stable')
+        + f':  {100 * result.stiff.mean():.1f} %',
     ]
     if held.any():
         one_sided = (np.nan_to_num(result.one_sided) >= result.required) & held

@@ -182,7 +182,7 @@ def _objects(
     nothing, nowhere = np.zeros((count, 3)), np.full((count, 3), np.nan)
     objects = WrapObjects(
         np.zeros(count, np.int64), nothing, 1.0 * nothing, nowhere, np.zeros(count, np.int64),
-        np.zeros(count),
+        np.zeros(count), np.zeros(count, dtype=bool),
     )  # fmt: skip
     if routes.objects is not None:
         for whole, part in zip(objects, routes.objects, strict=True):
@@ -193,6 +193,8 @@ def _objects(
     points, true = routes.placed(poses), routes.placed(poses, point)
     described = np.random.default_rng([seed, 0x3AB]).uniform(0.9, 1.1, count)
     for s, ends in enumerate(zip(routes.first, routes.second, strict=True)):
+        if objects.swivels[s]:
+            continue  # its tendon enters it at the centre of the object
         if objects.radius[s] > 0.0:
             turn, origin = (part[:, objects.joint[s]] for part in poses[:2])
             away = true[:, ends] - (origin + turn @ objects.centre[s])[:, None]

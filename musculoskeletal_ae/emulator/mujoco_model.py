@@ -16,7 +16,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.emulator.effects import Draw
 from musculoskeletal_ae.emulator.modules import STEP, joint_gear
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
 from musculoskeletal_ae.importing.adapted_mjcf import HAND
 from musculoskeletal_ae.mujoco_version import check_mujoco
 from musculoskeletal_ae.robot.description import Wrap, branches
@@ -175,6 +175,11 @@ def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[An
             joint, at = kin.placement(item.link)
             place, name, side = at.act(item.xyz), f'{muscle}, {n}', ''
             if isinstance(item, Wrap):
+                if item.swivels:
+                    raise RobotDescriptionError(
+                        f'{muscle}: MuJoCo has no swivelling pulleys (wrap: pulley); use the '
+                        'emulator model kin, or replace the pulley by a point'
+                    )
                 axis = None if item.axis is None else at.rotation @ item.axis
                 # Where the individual has random obstacles, wrap objects of the robot description
                 # get a random size, too.

@@ -22,6 +22,7 @@ from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.margin import AnomalyMargin
 from musculoskeletal_ae.learning.rest import REST_TIME, RestDetector
 from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
+from musculoskeletal_ae.learning.slow_moments import SlowMoments
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.joint_stream import JointStream
@@ -57,6 +58,8 @@ class SampleCollector:
         healthy: Reservoir,
         period: float = 0.01,
         joint_source: str = SENSOR,
+        *,
+        from_motion: bool = False,
     ) -> None:
         """Start without any messages.
 
@@ -66,6 +69,7 @@ class SampleCollector:
             healthy: Stores messages of the healthy arm.
             period: Period of the muscle modules' messages [s].
             joint_source: Source of θ: `SENSOR`, `MARKER` or `NONE`.
+            from_motion: Whether slow moments of a moving arm are samples, instead of rests.
         """
         self.samples, self.healthy = samples, healthy
         self.rejected: Counter[str] = Counter()
@@ -76,7 +80,9 @@ class SampleCollector:
         self._joint_stream = JointStream(robot)
         self.joint_trust = JointTrust.full(robot.joint_count)
         self._pairing = Pairing[MuscleSample](period)
-        self._detector = RestDetector(joint_source != SENSOR)
+        self._detector: RestDetector | SlowMoments = (
+            SlowMoments() if from_motion else RestDetector(joint_source != SENSOR)
+        )
         self._margin = AnomalyMargin()
         self._spread = np.full(robot.joint_count, SPREAD) if joint_source == MARKER else NOTHING
         # θ and the directions of gravity (see `Sample`) are paired as one array.

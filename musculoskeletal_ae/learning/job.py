@@ -31,9 +31,9 @@ class Update(NamedTuple):
     #: index of a muscle whose newest samples contradict the fitted body, and the number of these
     #: newest samples; at most one entry
     changed: tuple[tuple[int, int], ...] = ()
-    #: mean ‖θ_est − θ‖₂ over the newest samples, with θ_est of the network before the update [rad];
-    #: NaN if none of them has measured angles
-    error: float = 0.0
+    #: mean 2-norms of θ_est − θ at the newest samples, over the revolute and over the prismatic
+    #: joints (`JointUnits.mean_errors`), with θ_est of the network before the update [rad], (2,)
+    errors: Array = np.full(2, np.nan)
     seconds: float = 0.0  # duration of the update [s]
     device: str = 'cpu'  # device of the training
     #: root mean square over the samples of what the constants of the body model cannot express, for
@@ -41,3 +41,4 @@ class Update(NamedTuple):
     remainder: Array = np.empty(0)
     #: estimated joint-sensor offsets z [rad], (D,); empty if the preset estimates none
     sensor_offset: Array = np.empty(0)
+    unchanged: str = ''  # why the network was not trained; '' if it was

@@ -74,6 +74,7 @@ class Learner:
         steps: int = STEPS,
         period: float = 0.01,
         joint_source: str = SENSOR,
+        from_motion: bool = False,
         trainer: Callable[[Robot, str, int], Trainer] = Trainer,
         directory: Path | None = None,
     ) -> None:
@@ -88,6 +89,8 @@ class Learner:
             period: Period of the muscle modules' messages [s].
             joint_source: Source of θ, one of the constants `SENSOR`, `MARKER` and `NONE` of the
                 module `collector`.
+            from_motion: Whether to learn from slow moments of an arm that never rests
+                (`slow_moments`), instead of rests. This needs joint sensors.
             trainer: Creates the trainer.
             directory: State directory for samples and network; None to save nothing.
 
@@ -106,7 +109,9 @@ class Learner:
         self._polled_at = math.inf  # time of the last poll [s]
         self.trainer = trainer(robot, preset, seed)
         samples, healthy = SampleStore(), Reservoir(robot.muscle_count, seed)
-        self.collector = SampleCollector(robot, samples, healthy, period, joint_source)
+        self.collector = SampleCollector(
+            robot, samples, healthy, period, joint_source, from_motion=from_motion
+        )
         least = self.trainer.preset.least_samples
         self.scheduler = UpdateScheduler(
             least if joint_source == SENSOR else max(least, LEAST_BLIND), steps

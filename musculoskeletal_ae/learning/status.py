@@ -88,11 +88,13 @@ def _values(learner: Learner) -> dict[str, str]:
 
 def _update_values(robot: Robot, update: Update) -> dict[str, str]:
     values = {
-        'error at newest samples': f'{update.error:.4f} {robot.units.distance_unit}',
+        'error at newest samples': robot.units.errors_text(update.errors) or 'nan rad',
         'loss': f'{update.loss:.4f}',
         'update': f'{update.seconds:.2f} s on {update.device}',
         'anomaly calibrated': str(is_calibrated(update.mae)),
     }
+    if update.unchanged:
+        values['network unchanged'] = update.unchanged
     if len(update.noise):
         worst = int(update.noise.argmax())
         values['length noise'] = f'{1e3 * update.noise[worst]:.2f} mm ({robot.muscles[worst]})'

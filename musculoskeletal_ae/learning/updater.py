@@ -7,7 +7,6 @@ An updater keeps its network and optimiser between updates. Each preset chooses 
 
 from __future__ import annotations
 
-import math
 import time
 from abc import ABC, abstractmethod
 from dataclasses import replace
@@ -54,12 +53,10 @@ class Updater(ABC):
         start, newest = time.perf_counter(), job.observed[-NEWEST:]
         mae = self._mae.without(job.isolated)
         estimate = observed_theta(mae, newest)
-        observed = np.isfinite(newest.theta)
-        errors = np.where(observed, estimate - newest.theta, 0.0)[observed.any(axis=1)]
-        error = float(np.linalg.norm(errors, axis=1).mean()) if len(errors) else math.nan
+        errors = self._robot.units.mean_errors(estimate - newest.theta)
         update = self._learn(job)
         seconds, device = time.perf_counter() - start, str(torch.get_default_device())
-        return update._replace(error=error, seconds=seconds, device=device)
+        return update._replace(errors=errors, seconds=seconds, device=device)
 
     @abstractmethod
     def _learn(self, job: Job) -> Update: ...

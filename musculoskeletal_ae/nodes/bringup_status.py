@@ -55,14 +55,17 @@ class BringupStatus(Shell):
         self.begun = time.monotonic()
         #: θ of the newest joint_states [rad], (D,); None before the first message
         self.measured: Array | None = None
-        self.errors: list[float] = []
+        self.errors: list[Array] = []  # θ_est − θ of new estimates [rad], (D,) each
         self.anomalies: list[float] = []
         self.situation = Situation(
             self.get_namespace(),
             lambda: nodes_in_graph(self),
             lambda: self.awake.at(time.monotonic()),
         )
-        self.last_known = [math.nan, math.nan]  # last estimation error and A in a status line
+        self.last_known = (
+            '',
+            math.nan,
+        )  # last error, as text, and last A in a status line
         self.started: float | None = None
         self.ended: float | None = None  # when the end of the recording was first reported [s]
         self.ended_report = math.inf  # arrival of that report, as `Situation.heard_at` counts [s]
@@ -87,7 +90,7 @@ class BringupStatus(Shell):
 
     def _on_estimate(self, theta: Array) -> None:
         if (measured := self.theta) is not None:
-            self.errors.append(float(np.linalg.norm(np.nan_to_num(theta - measured))))
+            self.errors.append(theta - measured)
 
     def conditions(self) -> Iterable[Condition]:
         """Yield the conditions of the whole arm, so that the level is that of the worst node."""
@@ -190,15 +193,14 @@ class BringupStatus(Shell):
             print(printable('; '.join(filter(None, [line, note]))), flush=True)
 
     def _print_line(self, running_time: float) -> None:
-        means = [sum(v) / len(v) if v else math.nan for v in (self.errors, self.anomalies)]
-        unit = self.robot.units.distance_unit
-        situation = self.situation
-        self.last_known = [
-            old if math.isnan(new) else new for new, old in zip(means, self.last_known)
-        ]
+        units, situation = self.robot.units, self.situation
+        error = units.error_text(np.array(self.errors), '.3f') if self.errors else ''
+        anomaly = sum(self.anomalies) / len(self.anomalies) if self.anomalies else math.nan
+        before = self.last_known
+        self.last_known = error or before[0], before[1] if math.isnan(anomaly) else anomaly
         if self._has_recording_ended:  # no further messages are expected
-            means = self.last_known
-        known = figures(self.theta is not None, means[0], means[1], unit)
+            error, anomaly = self.last_known
+        known = figures(self.theta is not None, error, anomaly)
         self.errors, self.anomalies = [], []
         line = f'{running_time:6.0f} s  {known}'
         samples, checkpoints = situation.count('samples'), situation.count('checkpoints')

@@ -36,19 +36,18 @@ NOT_EXPLORING = {
 SHOWN_LEVELS: dict[Level, str] = {'error': 'ERROR', 'warn': 'warning', 'ok': 'note'}
 
 
-def figures(measured: bool, error: float, anomaly: float, unit: str = 'rad') -> str:
+def figures(measured: bool, error: str, anomaly: float) -> str:
     """Return the estimation error and the anomaly measure A as text.
 
     For an unknown value, the text names the topic on which messages are missing.
 
     Args:
         measured: Whether joint sensors measure θ.
-        error: Estimation error in the unit `unit`; NaN if it is unknown.
+        error: Estimation error as text; '' if it is unknown.
         anomaly: A; NaN if it is unknown.
-        unit: Unit of the error.
     """
     joints = 'estimated_joint_states' if measured else 'joint_states'
-    error_text = f'waits for {joints}' if math.isnan(error) else f'{error:.3f} {unit}'
+    error_text = error or f'waits for {joints}'
     anomaly_text = 'waits for anomaly' if math.isnan(anomaly) else f'{anomaly:.3f}'
     return f'error {error_text}  A {anomaly_text}'
 

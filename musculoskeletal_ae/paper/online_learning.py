@@ -79,4 +79,12 @@ class OnlineLearning(Updater):
                 losses.append(value.item())
         self._steps += len(losses)
         last = float(np.mean(losses[-ONLINE_BATCHES:])) if losses else np.nan
-        return Update(self._published(self._network, 'paper', self._steps, job), last)
+        unchanged = (
+            f'preset paper needs more than {THRESHOLD} samples with all joint angles and muscles, '
+            f'and has {len(values)}'
+        )
+        return Update(
+            self._published(self._network, 'paper', self._steps, job),
+            last,
+            unchanged='' if losses else unchanged,
+        )

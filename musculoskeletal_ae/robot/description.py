@@ -76,26 +76,30 @@ class RoutePoint(NamedTuple):
 
 
 class Wrap(NamedTuple):
-    """A sphere, cylinder or ring around which the tendon wraps between two points.
+    """A sphere, cylinder, ring or swivelling pulley around which a tendon wraps between two points.
 
     Vectors are in the frame of `link`, except `side` if `side_link` is set.
     """
 
     link: str
-    xyz: Array  # centre [m]
+    xyz: Array  # centre, or the point of a pulley at which the tendon enters it [m]
     radius: float  # [m]
-    axis: Array | None  # unit vector of a cylinder; None for a sphere
+    #: unit vector along a cylinder, or along the tendon where it enters a pulley; None for a sphere
+    axis: Array | None
     #: point on the side where the tendon passes [m]; a point inside the object makes it a ring
     side: Array | None
     side_link: str | None = None  # link in whose frame `side` is; None for `link`
+    swivels: bool = False  # whether it is a pulley that swivels about `axis`
 
 
 def written(item: RoutePoint | Wrap) -> dict[str, Any]:
     """Return a via point or wrap object as the entry of a route in muscles.yaml."""
-    entry = {key: value for key, value in item._asdict().items() if value is not None}
+    values = {key: value for key, value in item._asdict().items() if key != 'swivels'}
+    entry = {key: value for key, value in values.items() if value is not None}
     entry = {k: v if isinstance(v, str) else np.round(v, 10).tolist() for k, v in entry.items()}
     if isinstance(item, Wrap):
-        entry = {'wrap': 'sphere' if item.axis is None else 'cylinder', **entry}
+        kind = 'pulley' if item.swivels else 'sphere' if item.axis is None else 'cylinder'
+        entry = {'wrap': kind, **entry}
     return entry
 
 
@@ -485,7 +489,9 @@ def _read_wrap(entry: RouteEntry) -> Wrap:
         axis = axis / float(np.linalg.norm(axis))
     assert entry.radius is not None  # checked by `RouteEntry`
     own = None if entry.side_link == entry.link else entry.side_link
-    return Wrap(entry.link, np.array(entry.xyz), entry.radius, axis, side, own)
+    return Wrap(
+        entry.link, np.array(entry.xyz), entry.radius, axis, side, own, entry.wrap == 'pulley'
+    )
 
 
 def _check_link(place: str, name: str, links: Iterable[str], fail: Fail) -> None:

@@ -124,6 +124,39 @@ class JointUnits:
         """Return springs and dampers in the units of the joints: the inverse."""
         return elasticity.scaled(1.0 / self.radian)
 
+    def mean_errors(self, error: Array) -> Array:
+        """Return the mean 2-norms of errors over the revolute and over the prismatic joints [rad].
+
+        Args:
+            error: Errors of θ [rad], (N, D) or (D,); NaN where they are unknown.
+
+        Returns:
+            The means over all rows with known errors, (2,); NaN if there is none.
+        """
+        means = np.full(2, np.nan)
+        for kind, joints in enumerate((~self.slides, self.slides)):
+            off = np.atleast_2d(error)[:, joints]
+            off = off[np.isfinite(off).any(axis=1)]
+            if len(off):
+                means[kind] = np.linalg.norm(np.nan_to_num(off), axis=1).mean()
+        return means
+
+    def errors_text(self, means: Array, form: str = '.4f') -> str:
+        """Return the means of `mean_errors` as text, such as '0.0123 rad and 1.20 mm', or ''.
+
+        Args:
+            means: The means, (2,).
+            form: Format of the number in [rad].
+        """
+        turn, slide = means
+        parts = [] if np.isnan(turn) else [f'{turn:{form}} rad']
+        parts += [] if np.isnan(slide) else [f'{1e3 * RACK * slide:.2f} mm']
+        return ' and '.join(parts)
+
+    def error_text(self, error: Array, form: str = '.4f') -> str:
+        """Return the mean size of errors of θ as text; arguments as of the two methods above."""
+        return self.errors_text(self.mean_errors(error), form)
+
     @property
     def distance_unit(self) -> str:
         """Unit of a distance ‖Δθ‖ between postures, for texts."""

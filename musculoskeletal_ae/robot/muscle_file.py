@@ -64,7 +64,7 @@ class RouteEntry(Strict, frozen=True):
 
     link: Name
     xyz: Vector
-    wrap: Literal['sphere', 'cylinder'] | None = None
+    wrap: Literal['sphere', 'cylinder', 'pulley'] | None = None
     axis: Vector | None = None
     radius: Positive | None = None
     side: Vector | None = None
@@ -77,7 +77,7 @@ class RouteEntry(Strict, frozen=True):
         if self.wrap is None:
             of_wraps = self.axis, self.radius, self.side, self.side_link
             if any(value is not None for value in of_wraps):
-                legal = 'need `wrap: sphere` or `wrap: cylinder`'
+                legal = 'need `wrap: sphere`, `wrap: cylinder` or `wrap: pulley`'
                 raise ValueError(f'axis, radius, side and side_link {legal}')
             return
         if self.divisor is not None:
@@ -98,6 +98,10 @@ class RouteEntry(Strict, frozen=True):
         if length < SHORTEST_AXIS:
             legal = f'a vector of at least the length {SHORTEST_AXIS:g}'
             raise ValueError(f'axis: expected {legal}, got {list(self.axis)}')
+        if self.wrap == 'pulley' and self.side is not None:
+            raise ValueError(
+                "unknown key 'side'; legal for a pulley: link, xyz, wrap, axis, radius"
+            )
         if self.side is not None and self.side_link in (None, self.link):
             out = np.array(self.side) - np.array(self.xyz)
             beside = np.linalg.norm(np.cross(axis / length, out))

@@ -12,6 +12,14 @@ On a cylinder the tendon also advances evenly along the axis, which gives √(le
 - With a `side`, it passes the object on that side.
 - A side *inside* the object makes the object a ring through which the tendon runs.
 
+A *swivelling pulley* turns about the line along which the tendon enters it, until the tendon leaves
+in its plane. With the entry E, the direction f of entering, and the end at the height h along f and
+the distance d from this line,
+
+    length = (E − start) · f + r · arc + √(D² − r²),   arc = π − atan2(h, d − r) − acos(r / D)
+
+where D = √((d − r)² + h²) is the distance of the end from the centre of the pulley.
+
 The tangents are chosen as by MuJoCo's `mju_wrap`, so that imported models keep their lengths.
 Where the tendon lifts off, the arc has length zero and the tangents lie on the straight line.
 Length and moment arm are therefore continuous there. A point within RIM · r of the surface counts
@@ -29,7 +37,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics
 
@@ -50,6 +58,8 @@ class WrapObjects(NamedTuple):
     side: Array
     side_joint: Ints  # joint of the tree that carries the side point, (S,)
     radius: Array  # [m], (S,); 0 for a segment without an object
+    #: whether it is a swivelling pulley, with its entry as centre and f as axis, (S,)
+    swivels: Bools
 
 
 def place_objects(kinematics: Kinematics, wraps: Sequence[Wrap]) -> WrapObjects:
@@ -67,7 +77,7 @@ def place_objects(kinematics: Kinematics, wraps: Sequence[Wrap]) -> WrapObjects:
         if wrap.side is not None:
             carrier, place = kinematics.attach(wrap.side_link or wrap.link, wrap.side)
             side = place - centre if carrier == joint else place
-        rows.append((joint, centre, axis, side, carrier, wrap.radius))
+        rows.append((joint, centre, axis, side, carrier, wrap.radius, wrap.swivels))
     return WrapObjects(*map(np.array, zip(*rows)))
 
 
@@ -234,6 +244,31 @@ def side_of(objects: WrapObjects, s: int, rotation: Array, translation: Array) -
 
 
 @njit(cache=True)
+def _over_pulley(a: Vector, b: Vector, forward: Vector, r: float) -> tuple[float, Vector, float]:
+    """Guide a tendon over a swivelling pulley.
+
+    Args:
+        a: Start of the tendon, relative to the entry of the pulley [m].
+        b: End of the tendon, relative to the entry [m].
+        forward: Unit vector along which the tendon enters the pulley.
+        r: Radius [m].
+
+    Returns:
+        The length [m], which is 0 if the end lies inside the pulley; the unit vector from the entry
+        to the centre of the pulley; and the angle of the arc [rad].
+    """
+    height = dot(b, forward)
+    away = plus(b, forward, -height)
+    out = math.sqrt(dot(away, away)) - r
+    distance = math.hypot(out, height)
+    if distance <= r * (1.0 + RIM):
+        return 0.0, away, 0.0
+    arc = math.pi - math.atan2(height, out) - math.acos(r / distance)
+    length = r * arc + math.sqrt(distance * distance - r * r) - dot(a, forward)
+    return length, _unit(away), arc
+
+
+@njit(cache=True)
 def wrapped_segment(
     objects: WrapObjects, s: int, rotation: Array, translation: Array, start: Array, end: Array,
     leave: Array, arrive: Array,
@@ -261,6 +296,14 @@ def wrapped_segment(
     centre, sided = turned(rotation[j], objects.centre[s]), not math.isnan(side[0])
     a = plus(plus(start, translation[j], -1.0), centre, -1.0)
     b = plus(plus(end, translation[j], -1.0), centre, -1.0)
+    if objects.swivels[s]:
+        length, u, arc = _over_pulley(a, b, axis, radius)
+        if length <= 0.0:
+            return straight
+        for k in range(3):
+            leave[k] = axis[k]
+            arrive[k] = -math.cos(arc) * axis[k] - math.sin(arc) * u[k]
+        return length
     if dot(axis, axis) > 0.5:
         u = _beside(axis)
         v = cross(axis, u)
@@ -323,6 +366,13 @@ def arc_points(
     if np.linalg.norm(leave + arrive) < 1e-9:
         return np.zeros((0, 3))
     j, radius = objects.joint[s], objects.radius[s]
+    if objects.swivels[s]:
+        entry = translation[j] + rotation[j] @ objects.centre[s]
+        forward = rotation[j] @ objects.axis[s]
+        _, towards, arc = _over_pulley(start - entry, end - entry, forward, radius)
+        turn, u = np.linspace(0.0, arc, most)[:, None], np.array(towards)
+        on_pulley: Array = entry + radius * (np.sin(turn) * forward + (1.0 - np.cos(turn)) * u)
+        return on_pulley
     side = np.array(side_of(objects, s, rotation, translation))
     if side @ side < radius**2:
         # A ring: the straight parts meet at the point of contact.

@@ -263,17 +263,18 @@ class View(Node):
         return np.array([] if body is None else body.isolated, dtype=int)
 
     def _tell(self, posture: dict[str, Array], states: Array | None) -> None:
-        situation, error, anomaly = self.situation, math.nan, self._newest('anomaly')
+        situation, anomaly = self.situation, self._newest('anomaly')
+        error, error_text = math.nan, ''
         if {'measured', 'estimated'} <= posture.keys():
-            error = float(np.linalg.norm(posture['measured'] - posture['estimated']))
+            off = posture['estimated'] - posture['measured']
+            error, error_text = float(np.linalg.norm(off)), self.robot.units.error_text(off, '.3f')
         anomaly = math.nan if anomaly is None else anomaly
         distance = situation.number('estimator', 'd')
         shown_distance = '' if math.isnan(distance) else f'  d {distance:.0f}'
         counts = situation.count('samples'), situation.count('checkpoints')
         learned = f'samples {counts[0]} · networks {counts[1]}'
         lines = [
-            figures('measured' in posture, error, anomaly, self.robot.units.distance_unit)
-            + shown_distance,
+            figures('measured' in posture, error_text, anomaly) + shown_distance,
             f'{learned} · {situation.doing or "–"}',
             f'waiting for {self.motors.state_topic}' if states is None else situation.hint(),
         ]

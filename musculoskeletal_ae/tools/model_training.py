@@ -19,6 +19,7 @@ from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.description import shown
+from musculoskeletal_ae.robot.joint_units import RACK
 from musculoskeletal_ae.robot.robot import Robot
 
 HELD_OUT_STATES = 5000  # number of states of the geometric model over which errors are averaged
@@ -61,9 +62,16 @@ def train(args: Namespace) -> None:
     # This random stream differs from that of the training, so all states are held out.
     rng = np.random.default_rng([args.seed, 2])
     limit, most = robot.tension.limit, robot.tension.max
-    planned = pair_errors(trained.mae, random_states(robot, HELD_OUT_STATES, rng, limit))
-    print(model_error(planned, robot.units.distance_unit))
-    print(table(planned, f'{HELD_OUT_STATES} unseen states, T in [0, {shown(limit)}] N'))
+    states = random_states(robot, HELD_OUT_STATES, rng, limit)
+    planned = pair_errors(trained.mae, states)
+    off = trained.mae.estimate(states.tension, states.length).theta - states.theta
+    print(
+        f'error on the geometric model: {robot.units.error_text(off, ".3f")} (mean over unseen '
+        'states, from T and l)'
+    )
+    has_slides = bool(robot.units.slides.any())
+    rack = f'; {1e3 * RACK:g} mm of a prismatic joint count as 1 rad' * has_slides
+    print(table(planned, f'{HELD_OUT_STATES} unseen states, T in [0, {shown(limit)}] N{rack}'))
     if (most > limit).any():
         overload = pair_errors(trained.mae, random_states(robot, HELD_OUT_STATES, rng, most, limit))
         print(table(overload, f'overload: T in [{shown(limit)}, {shown(most)}] N'))
@@ -100,14 +108,6 @@ def table(errors: list[PairError], title: str) -> str:
         cells = [f'{e.norm:.4f} ({e.elements.mean():.4f})' for e in errors if e.mask is mask]
         lines.append(f'{name:<12}' + ''.join(cell.rjust(26) for cell in cells))
     return '\n'.join(lines)
-
-
-def model_error(errors: list[PairError], unit: str) -> str:
-    """Return the mean error of the estimated joint angles as one line, which bringup.sh shows."""
-    (error,) = (e.norm for e in errors if (e.mask, e.output) == (Mask.TENSION_LENGTH, 'theta'))
-    return (
-        f'error on the geometric model: {error:.3f} {unit} (mean over unseen states, from T and l)'
-    )
 
 
 def joint_table(robot: Robot, errors: list[PairError]) -> str:

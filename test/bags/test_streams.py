@@ -8,9 +8,11 @@ from numpy.testing import assert_allclose, assert_array_equal
 from bags import bag_samples as samples
 from bags.arm_bag import ARRAY, JOINTS, STRING, Arm, array, joints, string
 from musculoskeletal_ae.bags.check import check_bag, motion_text, recorded_wiring
+from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.exceptions import BagError
+from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 
@@ -348,3 +350,18 @@ def test_an_encoder_that_wraps_around_is_named_and_no_muscle_is_blamed(robot, tm
     assert_allclose(result.joints.values, arm.theta, atol=1e-12)
     (fault,) = check_bag(tmp_path / 'bag', 'arm26').faults
     assert 'whole turns' in fault and 'subtract the whole turns' in fault
+
+
+def test_recordings_of_a_robot_without_tensions_are_judged_and_unused_tensions_named(
+    arm, robot, tmp_path
+):
+    modules = with_modules(robot.description, actuation='position', tension_source='none')
+    silent = Robot(modules)
+    result = streams(arm, silent, tmp_path)
+    assert_allclose(result.pairs().tension, np.tile(silent.actuation.assumed_tension, (200, 1)))
+    assert not recorded_wiring(result.pairs(), silent).faulty
+    assert not wrong_joint_sensors(silent, result.pairs())
+    (note,) = result.notes
+    assert note.startswith('muscle_states has tensions from ') and 'tension_source: sensor' in note
+    (tmp_path / 'other').mkdir()
+    assert streams(arm, robot, tmp_path / 'other').notes == ()

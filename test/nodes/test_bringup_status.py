@@ -94,9 +94,9 @@ def test_the_hint_is_printed_once(graph, capsys):
 
 
 def test_unknown_values_are_shown_with_the_missing_topic():
-    assert figures(True, 0.1, 0.5) == 'error 0.100 rad  A 0.500'
-    assert figures(False, math.nan, 0.5) == 'error waits for joint_states  A 0.500'
-    none = figures(True, math.nan, math.nan)
+    assert figures(True, '0.100 rad', 0.5) == 'error 0.100 rad  A 0.500'
+    assert figures(False, '', 0.5) == 'error waits for joint_states  A 0.500'
+    none = figures(True, '', math.nan)
     assert none == 'error waits for estimated_joint_states  A waits for anomaly'
 
 

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 from graph import executable
-from robots import copy_robot, read_muscles, write_muscles, write_robot
+from robots import copy_robot, read_muscles, write_muscles, write_platform, write_robot
 from scipy.linalg import eigh
 
 from musculoskeletal_ae.design.checks import check_robot
@@ -549,3 +549,16 @@ def test_no_picture_is_drawn_unless_asked_for(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(['arm26', '--quiet', '--postures', '5']) == 0
     assert not list(tmp_path.iterdir())
+
+
+def test_a_platform_that_hangs_on_four_tendons_is_judged_in_its_equilibria(tmp_path):
+    check = check_robot(Robot.load(write_platform(tmp_path / 'platform')), 40)
+    assert check.faults == () and check.held.all() and check.stiff.all()
+    assert 'suspended' in {warning.kind for warning in check.warnings}
+    torque = check.setting.torque + np.einsum('nmd,nm->nd', check.setting.jacobian, check.tension)
+    assert np.abs(torque).max() < 0.01 * np.abs(check.setting.torque).max()
+
+
+def test_a_platform_that_would_turn_over_is_unstable(tmp_path):
+    check = check_robot(Robot.load(write_platform(tmp_path / 'platform', height=-0.4)), 40)
+    assert {fault.kind for fault in check.faults} & {'unstable', 'no_equilibrium'}

@@ -38,6 +38,13 @@ def test_60_mm_of_a_prismatic_joint_are_one_radian(robot):
     assert robot.units[0].torque_text(0.6) == '0.60 N·m'
 
 
+def test_errors_of_revolute_and_prismatic_joints_are_two_numbers(robot):
+    off = np.zeros((2, robot.joint_count))
+    off[:, 0], off[:, WRIST] = 0.02, [0.1, np.nan]
+    assert robot.units.error_text(off) == '0.0200 rad and 6.00 mm'
+    assert robot.units.error_text(np.full((2, robot.joint_count), np.nan)) == ''
+
+
 def test_a_joint_follows_a_prismatic_joint_by_its_position_in_metres(robot):
     tree = robot.kinematics.tree
     for share in (0.0, 0.3, 1.0):

@@ -29,7 +29,9 @@ WRAPS = {
 def wire(start, end, radius, axis=(0, 0, 0), side=NONE):
     one = (np.array(v, float)[None] for v in (np.zeros(3), axis, side))
     root = np.zeros(1, np.int64)
-    objects = WrapObjects(root, *one, side_joint=root, radius=np.array([float(radius)]))
+    objects = WrapObjects(
+        root, *one, side_joint=root, radius=np.array([float(radius)]), swivels=np.zeros(1, bool)
+    )
     ends = (np.array(v, float)[None, None] for v in (start, end))
     length, leave, arrive = wrapped_segments(
         objects, np.eye(3)[None, None], np.zeros((1, 1, 3)), *ends

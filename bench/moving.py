@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Learns emulated recordings of an arm that never rests, and of one that rests in each posture.
+
+    python -m bench moving [--robot arm26] [--reality kin] [--seeds 0,1]
+
+Each recording has random postures. The arm that never rests moves for 2 s from one to the next; the
+other one moves for 1 s, and then rests for 1 s. Both networks are tested on a minute of other
+postures, with rests. The table in doc/explanation/learning.md comes from this bench.
+"""
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.bags.streams import Pairs
+from musculoskeletal_ae.emulator.reality import make_arm
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.recordings import errors, learn
+from musculoskeletal_ae.mae.initial_training import initial_mae
+from musculoskeletal_ae.options import Parser
+from musculoskeletal_ae.robot.robot import Robot
+
+PERIOD = 0.01  # time between two readings [s]
+TENSIONS = 40.0, 120.0  # range of the tensions at the postures [N]
+
+
+def record(
+    robot: Robot, reality: str, seed: int, seconds: float, motion: float, rest: float, order: int
+) -> Pairs:
+    """Return a recording of an arm that moves to random postures.
+
+    Args:
+        robot: The geometric model.
+        reality: The emulator model.
+        seed: Seed of the emulated individual.
+        seconds: Duration of the recording [s].
+        motion: Duration of each motion [s].
+        rest: Duration of the rest after it [s].
+        order: Seed of the postures.
+    """
+    arm, rng = make_arm(robot, seed, reality), np.random.default_rng([order, 7])
+    rows, start = list[tuple[Array, Array, Array]](), arm.sense().length
+    while len(rows) * PERIOD < seconds:
+        posture = robot.random_postures(1, rng)
+        pull = rng.uniform(*TENSIONS, (1, robot.muscle_count))
+        goal = robot.muscle_lengths(posture, pull)[0]
+        for step in range(1, round((motion + rest) / PERIOD) + 1):
+            share = min(1.0, step * PERIOD / motion)
+            if rest:  # the motion begins and ends slowly
+                share *= share * (3.0 - 2.0 * share)
+            arm.command_length(start + (goal - start) * share)
+            arm.step(PERIOD)
+            now = arm.sense()
+            rows.append((now.theta.copy(), now.length.copy(), now.tension.copy()))
+        start = goal
+    theta, length, tension = (np.array(part, float) for part in zip(*rows, strict=True))
+    unknown = np.full(length.shape, -1)
+    return Pairs(PERIOD * np.arange(len(rows), dtype=float), theta, length, tension, unknown)
+
+
+def main(argv: list[str]) -> int:
+    """Print the errors for each individual."""
+    parser = Parser('moving', 'Learns emulated recordings with and without rests.')
+    parser.add_robot(default='arm26')
+    parser.add_reality()
+    parser.add_seeds((0, 1))
+    parser.add_argument('--seconds', type=float, default=150.0, help='duration of a recording [s]')
+    args = parser.parse_args(argv)
+    robot = Robot.load(args.robot)
+    mae = initial_mae(robot).mae
+    for seed in args.seeds:
+        held_out = record(robot, args.reality, seed, 60.0, 1.0, 1.0, order=9)
+        before = robot.units.error_text(errors(mae, held_out))
+        print(f'{args.reality} {seed}: initial network {before}', flush=True)
+        for name, motion, rest in (('without a rest', 2.0, 0.0), ('with rests', 1.0, 1.0)):
+            recording = record(robot, args.reality, seed, args.seconds, motion, rest, order=0)
+            learner = Learner(robot, mae, from_motion=not rest)
+            stop = learn(learner, recording)
+            after = robot.units.error_text(errors(learner.mae, held_out))
+            count = f'{len(learner.samples)} samples'
+            print(f'{args.reality} {seed}: {name} {after} ({count}) {stop}', flush=True)
+    return 0

@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Learns from recorded readings, and measures the errors of a network on them.
+
+    bag, CSV file or arrays ─► Table ─► learn_table ─► Learner
+
+Successive readings pass through the learner message by message, as on a running arm. Resting
+postures are stored as samples at once; the learner then makes UPDATES updates.
+"""
+
+import math
+from collections.abc import Callable
+from contextlib import suppress
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrival import LONGEST_STEP
+from musculoskeletal_ae.bags.storage import LONGEST_PAUSE
+from musculoskeletal_ae.bags.streams import Pairs
+from musculoskeletal_ae.estimation.finding import Finding, observe
+from musculoskeletal_ae.estimation.health import HealthMonitor
+from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
+from musculoskeletal_ae.exceptions import GateError
+from musculoskeletal_ae.learning.calibration import Reservoir
+from musculoskeletal_ae.learning.collector import SampleCollector
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.scheduler import LEAST_INTERVAL
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import Anomaly
+from musculoskeletal_ae.signals.friction import directions
+from musculoskeletal_ae.signals.joint_stream import JointStream
+from musculoskeletal_ae.signals.muscle_readings import MuscleReading, muscle_reading
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
+from musculoskeletal_ae.tables.table import Table
+
+#: Number of updates from a table of resting postures, and training steps in each of them. On a
+#: running arm, each rest causes an update of fewer steps.
+UPDATES, REST_STEPS = 8, 400
+#: Recordings with fewer different resting postures are learned from slow moments of the motion.
+LEAST_RESTS = 20
+
+
+def learn_table(
+    learner: Learner, table: Table, progress: Callable[[float], None] | None = None
+) -> str:
+    """Pass a table to a learner; create the learner with `steps=REST_STEPS` if it is at rest.
+
+    `progress` is called with the seconds or updates since its last call (`work`).
+
+    Returns:
+        A warning if learning stopped before the end of the table or has learned nothing, or ''.
+    """
+    if table.at_rest:
+        learn_rests(learner, table.rows, progress)
+    else:
+        for segment in table.segments():
+            if stop := learn(learner, segment, progress):
+                return stop
+    return unchanged(learner)
+
+
+def unchanged(learner: Learner) -> str:
+    """Return why the learner's network has not changed so far; '' if it has learned."""
+    if learner.last_update is not None:
+        return learner.last_update.unchanged
+    return (
+        f'{len(learner.samples)} different resting postures, and preset '
+        f'{learner.trainer.preset.name} learns from at least {learner.scheduler.least_samples}'
+    )
+
+
+def count_postures(
+    robot: Robot,
+    recording: Pairs,
+    progress: Callable[[], None] = lambda: None,
+    *,
+    from_motion: bool = False,
+    enough: float = math.inf,
+) -> int:
+    """Return how many different postures a learner would learn from a recording.
+
+    Args:
+        robot: The recorded robot.
+        recording: Successive readings.
+        progress: Called after each reading.
+        from_motion: Whether to count slow moments of a moving arm instead of rests.
+        enough: Number of postures at which counting ends.
+    """
+    samples, healthy = SampleStore(), Reservoir(robot.muscle_count)
+    collector = SampleCollector(robot, samples, healthy, from_motion=from_motion)
+    isolated: tuple[int, ...] = ()
+    for time, theta, length, tension, row in zip(*recording, strict=True):
+        newest = tuple(np.flatnonzero(row == 1).tolist())
+        if newest != isolated:
+            isolated = newest
+            collector.use_body(collector.body.with_isolated(isolated))
+        collector.joints(time, theta)
+        paired = None
+        with suppress(RejectionError):
+            paired = collector.take(time, muscle_reading(robot, length=length, tension=tension))
+        if paired is not None:
+            collector.collect(paired)
+        progress()
+        if samples.accepted >= enough:
+            break
+    return samples.accepted
+
+
+def work(table: Table) -> float:
+    """Return how much `learn_table` has to do: recorded seconds, or updates."""
+    if table.at_rest:
+        return UPDATES
+    return sum(float(without_pauses(np.diff(part.time)).sum()) for part in table.segments())
+
+
+def without_pauses(steps: ArrayLike) -> Array:
+    """Return the times between messages [s], in which a pause of the recording counts little."""
+    return np.minimum(steps, LONGEST_PAUSE / 1e9)
+
+
+def learn_rests(
+    learner: Learner, rests: Pairs, progress: Callable[[float], None] | None = None
+) -> None:
+    """Store resting postures as samples, and make UPDATES updates.
+
+    Implausible rows are not stored, but counted in `learner.collector.rejected`. The direction in
+    which the tendons slid before each rest is unknown.
+    """
+    robot = learner.robot
+    muscles, joints = MuscleStream(robot, learner.body), JointStream(robot)
+    for row, length, tension in zip(rests.theta, rests.length, rests.tension, strict=True):
+        muscles.reset()  # successive rows need not be near to each other
+        joints.reset()
+        theta = joints.take(0.0, row)
+        try:
+            sample = muscles.take(muscle_reading(robot, length=length, tension=tension), 0.0)
+        except RejectionError as error:
+            learner.collector.rejected[error.reason] += 1
+            continue
+        if np.isnan(theta).all():
+            learner.collector.rejected['no plausible joint position'] += 1
+            continue
+        still = np.zeros(robot.muscle_count)
+        learner.accept(Sample(theta, sample.tension_read, sample.length, still))
+    learner.scheduler.restart(updates_to_repeat=learner.updates + UPDATES)
+    for update in range(UPDATES):
+        learner.poll((update + 1.0) * LEAST_INTERVAL)
+        if progress is not None:
+            progress(1.0)
+    learner.poll((UPDATES + 1.0) * LEAST_INTERVAL)
+
+
+def learn(
+    learner: Learner, recording: Pairs, progress: Callable[[float], None] | None = None
+) -> str:
+    """Pass a recording to a learner, message by message, as on a running arm.
+
+    This function plays the part of the estimator: it validates the networks, and the health monitor
+    decides when learning has to stop. `progress` is called with the recorded seconds since its last
+    call.
+
+    Returns:
+        A warning if learning stopped before the end of the recording, or ''.
+    """
+    stream = MuscleStream(learner.robot, learner.body)
+    health = HealthMonitor(learner.robot, learner.trainer.preset.name)
+    validator = CheckpointValidator(learner.robot)
+    newest, stop = None, ''
+    learner.reset()
+    learner.use_body(learner.body.with_anomaly(Anomaly.NONE))
+    steps = np.diff(recording.time, prepend=recording.time[:1])
+    for dt, at, theta, length, tension, recorded in zip(steps, *recording, strict=True):
+        isolated = isolated_in(recorded, learner.isolated)
+        if isolated != learner.isolated:
+            learner.isolate(isolated)
+            validator.isolated = isolated
+            validator.forget()
+            stream.use_body(learner.body)
+            health.reset()
+            newest = None
+        if learner.mae is not newest:
+            newest = learner.mae
+            mae = _network_in_use(validator, learner, at).without(isolated)
+            stream.use_transmission(mae.transmission)
+            health.use(mae)
+        reading = muscle_reading(learner.robot, length=length, tension=tension)
+        learner.joints(at, theta)
+        sample = sample_of(stream, reading, at)
+        if sample is not None:
+            validator.message(sample.tension_read, sample.length, sample.sliding, at, theta)
+        finding = finding_in(health, mae, sample, min(dt, LONGEST_STEP))
+        if finding is not None:
+            learner.use_body(learner.body.with_anomaly(Anomaly.FOUND, finding.muscle))
+            if (before := validator.anomaly(True, at)) is not None:
+                learner.note_accepted(before)
+                learner.note_rejected(newest.version, 'an anomaly was detected soon after')
+            stop = stop or (
+                f'learning stopped {at:.1f} s after the start: an anomaly begins there '
+                f'({learner.robot.muscles[finding.muscle]}: {finding.kind.identifier})'
+            )
+        with suppress(RejectionError):  # the learner counts it
+            learner.take(reading, at)
+        learner.poll(at)
+        if progress is not None:
+            progress(float(without_pauses(dt)))
+    if learner.mae is not newest:
+        _network_in_use(validator, learner, at)
+    return stop
+
+
+def _network_in_use(validator: CheckpointValidator, learner: Learner, now: float) -> Mae:
+    """Decide on the learner's newest network, tell the learner, and return the network to use."""
+    mae = learner.mae
+    if validator.is_in_use(mae):
+        return mae
+    try:
+        validator.check(mae)
+    except GateError as error:
+        learner.note_rejected(mae.version, str(error))
+    else:
+        validator.take(mae, now)
+        learner.note_accepted(mae)
+    return mae if validator.mae is None else validator.mae
+
+
+def sample_of(stream: MuscleStream, reading: MuscleReading, time: float) -> MuscleSample | None:
+    """Return the sample of a message; None if it is implausible."""
+    try:
+        return stream.take(reading, time)
+    except RejectionError:
+        return None
+
+
+def finding_in(
+    health: HealthMonitor, mae: Mae, sample: MuscleSample | None, dt: float
+) -> Finding | None:
+    """Return the fault that the health monitor finds in a sample; None if it finds none."""
+    if sample is None:
+        return None
+    observation = observe(mae, sample.length, sample.motor_tension, sample.bone_tension, dt)
+    return health.step(observation)
+
+
+def errors(mae: Mae, recording: Pairs, at_rest: bool = False) -> Array:
+    """Return the errors θ_est − θ [rad], (N, D); NaN where θ was not measured.
+
+    Args:
+        mae: The network.
+        recording: The readings.
+        at_rest: Whether each row is a resting posture, so that rows do not show how tendons slid.
+    """
+    sliding = np.zeros_like(recording.length) if at_rest else directions(recording.length)
+    tension = mae.transmission.end(recording.tension, sliding)
+    estimate = np.empty_like(recording.theta)
+    for isolated in np.unique(recording.isolated, axis=0):
+        rows = (recording.isolated == isolated).all(axis=1)
+        without = mae.without(isolated_in(isolated, mae.isolated))
+        estimate[rows] = without.estimate(tension[rows], recording.length[rows]).theta
+    difference: Array = estimate - recording.theta
+    return difference
+
+
+def table_errors(mae: Mae, table: Table) -> Array:
+    """Return the errors of a network on all rows of a table [rad], (N, D), as `errors` does."""
+    return np.concatenate([errors(mae, part, table.at_rest) for part in table.segments()])
+
+
+def error(mae: Mae, recording: Pairs) -> float:
+    """Return the mean of ‖θ_est − θ‖₂ [rad] over all messages with θ, for joints with sensors."""
+    return mean_error(errors(mae, recording))
+
+
+def mean_error(off: Array) -> float:
+    """Return the mean of ‖θ_est − θ‖₂ [rad] of errors (N, D), for joints with sensors."""
+    is_known = np.isfinite(off).any(axis=1)
+    return float(np.linalg.norm(np.nan_to_num(off), axis=1)[is_known].mean())
+
+
+def isolated_in(row: Ints, default: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the indices of the isolated muscles; `default` if they were not recorded.
+
+    `row` is a row of `Pairs.isolated`: 1 for an isolated muscle, 0 for others, negative if unknown.
+    """
+    return default if (row < 0).any() else tuple(map(int, np.flatnonzero(row)))
