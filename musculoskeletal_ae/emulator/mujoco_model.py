@@ -64,6 +64,12 @@ def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
 def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
     """Return an individual's links and joints as an MjSpec, and the MuJoCo body of each joint."""
     kin, spec = robot.kinematics, mujoco.MjSpec()
+    if passive := kin.elasticity.tendons.names:
+        problem = f'passive tendon {passive[0]!r} has no route'
+        raise MusculoskeletalError(
+            f'a MuJoCo model cannot be made from {robot.description.directory}: {problem}; use the '
+            'reality model.xml that import_robot wrote, or `kin`'
+        )
     model, names, links = kin.model, list(kin.model.names), draw.sizes.links
     spec.option.gravity = model.gravity.linear
     spec.compiler.balanceinertia, spec.compiler.degree = True, False

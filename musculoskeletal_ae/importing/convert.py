@@ -13,6 +13,7 @@ from musculoskeletal_ae.design.route_jumps import jump_choices
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import new_directory, read_text
 from musculoskeletal_ae.importing.cardsflow import read_cardsflow, read_urdf_skeleton
+from musculoskeletal_ae.importing.held_range import held_ranges
 from musculoskeletal_ae.importing.mjcf import read_mjcf
 from musculoskeletal_ae.importing.source import (
     ARM_POSTURES,
@@ -109,8 +110,15 @@ def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
     if not source.routes:
         raise refuse(file, '; '.join(['no muscle remains', *source.lost()[-3:]]))
     with new_directory(out, refuse):
+        notes = list(source.notes)
         write(source, out)
         robot = Robot.load(out)
+        if held := held_ranges(robot):
+            source.notes = notes  # those of `write` come again
+            for part in held:
+                source.reduce_range(*part)
+            write(source, out)
+            robot = Robot.load(out)
     return Imported(robot, tuple(source.notes), compare(source, robot))
 
 
