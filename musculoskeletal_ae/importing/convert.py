@@ -4,11 +4,13 @@
 import re
 from argparse import Namespace
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 
 from musculoskeletal_ae.design.checks import RobotCheck, check_robot
+from musculoskeletal_ae.design.prospects import prospects
 from musculoskeletal_ae.design.route_jumps import jump_choices
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import new_directory, read_text
@@ -92,12 +94,15 @@ def read_source(file: Path) -> Source:
     return source
 
 
-def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
+def import_robot(
+    file: Path, out: Path, loaded: Callable[[Robot], None] = lambda _: None, **chain: Any
+) -> Imported:
     """Import a file as a robot directory.
 
     Args:
         file: The file.
         out: A new or empty directory.
+        loaded: Gets the new robot before it is compared with the source, which takes longer.
         chain: Options of `cut`.
 
     Raises:
@@ -119,13 +124,14 @@ def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
                 source.reduce_range(*part)
             write(source, out)
             robot = Robot.load(out)
+    loaded(robot)
     return Imported(robot, tuple(source.notes), compare(source, robot))
 
 
 def run(args: Namespace) -> int:
     """Import a file, print the report, and return the exit status."""
     chain = {name: getattr(args, name) for name in ('joints', 'muscles', 'without', 'base', 'end')}
-    robot, notes, comparison = import_robot(args.file, args.out, **chain)
+    robot, notes, comparison = import_robot(args.file, args.out, show_prospects, **chain)
     for note, count in Counter(notes).items():
         print(note + (f' ({count} times)' if count > 1 else ''))
     for note in robot.description.joint_notes:
@@ -142,6 +148,12 @@ def run(args: Namespace) -> int:
     print(f'{args.out}: {robot.joint_count} joints, {robot.muscle_count} muscles')
     print(check_verdict(check_robot(robot)))
     return 0
+
+
+def show_prospects(robot: Robot) -> None:
+    """Print what can be expected of a robot."""
+    for line in prospects(robot).lines():
+        print(line, flush=True)
 
 
 def length_verdict(comparison: Comparison | None) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from musculoskeletal_ae.design.prospects import prospects
 from musculoskeletal_ae.design.route_jumps import jump_warning
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.figures import save_plot
@@ -46,6 +47,8 @@ def prepare(args: Namespace) -> Robot:
             raise MusculoskeletalError(problem) from error
     train_on(args.device)
     robot = Robot.load(args.robot)
+    for line in prospects(robot).lines():
+        print(line, file=sys.stderr, flush=True)
     if warning := jump_warning(robot):
         print(f'warning: {warning}. Nodes may reject this network', file=sys.stderr)
     return robot

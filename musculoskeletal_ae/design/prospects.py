@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What to expect of a robot before minutes of work: found within seconds, and printed first.
+
+An arm that its muscles cannot hold explores nothing and therefore learns nothing. `check_robot`
+finds more, but takes longer for large arms.
+"""
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Bools
+from musculoskeletal_ae.design.checks import COUNTED_ARM_SHARE, LEAST_COUNTED_ARM
+from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import least_tension
+
+POSTURES = 150
+BUDGET = 4.0  # time after which no further posture is examined [s]
+LEAST_POSTURES = 20  # number of postures that are examined however long it takes
+#: share of holdable postures below which training is said to be pointless
+POINTLESS_SHARE = 0.02
+#: share of holdable postures below which the robot is said to be hard to explore
+HARD_SHARE = 0.5
+
+
+class Prospects(NamedTuple):
+    """The share of holdable postures of a robot, and what prevents that others are held."""
+
+    robot: Robot
+    held: int  # number of postures that the muscles can hold
+    postures: int  # number of postures that were examined
+    idle: Bools  # whether no muscle moves each joint, (D,)
+    #: the joints that lack torque in most postures that are not held, by their number of postures
+    lacking: tuple[tuple[str, int], ...]
+
+    @property
+    def share(self) -> float:
+        """Share of the examined postures that the muscles can hold."""
+        return self.held / self.postures
+
+    def lines(self) -> list[str]:
+        """Return the prospects as lines of text; what makes training pointless comes first."""
+        robot, lines = self.robot, list[str]()
+        counts = f'{self.held} of {self.postures} random postures can be held'
+        lacking = ', '.join(f'{name} ({count})' for name, count in self.lacking)
+        lack = f'; torque is missing most at {lacking}' if lacking else ''
+        if idle := [robot.joints[j] for j in np.flatnonzero(self.idle)]:
+            names = ', '.join(idle)
+            remedy = 'hold them (leave them out of --joints, or of `joints` in muscles.yaml)'
+            lines.append(f'warning: no muscle moves {names}; {remedy}')
+        if self.share < POINTLESS_SHARE:
+            remedy = 'choose a part of it (--joints, --end), or run check_robot, which has remedies'
+            problem = 'training is pointless, because the arm cannot explore'
+            lines.append(f'warning: {counts}: {problem}{lack}; {remedy}')
+        elif self.share < HARD_SHARE:
+            lines.append(f'warning: {counts}, and only these are explored{lack}')
+        else:
+            lines.append(f'{counts}')
+        lines.append(f'{robot.joint_count} joints, {robot.muscle_count} muscles')
+        return lines
+
+
+def prospects(robot: Robot) -> Prospects:
+    """Examine random postures of a robot for a few seconds."""
+    start = time.monotonic()
+    theta = robot.random_postures(POSTURES, np.random.default_rng(0))
+    limits, held, examined = robot.tension, 0, 0
+    longest, lacking = np.zeros(robot.joint_count), np.zeros(robot.joint_count, np.int64)
+    for n, at in enumerate(theta):
+        if n >= LEAST_POSTURES and time.monotonic() - start > BUDGET:
+            break
+        jacobian = robot.routes.muscle_jacobian(at[None])[0]
+        torque = robot.kinematics.holding_torque(at)
+        wanted = DESIRED_SHARE * limits.limit
+        missing = least_tension(jacobian, torque, limits.bias, limits.limit, wanted).missing_torque
+        longest = np.maximum(longest, np.abs(jacobian).max(axis=0))
+        examined += 1
+        if missing.any():
+            lacking[np.abs(missing).argmax()] += 1
+        else:
+            held += 1
+    worst = [int(j) for j in np.argsort(-lacking)[:3] if lacking[j]]
+    named = tuple((robot.joints[j], int(lacking[j])) for j in worst)
+    idle = longest <= min(LEAST_COUNTED_ARM, COUNTED_ARM_SHARE * float(longest.max()))
+    return Prospects(robot, held, examined, idle, named)
