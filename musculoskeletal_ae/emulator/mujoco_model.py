@@ -320,7 +320,7 @@ def _add_hand(body: Any, at: pin.SE3) -> None:
 def from_file(robot: Robot, file: Path) -> Any:
     """Return the compiled model of the file that `import_robot` wrote beside a robot.
 
-    The joint limits are those of the robot directory.
+    The joint limits are those of the robot directory, with firm stops.
 
     Raises:
         MusculoskeletalError: If MuJoCo cannot load the file, if the file lacks a tendon, a motor or
@@ -350,6 +350,9 @@ def from_file(robot: Robot, file: Path) -> Any:
     ids = [model.joint(name).id for name in robot.joints]
     ends = robot.units.to_position(np.array([robot.lower, robot.upper]))
     model.jnt_limited[ids], model.jnt_range[ids] = 1, ends.T
+    # The stops of MuJoCo yield in proportion to torque over inertia: a strong muscle would press a
+    # light finger far beyond its limits.
+    model.jnt_solimp[ids] = STIFF
     return model
 
 
