@@ -68,7 +68,7 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
         problem = f'passive tendon {passive[0]!r} has no route'
         raise MusculoskeletalError(
             f'a MuJoCo model cannot be made from {robot.description.directory}: {problem}; use the '
-            'reality model.xml that import_robot wrote, or `kin`'
+            'reality model.xml that import_robot wrote, or `kin`, and export with --into'
         )
     model, names, links = kin.model, list(kin.model.names), draw.sizes.links
     spec.option.gravity = model.gravity.linear
