@@ -97,3 +97,25 @@ CARDSFLOW = """<cardsflow>
     <link name="base"><viaPoint>0 0 0</viaPoint></link></myoMuscle>
 </cardsflow>
 """
+
+#: a finger whose straight flexor passes over the axis of its joint, and with a return spring
+SNAPPING = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <worldbody>
+    <site name="f0" pos="0.01 0 0.02"/><site name="e0" pos="-0.01 0 0.02"/>
+    <body name="finger">
+      <joint name="mcp" axis="0 1 0" range="0 1.5" damping="0.01"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.05" size="0.008" mass="0.03"/>
+      <site name="f1" pos="0.01 0 -0.02"/><site name="e1" pos="-0.01 0 -0.02"/>
+    </body>
+  </worldbody>
+  <tendon>
+    <spatial name="flexor"><site site="f0"/><site site="f1"/></spatial>
+    <spatial name="return" stiffness="500" springlength="0 0.01">
+      <site site="e0"/><site site="e1"/>
+    </spatial>
+  </tendon>
+  <actuator><motor name="flexor" tendon="flexor" ctrlrange="-60 0"/></actuator>
+</mujoco>
+"""

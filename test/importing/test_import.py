@@ -155,27 +155,6 @@ def test_the_end_effector_is_the_tip_of_the_chain_whatever_its_name(mjcf, tmp_pa
     assert Robot.load(out).description.end_effector == names[1]
 
 
-#: a finger whose straight flexor passes over the axis of its joint, and with a return spring
-SNAPPING = """
-<mujoco>
-  <compiler angle="radian" autolimits="true"/>
-  <worldbody>
-    <site name="f0" pos="0.01 0 0.02"/><site name="e0" pos="-0.01 0 0.02"/>
-    <body name="finger">
-      <joint name="mcp" axis="0 1 0" range="0 1.5" damping="0.01"/>
-      <geom type="capsule" fromto="0 0 0 0 0 -0.05" size="0.008" mass="0.03"/>
-      <site name="f1" pos="0.01 0 -0.02"/><site name="e1" pos="-0.01 0 -0.02"/>
-    </body>
-  </worldbody>
-  <tendon>
-    <spatial name="flexor"><site site="f0"/><site site="f1"/></spatial>
-    <spatial name="return" stiffness="500" springlength="0 0.01">
-      <site site="e0"/><site site="e1"/>
-    </spatial>
-  </tendon>
-  <actuator><motor name="flexor" tendon="flexor" ctrlrange="-60 0"/></actuator>
-</mujoco>
-"""
 RANGE = 'tendon="out" ctrllimited="true" ctrlrange='
 FORCES = 'forcelimited="true" forcerange="-100 500"'
 
@@ -225,7 +204,7 @@ def test_muscles_have_the_tensions_that_the_model_asks_for_and_tendons_hardly_st
 
 
 def test_a_joint_that_a_spring_takes_past_its_muscles_keeps_the_range_that_they_can_hold(tmp_path):
-    result = import_robot(put(tmp_path, 'snap.xml', SNAPPING), tmp_path / 'out')
+    result = import_robot(put(tmp_path, 'snap.xml', bodies.SNAPPING), tmp_path / 'out')
     note = [note for note in result.notes if note.startswith('chosen: limits of joint mcp')]
     assert 'instead of [0, 1.5]' in note[0]
     assert result.robot.lower[0] == 0.0

@@ -4,10 +4,17 @@
 import re
 from pathlib import Path
 
+import bodies
 import mujoco
+import numpy as np
 import pytest
 
+from musculoskeletal_ae.emulator.reality import make_arm
+from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop
+from musculoskeletal_ae.importing.convert import import_robot
+from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.train import main
 
@@ -25,6 +32,26 @@ def test_a_mujoco_file_is_imported_explored_learned_and_reported(tmp_path, capsy
     robot = Robot.load(tmp_path / 'arm_robot')
     assert checkpoint.load(out, robot).joints == robot.joints
     mujoco.MjModel.from_xml_path(str(tmp_path / 'arm_model' / EXAMPLE.name))
+
+
+def test_a_finger_with_a_spring_return_explores_and_learns(tmp_path):
+    (tmp_path / 'finger.xml').write_text(bodies.SNAPPING)
+    robot = import_robot(tmp_path / 'finger.xml', tmp_path / 'robot').robot
+    mae = initial_mae(robot, steps=300).mae
+    arm = make_arm(robot, 1, str(tmp_path / 'robot' / 'model.xml'), deviates=True)
+    loop, learner = ClosedLoop(arm, mae, seed=101), Learner(robot, mae, seed=1)
+    theta = []
+    for n in range(2500):
+        if learner.mae is not loop.mae:
+            loop.use(learner.mae)
+        true, read, length, tension, _ = loop.explore()
+        learner.step(n * SAMPLE_TIME, read, tension, length)
+        theta.append(true[0])
+    assert np.ptp(theta) > 0.8 * (robot.upper - robot.lower)[0]
+    # A stop that yields would let a strong muscle press the light finger far beyond its limits.
+    assert max(theta) < robot.upper[0] + 0.02
+    assert len(learner.samples) >= 3
+    assert learner.mae is not mae
 
 
 def test_a_model_that_its_muscles_cannot_hold_is_refused_before_any_training(tmp_path, capsys):
