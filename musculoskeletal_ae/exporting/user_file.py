@@ -140,7 +140,9 @@ class UserFile:
             if file not in self._changed
             for match in COMPILER.finditer(_without_comments(text))
         )
-        if not is_folder_stated:
+        model = self.model
+        has_assets = any((model.nmesh, model.ntex, model.nhfield, model.nskin))
+        if has_assets and not is_folder_stated:
             folders = ' '.join(f'{key}="{self.file.parent}"' for key in FOLDERS[:2])
             head = re.compile(r'(<mujoco\b[^>]*>)')
             self.texts[self.file] = head.sub(
