@@ -17,7 +17,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
 POSTURES = 150
-BUDGET = 4.0  # time after which no further posture is examined [s]
+BUDGET = 2.5  # time after which no further posture is examined [s]
 LEAST_POSTURES = 20  # number of postures that are examined however long it takes
 #: share of holdable postures below which training is said to be pointless
 POINTLESS_SHARE = 0.02
@@ -50,6 +50,12 @@ class Prospects(NamedTuple):
             names = ', '.join(idle)
             remedy = 'hold them (leave them out of --joints, or of `joints` in muscles.yaml)'
             lines.append(f'warning: no muscle moves {names}; {remedy}')
+        moved = robot.joint_count - len(idle)
+        if robot.muscle_count < moved:
+            problem = 'cannot tell the angles of'
+            reason = 'only postures in which springs and muscles balance could be estimated'
+            counts_of = f'the lengths of {robot.muscle_count} muscles', f'{moved} joints'
+            lines.append(f'warning: {counts_of[0]} {problem} {counts_of[1]}; {reason}')
         if self.share < POINTLESS_SHARE:
             remedy = 'choose a part of it (--joints, --end), or run check_robot, which has remedies'
             problem = 'training is pointless, because the arm cannot explore'

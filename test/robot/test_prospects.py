@@ -2,6 +2,7 @@
 """What makes training pointless is known within seconds, and before anything else."""
 
 import time
+from itertools import combinations
 
 import numpy as np
 from robots import read_muscles, write_muscles, write_robot
@@ -49,6 +50,15 @@ def test_an_arm_that_nothing_can_hold_and_an_idle_joint_are_said_first(tmp_path,
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith('warning: no muscle moves loose')
     assert lines[1].startswith('warning: 0 of 150 random postures can be held: training is pointl')
+
+
+def test_fewer_muscles_than_joints_are_said(tmp_path):
+    document = read_muscles(write_robot(tmp_path))
+    crossed = Robot.load(tmp_path).routes.crossed
+    pair = next(pair for pair in combinations(range(8), 2) if crossed[list(pair)].any(axis=0).all())
+    document['muscles'] = [document['muscles'][m] for m in pair]
+    lines = prospects(Robot.load(write_muscles(tmp_path, document))).lines()
+    assert any('lengths of 2 muscles cannot tell the angles of' in line for line in lines)
 
 
 def test_few_holdable_postures_are_said_with_the_joint_that_lacks_torque(tmp_path):
