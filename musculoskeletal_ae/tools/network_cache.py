@@ -3,7 +3,8 @@
 
     python -m musculoskeletal_ae.tools.network_cache ROBOT PRESET [quick]
 
-prints the file of an initial network for bringup.sh, and creates its directory.
+prints the file of an initial network for bringup.sh, and creates its directory. With `quick`, it is
+that of a shortened training, unless the network of the whole training is there.
 
 The name of the file contains a hash of everything that determines the network: the two files of the
 robot directory, and the code that reads them and trains. Another robot, or another version of the
@@ -81,7 +82,9 @@ def main(arguments: list[str]) -> int:
     """Print the file of an initial network; return the exit status."""
     robot, preset, *quick = arguments
     try:
-        file = network_file(robot, preset, bool(quick))
+        file = network_file(robot, preset)
+        if quick and not file.is_file():  # otherwise, the whole training is there already
+            file = network_file(robot, preset, True)
         file.parent.mkdir(parents=True, exist_ok=True)
     except (MusculoskeletalError, OSError) as error:
         remedy = '; set XDG_CACHE_HOME to a folder that can be written'
