@@ -119,8 +119,8 @@ class UserFile:
         while before != len(self._changed):
             before = len(self._changed)
             for file, text in self.texts.items():
-                names = [match[1] for match in INCLUDE.finditer(_without_comments(text))]
-                if any(self._included(file, name) in self._changed for name in names):
+                included = [match[1] for match in INCLUDE.finditer(_without_comments(text))]
+                if any(self._included(file, name) in self._changed for name in included):
                     self._changed.add(file)
         self._changed.add(self.file)
         names = dict[Path, str]()

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.design.prospects import POINTLESS_SHARE, prospects
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
@@ -21,7 +22,6 @@ from musculoskeletal_ae.experiments.recording import (
     HELD_OUT_STREAM,
     SAMPLE_TIME,
     ClosedLoop,
-    Settings,
     estimation_error,
     record,
 )
