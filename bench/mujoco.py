@@ -58,7 +58,7 @@ import numpy as np
 from bench.wire import KINDS, systems
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.design.prospects import POINTLESS_SHARE, prospects
+from musculoskeletal_ae.design.prospects import prospects
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
@@ -297,7 +297,7 @@ def model_rows(
         nonlocal share
         found = prospects(robot)
         share = found.share
-        if share < POINTLESS_SHARE:
+        if found.is_pointless:
             seconds = time.perf_counter() - begun
             raise MusculoskeletalError(f'after {seconds:.1f} s: {" ".join(found.lines())}')
 

@@ -119,3 +119,27 @@ SNAPPING = """
   <actuator><motor name="flexor" tendon="flexor" ctrlrange="-60 0"/></actuator>
 </mujoco>
 """
+
+#: a pendulum that is far too heavy for its two tendons
+HEAVY = """
+<mujoco model="heavy">
+  <worldbody>
+    <site name="a0" pos="0.03 0 0.1"/><site name="b0" pos="-0.03 0 0.1"/>
+    <body name="link">
+      <joint name="swing" axis="0 1 0" range="-60 60"/>
+      <geom type="capsule" fromto="0 0 0 0.5 0 0" size="0.05" mass="500"/>
+      <site name="a1" pos="0.03 0 -0.1"/><site name="b1" pos="-0.03 0 -0.1"/>
+      <body name="tip" pos="0.5 0 0">
+        <joint name="loose" axis="0 1 0" range="-60 60"/><geom size="0.02" mass="0.1"/>
+      </body>
+    </body>
+  </worldbody>
+  <tendon>
+    <spatial name="a"><site site="a0"/><site site="a1"/></spatial>
+    <spatial name="b"><site site="b0"/><site site="b1"/></spatial>
+  </tendon>
+  <actuator>
+    <motor name="a" tendon="a" ctrlrange="-50 0"/><motor name="b" tendon="b" ctrlrange="-50 0"/>
+  </actuator>
+</mujoco>
+"""

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.design.prospects import POINTLESS_SHARE, prospects
+from musculoskeletal_ae.design.prospects import prospects
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -82,7 +82,7 @@ def _imported(args: Namespace, folder: Path) -> Robot:
     def check(robot: Robot) -> None:
         found = prospects(robot)
         print(*found.lines(), sep='\n', flush=True)
-        if found.share < POINTLESS_SHARE:
+        if found.is_pointless:
             raise MusculoskeletalError(f'{args.mujoco}: its muscles cannot hold it, see above')
 
     chain = {name: getattr(args, name) for name in CHAIN}

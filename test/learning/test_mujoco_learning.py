@@ -55,8 +55,7 @@ def test_a_finger_with_a_spring_return_explores_and_learns(tmp_path):
 
 
 def test_a_model_that_its_muscles_cannot_hold_is_refused_before_any_training(tmp_path, capsys):
-    heavy = EXAMPLE.read_text().replace('mass="1.2"', 'mass="9000"')
-    (tmp_path / 'heavy.xml').write_text(heavy)
+    (tmp_path / 'heavy.xml').write_text(bodies.HEAVY)
     options = ['--mujoco', str(tmp_path / 'heavy.xml'), '--out', str(tmp_path / 'a.safetensors')]
     assert main(options) == 1
     streams = capsys.readouterr()

@@ -4,6 +4,7 @@
 import time
 from itertools import combinations
 
+import bodies
 import numpy as np
 from robots import read_muscles, write_muscles, write_robot
 
@@ -13,30 +14,6 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools import import_robot as tool
 from musculoskeletal_ae.tools.network_cache import network_file
 
-#: a pendulum that is far too heavy for its two tendons
-HEAVY = """
-<mujoco model="heavy">
-  <worldbody>
-    <site name="a0" pos="0.03 0 0.1"/><site name="b0" pos="-0.03 0 0.1"/>
-    <body name="link">
-      <joint name="swing" axis="0 1 0" range="-60 60"/>
-      <geom type="capsule" fromto="0 0 0 0.5 0 0" size="0.05" mass="500"/>
-      <site name="a1" pos="0.03 0 -0.1"/><site name="b1" pos="-0.03 0 -0.1"/>
-      <body name="tip" pos="0.5 0 0">
-        <joint name="loose" axis="0 1 0" range="-60 60"/><geom size="0.02" mass="0.1"/>
-      </body>
-    </body>
-  </worldbody>
-  <tendon>
-    <spatial name="a"><site site="a0"/><site site="a1"/></spatial>
-    <spatial name="b"><site site="b0"/><site site="b1"/></spatial>
-  </tendon>
-  <actuator>
-    <motor name="a" tendon="a" ctrlrange="-50 0"/><motor name="b" tendon="b" ctrlrange="-50 0"/>
-  </actuator>
-</mujoco>
-"""
-
 
 def test_a_sound_arm_has_no_warning(tmp_path):
     found = prospects(Robot.load(write_robot(tmp_path)))
@@ -45,7 +22,7 @@ def test_a_sound_arm_has_no_warning(tmp_path):
 
 
 def test_an_arm_that_nothing_can_hold_and_an_idle_joint_are_said_first(tmp_path, capsys):
-    (tmp_path / 'heavy.xml').write_text(HEAVY)
+    (tmp_path / 'heavy.xml').write_text(bodies.HEAVY)
     assert tool.main([str(tmp_path / 'heavy.xml'), '--out', str(tmp_path / 'out')]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith('warning: no muscle moves loose')
