@@ -33,6 +33,7 @@ doc/howto/your_robot.md is the guide for your own robot.
                              options --joints, --muscles, --without NAME,…, --base and --end NAME
                              are passed to import_robot
   --checkpoint FILE          network to start from (default: train one once, and cache it)
+  --quick                    a tenth of the initial training, for a first try
   --hardware                 your own driver instead of the emulator: waits for its muscle_states,
                              reports faults, and starts the nodes when all checks pass
   --no-controller            start no controller, so that nothing moves the arm
@@ -90,6 +91,7 @@ robot=musashi_left_arm
 mujoco=
 chain=() # options of import_robot that select a part of the model
 checkpoint=
+quick=() # option of train
 hardware=false
 controller=true
 combined=false
@@ -116,7 +118,7 @@ nodes='controller|estimator|hardware_emulator|learner|sim'
 sorted=$(getopt --name bringup.sh --options hp: --longoptions robot:,checkpoint:,hardware \
   --longoptions no-controller,combined,bag:,explore,no-explore,no-learner,preset:,seed:,reality: \
   --longoptions joint-source:,params-file:,namespace:,network,duration:,record:,view,port: \
-  --longoptions read-only,mujoco:,joints:,muscles:,without:,base:,end:,from-namespace:,help -- "$@") || refuse 'see ./bringup.sh --help for the legal options'
+  --longoptions read-only,quick,mujoco:,joints:,muscles:,without:,base:,end:,from-namespace:,help -- "$@") || refuse 'see ./bringup.sh --help for the legal options'
 eval set -- "$sorted"
 passed=$sorted
 while [ $# -gt 0 ]; do
@@ -125,6 +127,7 @@ while [ $# -gt 0 ]; do
     --mujoco) mujoco=$2 && shift ;;
     --joints | --muscles | --without | --base | --end) chain+=("$1" "$2") && shift ;;
     --checkpoint) checkpoint=$2 && shift ;;
+    --quick) quick=(--quick) ;;
     --hardware) hardware=true ;;
     --no-controller) controller=false ;;
     --combined) combined=true ;;
@@ -172,6 +175,7 @@ exclude() { # OPTION OTHER_OPTION…
   done
 }
 [ -n "$bag" ] || [ ${#from[@]} = 0 ] || refuse '--from-namespace requires --bag'
+exclude --quick --checkpoint
 exclude --bag --hardware --combined --explore --reality
 exclude --hardware --reality
 exclude --no-controller --combined --explore
@@ -333,14 +337,15 @@ trap 'exit 129' HUP
 
 # Sets $checkpoint to a file in the cache of initial networks, which `train --from-bag` shares.
 train_once() {
-  checkpoint=$("$python" -m musculoskeletal_ae.tools.network_cache "$robot" "$preset") || exit 1
+  checkpoint=$("$python" -m musculoskeletal_ae.tools.network_cache "$robot" "$preset" ${quick[@]:+quick}) || exit 1
   if [ -s "$checkpoint" ]; then
     say "initial network from an earlier run (without what was learned since): $checkpoint"
     return
   fi
   say "training the initial network of $robot (once; it takes a minute or two)"
-  launch train --robot "$robot" --preset "$preset" --out "$checkpoint" \
+  launch train --robot "$robot" --preset "$preset" --out "$checkpoint" "${quick[@]}" \
     > >(tee -p "$logs/train.log" | sed -un -e '/^training: /p' -e '/^warning: /p' \
+      -e '/^[0-9].* random postures can be held/p' \
       -e 's/^error on the geometric model: \([^(]*[^ (]\).*/-- initial network: \1 on the geometric model/p') 2>&1
   wait_for train || died train $?
 }

@@ -11,10 +11,17 @@ You have to fetch the models yourself; this repository does not contain them:
     shoulder        MyoHub/myo_sim, arm/myoarm.xml with five joints (Apache-2.0)
     aero_hand       google-deepmind/mujoco_playground, aero_hand/xmls/right_hand.xml, a hand of
                     TetherIA (Apache-2.0), with its meshes of mujoco_menagerie
+    finger          MyoHub/myo_sim, finger/motorfinger_v0.xml and finger/myofinger_v0.xml
+    hand            MyoHub/myo_sim, hand/myohand.xml, whole, or a finger, the thumb, the wrist of it
+    leg             MyoHub/myo_sim, leg/myolegs.xml, whole, or hip, knee and ankle of one leg
+    arm             MyoHub/myo_sim, arm/myoarm.xml
 
 Each seed is an emulated individual that deviates from the file (`emulator/deviation.py`). The
 columns of a row are
 
+- the share of random postures that the muscles can hold; if there are hardly any, only the reason
+  is printed, with the time after which it was known,
+- the time from the start of the import to the first network [s],
 - the estimation error on the held-out motion before learning, after learning with preset `paper`,
   and after learning with preset `default` [rad, norm over the joints],
 - the number of ruptures that were detected, and the number attributed to the right muscle,
@@ -51,6 +58,7 @@ import numpy as np
 from bench.wire import KINDS, systems
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.design.prospects import prospects
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
@@ -64,7 +72,8 @@ from musculoskeletal_ae.experiments.recording import (
     record,
 )
 from musculoskeletal_ae.experiments.study import Study
-from musculoskeletal_ae.exporting.mjcf import export
+from musculoskeletal_ae.exporting.learned_routes import errors as route_errors
+from musculoskeletal_ae.exporting.mjcf import export_into
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.motion import reach, slowness
@@ -76,9 +85,9 @@ from musculoskeletal_ae.robot.robot import Robot
 
 ALL_NODES = 'with learner'  # the kind of `bench wire` that runs all nodes
 HEAD = (
-    'model', 'seed', 'joints', 'muscles', 'before [rad]', '`paper`', 'after', 'detected', 'named',
-    'trajectory [rad]', 'held [rad]', 'export, network [mm]', 'export, body', 'file, body', 'of',
-    'real time', 'training [s]',
+    'model', 'seed', 'joints', 'muscles', 'held', 'first network [s]', 'before [rad]', '`paper`',
+    'after', 'detected', 'named', 'trajectory [rad]', 'held [rad]', 'export, network [mm]',
+    'export, body', 'file, body', 'of', 'real time', 'training [s]',
 )  # fmt: skip
 NODES_HEAD = 'model', 'joints', 'muscles', *KINDS[ALL_NODES], 'sum', 'arrived'
 MOTIONS, DURATION, TRIES = 4, 2.0, 400
@@ -195,8 +204,19 @@ def learned_error(preset: str, held_out: Recording, study: Study, seed: int) -> 
     return estimation_error(learner.mae, held_out)
 
 
-def table_row(study: Study, name: str, seed: int, training: float) -> list[str]:
-    """Return the cells of one individual; `training` is the duration of its training [s]."""
+def table_row(
+    study: Study, name: str, seed: int, training: float, file: Path, chain: dict[str, Any]
+) -> list[str]:
+    """Return the cells of one individual.
+
+    Args:
+        study: The experiments.
+        name: Name of the model.
+        seed: Seed of the individual.
+        training: CPU time of the initial training [s].
+        file: The MJCF file.
+        chain: The part of it that was imported.
+    """
     robot = study.robot
     held_out = record(study.arm(seed), study.network(None), 0xB0 + seed, study.held_out_time)
     cells = [name, str(seed), str(robot.joint_count), str(robot.muscle_count)]
@@ -207,11 +227,14 @@ def table_row(study: Study, name: str, seed: int, training: float) -> list[str]:
     cells += rupture_cells(study, seed)
     cells += [attempt(error, study, seed) for error in (tracking_error, holding_error)]
     out = study.folder / f'model_{seed}'
-    report = export(robot, study.network(seed), out)
-    exported = import_robot(out / 'model.xml', study.folder / f'exported_{seed}').robot
+    export_into(robot, study.network(seed), file, out)
+    exported = import_robot(out / file.name, study.folder / f'exported_{seed}', **chain).robot
+    theta = robot.random_postures(ARM_POSTURES, np.random.default_rng(0x309))
+    differences = route_errors(exported, study.network(seed), theta)
+    arm_size = np.sqrt((robot.routes.muscle_jacobian(theta) ** 2).sum(axis=2).mean(axis=0))
     bodies = exported.routes, robot.routes
     from_individual = [arm_errors(study.arm(seed), body.muscle_jacobian) for body in bodies]
-    parts = report.arms, *from_individual, report.arm_size
+    parts = differences.arms, *from_individual, arm_size
     cells += [f'{1e3 * np.median(part):.2f}' for part in parts]
     return [*cells, f'{speed(study.arm(seed)):.1f}', f'{training:.0f}']
 
@@ -267,17 +290,29 @@ def model_rows(
     """Import a model, train, and yield the row of each individual."""
     folder = args.out / name
     folder.mkdir(parents=True)
-    robot: Robot = import_robot(file, folder / 'robot', **chain).robot
+    begun = time.perf_counter()
+    share = 1.0
+
+    def check(robot: Robot) -> None:
+        nonlocal share
+        found = prospects(robot)
+        share = found.share
+        if found.is_pointless:
+            seconds = time.perf_counter() - begun
+            raise MusculoskeletalError(f'after {seconds:.1f} s: {" ".join(found.lines())}')
+
+    robot: Robot = import_robot(file, folder / 'robot', check, **chain).robot
     study = Individuals(
         robot, 'default', args.seeds, args.minutes, quick=args.quick, folder=folder,
         reality=str(folder / 'robot' / 'model.xml'),
     )  # fmt: skip
     start = time.process_time()
     online_learning.train_initial(study, study.preset)
-    training = time.process_time() - start
+    training, first = time.process_time() - start, time.perf_counter() - begun
     online_learning.train_initial(study, PAPER_PRESET)
     for seed in args.seeds:
-        yield table_row(study, name, seed, training)
+        cells = table_row(study, name, seed, training, file, chain)
+        yield [*cells[:4], f'{100 * share:.0f} %', f'{first:.0f}', *cells[4:]]
 
 
 def main(argv: list[str]) -> None:

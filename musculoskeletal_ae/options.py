@@ -167,6 +167,18 @@ class Parser(argparse.ArgumentParser):
         text = 'initial checkpoint (default: train one)'
         self.add_argument('--initial', type=Path, metavar='FILE', help=text)
 
+    def add_chain(self) -> None:
+        """Add the options that select a part of a model to import."""
+        for kind in ('joints', 'muscles'):
+            text = f'{kind} to keep'
+            self.add_argument(f'--{kind}', type=names, default=[], metavar='NAME,…', help=text)
+        text = 'muscles to leave out'
+        self.add_argument('--without', type=names, default=[], metavar='NAME,…', help=text)
+        self.add_argument('--base', metavar='LINK', help='root link of the chain to keep')
+        text = 'end effector: a link, a site, or LINK_tip, the far end of a drawn link; '
+        text += 'joints outside the chain to it are held fixed'
+        self.add_argument('--end', metavar='NAME', help=text)
+
     def add_plot(self, text: str) -> None:
         """Add `--plot`, the file of a picture for `save_plot`; the text says what it shows."""
         self.add_argument('--plot', type=picture, metavar='FILE.png', help=f'draw {text}')

@@ -35,11 +35,16 @@ class ProgressBar:
 
     Lines of text look like `training: 40 %, loss 0.0213, about 12 s left`. They are printed every
     REPORT_INTERVAL, so that short tasks print none. The remaining time is left out until
-    ESTIMATE_TIME has passed and ESTIMATE_SHARE is done.
+    ESTIMATE_TIME has passed and, unless all parts take the same time, ESTIMATE_SHARE is done.
     """
 
     def __init__(
-        self, title: str, total: float = 1.0, note: Callable[[], str] | None = None
+        self,
+        title: str,
+        total: float = 1.0,
+        note: Callable[[], str] | None = None,
+        *,
+        is_even: bool = False,
     ) -> None:
         """Show the bar, if stderr is a terminal.
 
@@ -47,7 +52,9 @@ class ProgressBar:
             title: What is being done.
             total: Sum of all parts.
             note: Returns a text on the present state, which is shown beside the progress.
+            is_even: Whether all parts take the same time.
         """
+        self._least_share = 0.0 if is_even else ESTIMATE_SHARE
         self._title, self._total, self._note = title, total, note
         self._is_bar = is_bar_visible()
         self._bar = tqdm(
@@ -105,7 +112,7 @@ class ProgressBar:
         """Return the remaining time as a text, or '' while an estimate would be unreliable."""
         assert self._first is not None
         begun, done = self._first
-        if now - begun < ESTIMATE_TIME or self._done - done < ESTIMATE_SHARE * self._total:
+        if now - begun < ESTIMATE_TIME or self._done - done < self._least_share * self._total:
             return ''
         left = (self._total - self._done) * self._recent_time / self._recent_parts
         return f'about {left:.0f} s left'

@@ -97,3 +97,49 @@ CARDSFLOW = """<cardsflow>
     <link name="base"><viaPoint>0 0 0</viaPoint></link></myoMuscle>
 </cardsflow>
 """
+
+#: a finger whose straight flexor passes over the axis of its joint, and with a return spring
+SNAPPING = """
+<mujoco>
+  <compiler angle="radian" autolimits="true"/>
+  <worldbody>
+    <site name="f0" pos="0.01 0 0.02"/><site name="e0" pos="-0.01 0 0.02"/>
+    <body name="finger">
+      <joint name="mcp" axis="0 1 0" range="0 1.5" damping="0.01"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.05" size="0.008" mass="0.03"/>
+      <site name="f1" pos="0.01 0 -0.02"/><site name="e1" pos="-0.01 0 -0.02"/>
+    </body>
+  </worldbody>
+  <tendon>
+    <spatial name="flexor"><site site="f0"/><site site="f1"/></spatial>
+    <spatial name="return" stiffness="500" springlength="0 0.01">
+      <site site="e0"/><site site="e1"/>
+    </spatial>
+  </tendon>
+  <actuator><motor name="flexor" tendon="flexor" ctrlrange="-60 0"/></actuator>
+</mujoco>
+"""
+
+#: a pendulum that is far too heavy for its two tendons
+HEAVY = """
+<mujoco model="heavy">
+  <worldbody>
+    <site name="a0" pos="0.03 0 0.1"/><site name="b0" pos="-0.03 0 0.1"/>
+    <body name="link">
+      <joint name="swing" axis="0 1 0" range="-60 60"/>
+      <geom type="capsule" fromto="0 0 0 0.5 0 0" size="0.05" mass="500"/>
+      <site name="a1" pos="0.03 0 -0.1"/><site name="b1" pos="-0.03 0 -0.1"/>
+      <body name="tip" pos="0.5 0 0">
+        <joint name="loose" axis="0 1 0" range="-60 60"/><geom size="0.02" mass="0.1"/>
+      </body>
+    </body>
+  </worldbody>
+  <tendon>
+    <spatial name="a"><site site="a0"/><site site="a1"/></spatial>
+    <spatial name="b"><site site="b0"/><site site="b1"/></spatial>
+  </tendon>
+  <actuator>
+    <motor name="a" tendon="a" ctrlrange="-50 0"/><motor name="b" tendon="b" ctrlrange="-50 0"/>
+  </actuator>
+</mujoco>
+"""

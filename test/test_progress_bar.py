@@ -58,12 +58,12 @@ def test_a_long_task_prints_its_progress_at_intervals(capsys, monkeypatch):
     assert lines[0].startswith('working: ') and ' %, note, about ' in lines[-1]
 
 
-def lines_of(durations, capsys, monkeypatch):
+def lines_of(durations, capsys, monkeypatch, **options):
     """Return the time [s] and the text of each line about parts with these durations [s]."""
     now = 0.0
     monkeypatch.setattr(progress_bar, 'time', SimpleNamespace(perf_counter=lambda: now))
     lines = []
-    with ProgressBar('working', len(durations)) as bar:
+    with ProgressBar('working', len(durations), **options) as bar:
         for duration in durations:
             now += duration
             bar.add()
@@ -78,6 +78,13 @@ def test_the_remaining_time_is_not_shown_before_5_s_and_5_percent(part, capsys, 
         is_reliable = at >= 5.5 + max(5.0, part * 50.0)
         assert (' s left' in line) == is_reliable, (at, line)
     assert ' s left' in lines[-1][1] and ' s left' not in lines[0][1]
+
+
+def test_the_remaining_time_of_equal_parts_is_shown_after_5_s(capsys, monkeypatch):
+    lines = lines_of([1.0] * 1000, capsys, monkeypatch, is_even=True)
+    (at, line) = lines[1]
+    assert at <= 10.0
+    assert 'about 990 s left' in line
 
 
 def test_the_remaining_time_does_not_jump_if_some_parts_take_much_longer(capsys, monkeypatch):

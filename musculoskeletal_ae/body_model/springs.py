@@ -5,8 +5,9 @@
 
 K̄ and b̄ are the stated stiffness and preload. α are logarithmic errors of the stiffnesses, and β
 errors of the torques at θ = 0 [N·m]. In this form, K has no negative eigenvalue for any α. Only
-joints with their own spring in muscles.yaml have these two parameters. They follow from the torque
-balance of rest samples (`posture_model`), and therefore only from samples with tensions.
+joints with a spring or a passive tendon in muscles.yaml have these two parameters; α does not
+change the passive tendons. Both follow from the torque balance of rest samples
+(`posture_model`), and therefore only from samples with tensions.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def none_learned(joint_count: int) -> Array:
 
 def prior_spread(nominal: JointElasticity) -> Array:
     """Return the prior spread of α and of β [N·m], (2, D); `nominal` are those of muscles.yaml."""
-    stiffness = np.diag(nominal.stiffness)
+    stiffness = nominal.typical_stiffness
     return np.stack([np.full(len(stiffness), STIFFNESS_SPREAD), stiffness * REST_SPREAD])
 
 
@@ -40,7 +41,8 @@ def learned(nominal: JointElasticity, springs: Array) -> JointElasticity:
     log = np.clip(springs[0], -LARGEST_LOG, LARGEST_LOG)
     scale = np.exp(0.5 * log)
     stiffness = scale[:, None] * nominal.stiffness * scale
-    return JointElasticity(stiffness, np.exp(log) * nominal.preload + springs[1], nominal.damping)
+    preload = np.exp(log) * nominal.preload + springs[1]
+    return JointElasticity(stiffness, preload, nominal.damping, nominal.tendons)
 
 
 def slope(nominal: JointElasticity, springs: Array, theta: Array, joints: Ints) -> Array:

@@ -10,10 +10,10 @@ For postures drawn uniformly within the joint limits, the check computes
 
 A tendon parallel to the axis of a prismatic joint has r = RACK (`robot/joint_units.py`).
 
-doc/explanation/method.md ("An arm must be holdable") defines a sound arm. A joint with a spring of
-its own may have muscles on one side only, if these muscles can hold the joint. The report also
-shows the one-sided stiffness, for information only. In it, muscles at the tension that their
-modules maintain (T_bias, or 0 for position-controlled modules) count as slack.
+doc/explanation/method.md ("An arm must be holdable") defines a sound arm. A joint with a spring
+or a passive tendon may have muscles on one side only, if these muscles can hold the joint. The
+report also shows the one-sided stiffness, for information only. In it, muscles at the tension that
+their modules maintain (T_bias, or 0 for position-controlled modules) count as slack.
 
 A suspended robot, such as a platform that hangs on four tendons, is judged in its equilibria only
 (`equilibria.py`), and need only be stable there.
@@ -102,9 +102,9 @@ class Setting(NamedTuple):
     theta: Array  # [rad], (N, D)
     jacobian: Array  # G [m/rad], (N, M, D)
     hessian: Array  # ∂²l/∂θ² [m/rad²], (N, M, D, D)
-    torque: Array  # g + K θ − b, which holds the arm against weight and springs [N·m], (N, D)
+    torque: Array  # g + K θ − b + h, which holds the arm against weight and springs [N·m], (N, D)
     weight: Array  # g [N·m], (N, D)
-    springs: Array  # K [N·m/rad], (D, D)
+    springs: Array  # stiffness of springs and passive tendons [N·m/rad], (N, D, D)
 
     @classmethod
     def of(cls, robot: Robot, theta: Array) -> Setting:
@@ -113,7 +113,8 @@ class Setting(NamedTuple):
         elasticity = robot.kinematics.elasticity
         torque = weight + elasticity.holding_torque(theta)
         slopes = _slopes(robot, theta)
-        return cls(robot, theta, *slopes, torque, weight, elasticity.stiffness)
+        springs = elasticity.stiffness_at(theta)
+        return cls(robot, theta, *slopes, torque, weight, springs)
 
     def rerouted(self, robot: Robot) -> Setting:
         """Return the quantities of a robot that differs from this one only in its routes."""
@@ -230,7 +231,7 @@ def _at_tensions(
         tension: Holding tensions [N], (N, M); NaN where the posture is not held.
         missing: Torque that the muscles lack [N·m], (N, D).
         required: Required stiffness [N·m/rad].
-        passive: Stiffness that does not come from the muscles [N·m/rad], (D, D) or (N, D, D).
+        passive: Stiffness that does not come from the muscles [N·m/rad], (N, D, D).
     """
     robot, theta, jacobian, hessian, *_ = setting
     arms = -jacobian
@@ -243,9 +244,8 @@ def _at_tensions(
     # as taut.
     is_taut = tension[held] > robot.actuation.kept_tension + SLACK_MARGIN
     taut = np.where(is_taut, k, 0.0)
-    passive = passive if passive.ndim == 2 else passive[held]
     full, sided = (
-        passive + joint_stiffness(jacobian[held], hessian[held], x, tension[held])
+        passive[held] + joint_stiffness(jacobian[held], hessian[held], x, tension[held])
         for x in (k, taut)
     )
     values, vectors = np.linalg.eigh(full)
@@ -403,8 +403,8 @@ def _one_way_joints(
 ) -> Iterator[Finding]:
     """Yield a fault for each joint that lacks necessary muscles in too many postures.
 
-    A joint needs muscles on both sides, or on one side if it has a spring of its own. The joints of
-    a suspended robot need any muscle.
+    A joint needs muscles on both sides, or on one side if it has a spring or a passive tendon. The
+    joints of a suspended robot need any muscle.
     """
     lacks = {
         '+': np.max(moment_arms, axis=1) <= matters,
@@ -413,7 +413,7 @@ def _one_way_joints(
     median, longest = np.median(moment_arms, axis=0), np.abs(moment_arms).max(axis=0)
     one_way = np.mean(lacks['+'] | lacks['-'], axis=0) > TOLERATED_SHARE
     # A joint with a spring needs muscles on one side only, because the spring turns it back.
-    has_muscle = ~(lacks['+'] & lacks['-']).any(axis=0)
+    has_muscle = np.mean(lacks['+'] & lacks['-'], axis=0) <= TOLERATED_SHARE
     one_way &= ~(robot.kinematics.elasticity.is_sprung & has_muscle)
     for joint in np.flatnonzero(one_way).tolist():
         missing = ' and '.join(

@@ -29,6 +29,7 @@ from musculoskeletal_ae.emulator.modules import STEP, Command, Modules, MuscleSt
 from musculoskeletal_ae.emulator.wrapping import Placed
 from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.kinematics import joint_space_inertia
+from musculoskeletal_ae.robot.passive_tendons import add_passive
 from musculoskeletal_ae.robot.robot import Robot
 
 SLIDING_DISTANCE = 0.0005  # sliding distance over which tendon friction builds up [m]
@@ -43,13 +44,13 @@ STOP_LOAD = 40.0  # load by weight and muscles at T_bias above which stops are s
 #: Constants of one individual for the compiled step: series elastic elements, tendons and sensors
 #: of M muscles; friction and stops of the J−1 joints of the tree; joint of the end effector, and
 #: its position in that joint's frame [m]. `gear` multiplies viscous friction, `firmness` the stops.
-#: `springs` (D, D), `preload` and `damping` (D,) are those of the joints of θ, whose indices in the
-#: tree are `order`.
+#: `springs` (D, D), `preload`, `damping` (D,) and `passive` tendons are those of the joints of θ,
+#: whose indices in the tree are `order`.
 Body = namedtuple(
     'Body',
     'force rate wire_stretch length_at_zero tendon_friction sensor_gain sensor_offset '
     'joint_friction lower upper gear firmness effector_joint effector '
-    'springs preload damping order',
+    'springs preload damping passive order',
 )
 #: q, q̇, friction state in [−1, 1] and generalised torque of the tree, each (J−1,).
 JointState = namedtuple('JointState', 'q velocity sticking torque')
@@ -128,6 +129,12 @@ def muscle_step(arm: Handle, kind: int, acceleration: Array) -> None:
         joint.torque[i] += body.preload[d] - body.damping[d] * joint.velocity[i]
         for e in range(body.order.shape[0]):
             joint.torque[i] -= body.springs[d, e] * joint.q[body.order[e]]
+    if body.passive.law.shape[0]:
+        own = joint.q[body.order]
+        held, slopes = np.zeros(own.shape[0]), np.zeros((own.shape[0], own.shape[0]))
+        add_passive(body.passive, own, held, slopes)
+        for d in range(own.shape[0]):
+            joint.torque[body.order[d]] -= held[d]
     for s in range(routes.first.shape[0]):
         tension = muscle.end_tension[routes.muscle[s]]
         wrapping.add_tension_torque(routes, s, placed, tension, joint.torque)
@@ -230,7 +237,7 @@ class EmulatedArm(modules.Arm):
             true.tendon_friction, true.tension_gain, true.tension_bias, friction, lower, upper,
             self._gear, firmness, joint, np.array(hand.translation),
             np.ascontiguousarray(springs.stiffness), springs.preload.copy(),
-            springs.damping.copy(), self._order.astype(np.int64),
+            springs.damping.copy(), springs.tendons.arrays, self._order.astype(np.int64),
         )  # fmt: skip
 
     def _stand(self, theta: Array) -> None:

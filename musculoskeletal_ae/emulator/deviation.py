@@ -9,7 +9,7 @@ A built robot never equals its description exactly. The seed draws these differe
     tendon friction      15 to 20 % of the tension along the route
     joint friction       1.1 to 1.5 % of the joint's largest load by weight and muscles at T_bias
     masses               σ = 10 % of the mass of each body, with its inertia
-    tension sensors      gain: σ = 2 %; offset: σ = 1 % of T_limit
+    tension sensors      gain: σ = 2 %; offset: σ = 10 % of T_bias
     joint sensors        offset: σ = 1°
 
 Both kinds of friction are in addition to the friction in the file. The typical moment arm is the
@@ -32,7 +32,9 @@ FARTHEST = 0.005  # largest σ of a displacement [m]
 SLACK = 0.05  # σ of the slack, relative to the typical moment arm
 LONGEST = 0.002  # largest σ of the slack [m]
 MASS = 0.1  # σ of the logarithm of a mass
-ZERO = 0.01  # σ of the offset of tension sensors, relative to T_limit
+#: σ of the offset of tension sensors, relative to T_bias: modules that keep a low tension have
+#: sensors that can measure it
+ZERO = 0.1
 POSTURES = 200  # number of postures over which moment arms are averaged
 
 
@@ -44,7 +46,7 @@ def effects(robot: Robot) -> Effects:
         guide_friction=0.2,
         joint_friction=0.015,
         tension_gain=0.02,
-        tension_zero=ZERO * float(np.median(robot.tension.limit)),
+        tension_zero=ZERO * float(np.median(robot.tension.bias)),
         joint_zero=np.radians(1.0),
     )
 

@@ -52,6 +52,8 @@ HEAT_SPREAD = 0.15  # standard deviation of the logarithm of LOSS, the capacitie
 ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # [rad]
 LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # [m]
 TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # [N]
+#: largest noise of a tension sensor relative to T_bias: sensors of weak muscles are finer
+TENSION_NOISE_SHARE = 0.1
 TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3  # [°C]
 CURRENT_NOISE, CURRENT_RESOLUTION = 1.0, 2.0**-3  # of a motor current, as a tension [N]
 #: errors of a motor current as a measure of tension: standard deviation of the logarithm of the
@@ -469,7 +471,10 @@ class Arm(ABC):
         theta, length, tension, housing = self._raw_readings()
         ruptured, rng = self._muscle.ruptured > 0.0, self._rng
         # A ruptured tendon does not load the sensor, and a tension sensor does not read below zero.
-        measured = noisy(np.where(ruptured, 0.0, tension), TENSION_NOISE, TENSION_RESOLUTION, rng)
+        finest = TENSION_NOISE_SHARE * self.robot.description.tension.bias
+        fineness = np.minimum(1.0, finest / TENSION_NOISE)
+        noise, resolution = fineness * TENSION_NOISE, fineness * TENSION_RESOLUTION
+        measured = noisy(np.where(ruptured, 0.0, tension), noise, resolution, rng)
         readings = Readings(
             noisy(theta, ANGLE_NOISE, ANGLE_RESOLUTION, rng),
             noisy(length, LENGTH_NOISE, LENGTH_RESOLUTION, rng),

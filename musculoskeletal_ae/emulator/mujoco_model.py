@@ -64,6 +64,12 @@ def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
 def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
     """Return an individual's links and joints as an MjSpec, and the MuJoCo body of each joint."""
     kin, spec = robot.kinematics, mujoco.MjSpec()
+    if passive := kin.elasticity.tendons.names:
+        problem = f'passive tendon {passive[0]!r} has no route'
+        raise MusculoskeletalError(
+            f'a MuJoCo model cannot be made from {robot.description.directory}: {problem}; use the '
+            'reality model.xml that import_robot wrote, or `kin`, and export with --into'
+        )
     model, names, links = kin.model, list(kin.model.names), draw.sizes.links
     spec.option.gravity = model.gravity.linear
     spec.compiler.balanceinertia, spec.compiler.degree = True, False
@@ -319,7 +325,7 @@ def _add_hand(body: Any, at: pin.SE3) -> None:
 def from_file(robot: Robot, file: Path) -> Any:
     """Return the compiled model of the file that `import_robot` wrote beside a robot.
 
-    The joint limits are those of the robot directory.
+    The joint limits are those of the robot directory, with firm stops.
 
     Raises:
         MusculoskeletalError: If MuJoCo cannot load the file, if the file lacks a tendon, a motor or
@@ -349,6 +355,9 @@ def from_file(robot: Robot, file: Path) -> Any:
     ids = [model.joint(name).id for name in robot.joints]
     ends = robot.units.to_position(np.array([robot.lower, robot.upper]))
     model.jnt_limited[ids], model.jnt_range[ids] = 1, ends.T
+    # The stops of MuJoCo yield in proportion to torque over inertia: a strong muscle would press a
+    # light finger far beyond its limits.
+    model.jnt_solimp[ids] = STIFF
     return model
 
 

@@ -29,9 +29,12 @@ from musculoskeletal_ae.emulator import mujoco_model
 from musculoskeletal_ae.emulator.effects import NONE, Draw
 from musculoskeletal_ae.emulator.modules import joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exporting.learned_routes import learned_routes, place_of
+from musculoskeletal_ae.exporting.user_file import UserFile
 from musculoskeletal_ae.files import new_directory
+from musculoskeletal_ae.importing.source import names_of_all
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.robot.description import Route, RoutePoint
+from musculoskeletal_ae.robot.description import RoutePoint
 from musculoskeletal_ae.robot.drawing import SHORTEST_BONE
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -70,6 +73,7 @@ class Report(NamedTuple):
     stretch: Array  # largest error of the linear spring within [T_bias, T_limit] [m], (M,)
     warnings: tuple[str, ...]  # warnings of MuJoCo about the model
     mjx: str  # text that says whether MJX can load the model
+    kept: dict[str, str]  # why a muscle keeps the points of the robot directory, by muscle
 
     def text(self, robot: Robot, offsets: Array) -> str:
         """Return the report as a text; `offsets` are the offsets of the controls [m], (M,)."""
@@ -85,10 +89,71 @@ class Report(NamedTuple):
             f'{name} {unit.torque_text(value, ".2g")}'
             for name, value, unit in zip(robot.joints, self.torque, robot.units)
         )
+        lines += ['', kept_text(self.kept)]
         warned = '; '.join(self.warnings) or 'none'
         lines += ['', f'torque of weight and springs, largest difference: {torques}']
         lines += [f'warnings of MuJoCo: {warned}', f'MJX {self.mjx}', '', LEGEND]
         return '\n'.join(lines)
+
+
+def kept_text(kept: dict[str, str]) -> str:
+    """Return a line that names the muscles with the points of the input, and the reasons."""
+    reasons = dict[str, list[str]]()
+    for muscle, reason in kept.items():
+        reasons.setdefault(reason, []).append(muscle)
+    parts = [f'{", ".join(muscles)} ({reason})' for reason, muscles in reasons.items()]
+    return f'muscles that keep their points: {"; ".join(parts) or "none"}'
+
+
+def export_into(robot: Robot, mae: Mae, file: Path, out: Path, seed: int = 0) -> str:
+    """Write a copy of a user's MJCF file with learned attachment points, and `report.txt`.
+
+    Args:
+        robot: The robot that was imported from the file.
+        mae: The network that learned an arm of this robot.
+        file: The file.
+        out: A new or empty directory.
+        seed: Seed of the fit.
+
+    Returns:
+        The report.
+
+    Raises:
+        MusculoskeletalError: If the file is not that of the robot, the directory is not empty, or
+            MuJoCo does not load the result.
+    """
+
+    def refuse(where: Path, problem: str) -> MusculoskeletalError:
+        return MusculoskeletalError(f'{where}: {problem}')
+
+    user = UserFile(file)
+    bodies = [user.model.body(i).name for i in range(user.model.nbody)]
+    places = user.places(dict(zip(bodies, names_of_all('body', bodies), strict=True)))
+    own = {place_of(p) for r in robot.description.routes for p in r if isinstance(p, RoutePoint)}
+    if own.isdisjoint(places):
+        raise refuse(
+            file, f'no site is at a route point of {robot.description.directory}; import it'
+        )
+    with new_directory(out, refuse):
+        robot = robot.with_elasticity(mae.elasticity)
+        body = CalibratedBody.of_straight_lines(robot)
+        fit_to_network(body, mae, seed, with_remainder=False)
+        learned = learned_routes(robot, body, mae, places)
+        for route, moved in zip(robot.description.routes, learned.routes, strict=True):
+            for before, after in zip(route, moved, strict=True):
+                if isinstance(before, RoutePoint) and before is not after:
+                    user.move(places[place_of(before)], after.xyz)
+        written = user.write(out)
+        mjx = loads_in_mjx(mujoco.MjModel.from_xml_path(str(written)))
+        head = f'{"muscle":<28}{"length [mm]":>18}{"moment arm [mm]":>20}'
+        lines = [f'{written.name}: {file} with learned attachment points', '', head]
+        parts = *learned.before, *learned.after
+        for name, l0, a0, l1, a1 in zip(robot.muscles, *(1e3 * part for part in parts)):
+            lines.append(f'{name:<28}{f"{l0:.2f} → {l1:.2f}":>18}{f"{a0:.2f} → {a1:.2f}":>20}')
+        lines += ['', 'differences from the network, of the file → of the copy, as in export_mjcf']
+        lines += ['', kept_text(learned.kept), f'MJX {mjx}', '']
+        (out / 'report.txt').write_text(text := '\n'.join(lines), encoding='utf-8')
+    return text
 
 
 def loads_in_mjx(model: Any) -> str:
@@ -122,8 +187,8 @@ def _write(robot: Robot, mae: Mae, out: Path, seed: int) -> Report:
     robot = robot.with_elasticity(mae.elasticity)
     body = CalibratedBody.of_straight_lines(robot)
     fit_to_network(body, mae, seed, with_remainder=False)
-    shift = np.concatenate([body.shift(m) for m in range(robot.muscle_count)])
-    moved = Robot(replace(robot.description, routes=_moved(robot, shift)))
+    learned = learned_routes(robot, body, mae)
+    moved = Robot(replace(robot.description, routes=learned.routes))
     moved = moved.with_elasticity(mae.elasticity)
     springs = _springs(robot, body)
     spec = _spec(moved, mae, springs)
@@ -141,7 +206,7 @@ def _write(robot: Robot, mae: Mae, out: Path, seed: int) -> Report:
         model = mujoco.MjModel.from_xml_path(str(file))
     finally:
         mujoco.set_mju_user_warning(lambda _: None)
-    report, offsets = _compare(robot, mae, model, springs, tuple(warnings))
+    report, offsets = _compare(robot, mae, model, springs, tuple(warnings), learned.kept)
     text = report.text(robot, offsets)
     (out / 'report.txt').write_text(text, encoding='utf-8')
     return report
@@ -169,22 +234,6 @@ def _springs(robot: Robot, body: CalibratedBody) -> Springs:
         error = float(np.abs(middle + (tension - mid[m]) / stiffness - elongation).max())
         rows.append((mid[m], middle, stiffness, error))
     return Springs(*map(np.array, zip(*rows, strict=True)))
-
-
-def _moved(robot: Robot, shift: Array) -> tuple[Route, ...]:
-    """Return the routes with their points displaced by `shift` [m] (P, 3).
-
-    Each row of `shift` is given in the frame of the joint that moves the point.
-    """
-    left = iter(shift)
-
-    def item(part: Any) -> Any:
-        if not isinstance(part, RoutePoint):
-            return part
-        _, at = robot.kinematics.placement(part.link)
-        return part._replace(xyz=part.xyz + at.rotation.T @ next(left))
-
-    return tuple(tuple(item(part) for part in route) for route in robot.description.routes)
 
 
 def _spec(robot: Robot, mae: Mae, springs: Springs) -> Any:
@@ -242,7 +291,12 @@ def _quaternion(at: pin.SE3) -> Array:
 
 
 def _compare(
-    robot: Robot, mae: Mae, model: Any, springs: Springs, warnings: tuple[str, ...]
+    robot: Robot,
+    mae: Mae,
+    model: Any,
+    springs: Springs,
+    warnings: tuple[str, ...],
+    kept: dict[str, str],
 ) -> tuple[Report, Array]:
     """Compare an exported model with the network from which it was made.
 
@@ -252,6 +306,7 @@ def _compare(
         model: The compiled MjModel.
         springs: Linear springs that represent the series elastic elements in the model.
         warnings: Warnings of MuJoCo about the model, for the report.
+        kept: Why muscles keep their points, for the report.
 
     Returns:
         The report, and for each muscle the offset [m], (M,), that is added to a length l in
@@ -283,6 +338,7 @@ def _compare(
         stretch=springs.error,
         warnings=warnings,
         mjx=loads_in_mjx(model),
+        kept=kept,
     ), off.mean(axis=0) + springs.elongation - springs.tension / springs.stiffness
 
 

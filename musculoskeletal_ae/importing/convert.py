@@ -4,15 +4,18 @@
 import re
 from argparse import Namespace
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 
 from musculoskeletal_ae.design.checks import RobotCheck, check_robot
+from musculoskeletal_ae.design.prospects import prospects
 from musculoskeletal_ae.design.route_jumps import jump_choices
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import new_directory, read_text
 from musculoskeletal_ae.importing.cardsflow import read_cardsflow, read_urdf_skeleton
+from musculoskeletal_ae.importing.held_range import held_ranges
 from musculoskeletal_ae.importing.mjcf import read_mjcf
 from musculoskeletal_ae.importing.source import (
     ARM_POSTURES,
@@ -86,12 +89,15 @@ def read_source(file: Path) -> Source:
     return source
 
 
-def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
+def import_robot(
+    file: Path, out: Path, loaded: Callable[[Robot], None] = lambda _: None, **chain: Any
+) -> Imported:
     """Import a file as a robot directory.
 
     Args:
         file: The file.
         out: A new or empty directory.
+        loaded: Gets the new robot before it is compared with the source, which takes longer.
         chain: Options of `cut`.
 
     Raises:
@@ -104,15 +110,23 @@ def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
     if not source.routes:
         raise refuse(file, '; '.join(['no muscle remains', *source.lost()[-3:]]))
     with new_directory(out, refuse):
+        notes = list(source.notes)
         write(source, out)
         robot = Robot.load(out)
+        if held := held_ranges(robot):
+            source.notes = notes  # those of `write` come again
+            for part in held:
+                source.reduce_range(*part)
+            write(source, out)
+            robot = Robot.load(out)
+    loaded(robot)
     return Imported(robot, tuple(source.notes), compare(source, robot))
 
 
 def run(args: Namespace) -> int:
     """Import a file, print the report, and return the exit status."""
     chain = {name: getattr(args, name) for name in ('joints', 'muscles', 'without', 'base', 'end')}
-    robot, notes, comparison = import_robot(args.file, args.out, **chain)
+    robot, notes, comparison = import_robot(args.file, args.out, show_prospects, **chain)
     for note, count in Counter(notes).items():
         print(note + (f' ({count} times)' if count > 1 else ''))
     for note in robot.description.joint_notes:
@@ -129,6 +143,12 @@ def run(args: Namespace) -> int:
     print(f'{args.out}: {robot.joint_count} joints, {robot.muscle_count} muscles')
     print(check_verdict(check_robot(robot)))
     return 0
+
+
+def show_prospects(robot: Robot) -> None:
+    """Print what can be expected of a robot."""
+    for line in prospects(robot).lines():
+        print(line, flush=True)
 
 
 def length_verdict(comparison: Comparison | None) -> str:

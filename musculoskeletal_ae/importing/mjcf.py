@@ -4,7 +4,8 @@
 Spatial tendons become routes: sites, wrapping spheres and cylinders with their side sites, and
 branches over pulleys. Hinges and slides become joints; a body with several joints becomes a chain
 of massless links, and a ball joint becomes three hinges. `equality/joint` becomes a coupling.
-Springs and dampers of joints, and springs of fixed tendons, become `joint_elasticity`.
+Springs and dampers of joints, and springs of fixed tendons, become `joint_elasticity`. Springs of
+other tendons become `passive_tendons`, and their damping becomes damping of the joints.
 
 If a site lies on the rim of an object that its tendon wraps around, rounding decides in MuJoCo
 whether the tendon wraps. In this package, the site counts as outside (`robot/wrapping.py`). To make
@@ -14,6 +15,7 @@ MuJoCo agree, the import reduces the radius of the object there by a share 2·RI
 """
 
 from collections import defaultdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -26,6 +28,7 @@ from scipy.spatial.transform import Rotation
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.importing.adapted_mjcf import AdaptedModel
 from musculoskeletal_ae.importing.source import (
+    PassiveTendon,
     Source,
     Spring,
     distinct,
@@ -175,6 +178,7 @@ def _ends(model: Any, data: Any, geom: int) -> Array:
 class _Reader:
     def __init__(self, model: Any, name: str) -> None:
         self.model, self.source = model, Source(safe_name(name, 'robot'))
+        self.source.is_rigid = True
         weightless = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
         self.source.model.gravity.linear = model.opt.gravity * (not weightless)
         self.start = mujoco.MjData(model)
@@ -184,15 +188,18 @@ class _Reader:
         #: by coupled joint: its master (−1: none) and the coefficients, the highest power first
         self.polynomials: dict[int, tuple[int, Array]] = {}
         self.tendons: dict[str, int] = {}
+        self.passive: dict[str, int] = {}
         self.radius = model.geom_size[:, 0].copy()  # as in the file, before `tie_rims` changes it
         self._tie_rims()
         self._bodies()
         self._points()
         self._couplings()
         self._springs()
+        self._passive_tendons()
         self._not_modelled()
         self._tendons()
-        self.source.lengths = self._lengths
+        self.source.lengths = partial(self._lengths, self.tendons)
+        self.source.passive_lengths = partial(self._lengths, self.passive)
 
     def _names(self, kind: str) -> list[str]:
         """Return the names of all elements of a kind; unnamed ones are numbered."""
@@ -222,10 +229,27 @@ class _Reader:
             shares = {self.names['joint'][m.wrap_objid[w]]: float(m.wrap_prm[w]) for w in path}
             low, high = m.tendon_lengthspring[t]
             name = f'tendon {self.names["tendon"][t]}'
-            if high - low > 1e-9:
-                source.note('dropped', f'springs: {name}, which is slack from {low:g} to {high:g}')
+            if high - low > 1e-9:  # its spring is slack in between
                 continue
             source.springs.append(Spring(shares, float(m.tendon_stiffness[t]), float(low), name))
+
+    def _passive_tendons(self) -> None:
+        """Read the elasticity and damping of tendons that `_springs` does not represent."""
+        m, source = self.model, self.source
+        low, high = m.tendon_lengthspring.T
+        is_linear = self._is_fixed() & (high - low <= 1e-9)
+        stiffness = m.tendon_stiffness * ~is_linear
+        for t in np.flatnonzero((stiffness > 0.0) | (m.tendon_damping > 0.0)).tolist():
+            slack, name = (float(low[t]), float(high[t])), self.names['tendon'][t]
+            parts = float(stiffness[t]), slack, float(m.tendon_damping[t])
+            source.passive.append(PassiveTendon(name, *parts))
+            self.passive[name] = t
+        for kind, effect in (('joint', 'jnt_stiffness'), ('tendon', 'tendon_stiffness')):
+            # Recent versions of MuJoCo have springs whose force is a polynomial.
+            higher = np.asarray(getattr(m, f'{effect}poly', np.zeros((0, 1))))
+            for i in np.flatnonzero(higher.any(axis=1)).tolist():
+                problem = f'nonlinear stiffness: {kind} {self.names[kind][i]}'
+                source.note('dropped', problem)
 
     def _is_fixed(self) -> Bools:
         """Return a mask (tendons,) of the fixed tendons, which have no route."""
@@ -233,15 +257,13 @@ class _Reader:
         return fixed
 
     def _not_modelled(self) -> None:
-        m, fixed = self.model, self._is_fixed()
+        m = self.model
         for kind, effect, values in (
             ('joint', 'armature', m.dof_armature[m.jnt_dofadr]),
             ('joint', "limits of the actuators' force", m.jnt_actfrclimited),
             ('joint', 'friction', m.dof_frictionloss[m.jnt_dofadr]),
-            ('tendon', 'springs', m.tendon_stiffness * ~fixed),
             ('tendon', 'armature', m.tendon_armature),
             ('tendon', 'limits', m.tendon_limited),
-            ('tendon', 'damping', m.tendon_damping),
             ('tendon', 'friction', m.tendon_frictionloss),
             ('body', 'compensated weight', m.body_gravcomp),
         ):
@@ -330,29 +352,39 @@ class _Reader:
         driven = defaultdict(list)
         for a in range(m.nu):
             if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON:
-                driven[int(m.actuator_trnid[a][0])].append(self._strength(a))
+                driven[int(m.actuator_trnid[a][0])].append(self._pull(a))
             else:
                 name = self.names['actuator'][a]
                 source.note('dropped', f'actuator {name}: it does not act on a tendon')
         for t in range(m.ntendon):
             name, first = self.names['tendon'][t], m.tendon_adr[t]
             if m.wrap_type[first] == mujoco.mjtWrap.mjWRAP_JOINT:
+                if m.tendon_stiffness[t] > 0.0:
+                    continue
                 source.note('dropped', f'tendon {name}: it is a fixed tendon, which has no route')
             elif driven and t not in driven:
+                if m.tendon_stiffness[t] > 0.0:
+                    continue  # a passive tendon
                 source.note('dropped', f'tendon {name}: no actuator pulls it')
             else:
                 self.tendons[name] = t
                 self._route(name, range(first, first + m.tendon_num[t]))
-                known = [force for force in driven.get(t, []) if force < np.inf]
-                source.strength[name] = sum(known)
+                pulls = driven.get(t, [])
+                least, most = (sum(ends) for ends in zip(*pulls)) if pulls else (0.0, np.inf)
                 if m.tendon_actfrclimited[t]:  # a negative force shortens the tendon
-                    most = max(0.0, -float(m.tendon_actfrcrange[t][0]))
-                    source.strength[name] = min(sum(known) or np.inf, most)
+                    ends = -m.tendon_actfrcrange[t][::-1]
+                    least, most = np.clip([least, most], 0.0, max(0.0, float(ends[1])))
+                source.strength[name] = float(most) if most < np.inf else 0.0
+                if least > 0.0:
+                    source.least[name] = float(least)
         if self.tendons and not driven:
             source.note('chosen', 'no actuator pulls a tendon, so every tendon is a muscle')
 
-    def _strength(self, a: int) -> float:
-        """Return the largest tension of actuator a [N]; infinity if the file states no limit."""
+    def _pull(self, a: int) -> tuple[float, float]:
+        """Return the least and the largest tension that actuator a can exert [N].
+
+        The largest is infinity if the file states no limit.
+        """
         m, ends = self.model, np.array([-np.inf, np.inf])
         gain, gear = m.actuator_gainprm[a], m.actuator_gear[a][0]
         if m.actuator_gaintype[a] == mujoco.mjtGain.mjGAIN_MUSCLE:
@@ -374,13 +406,14 @@ class _Reader:
         if m.actuator_forcelimited[a]:
             ends = np.clip(ends, *m.actuator_forcerange[a])
         # In MuJoCo, a negative force shortens the tendon.
-        pull = float(max(-gear * ends)) if gear else 0.0
+        least, pull = (float(end) for end in sorted(-gear * ends)) if gear else (0.0, 0.0)
         if pull <= 0.0:
             problem = (
                 f'actuator {self.names["actuator"][a]}: it can only push, but a tendon only pulls'
             )
             self.source.note('dropped', problem)
-        return max(pull, 0.0) if pull <= STRONGEST else np.inf
+        least = max(least, 0.0) if least > -np.inf else 0.0
+        return least, max(pull, 0.0) if pull <= STRONGEST else np.inf
 
     def _route(self, name: str, wraps: range) -> None:
         m, types = self.model, mujoco.mjtWrap
@@ -464,8 +497,11 @@ class _Reader:
         mujoco.mj_tendon(self.model, data)
         return data
 
-    def _lengths(self, values: dict[str, Array]) -> dict[str, Array]:
-        """Return the tendon lengths that MuJoCo computes [m], (N,) each; see `source.Lengths`."""
+    def _lengths(self, tendons: dict[str, int], values: dict[str, Array]) -> dict[str, Array]:
+        """Return the tendon lengths that MuJoCo computes [m], (N,) each; see `source.Lengths`.
+
+        `tendons` are the indices of the tendons by name.
+        """
         m, data, start = self.model, mujoco.MjData(self.model), self.model.qpos0
         address = {self.names['joint'][j]: at for j, at in enumerate(m.jnt_qposadr.tolist())}
         lengths = []
@@ -486,4 +522,4 @@ class _Reader:
                     moved = (data.qpos - start)[at[1]] if master >= 0 else 0.0
                     data.qpos[at[0]] = start[at[0]] + np.polyval(terms, moved)
             lengths.append(self._with_tendons(data).ten_length.copy())
-        return dict(zip(self.tendons, np.array(lengths)[:, list(self.tendons.values())].T))
+        return dict(zip(tendons, np.array(lengths)[:, list(tendons.values())].T))

@@ -15,7 +15,15 @@ import yaml
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
-from musculoskeletal_ae.robot.description import Route, RoutePoint, written
+from musculoskeletal_ae.importing.passive_lengths import SAMPLES, fitted
+from musculoskeletal_ae.robot import series_elastic
+from musculoskeletal_ae.robot.description import (
+    STIFFNESS_DEFAULT,
+    TENSION_DEFAULT,
+    Route,
+    RoutePoint,
+    written,
+)
 from musculoskeletal_ae.robot.joint_tree import REVOLUTE, Coupling, joint_axis
 from musculoskeletal_ae.robot.joint_units import PRISMATIC
 from musculoskeletal_ae.robot.kinematics import link_placement, reduced
@@ -24,13 +32,21 @@ from musculoskeletal_ae.robot.robot import Robot
 KINDS = REVOLUTE + PRISMATIC
 POSTURES = 1000  # number of postures in which lengths are compared
 ARM_POSTURES = 200  # number of postures in which moment arms are compared
+PROBES = 20  # postures in which it is found which joints change the length of a passive tendon
+MOVED = 1e-8  # change of a length from which on a joint counts as moving a tendon [m]
+WRONG_LENGTH = 5e-5  # error of a passive tendon's polynomial from which on it is reported [m]
 TURN = 1e-5  # step of the numerical derivatives that give moment arms [rad]
 SHORT_ARM = 1e-3  # length of a moment arm below which its sign is not compared [m]
 LISTED = 12  # largest number of names in a message
-STRENGTH = (
-    'tension.limit is the largest tension in the source, max 1.5 times that, and bias 0.1 times '
-    'that, but at most 30 N'
-)
+# Tensions of a muscle whose largest tension the source states: `limit` is that tension.
+MAX_SHARE = 1.5  # tension.max, relative to the limit
+#: tension.bias, relative to the limit, if the source lets the muscle be slack. Modules and their
+#: sensors need a tension that is not 0.
+BIAS_SHARE = 0.01
+# Muscles of a source whose tendons do not stretch get elements that are as stiff as the emulated
+# modules can regulate, but not stiffer than needed.
+RIGID_STIFFNESS = 1e5  # largest stiffness of an element at tension.max [N/m]
+RIGID_ELONGATION = 5e-4  # elongation at the limit that is short enough to count as none [m]
 EARTH = 9.81  # gravity of the earth [m/s²]
 #: ± limits of joints without limits, by whether the joint is prismatic: [rad] or [m]
 UNLIMITED = {False: np.pi, True: 0.5}
@@ -61,6 +77,18 @@ class Spring(NamedTuple):
     name: str  # name in the source
 
 
+class PassiveTendon(NamedTuple):
+    """A tendon without a muscle, or the elasticity of a muscle's tendon in the source.
+
+    Its force is −k (x − x_high) above x_high, −k (x − x_low) below x_low, and −d ẋ.
+    """
+
+    name: str
+    stiffness: float  # k [N/m]
+    slack: tuple[float, float]  # x_low and x_high [m]
+    damping: float  # d [N·s/m]
+
+
 @dataclass
 class Source:
     """The content of a file, as a pinocchio model in which links are frames."""
@@ -73,10 +101,16 @@ class Source:
     couplings: dict[str, Coupling] = field(default_factory=dict)
     routes: dict[str, Route] = field(default_factory=dict)
     strength: dict[str, float] = field(default_factory=dict)  # largest tension [N], if known
+    #: tension that the actuators of a muscle always exert [N]; 0 if missing
+    least: dict[str, float] = field(default_factory=dict)
+    #: whether tendons do not stretch in the source; otherwise, their elasticity is unknown
+    is_rigid: bool = False
     springs: list[Spring] = field(default_factory=list)
     damping: dict[str, float] = field(default_factory=dict)  # by joint [N·m·s/rad]
+    passive: list[PassiveTendon] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     lengths: Lengths | None = None
+    passive_lengths: Lengths | None = None  # lengths of all `passive` tendons, by name
     #: function that returns the body as a MuJoCo model, after `cut` (`adapted_mjcf.py`)
     adapted: Callable[[], str] | None = None
     end_effector: str = ''
@@ -165,6 +199,18 @@ class Source:
         """Return the limits of a joint [rad or m]."""
         q = self.model.joints[self.model.getJointId(joint)].idx_q
         return float(self.model.lowerPositionLimit[q]), float(self.model.upperPositionLimit[q])
+
+    def reduce_range(self, joint: str, low: float, high: float) -> None:
+        """Set the limits of a joint [rad or m] to the part that its muscles can hold."""
+        before = ', '.join(f'{end:.4g}' for end in self.span(joint))
+        q = self.model.joints[self.model.getJointId(joint)].idx_q
+        for limits, end in (('lowerPositionLimit', low), ('upperPositionLimit', high)):
+            ends = getattr(self.model, limits)
+            ends[q] = end
+            setattr(self.model, limits, ends)
+        text = f'limits of joint {joint}: [{low:.4g}, {high:.4g}] instead of [{before}]'
+        reason = 'beyond them, no muscle can hold the joint or bring it back'
+        self.note('chosen', f'{text}, because {reason} (robot.urdf has them)')
 
     def slides(self, joint: str) -> bool:
         """Return whether a joint is prismatic."""
@@ -361,8 +407,6 @@ def cut(
         elif name not in without and (not muscles or name in muscles):
             continue
         del source.routes[name]
-    if any(source.strength.values()):
-        source.note('chosen', STRENGTH)
     if count := sum(not source.strength.get(name) for name in source.routes):
         source.note(
             'chosen', f'tension of {count} muscles: the defaults, because the source states none'
@@ -453,22 +497,130 @@ def write(source: Source, out: Path) -> None:
     muscles: list[dict[str, Any]] = []
     for name, route in source.routes.items():
         muscles.append({'name': name, 'route': [written(item) for item in route]})
-        if (force := source.strength.get(name, 0.0)) > 0.0:
-            tension = {'bias': min(30.0, 0.1 * force), 'limit': force, 'max': 1.5 * force}
-            muscles[-1]['tension'] = {k: float(f'{v:.6g}') for k, v in tension.items()}
+        muscles[-1] |= _modules(source, name)
+    _note_chosen_constants(source)
     joints = [name for name in source.model.names[1:] if name not in source.couplings]
     document: dict[str, Any] = {'joints': joints, 'muscles': muscles}
     document['end_effector'] = source.end_effector
     if source.couplings:
         document['couplings'] = [_coupling(s, c) for s, c in source.couplings.items()]
+    tendons = passive_tendons(source, joints)  # first, because they may add damping to joints
     if elasticity := _joint_elasticity(source, joints):
         document['joint_elasticity'] = elasticity
+    if tendons:
+        document['passive_tendons'] = tendons
     text, body = yaml.safe_dump(document, sort_keys=False, default_flow_style=None), urdf(source)
     head = ''.join(f'# {line}\n' for line in [f'Imported from {source.name}.', *source.notes])
     (out / 'muscles.yaml').write_text(head + text, encoding='utf-8')
     (out / 'robot.urdf').write_text(body, encoding='utf-8')
     if source.adapted is not None:
         (out / 'model.xml').write_text(source.adapted(), encoding='utf-8')
+
+
+def _modules(source: Source, muscle: str) -> dict[str, Any]:
+    """Return the entries of a muscle in muscles.yaml that describe its tension and elasticity."""
+    entries, force = dict[str, Any](), source.strength.get(muscle, 0.0)
+    if force > 0.0:
+        bias = np.clip(BIAS_SHARE * force, source.least.get(muscle, 0.0), 0.5 * force)
+        tension = {'bias': bias, 'limit': force, 'max': MAX_SHARE * force}
+        entries['tension'] = {key: float(f'{value:.6g}') for key, value in tension.items()}
+    if source.is_rigid:
+        limit = force or TENSION_DEFAULT['limit']
+        most = MAX_SHARE * force or TENSION_DEFAULT['max']
+        stiffness = min(RIGID_STIFFNESS, limit / RIGID_ELONGATION)
+        rate = float(f'{stiffness / (limit + most):.6g}')
+        entries['series_elastic'] = {
+            'force': float(f'{limit:.6g}'),
+            'rate': rate,
+            'wire_stretch': 0.0,
+        }
+    return entries
+
+
+def _note_chosen_constants(source: Source) -> None:
+    """Add a note for each constant of the muscle modules that the source does not state."""
+    if any(source.strength.values()):
+        least = ', or the tension that its actuators always exert' if source.least else ''
+        source.note(
+            'chosen',
+            'tension.limit is the largest tension in the source; tension.max is '
+            f'{MAX_SHARE:g} times that, and tension.bias {100 * BIAS_SHARE:g} % of it{least}',
+        )
+    k = f'stiffness: K of muscle stiffness control {STIFFNESS_DEFAULT:g} N/m, the default'
+    source.note('chosen', k)
+    if not source.is_rigid:
+        elastic = ', '.join(f'{key} {value:g}' for key, value in series_elastic.DEFAULT.items())
+        text = f'series_elastic: {elastic}, the defaults, because the source states none'
+        source.note('chosen', text)
+        return
+    forces = [source.strength.get(name) or TENSION_DEFAULT['limit'] for name in source.routes]
+    each = [_modules(source, name)['series_elastic'] for name in source.routes]
+    long = [1e3 * np.log(2.0) / entry['rate'] for entry in each]
+    source.note(
+        'chosen',
+        'series_elastic: tendons do not stretch in the source; the emulated modules need elements '
+        f'of at most {RIGID_STIFFNESS:g} N/m, which stretch by {min(long):.2g} to {max(long):.2g} '
+        f'mm at the limits of {min(forces):.3g} to {max(forces):.3g} N',
+    )
+
+
+def passive_tendons(source: Source, joints: list[str]) -> list[dict[str, Any]]:
+    """Return the entries of `passive_tendons` in muscles.yaml, and note how exact they are.
+
+    Damping of passive tendons becomes damping of the joints, in `source.damping`.
+    """
+    if not source.passive or source.passive_lengths is None or not joints:
+        return []
+    low, high = np.array([source.span(name) for name in joints]).T
+    centre, half = 0.5 * (low + high), 0.5 * (high - low)
+    rng, entries = np.random.default_rng(0), list[dict[str, Any]]()
+    share = rng.uniform(-1.0, 1.0, (2 * SAMPLES, len(joints)))
+    positions = centre + half * share
+
+    def lengths(at: Array) -> dict[str, Array]:
+        assert source.passive_lengths is not None
+        return source.passive_lengths(dict(zip(joints, at.T, strict=True)))
+
+    # A tendon depends on the joints that change its length in any of the first postures.
+    some = positions[:PROBES]
+    still, slopes = lengths(some), dict[str, dict[int, float]]()
+    for j in range(len(joints)):
+        moved = some.copy()
+        moved[:, j] += 0.01 * half[j]
+        for name, length in lengths(moved).items():
+            if np.abs(length - still[name]).max() > MOVED:
+                slope = (length - still[name]) / (0.01 * half[j])
+                slopes.setdefault(name, {})[j] = float(np.mean(slope**2))
+    every = lengths(positions)
+    for tendon in source.passive:
+        own = list(slopes.get(tendon.name, {}))
+        if not own:
+            continue
+        if tendon.damping:
+            for j, squared in slopes[tendon.name].items():
+                before = source.damping.get(joints[j], 0.0)
+                source.damping[joints[j]] = before + tendon.damping * squared
+            source.note('approximated', f'damping of tendon {tendon.name}: by damping its joints')
+        if not tendon.stiffness:
+            continue
+        fit = fitted(share[:, own], half[own], every[tendon.name])
+        if fit.error > WRONG_LENGTH:
+            error = f'the length that its polynomial of degree {fit.degree} gives is wrong by'
+            source.note(
+                'approximated', f'passive tendon {tendon.name}: {error} {1e3 * fit.error:.2g} mm'
+            )
+        terms = zip(fit.coefficient.tolist(), fit.powers.tolist(), strict=True)
+        entries.append(
+            {
+                'name': tendon.name,
+                'stiffness': float(f'{tendon.stiffness:.10g}'),
+                'slack': [float(f'{length:.10g}') for length in tendon.slack],
+                'joints': [joints[j] for j in own],
+                'centre': [float(f'{centre[j]:.12g}') for j in own],
+                'length': [[float(f'{factor:.10g}'), *map(int, row)] for factor, row in terms],
+            }
+        )
+    return entries
 
 
 def _joint_elasticity(source: Source, joints: list[str]) -> list[dict[str, Any]]:

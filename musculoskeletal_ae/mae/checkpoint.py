@@ -372,8 +372,11 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
         touch = TouchStatistics(friction, spread, meta.touch_time, *drive)
     elasticity = None
     if meta.elastic:
-        parts = ('stiffness', 'preload', 'damping')
-        elasticity = JointElasticity(*(tensors[f'elasticity.{part}'] for part in parts))
+        elasticity = JointElasticity(
+            tensors['elasticity.stiffness'],
+            tensors['elasticity.preload'],
+            tensors['elasticity.damping'],
+        )
     return Mae(
         encoder=stack('encoder'),
         decoder=stack('decoder'),

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim.adam import adam
 
+TINY = 1e-20  # keeps the root of a zero matrix finite
 MOMENTUM = 0.95  # decay of Muon's momentum per step
 # Coefficients (a, b, c) of the Newton–Schulz polynomials a x + b x³ + c x⁵. Applied one after the
 # other, they bring every singular value close to 1.
@@ -26,6 +27,11 @@ POLYNOMIALS = (
     (2.8769, -3.1427, 1.2046),
     (2.8366, -3.0525, 1.2012),
 )
+# For matrices whose smaller side is longer than this, an eigendecomposition takes half the time of
+# the polynomials. It was measured for 413 × 827, as in the network of a hand of 23 joints; for
+# 163 × 327, both take the same time.
+LARGE = 256
+LEAST_EIGENVALUE = 1e-7  # relative to the largest; float32 does not resolve smaller ones
 MATRIX_RATIO = 12.5  # γ divided by Adam's step size for the biases
 
 
@@ -33,6 +39,12 @@ def orthogonal(matrix: Tensor) -> Tensor:
     """Return approximately U Vᵀ of a matrix U Σ Vᵀ; the zero matrix stays zero."""
     tall = matrix.shape[0] > matrix.shape[1]
     x = matrix / (matrix.norm() + 1e-7)
+    if min(matrix.shape) > LARGE:
+        # U Vᵀ = X (Xᵀ X)^(−1/2), or (X Xᵀ)^(−1/2) X
+        values, vectors = torch.linalg.eigh(x.T @ x if tall else x @ x.T)
+        least = LEAST_EIGENVALUE * values[-1] + TINY
+        root = (vectors * values.clamp(min=least).rsqrt()) @ vectors.T
+        return x @ root if tall else root @ x
     for a, b, c in POLYNOMIALS:
         square = x.T @ x if tall else x @ x.T
         rest = torch.addmm(square, square, square, beta=b, alpha=c)

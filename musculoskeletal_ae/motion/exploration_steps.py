@@ -11,10 +11,21 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import InfeasibleError, RobotDescriptionError
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import holding_tension
+from musculoskeletal_ae.robot.tension import holding_tension, least_tension
 
 TRIES = 1000  # largest number of random postures among which holdable ones are sought
 AT_LIMITS = 0.25  # fraction of each joint's random angles that are at one of its limits
+#: number of random postures after which postures with the support of joint stops are sought instead
+TRIES_WITHOUT_STOPS = 200
+TRIES_WITH_STOPS = 5  # number of random postures near which such postures are sought
+LEAST_SPREAD = 0.1  # smallest mean spread of these postures, relative to the ranges of the joints
+LEAST_FREE = 0.3  # smallest share of joints that are away from their limits in these postures
+SETTLING_STEPS = 40  # largest number of steps towards a posture with the support of stops
+LARGEST_STEP = 0.2  # largest change of a joint in one of these steps [rad]
+LEAST_STIFFNESS = 0.05  # smallest stiffness of these steps, relative to the largest
+AT_STOP = 1e-3  # distance from a limit up to which its stop supports a joint [rad]
+STOP_TORQUE = 100.0  # largest torque with which a stop supports a joint [N·m]
+BALANCED = 1e-3  # missing torque up to which a posture is held, relative to the largest torque
 SMALL = 1e-9  # smallest torque by which torques are divided, to avoid a division by zero [N·m]
 PRESSES = 10  # number of random T_const from which the most strongly pressing one is chosen
 
@@ -60,6 +71,74 @@ def pressing_tension(robot: Robot, theta: Array, rng: np.random.Generator) -> Ar
     pressure = torque / np.maximum(np.abs(torque).max(axis=0), SMALL) @ side
     most_pressing: Array = tension[np.argmax(pressure)]
     return most_pressing
+
+
+def explored_posture(robot: Robot, draw: Callable[[], Array]) -> tuple[Array, Array]:
+    """Return a random posture (D,) that the arm can hold, with tensions that hold it [N], (M,).
+
+    If hardly any random posture is holdable, as in a hand with many joints, it is one near a random
+    posture in which joint stops support the joints that the muscles cannot hold.
+
+    Args:
+        robot: The robot.
+        draw: Draws a random posture.
+
+    Raises:
+        RobotDescriptionError: If no posture is found.
+    """
+    try:
+        postures = (draw() for _ in range(TRIES_WITHOUT_STOPS))
+        return holdable_postures(robot, postures, 1)[0]
+    except RobotDescriptionError:
+        if found := supported_postures(robot, [draw() for _ in range(TRIES_WITH_STOPS)]):
+            return found[0]
+        raise
+
+
+def supported_postures(robot: Robot, postures: Iterable[Array]) -> list[tuple[Array, Array]]:
+    """Return postures near random ones that muscles and joint stops hold, with the tensions.
+
+    The list is empty if the postures are nearly the same, or if nearly all joints lie at their
+    stops: the muscles of such an arm do not move it, or there are fewer of them than joints.
+    """
+    found = [each for theta in postures if (each := settled(robot, theta)) is not None]
+    if not found:
+        return []
+    theta = np.array([at for at, _ in found])
+    spread = theta.std(axis=0) / (robot.upper - robot.lower)
+    is_free = (theta > robot.lower + AT_STOP) & (theta < robot.upper - AT_STOP)
+    return found if spread.mean() > LEAST_SPREAD and is_free.mean() > LEAST_FREE else []
+
+
+def settled(robot: Robot, theta: Array) -> tuple[Array, Array] | None:
+    """Return a posture near θ (D,) that muscles and joint stops hold, with the tensions (M,).
+
+    The muscles exert the tensions that come nearest to holding the present posture, and the joints
+    move as the missing torque moves them. A joint that reaches its limit is supported there.
+
+    Returns:
+        The posture and the tensions; None if no such posture is found.
+    """
+    limits, eye, theta = robot.tension, np.eye(robot.joint_count), theta.copy()
+    for _ in range(SETTLING_STEPS):
+        torque = robot.kinematics.holding_torque(theta)
+        is_low, is_high = theta < robot.lower + AT_STOP, theta > robot.upper - AT_STOP
+        # A stop acts as a muscle that pulls the joint away from it.
+        stops = np.vstack([-eye[is_low], eye[is_high]])
+        jacobian = np.vstack([robot.routes.muscle_jacobian(theta), stops])
+        low, high = np.zeros(len(jacobian)), np.full(len(jacobian), STOP_TORQUE)
+        low[: robot.muscle_count], high[: robot.muscle_count] = limits.bias, limits.limit
+        exertion = least_tension(jacobian, torque, low, high)
+        if np.abs(exertion.missing_torque).max() <= BALANCED * np.abs(torque).max():
+            return theta, exertion.tension[: robot.muscle_count]
+        falling = -jacobian.T @ exertion.tension - torque
+        gradient = robot.kinematics.holding_gradient(theta)
+        values, vectors = np.linalg.eigh(0.5 * (gradient + gradient.T))
+        values = np.maximum(np.abs(values), LEAST_STIFFNESS * np.abs(values).max() + SMALL)
+        step = vectors @ (vectors.T @ falling / values)
+        step *= min(1.0, LARGEST_STEP / max(float(np.abs(step).max()), SMALL))
+        theta = np.clip(theta + step, robot.lower, robot.upper)
+    return None
 
 
 def holdable_postures(

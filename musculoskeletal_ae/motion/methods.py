@@ -145,7 +145,7 @@ class StiffnessModel(NamedTuple):
     hessian: Array  # ∂²l/∂θ² [m/rad²], (M, D, D)
     compliance: Array  # ∂L_e/∂T [m/N] as polynomials of T, highest power first, (3, M)
     module: Array  # stiffness K_stiff of the modules [N/m], (M,)
-    springs: Array  # stiffness of the joints' own springs [N·m/rad], (D, D)
+    springs: Array  # stiffness of springs and passive tendons [N·m/rad], (D, D)
 
     @classmethod
     def read(cls, robot: Robot, mae: Mae, theta: Array, tension: Array) -> StiffnessModel:
@@ -171,7 +171,7 @@ class StiffnessModel(NamedTuple):
             hessian=bend,
             compliance=cubic[:3] * np.array([3.0, 2.0, 1.0])[:, None],
             module=robot.stiffness,
-            springs=robot.kinematics.elasticity.stiffness,
+            springs=robot.kinematics.elasticity.stiffness_at(theta),
         )
 
     def muscle_stiffness(self, tension: Array) -> tuple[Array, Array]:

@@ -6,8 +6,9 @@
 3. For 3 s, `first` (7) with the same θ_target and a random T_const in [T_bias, T_limit].
 
 The paper does not state the following, which we chose. Targets are drawn from the postures that the
-arm can hold with tensions in [T_bias, T_limit]. Each step ramps the command and then holds it,
-because the body is learned from rest samples (`motion/ramps.py`).
+arm can hold with tensions in [T_bias, T_limit]; if there are hardly any, joint stops may help. Each
+step ramps the command and then holds it, because the body is learned from rest samples
+(`motion/ramps.py`).
 """
 
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from collections.abc import Callable
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.motion.exploration_steps import TRIES, ExplorationStep, holdable_postures
+from musculoskeletal_ae.motion.exploration_steps import ExplorationStep, explored_posture
 from musculoskeletal_ae.paper.constants import DURATIONS
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -48,8 +49,7 @@ def three_steps(
         RobotDescriptionError: If the arm can hold too few postures.
     """
     bias = np.full(robot.muscle_count, robot.tension.bias)
-    postures = (posture(robot, rng) for _ in range(TRIES))
-    ((theta, holding),) = holdable_postures(robot, postures, 1)
+    theta, holding = explored_posture(robot, lambda: posture(robot, rng))
     constant = constant_tension(robot, theta, rng)
     return (
         ExplorationStep('first', theta, bias, DURATIONS[0]),

@@ -36,6 +36,7 @@ from musculoskeletal_ae.robot.muscle_file import (
     RouteEntry,
     TensionEntry,
 )
+from musculoskeletal_ae.robot.passive_tendons import Passive, PassiveTendons
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.tension_source import CURRENT, TensionSource
 from musculoskeletal_ae.robot.urdf import parse_xml, read_mimics, read_urdf
@@ -193,13 +194,18 @@ class RobotDescription:
 
     @property
     def spring_notes(self) -> list[str]:
-        """One line for each joint with a spring, which states its stiffness and rest position."""
+        """One line for each spring at a joint, and for each passive tendon."""
         springs, lines = self.joint_elasticity, list[str]()
         for i, unit in enumerate(JointUnits.of_model(self.model, self.joints)):
-            if springs.is_sprung[i]:
+            if springs.stiffness[i, i] > 0.0:
                 own = unit.stiffness_text(springs.stiffness[i, i], '.3g')
                 rest = unit.position_text(springs.rest[i], '.3g')
                 lines.append(f'{self.joints[i]}: spring of {own}, at rest at {rest}')
+        tendons = springs.tendons
+        for name, law, own in zip(tendons.names, tendons.arrays.law, tendons.spanned, strict=True):
+            joints = ', '.join(np.array(self.joints)[own])
+            slack = f'no force from {1e3 * law[1]:.4g} to {1e3 * law[2]:.4g} mm'
+            lines.append(f'passive tendon {name} of {law[0]:.4g} N/m at {joints}: {slack}')
         return lines
 
 
@@ -394,7 +400,7 @@ def _read_couplings(
 def _read_joint_elasticity(
     content: MuscleFile, couplings: Iterable[str], fail: Fail
 ) -> JointElasticity:
-    """Return the springs and dampers of the joints, in the units of the joints."""
+    """Return springs, dampers and passive tendons, in the units of the joints."""
     joints = content.joints
     stiffness, rest, damping = (
         np.zeros(shape) for shape in ((len(joints),) * 2, *[len(joints)] * 2)
@@ -436,7 +442,43 @@ def _read_joint_elasticity(
             f'$.joint_elasticity: the stiffness matrix has the eigenvalue {values[0]:.3g}; legal: '
             'none below 0, because springs only store energy; reduce the values in `coupled`'
         )
-    return JointElasticity(stiffness, stiffness @ rest, damping)
+    tendons = _read_passive_tendons(content, index, fail)
+    return JointElasticity(stiffness, stiffness @ rest, damping, tendons)
+
+
+def _read_passive_tendons(
+    content: MuscleFile, index: Callable[[str, str], int], fail: Fail
+) -> PassiveTendons:
+    """Return the passive tendons, in the units of the joints.
+
+    Args:
+        content: The content of muscles.yaml.
+        index: Returns the index of a joint, from its place in the file and its name.
+        fail: Returns the error for a problem.
+    """
+    joints, entries = len(content.joints), content.passive_tendons
+    if not entries:
+        return PassiveTendons.none(joints)
+    centre, stated = np.zeros(joints), np.zeros(joints, dtype=bool)
+    coefficient, power, first = list[float](), list[list[int]](), [0]
+    for k, entry in enumerate(entries):
+        own = [index(f'$.passive_tendons[{k}].joints', name) for name in entry.joints]
+        for j, name, value in zip(own, entry.joints, entry.centre, strict=True):
+            if stated[j] and centre[j] != value:
+                problem = f'{value} for {name!r}, but another passive tendon states {centre[j]}'
+                raise fail(f'$.passive_tendons[{k}].centre: {problem}; state the same value')
+            centre[j], stated[j] = value, True
+        for factor, *powers in entry.length:
+            row = [0] * joints
+            for j, value in zip(own, powers, strict=True):
+                row[j] = int(value)
+            coefficient.append(factor)
+            power.append(row)
+        first.append(len(coefficient))
+    law = np.array([(entry.stiffness, *entry.slack) for entry in entries])
+    terms = np.array(power, np.int64), np.array(coefficient), np.array(first, np.int64)
+    names = tuple(entry.name for entry in entries)
+    return PassiveTendons(names, Passive(centre, *terms, law))
 
 
 def _read_tension(

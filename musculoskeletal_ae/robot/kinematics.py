@@ -134,9 +134,10 @@ class Kinematics:
     def holding_torque(self, theta: Array) -> Array:
         """Return the torque that holds the arm against its weight and its springs.
 
-            g(θ) + K θ − b
+            g(θ) + K θ − b + h(θ)
 
-        g(θ) holds the weight, and K θ − b the springs of the joints (`JointElasticity`).
+        g(θ) holds the weight, K θ − b the springs of the joints, and h(θ) passive tendons
+        (`JointElasticity`).
 
         Args:
             theta: Joint angles θ [rad], (..., D).
@@ -166,10 +167,10 @@ class Kinematics:
     def inverse_dynamics(self, theta: Array, velocity: Array, acceleration: Array) -> Array:
         """Return the joint torque that a motion requires [N·m], (D,).
 
-            M(θ) θ̈ + h(θ, θ̇) + K θ − b + diag(d) θ̇
+            M(θ) θ̈ + c(θ, θ̇) + K θ − b + h(θ) + diag(d) θ̇
 
-        M is the inertia, and h the torque of weight and velocity. The other terms are those of the
-        springs and dampers of the joints (`JointElasticity`).
+        M is the inertia, and c the torque of weight and velocity. The other terms are those of the
+        springs, passive tendons and dampers of the joints (`JointElasticity`).
 
         Args:
             theta: Joint angles θ [rad], (D,).
@@ -198,7 +199,7 @@ class Kinematics:
         if tree.is_nonlinear:
             of_curvature = self._gravity(theta) * tree.curvatures(theta)
             result = result + np.diag(of_curvature @ tree.moved_by)
-        return result + self.elasticity.stiffness
+        return result + self.elasticity.stiffness_at(theta)
 
     def joint_inertia(self, theta: Array) -> Array:
         """Return the inertia that each joint moves while all other joints are held [kg·m²], (D,).

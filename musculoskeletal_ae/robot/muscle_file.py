@@ -27,6 +27,7 @@ from musculoskeletal_ae.robot.joint_tree import MOST_TERMS
 from musculoskeletal_ae.schema import Strict
 
 STIFFNESS, POSITION = 'stiffness', 'position'  # values of `actuation`
+MOST_POWER = 12  # largest power of an angle in the length of a passive tendon
 SHORTEST_AXIS = 1e-6  # length below which a vector defines no direction
 
 
@@ -170,6 +171,36 @@ class JointElasticityEntry(Strict, frozen=True):
     )
 
 
+class PassiveTendonEntry(Strict, frozen=True):
+    """A passive tendon, which pulls (or pushes) while its length is outside `slack`."""
+
+    name: Name
+    stiffness: Positive  # [N/m]
+    slack: tuple[Number, Number]  # the lengths between which it exerts no force [m]
+    joints: Names
+    centre: Annotated[tuple[Number, ...], Meta(max_length=LONGEST_LIST)]  # [rad or m]
+    #: terms of its length [m]: the coefficient, and the power of each joint's distance to `centre`
+    length: Annotated[
+        tuple[Annotated[tuple[Number, ...], Meta(max_length=LONGEST_LIST)], ...],
+        Meta(min_length=1, max_length=LONGEST_LIST),
+    ]
+
+    def __post_init__(self) -> None:
+        """Check that the parts of the entry have the same number of joints."""
+        count = len(self.joints)
+        if len(self.centre) != count:
+            raise ValueError(f'centre: expected {count} numbers, got {len(self.centre)}')
+        if self.slack[0] > self.slack[1]:
+            low, high = self.slack
+            raise ValueError(f'slack: expected the smaller length first, got [{low}, {high}]')
+        for term in self.length:
+            powers = term[1:]
+            is_legal = all(0 <= p <= MOST_POWER and p == int(p) for p in powers)
+            if len(powers) != count or not is_legal:
+                legal = f'a coefficient and {count} whole powers from 0 to {MOST_POWER}'
+                raise ValueError(f'length: expected {legal}, got {list(term)}')
+
+
 class MuscleFile(Strict, frozen=True):
     """The content of muscles.yaml."""
 
@@ -189,6 +220,7 @@ class MuscleFile(Strict, frozen=True):
     joint_elasticity: Annotated[
         tuple[JointElasticityEntry, ...], Meta(max_length=LONGEST_LIST)
     ] = ()
+    passive_tendons: Annotated[tuple[PassiveTendonEntry, ...], Meta(max_length=LONGEST_LIST)] = ()
 
     def __post_init__(self) -> None:
         """Check that names are unique, and that the file has no keys that exclude each other."""
@@ -197,6 +229,7 @@ class MuscleFile(Strict, frozen=True):
         _check_unique('end_effectors', self.end_effectors or ())
         _check_unique('couplings', (coupling.joint for coupling in self.couplings))
         _check_unique('joint_elasticity', (entry.joint for entry in self.joint_elasticity))
+        _check_unique('passive_tendons', (entry.name for entry in self.passive_tendons))
         if self.end_effector is not None and self.end_effectors is not None:
             raise ValueError('expected end_effector or end_effectors, got both')
         self._check_actuation()

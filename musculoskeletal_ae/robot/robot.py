@@ -157,7 +157,12 @@ class Robot:
         Args:
             elasticity: The learned springs and dampers; None for those of the description.
         """
-        own = self.description.joint_elasticity if elasticity is None else elasticity
+        own, stated = elasticity, self.description.joint_elasticity
+        if own is None:
+            own = stated
+        elif stated.tendons and not own.tendons:
+            # Passive tendons are not learned, so a network does not contain them.
+            own = replace(own, tendons=stated.tendons)
         if own is self.kinematics.elasticity:
             return self
         changed = copy.copy(self)

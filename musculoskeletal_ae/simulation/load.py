@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joint torques that hold N arms against weight, springs and a wrench, and their gradient.
 
-    load(θ) = g(θ) + K θ − b − Jᵀ F
+    load(θ) = g(θ) + K θ − b + h(θ) − Jᵀ F
 
-(paper, §III-F: the necessary torque from the geometric model). K and b describe the springs of the
-joints (`JointElasticity`). Pinocchio computes the same torque of weight and wrench, and a test
-compares both results. Its gradient with external forces (`computeStaticTorqueDerivatives`) cannot
-be used, because it holds each force constant in the frame of a joint. The force of the wrench F is
-constant in the axes of the root link. In addition, the simulator calls `hold` from code that numba
-compiles, and such code cannot call Pinocchio.
+(paper, §III-F: the necessary torque from the geometric model). K, b and h describe the springs and
+passive tendons of the joints (`JointElasticity`). Pinocchio computes the same torque of weight and
+wrench, and a test compares both. Its gradient with external forces
+(`computeStaticTorqueDerivatives`) cannot be used, because it holds each force constant in the frame
+of a joint. The force of the wrench F is constant in the axes of the root link. In addition, the
+simulator calls `hold` from code that numba compiles, and such code cannot call Pinocchio.
 
 With forces f_i at points c_i, a joint k at o_k with axis a_k needs only sums over the bodies that
 it carries:
@@ -27,6 +27,7 @@ from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.robot.kinematics import Kinematics
+from musculoskeletal_ae.robot.passive_tendons import Passive, add_passive
 from musculoskeletal_ae.robot.wrapping import Vector, cross, dot, plus
 
 
@@ -52,6 +53,7 @@ class Tree(NamedTuple):
     effector: Array  # position of the end effector in the frame of that joint [m], (3,)
     springs: Array  # stiffness K of the joints' springs [N·m/rad], (D, D)
     preload: Array  # preload b of the joints' springs [N·m], (D,)
+    passive: Passive  # the passive tendons
 
 
 @njit(cache=True)
@@ -142,6 +144,13 @@ def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) 
                 for n in range(arms):
                     load[d, n] += spring * theta[e, n]
                     gradient[d, e, n] = spring
+    if len(tree.passive.law):
+        for n in range(arms):
+            posture = theta[:, n].copy()
+            held, slopes = np.zeros(len(posture)), np.zeros((len(posture), len(posture)))
+            add_passive(tree.passive, posture, held, slopes)
+            load[:, n] += held
+            gradient[:, :, n] += slopes
     down, tip, hand = vector(tree.gravity), vector(tree.effector), pose[tree.effector_joint]
     tips, nothing = hand[3].copy(), np.zeros_like(wrench)
     for c in range(3):
@@ -208,6 +217,7 @@ class Load:
             effector=np.array(effector.placement.translation),
             springs=np.ascontiguousarray(kin.elasticity.stiffness),
             preload=kin.elasticity.preload.copy(),
+            passive=kin.elasticity.tendons.arrays,
         )
 
     def __call__(self, theta: Array, wrench: Array | None = None) -> tuple[Array, Array]:

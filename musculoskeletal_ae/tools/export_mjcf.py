@@ -15,11 +15,14 @@ def main(argv: list[str] | None = None) -> int:
         'Writes the body model of a checkpoint as an MJCF model. Links, joints, limits and masses '
         'are those of the robot; route points, series elastic elements and friction are learned. '
         'A report compares lengths and moment arms with those of the network, and the torques of '
-        'weight and springs with those of the robot.',
+        'weight and springs with those of the robot. With --into, a copy of your MJCF file gets '
+        'the learned attachment points instead, and everything else in it stays.',
     )
     parser.add_argument('checkpoint', type=Path, metavar='CHECKPOINT', help='.safetensors file')
     parser.add_robot(default=None)
     parser.add_out('DIR', 'new or empty directory, for model.xml and report.txt')
+    text = 'the MJCF file from which the robot was imported: write a copy with learned points'
+    parser.add_argument('--into', type=Path, metavar='FILE', help=text)
     args = parser.parse_args(argv)
     return exit_status(lambda: _run(args), out=args.out)
 
@@ -28,7 +31,12 @@ def _run(args: Namespace) -> int:
     checkpoint = import_heavy('musculoskeletal_ae.mae.checkpoint')
     exporting = import_heavy('musculoskeletal_ae.exporting.mjcf')
     robot = import_heavy('musculoskeletal_ae.robot.robot').Robot.load(args.robot)
-    exporting.export(robot, checkpoint.load(args.checkpoint, robot), args.out)
+    mae = checkpoint.load(args.checkpoint, robot)
+    if args.into is not None:
+        print(exporting.export_into(robot, mae, args.into, args.out), end='')
+        print(f'model: {args.out / args.into.name}')
+        return 0
+    exporting.export(robot, mae, args.out)
     print((args.out / 'report.txt').read_text(encoding='utf-8'), end='')
     print(f'model: {args.out / "model.xml"}')
     return 0

@@ -3,7 +3,7 @@
 
 from pathlib import Path
 
-from musculoskeletal_ae.options import Parser, exit_status, names
+from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.process_signals import import_heavy
 
 
@@ -19,15 +19,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument('file', type=Path, metavar='FILE', help='the model')
     parser.add_out('DIR', 'new or empty directory')
-    for kind in ('joints', 'muscles'):
-        text = f'{kind} to keep'
-        parser.add_argument(f'--{kind}', type=names, default=[], metavar='NAME,…', help=text)
-    text = 'muscles to leave out'
-    parser.add_argument('--without', type=names, default=[], metavar='NAME,…', help=text)
-    parser.add_argument('--base', metavar='LINK', help='root link of the chain to keep')
-    text = 'end effector: a link, a site, or LINK_tip, the far end of a drawn link; '
-    text += 'joints outside the chain to it are held fixed'
-    parser.add_argument('--end', metavar='NAME', help=text)
+    parser.add_chain()
     args = parser.parse_args(argv)
     return exit_status(
         lambda: import_heavy('musculoskeletal_ae.importing.convert').run(args), out=args.out

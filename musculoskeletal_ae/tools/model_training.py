@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from musculoskeletal_ae.design.prospects import prospects
 from musculoskeletal_ae.design.route_jumps import jump_warning
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.figures import save_plot
@@ -47,6 +48,8 @@ def prepare(args: Namespace) -> Robot:
             raise MusculoskeletalError(problem) from error
     train_on(args.device)
     robot = Robot.load(args.robot)
+    for line in prospects(robot).lines():
+        print(line, file=sys.stderr, flush=True)
     if warning := jump_warning(robot):
         print(f'warning: {warning}. Nodes may reject this network', file=sys.stderr)
     return robot
@@ -84,7 +87,7 @@ def train_on_model(robot: Robot, args: Namespace) -> Trained:
     """Train a network on the geometric model, and show the progress."""
     steps = PRESETS[args.preset].initial_steps(robot.groups) // (10 if args.quick else 1)
     newest = 0.0  # loss of the newest mini-batch
-    with ProgressBar('training', steps, lambda: f'loss {newest:.4f}') as bar:
+    with ProgressBar('training', steps, lambda: f'loss {newest:.4f}', is_even=True) as bar:
         bar.announce(f': drawing states of the geometric model, {steps} mini-batches follow')
 
         def progress(_step: int, loss: float, *_: object) -> None:

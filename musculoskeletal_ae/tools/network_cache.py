@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The cache of initial networks, which `bringup.sh` and `train --from-bag` share.
 
-    python -m musculoskeletal_ae.tools.network_cache ROBOT PRESET
+    python -m musculoskeletal_ae.tools.network_cache ROBOT PRESET [quick]
 
-prints the file of an initial network for bringup.sh, and creates its directory.
+prints the file of an initial network for bringup.sh, and creates its directory. With `quick`, it is
+that of a shortened training, unless the network of the whole training is there.
 
 The name of the file contains a hash of everything that determines the network: the two files of the
 robot directory, and the code that reads them and trains. Another robot, or another version of the
@@ -32,12 +33,13 @@ CODE = (
 ROBOT_FILES = 'robot.urdf', 'muscles.yaml'
 
 
-def network_file(robot: str | Path, preset: str) -> Path:
+def network_file(robot: str | Path, preset: str, quick: bool = False) -> Path:
     """Return the file in the cache for the initial network of a robot; it may not exist.
 
     Args:
         robot: A shipped robot or a robot directory.
         preset: Name of the preset that trains the network.
+        quick: Whether it is trained with `train --quick`.
 
     Raises:
         MusculoskeletalError: If there is no such robot, or no place for a cache.
@@ -48,7 +50,8 @@ def network_file(robot: str | Path, preset: str) -> Path:
         data = file.read_bytes()
         digest.update(f'{name} {len(data)}\n'.encode())
         digest.update(data)
-    name = f'{directory.name}-{preset}-{digest.hexdigest()[:16]}.safetensors'
+    kind = f'{preset}-quick' if quick else preset
+    name = f'{directory.name}-{kind}-{digest.hexdigest()[:16]}.safetensors'
     return _cache_directory() / name
 
 
@@ -77,9 +80,11 @@ def _cache_directory() -> Path:
 
 def main(arguments: list[str]) -> int:
     """Print the file of an initial network; return the exit status."""
-    robot, preset = arguments
+    robot, preset, *quick = arguments
     try:
         file = network_file(robot, preset)
+        if quick and not file.is_file():  # otherwise, the whole training is there already
+            file = network_file(robot, preset, True)
         file.parent.mkdir(parents=True, exist_ok=True)
     except (MusculoskeletalError, OSError) as error:
         remedy = '; set XDG_CACHE_HOME to a folder that can be written'

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`train`: initial training from a robot description, or learning from recordings."""
+"""`train`: initial training, or learning from recordings or from an emulated MuJoCo model."""
 
 import argparse
 from pathlib import Path
@@ -7,6 +7,7 @@ from pathlib import Path
 from musculoskeletal_ae.options import Parser, exit_status, positive
 from musculoskeletal_ae.parameters import DEVICES
 from musculoskeletal_ae.process_signals import import_heavy
+from musculoskeletal_ae.robot.directories import shipped_robots
 
 HELD_OUT = (
     'bags or CSV files for measuring the error before and after; without them, a fifth of the rows '
@@ -23,7 +24,13 @@ def main(argv: list[str] | None = None) -> int:
         'Exit status 1: the robot or a file is unusable, or nothing was learned from recordings; '
         '2: invalid options.',
     )
-    parser.add_robot(default=None)
+    either = parser.add_mutually_exclusive_group(required=True)
+    text = f'a directory, or one of: {", ".join(sorted(shipped_robots()))}'
+    either.add_argument('--robot', metavar='NAME|DIR', help=text)
+    text = 'a MuJoCo model: import it, let an emulated arm of it explore, and learn, without ROS'
+    either.add_argument('--mujoco', type=Path, metavar='FILE', help=text)
+    parser.add_minutes('with --mujoco: duration of the exploration', 10.0)
+    parser.add_chain()
     parser.add_out('FILE.safetensors', 'the checkpoint')
     parser.add_preset('paper: network and training as in the paper; default: the best measured')
     parser.add_seed('of data and weights')
@@ -79,6 +86,12 @@ def main(argv: list[str] | None = None) -> int:
         parser.error('--plot shows the initial training; do not use it with recordings')
     args.columns, args.units = dict(args.columns), dict(args.units)
     work = 'recording_learning' if read_files else 'model_training'
+    if args.mujoco:
+        if read_files or args.plot:
+            parser.error('--mujoco learns an emulated arm; remove --from-bag, --from-csv, --plot')
+        work = 'mujoco_learning'
+    elif any(getattr(args, name) for name in ('joints', 'muscles', 'without', 'base', 'end')):
+        parser.error('--joints, --muscles, --without, --base and --end need --mujoco')
     return exit_status(
         lambda: import_heavy(f'musculoskeletal_ae.tools.{work}').train(args), out=args.out
     )

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Export of a learned body as MJCF: import, learn, export, load."""
 
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,9 +10,12 @@ import mujoco
 import numpy as np
 import pytest
 
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.body_model.fit import fit_to_network
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.exporting.mjcf import export
+from musculoskeletal_ae.exporting import learned_routes
+from musculoskeletal_ae.exporting.mjcf import export, export_into
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
@@ -77,6 +81,66 @@ def test_an_exported_model_loads_and_is_as_close_to_the_network_as_reported(lear
     before, after = differences(nominal, true), differences(exported, true)
     assert np.median(after) < 0.1 * np.median(before)
     assert after.max() < 0.2 * before.max()
+
+
+def without_sites(text):
+    """Return a text without the positions of its sites."""
+    return re.sub(r'(<site [^>]*?)\s*pos="[^"]*"', r'\1', text)
+
+
+def test_learned_points_are_written_into_the_users_file_and_all_else_stays(learned, capsys):
+    robot, individual, mae, folder = learned
+    checkpoint.save(mae, folder / 'into.safetensors')
+    text = (folder / 'own.xml').read_text().replace('<worldbody>', '<!-- mine --><worldbody>', 1)
+    body = re.search(r'<tendon>.*?</tendon>', text, re.DOTALL)[0]
+    (folder / 'tendons.xml').write_text(f'<mujocoinclude>{body}</mujocoinclude>')
+    mine = folder / 'mine.xml'
+    mine.write_text(text.replace(body, '<include file="tendons.xml"/>'))
+    options = ['--robot', str(robot.description.directory), '--into', str(mine)]
+    assert main([str(folder / 'into.safetensors'), *options, '--out', str(folder / 'into')]) == 0
+    printed = capsys.readouterr().out
+    assert 'muscles that keep their points: none' in printed
+    written = (folder / 'into' / 'mine.xml').read_text()
+    assert '<!-- mine -->' in written
+    expected = mine.read_text().replace('"tendons.xml"', f'"{folder}/tendons.xml"')
+    assert without_sites(written) == without_sites(expected)
+    again = import_robot(folder / 'into' / 'mine.xml', folder / 'again_into').robot
+    theta = robot.random_postures(200, np.random.default_rng(5))
+    true = individual.muscle_jacobian(theta)
+    before = differences(robot.routes.muscle_jacobian(theta), true)
+    after = differences(again.routes.muscle_jacobian(theta), true)
+    assert np.median(after) < 0.2 * np.median(before)
+
+
+def test_another_file_is_refused(learned):
+    robot, _, mae, folder = learned
+    (folder / 'other.xml').write_text('<mujoco><worldbody/></mujoco>')
+    with pytest.raises(MusculoskeletalError, match='no site is at a route point'):
+        export_into(robot, mae, folder / 'other.xml', folder / 'refused')
+
+
+def test_a_muscle_keeps_points_if_learned_ones_are_worse_or_make_its_length_jump(
+    learned, monkeypatch
+):
+    robot, _, mae, _ = learned
+    body, rng = CalibratedBody.of_straight_lines(robot), np.random.default_rng(0)
+    fit_to_network(body, mae, with_remainder=False)
+    layout = body.layouts[0]
+    body.parameters[0][layout.attachment] += 0.05 * rng.normal(size=3 * len(layout.points))
+
+    def jumping(*_):
+        return np.arange(robot.muscle_count) == 1
+
+    monkeypatch.setattr(learned_routes, 'newly_jumping', jumping)
+    found = learned_routes.learned_routes(robot, body, mae)
+    assert found.kept == {
+        robot.muscles[0]: 'learned points are not closer to the network',
+        robot.muscles[1]: 'its length would jump',
+    }
+    for m in (0, 1):
+        assert found.routes[m] is robot.description.routes[m]
+    assert np.all(found.after.lengths <= found.before.lengths)
+    assert np.all(found.after.arms <= found.before.arms)
 
 
 def test_a_directory_in_use_is_refused(learned):

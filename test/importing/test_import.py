@@ -186,6 +186,33 @@ def test_a_limit_is_never_above_what_the_tendon_is_allowed_to_pull(mjcf, tmp_pat
     assert 'dropped: armature: tendon out' in result.notes
 
 
+def test_muscles_have_the_tensions_that_the_model_asks_for_and_tendons_hardly_stretch(
+    mjcf, tmp_path
+):
+    muscle = '<muscle name="m3" tendon="out" force="150"/>'
+    always = f'<motor {RANGE}"-200 -25"/>'
+    mjcf.write_text(mjcf.read_text().replace(muscle, always))
+    result = import_robot(mjcf, tmp_path / 'out')
+    robot, out = result.robot, result.robot.muscles.index('out')
+    assert robot.tension.bias[out] == pytest.approx(25.0)
+    assert robot.tension.bias[0] == pytest.approx(0.01 * robot.tension.limit[0])
+    limit = robot.tension.limit
+    stretch = robot.series_elastic.elongation(robot.routes.length_at_zero, limit)
+    assert np.all(stretch < 1.8e-5 * limit + 4e-4)
+    for constant in ('tension.limit', 'series_elastic', 'stiffness'):
+        assert any(note.startswith(f'chosen: {constant}') for note in result.notes)
+
+
+def test_a_joint_that_a_spring_takes_past_its_muscles_keeps_the_range_that_they_can_hold(tmp_path):
+    result = import_robot(put(tmp_path, 'snap.xml', bodies.SNAPPING), tmp_path / 'out')
+    note = [note for note in result.notes if note.startswith('chosen: limits of joint mcp')]
+    assert 'instead of [0, 1.5]' in note[0]
+    assert result.robot.lower[0] == 0.0
+    # At 0.927 rad, the flexor passes over the axis.
+    assert 0.2 < result.robot.upper[0] < 0.927
+    assert check_robot(result.robot).held.mean() > 0.95
+
+
 def test_mujoco_decides_what_it_reads(mjcf, tmp_path):
     """MuJoCo accepts XML in which the space between two attributes is missing.
 
@@ -219,7 +246,7 @@ def test_forces_that_are_not_modelled_are_reported_as_dropped(mjcf, tmp_path):
     notes = import_robot(mjcf, tmp_path / 'out').notes
     for effect in ('friction', 'armature'):
         assert f'dropped: {effect}: joint elbow' in notes
-    for effect in ('damping', 'friction', 'springs', 'limits'):
+    for effect in ('friction', 'limits'):
         assert f'dropped: {effect}: tendon out' in notes
     assert 'dropped: compensated weight: body upper' in notes
     assert any(re.match(r'dropped: contacts: \d+ geoms', note) for note in notes)
@@ -477,7 +504,7 @@ def test_a_chain_is_cut_out_and_what_is_held_is_named(mjcf, tmp_path, capsys):
     assert set(robot.muscles) == {'bend', 'stretch', 'curler'}
     assert 'dropped: muscle front: attached to base, which is left out' in output
     assert 'largest length error over 1000 postures: 0.000 mm' in output
-    assert 'check_robot: not sound' in output  # no muscle holds the elbow open against its weight
+    assert 'check_robot: sound' in output
 
 
 def test_weight_pulls_in_the_same_direction_on_a_chain_that_was_cut_out(mjcf, tmp_path):

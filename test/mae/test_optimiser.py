@@ -6,7 +6,7 @@ import torch
 from musculoskeletal_ae.mae.optimiser import MATRIX_RATIO, Optimiser, orthogonal
 
 
-@pytest.mark.parametrize('shape', [(4, 9), (9, 4), (1, 3)])
+@pytest.mark.parametrize('shape', [(4, 9), (9, 4), (1, 3), (300, 700), (700, 300)])
 def test_orthogonalised_matrix_has_singular_values_near_one(shape):
     matrix = torch.randn(shape, generator=torch.Generator().manual_seed(0))
     singular = torch.linalg.svdvals(orthogonal(matrix))

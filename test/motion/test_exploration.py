@@ -5,12 +5,12 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from robots import write_robot
+from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.emulator.individual import Individual
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.motion.exploration import Exploration
-from musculoskeletal_ae.motion.exploration_steps import holdable_postures
+from musculoskeletal_ae.motion.exploration_steps import explored_posture, holdable_postures
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
@@ -81,6 +81,29 @@ def test_a_seed_determines_the_stream_of_exploration():
         np.testing.assert_array_equal(a.theta, b.theta)
         np.testing.assert_array_equal(a.tension, b.tension)
     assert not np.array_equal(one[0].theta, other[0].theta)
+
+
+def test_an_arm_that_holds_hardly_any_posture_leans_on_its_stops(tmp_path):
+    # Without a muscle that lifts, only the lower stop of the joint `lift` holds the arm.
+    document = read_muscles(write_robot(tmp_path))
+    robot = Robot.load(tmp_path)
+    arms = robot.routes.muscle_jacobian(robot.random_postures(50, np.random.default_rng(0)))
+    lift = robot.joints.index('lift')
+    needed = robot.kinematics.holding_torque(robot.random_postures(50, np.random.default_rng(0)))
+    lifts = (-arms[:, :, lift] * np.sign(needed[:, None, lift])).mean(axis=0) > 0.0
+    document['muscles'] = [m for m, is_up in zip(document['muscles'], lifts) if not is_up]
+    weak = Robot.load(write_muscles(tmp_path, document))
+    rng = np.random.default_rng(1)
+    theta, tension = explored_posture(weak, lambda: weak.random_postures(1, rng)[0])
+    torque = weak.kinematics.holding_torque(theta)
+    missing = torque + weak.routes.muscle_jacobian(theta).T @ tension
+    is_low, is_high = theta < weak.lower + 2e-3, theta > weak.upper - 2e-3
+    # What muscles do not exert, a stop does: it pushes back from a limit.
+    tolerance = 2e-3 * np.abs(torque).max()
+    assert np.all(np.abs(missing[~is_low & ~is_high]) < tolerance)
+    assert np.all(missing[is_low] > -tolerance)
+    assert np.all(missing[is_high] < tolerance)
+    assert np.all((tension >= weak.tension.bias - 1e-9) & (tension <= weak.tension.limit + 1e-9))
 
 
 def test_an_arm_that_holds_no_posture_is_refused_with_a_remedy(tmp_path):

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Route points of a learned body that are for no muscle worse than those of the robot directory.
+
+Learned points are fitted to the lengths of the network. A fit may be worse than the input for some
+muscles: if the learned arm deviates in ways that route points cannot express, or if a tendon slips
+over an object that it wraps around and its length jumps. Such muscles keep their points.
+"""
+
+from collections.abc import Container
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.design.route_jumps import newly_jumping
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.description import Route, RoutePoint
+from musculoskeletal_ae.robot.robot import Robot
+
+POSTURES = 400  # number of postures in which routes are compared with the network
+#: identifies the place of a route point: its link, and its position there in units of 1e-7 m
+Place = tuple[str, tuple[int, ...]]
+
+
+class Errors(NamedTuple):
+    """Differences between routes and a network, for each muscle (M,)."""
+
+    lengths: Array  # standard deviation of the length [m]
+    arms: Array  # moment arms: norm over the joints, root mean square over the postures [m]
+
+
+class LearnedRoutes(NamedTuple):
+    """Learned route points, and what they are better for."""
+
+    routes: tuple[Route, ...]
+    kept: dict[str, str]  # reason why a muscle keeps its points, by muscle
+    before: Errors
+    after: Errors
+
+
+def place_of(point: RoutePoint) -> Place:
+    """Return the place of a route point."""
+    return point.link, tuple(np.rint(1e7 * point.xyz).astype(int).tolist())
+
+
+def learned_routes(
+    robot: Robot, body: CalibratedBody, mae: Mae, movable: Container[Place] | None = None
+) -> LearnedRoutes:
+    """Return routes with learned points.
+
+    Args:
+        robot: The robot whose points are moved.
+        body: The calibrated body that was fitted to the network.
+        mae: The network.
+        movable: The places that may be moved; a point that several muscles share stays shared.
+            None if all points may be moved on their own.
+    """
+    theta = robot.random_postures(POSTURES, np.random.default_rng([3, 0xE2]))
+    before = errors(robot, mae, theta)
+    is_kept = np.zeros(robot.muscle_count, dtype=bool)
+    kept = dict[str, str]()
+    while True:
+        routes = _moved(robot, body, is_kept, movable)
+        moved = robot.with_routes(routes)
+        after = errors(moved, mae, theta)
+        is_worse = (after.lengths > before.lengths) | (after.arms > before.arms)
+        is_moved = np.array([a is not b for a, b in zip(routes, robot.description.routes)])
+        jumps = is_moved & newly_jumping(
+            moved.routes.absolute_lengths, robot.routes.absolute_lengths, robot
+        )
+        reasons = (
+            (jumps, 'its length would jump'),
+            (is_worse & is_moved, 'learned points are not closer to the network'),
+        )
+        found = False
+        for mask, reason in reasons:
+            for m in np.flatnonzero(mask & ~is_kept).tolist():
+                kept.setdefault(robot.muscles[m], reason)
+                found, is_kept[m] = True, True
+        if not found:
+            break
+    for name, own, first in zip(robot.muscles, routes, robot.description.routes, strict=True):
+        if own is first:
+            kept.setdefault(name, 'its points cannot be moved')
+    return LearnedRoutes(routes, kept, before, after)
+
+
+def errors(robot: Robot, mae: Mae, theta: Array) -> Errors:
+    """Return how far the routes of a robot differ from a network at θ (N, D)."""
+    middle = 0.5 * (robot.tension.bias + robot.tension.limit)
+    tension = np.broadcast_to(middle, (len(theta), robot.muscle_count))
+    off = robot.routes.absolute_lengths(theta) - mae.lengths(theta, tension)
+    arms = robot.routes.muscle_jacobian(theta) - mae.muscle_jacobian(theta, tension)
+    return Errors(off.std(axis=0), np.sqrt((arms**2).sum(axis=2).mean(axis=0)))
+
+
+def _moved(
+    robot: Robot, body: CalibratedBody, is_kept: Bools, movable: Container[Place] | None
+) -> tuple[Route, ...]:
+    """Return the routes with learned points; unchanged routes are those of the description.
+
+    Args:
+        robot: The robot.
+        body: The fitted body, which has the displacement of each point.
+        is_kept: Which muscles keep their points, (M,).
+        movable: As in `learned_routes`. Shared points move by the mean of their displacements, and
+            stay if one of their muscles keeps its points.
+    """
+    shifts, routes = dict[Place, list[Array]](), robot.description.routes
+    own = [iter(_link_shifts(robot, body, m)) for m in range(robot.muscle_count)]
+    of_points = [[next(own[m]) if isinstance(p, RoutePoint) else None for p in route]
+                 for m, route in enumerate(routes)]  # fmt: skip
+    fixed = set[Place]()
+    for m, route in enumerate(routes):
+        for point, shift in zip(route, of_points[m], strict=True):
+            if isinstance(point, RoutePoint) and shift is not None:
+                shifts.setdefault(place_of(point), []).append(shift)
+                if is_kept[m]:
+                    fixed.add(place_of(point))
+    result = list[Route]()
+    for m, route in enumerate(routes):
+        items, changed = list(route), False
+        for i, (point, shift) in enumerate(zip(route, of_points[m], strict=True)):
+            if not isinstance(point, RoutePoint) or shift is None or is_kept[m]:
+                continue
+            if movable is not None:
+                place = place_of(point)
+                if place not in movable or place in fixed:
+                    continue
+                shift = np.mean(shifts[place], axis=0)
+            items[i], changed = point._replace(xyz=point.xyz + shift), True
+        result.append(tuple(items) if changed else route)
+    return tuple(result)
+
+
+def _link_shifts(robot: Robot, body: CalibratedBody, muscle: int) -> list[Array]:
+    """Return the displacement of each route point of a muscle in the frame of its link [m]."""
+    points = [p for p in robot.description.routes[muscle] if isinstance(p, RoutePoint)]
+    pairs = zip(points, body.shift(muscle), strict=True)
+    return [robot.kinematics.placement(p.link)[1].rotation.T @ shift for p, shift in pairs]

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Limits of joints that springs turn back, where the muscles can hold them in a part of the range.
+
+The muscles of such a joint pull it in one direction. If a tendon passes over the axis of the joint
+inside its range, the muscle pulls the other way beyond it, like the spring. The joint then snaps to
+its stop, and nothing can bring it back. Without such a limit, an arm is lost there in its first
+second.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from musculoskeletal_ae.design.checks import TOLERATED_SHARE, Setting, measure
+from musculoskeletal_ae.robot.robot import Robot
+
+POSTURES = 600
+PARTS = 20  # number of equal parts into which the range of a joint is divided
+#: keep a part of a range in which this share of the postures is held, relative to the best part
+KEPT_SHARE = 0.5
+
+
+class HeldRange(NamedTuple):
+    """The part of a joint's range that its muscles can hold."""
+
+    joint: str
+    low: float  # [rad or m]
+    high: float  # [rad or m]
+
+
+def held_ranges(robot: Robot) -> list[HeldRange]:
+    """Return the held part of the range of each joint that needs other limits."""
+    sprung = robot.kinematics.elasticity.is_sprung
+    if not sprung.any():
+        return []
+    theta = robot.random_postures(POSTURES, np.random.default_rng(2))
+    check = measure(Setting.of(robot, theta))
+    # An unstable posture cannot be held either: near the axis, a tendon pulls itself past it.
+    arms, held = check.moment_arms, check.held & (check.stiffness > 0.0)
+    is_two_sided = (arms.max(axis=1) > check.matters) & (arms.min(axis=1) < -check.matters)
+    ranges = list[HeldRange]()
+    for j in np.flatnonzero(sprung).tolist():
+        if np.mean(~is_two_sided[:, j]) <= TOLERATED_SHARE or not held.any():
+            continue
+        low, high = robot.lower[j], robot.upper[j]
+        part = np.clip((PARTS * (theta[:, j] - low) / (high - low)).astype(int), 0, PARTS - 1)
+        count = np.bincount(part, minlength=PARTS)
+        share = np.bincount(part, held, minlength=PARTS) / np.maximum(count, 1)
+        first = last = int(share.argmax())
+        is_kept = share >= KEPT_SHARE * share.max()
+        while first > 0 and is_kept[first - 1]:
+            first -= 1
+        while last < PARTS - 1 and is_kept[last + 1]:
+            last += 1
+        if first == 0 and last == PARTS - 1:
+            continue
+        radian = robot.units.radian[j]
+        ends = [radian * (low + edge / PARTS * (high - low)) for edge in (first, last + 1)]
+        ranges.append(HeldRange(robot.joints[j], *(float(f'{end:.4g}') for end in ends)))
+    return ranges

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Passive tendons: tendons without a muscle that pull joints back like rubber bands.
+
+A passive tendon has the length x(θ) and the spring constant k. It exerts no force while its length
+is within [x_low, x_high]:
+
+    τ = −f ∂x/∂θ,    f = k (x − x_high) above,  k (x − x_low) below,  0 within
+
+Its length is a polynomial of the angles of its joints:
+
+    x(θ) = Σ_r c_r Π_j (θ_j − θ̄_j)^p_rj
+
+For a tendon that only pulls, x_low is 0 or less than any length of the tendon.
+`JointElasticity` adds these torques to those of the springs at the joints.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from musculoskeletal_ae.arrays import Array, Bools, Ints
+
+
+class Passive(NamedTuple):
+    """T passive tendons of D joints as arrays, for compiled code."""
+
+    centre: Array  # θ̄ [rad], (D,)
+    power: Ints  # powers p of all R terms, (R, D)
+    coefficient: Array  # c [m/rad^p], (R,)
+    first: Ints  # index of the first term of each tendon, then R, (T+1,)
+    law: Array  # k [N/m], x_low and x_high [m] of each tendon, (T, 3)
+
+
+@njit(cache=True)
+def monomial(passive: Passive, term: int, theta: Array, a: int, b: int) -> float:
+    """Return a term of a length at θ (D,), differentiated by θ_a and θ_b; −1 stands for neither."""
+    value = passive.coefficient[term]
+    for j in range(len(theta)):
+        power, order = passive.power[term, j], int(j == a) + int(j == b)
+        if order > power:
+            return 0.0
+        for i in range(order):
+            value *= power - i
+        value *= (theta[j] - passive.centre[j]) ** (power - order)
+    return value
+
+
+@njit(cache=True)
+def add_passive(passive: Passive, theta: Array, torque: Array, gradient: Array) -> None:
+    """Add what holds joints at θ (D,) against passive tendons to `torque` [N·m] and `gradient`.
+
+    `gradient` [N·m/rad] (D, D) is the derivative of `torque` (D,) with respect to θ.
+    """
+    joints = len(theta)
+    slope = np.empty(joints)
+    for t in range(len(passive.law)):
+        terms = range(passive.first[t], passive.first[t + 1])
+        stiffness, low, high = passive.law[t]
+        length = 0.0
+        for r in terms:
+            length += monomial(passive, r, theta, -1, -1)
+        if low <= length <= high:
+            continue
+        force = stiffness * (length - (high if length > high else low))
+        slope[:] = 0.0
+        for j in range(joints):
+            for r in terms:
+                if passive.power[r, j]:
+                    slope[j] += monomial(passive, r, theta, j, -1)
+        for j in range(joints):
+            torque[j] += force * slope[j]
+            for i in range(joints):
+                gradient[j, i] += stiffness * slope[j] * slope[i]
+                for r in terms:
+                    if passive.power[r, j] and passive.power[r, i]:
+                        gradient[j, i] += force * monomial(passive, r, theta, j, i)
+
+
+@njit(cache=True)
+def hold_postures(passive: Passive, theta: Array, torque: Array, gradient: Array) -> None:
+    """Call `add_passive` for N postures: θ (N, D), `torque` (N, D) and `gradient` (N, D, D)."""
+    for n in range(len(theta)):
+        add_passive(passive, theta[n], torque[n], gradient[n])
+
+
+@dataclass(frozen=True, eq=False)
+class PassiveTendons:
+    """T passive tendons of D joints, in the order of θ."""
+
+    names: tuple[str, ...]
+    arrays: Passive
+
+    @classmethod
+    def none(cls, joint_count: int) -> PassiveTendons:
+        """Return no passive tendons."""
+        powers, first = np.zeros((0, joint_count), np.int64), np.zeros(1, np.int64)
+        centre = np.zeros(joint_count)
+        return cls((), Passive(centre, powers, np.zeros(0), first, np.zeros((0, 3))))
+
+    def __bool__(self) -> bool:
+        """Return whether there is any passive tendon."""
+        return bool(self.names)
+
+    @property
+    def spanned(self) -> Bools:
+        """The joints that each tendon can turn, (T, D)."""
+        ends = self.arrays.first
+        parts = [self.arrays.power[a:b].any(axis=0) for a, b in pairwise(ends)]
+        return np.array(parts, dtype=bool).reshape(len(self.names), len(self.arrays.centre))
+
+    @property
+    def typical_stiffness(self) -> Array:
+        """Σ k (∂x_t/∂θ)² at θ̄ [N·m/rad], (D,): stiffness that the tendons give to each joint."""
+        passive, stiffness = self.arrays, np.zeros(len(self.arrays.centre))
+        for t, (a, b) in enumerate(pairwise(passive.first)):
+            is_linear = passive.power[a:b].sum(axis=1) == 1
+            slope = passive.coefficient[a:b][is_linear] @ passive.power[a:b][is_linear]
+            stiffness += passive.law[t, 0] * slope**2
+        return stiffness
+
+    def hold(self, theta: Array) -> tuple[Array, Array]:
+        """Return torques that hold the joints, and their derivatives.
+
+        Args:
+            theta: θ [rad], (..., D).
+
+        Returns:
+            Torques [N·m], (..., D), and their derivatives with respect to θ [N·m/rad],
+            (..., D, D).
+        """
+        theta = np.asarray(theta, dtype=float)
+        rows = np.ascontiguousarray(theta.reshape(-1, theta.shape[-1]))
+        torque, gradient = np.zeros(rows.shape), np.zeros((*rows.shape, rows.shape[1]))
+        hold_postures(self.arrays, rows, torque, gradient)
+        return torque.reshape(theta.shape), gradient.reshape(*theta.shape, theta.shape[-1])
+
+    def deviating(self, factor: Array, shift: Array) -> PassiveTendons:
+        """Return tendons that deviate like the springs of their joints.
+
+        Args:
+            factor: Factor of the stiffness at each joint, (D,); the mean over its joints counts.
+            shift: Displacement of the postures with the same lengths [rad], (D,).
+        """
+        spanned, law = self.spanned, self.arrays.law.copy()
+        law[:, 0] *= (spanned @ factor) / np.maximum(spanned.sum(axis=1), 1)
+        arrays = self.arrays._replace(law=law, centre=self.arrays.centre + shift)
+        return replace(self, arrays=arrays)
+
+    def scaled(self, radian: Array) -> PassiveTendons:
+        """Return the same tendons for other units of the joint angles, as `JointElasticity`."""
+        own = self.arrays
+        coefficient = own.coefficient * np.prod(radian**own.power, axis=1)
+        arrays = own._replace(centre=own.centre / radian, coefficient=coefficient)
+        return replace(self, arrays=arrays)
+
+    def of_joints(self, joints: Ints) -> PassiveTendons:
+        """Return the tendons for some joints (indices), while all other joints are held at 0."""
+        own = self.arrays
+        is_held = np.ones(len(own.centre), dtype=bool)
+        is_held[joints] = False
+        held = np.prod((-own.centre[is_held]) ** own.power[:, is_held], axis=1)
+        power = np.ascontiguousarray(own.power[:, joints])
+        arrays = own._replace(
+            centre=own.centre[joints], power=power, coefficient=held * own.coefficient
+        )
+        return replace(self, arrays=arrays)

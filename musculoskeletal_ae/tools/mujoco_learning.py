@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`train --mujoco`: imports a MuJoCo model, and learns an emulated arm of it, without ROS.
+
+The emulated arm is an individual that deviates from the file (`emulator/deviation.py`). It explores
+in closed loop, as fast as the computer can.
+"""
+
+import time
+from argparse import Namespace
+from collections.abc import Iterator
+from pathlib import Path
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.design.prospects import prospects
+from musculoskeletal_ae.emulator.modules import Arm
+from musculoskeletal_ae.emulator.reality import make_arm
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.experiments.online_learning import explore, teach
+from musculoskeletal_ae.experiments.recording import (
+    EXPLORATION_STREAM,
+    HELD_OUT_STREAM,
+    SAMPLE_TIME,
+    ClosedLoop,
+    estimation_error,
+    record,
+)
+from musculoskeletal_ae.exporting.mjcf import export_into
+from musculoskeletal_ae.importing import convert
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.training import train_on
+from musculoskeletal_ae.progress_bar import ProgressBar
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.tools.model_training import train_on_model
+
+HELD_OUT = 60.0  # duration of the motion in which the error is measured; it is not learned [s]
+CHAIN = 'joints', 'muscles', 'without', 'base', 'end'  # options of `import_robot`
+
+
+def train(args: Namespace) -> None:
+    """Import, train, explore and learn; write the network, the robot and the learned model.
+
+    Raises:
+        MusculoskeletalError: If the file cannot be imported, or if the muscles of the model can
+            hold it in nearly no posture.
+    """
+    robot_folder = args.out.with_name(f'{args.out.stem}_robot')
+    model_folder = args.out.with_name(f'{args.out.stem}_model')
+    for folder in (robot_folder, model_folder):
+        if folder.exists():
+            raise MusculoskeletalError(f'{folder}: exists; remove it, or choose another --out')
+    train_on(args.device)
+    robot = _imported(args, robot_folder)
+    initial = train_on_model(robot, args).mae
+
+    def new_arm() -> Arm:
+        return make_arm(robot, args.seed, str(robot_folder / 'model.xml'), deviates=True)
+
+    held_out = record(new_arm(), initial, HELD_OUT_STREAM + args.seed, HELD_OUT)
+    learner = Learner(robot, initial, args.preset, args.seed)
+    settings = Settings(preset=args.preset)
+    loop = ClosedLoop(new_arm(), initial, settings, EXPLORATION_STREAM + args.seed)
+    start = time.perf_counter()
+    teach(learner, _shown(loop, learner, 60.0 * args.minutes))
+    speed = 60.0 * args.minutes / (time.perf_counter() - start)
+    checkpoint.save(learner.mae, args.out)
+    before, after = (estimation_error(mae, held_out) for mae in (initial, learner.mae))
+    unit, count = robot.units.distance_unit, len(learner.samples)
+    print(f'{args.minutes:g} min of exploration at {speed:.1f} times real time, {count} samples')
+    print(f'error on {HELD_OUT:g} s of held-out motion: {before:.4f} → {after:.4f} {unit}')
+    report = export_into(robot, learner.mae, args.mujoco, model_folder, args.seed)
+    print(next(line for line in report.splitlines() if line.startswith('muscles that keep')))
+    print(f'robot: {robot_folder}')
+    print(f'learned model: {model_folder / args.mujoco.name} (report.txt beside it)')
+    print(f'checkpoint: {args.out}')
+
+
+def _imported(args: Namespace, folder: Path) -> Robot:
+    """Import the file, and print the report; refuse a robot that cannot explore."""
+
+    def check(robot: Robot) -> None:
+        found = prospects(robot)
+        print(*found.lines(), sep='\n', flush=True)
+        if found.is_pointless:
+            raise MusculoskeletalError(f'{args.mujoco}: its muscles cannot hold it, see above')
+
+    chain = {name: getattr(args, name) for name in CHAIN}
+    imported = convert.import_robot(args.mujoco, folder, check, **chain)
+    for note in imported.notes:
+        print(note)
+    print(convert.length_verdict(imported.comparison), flush=True)
+    return imported.robot
+
+
+def _shown(loop: ClosedLoop, learner: Learner, duration: float) -> Iterator[tuple[Array, ...]]:
+    """Yield the messages of an exploration, and show the progress."""
+    with ProgressBar('exploring', duration, lambda: f'{len(learner.samples)} samples') as bar:
+        bar.announce(f' for {duration:g} s')
+        for row in explore(loop, learner, duration):
+            yield row
+            bar.add(SAMPLE_TIME)
