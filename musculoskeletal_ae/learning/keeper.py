@@ -92,7 +92,7 @@ class CheckpointKeeper:
         self._in_use: Mae | None = None  # network of the estimator; None without an estimator
         self._rejected_version = -1  # version of the network that was rejected last
         self._highest_version = 0  # highest version so far, also of the estimator's decisions
-        self._isolated: tuple[int, ...] = ()  # muscles that published networks leave out
+        self._isolated: tuple[int, ...] = ()  # muscles whose readings are not used
         self._torque, self._has_torque = HealthyTorque(robot), robot.tension_source.is_known
         self._samples = samples
         self._state = None if directory is None else StateStore(directory, robot)
@@ -115,8 +115,10 @@ class CheckpointKeeper:
         self._torque.reset()
 
     def isolate(self, muscles: Iterable[int]) -> None:
-        """Set the isolated muscles of the networks that are published from now on."""
+        """Measure the torque without these muscles from now on; networks are not changed."""
         self._isolated = tuple(muscles)
+        if self.mae is not None:
+            self._torque.use(self.mae.without(self._isolated))
 
     # -- networks -------------------------------------------------------------------------------
 
@@ -139,7 +141,8 @@ class CheckpointKeeper:
         self._save_newest()
 
     def _publish(self, mae: Mae) -> None:
-        self.mae = mae = self._torque.use(mae.without(self._isolated))
+        touch = self._torque.use(mae.without(self._isolated)).touch
+        self.mae = mae = replace(mae, touch=touch)
         self._highest_version = max(self._highest_version, mae.version)
         self.publication.offer(checkpoint.to_bytes(mae))
 

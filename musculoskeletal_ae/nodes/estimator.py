@@ -84,9 +84,6 @@ class Estimator(Shell):
         self.follow_parameter('isolate_muscles', self._on_isolate_muscles)
         self.core.isolate([*self.muscles_to_isolate, *(() if found is None else found.isolated)])
         self.candidates.follow()
-        if found is None and (chosen := self.core.state.complete_mae) is not None:
-            # At its first start, the estimator isolates the muscles that the chosen network lacks.
-            self.core.isolate([*self.muscles_to_isolate, *chosen.isolated])
         self.follow_parameter(
             'on_anomaly', lambda value: self.core.configure(Settings(on_anomaly=value))
         )

@@ -64,6 +64,8 @@ def train(args: Namespace) -> None:
     mae = _initial_network(robot, args)
     CheckpointValidator(robot).check(mae)
     learner = Learner(robot, mae, args.preset, args.seed)
+    # A recording that does not tell which muscles were isolated is of the arm of this network.
+    learner.use_body(learner.body.with_isolated(mae.isolated))
     before = {path: error(mae, pairs) for path, pairs in recordings.items()}
     try:
         for path, pairs in recordings.items():
@@ -317,7 +319,7 @@ def learn(
     for dt, at, theta, length, tension, recorded in zip(steps, *recording, strict=True):
         isolated = _isolated(recorded, learner.isolated)
         if isolated != learner.isolated:
-            learner.isolate(isolated)
+            learner.use_body(learner.body.with_isolated(isolated))
             validator.isolated = isolated
             validator.forget()
             stream.use_body(learner.body)

@@ -166,12 +166,3 @@ def test_the_first_network_stays_if_it_is_rejected(scene):
     scene.wait()
     assert scene.learner.mae.version == first.version
     assert len(scene.published) == 1
-
-
-def test_the_isolated_muscles_stay_isolated_after_a_rejection(scene):
-    scene.learner.note_accepted(scene.published[-1])
-    scene.learner.isolate([2])
-    scene.wait()
-    scene.reject(scene.published[-1])
-    scene.wait()
-    assert scene.learner.mae.isolated == (2,)

@@ -109,12 +109,12 @@ def test_isolated_muscles_of_a_recording_are_neither_learned_nor_used(arm26, ini
     assert error(initial, recording) < 0.1 * error(initial, nothing_said)
     learner = Learner(arm26, initial, steps=1)
     learn(learner, part(recording, 0.0, 4.0))
-    assert learner.isolated == learner.mae.isolated == (2,)
+    assert learner.isolated == (2,)
     (known,) = learner.samples.known
     assert np.flatnonzero(~known).tolist() == [2]
     learn(learner, part(recording, 4.0, 5.0))
     assert learner.isolated == ()
-    learner.isolate((1,))
+    learner.use_body(learner.body.with_isolated((1,)))
     learn(learner, nothing_said)
     assert learner.isolated == (1,)
 

@@ -282,10 +282,11 @@ def test_a_roll_back_does_not_restore_the_calibration_of_the_arm_before(learner,
     assert not calibrated(learner)
 
 
-def test_a_replaced_network_keeps_the_isolated_muscles(learner, initial):
-    learner.isolate((3,))
+def test_a_replaced_network_does_not_change_the_isolated_muscles(learner, initial):
+    learner.use_body(learner.body.with_isolated((3,)))
     learner.replace(initial)
-    assert learner.isolated == learner.mae.isolated == (3,)
+    assert learner.isolated == (3,)
+    assert learner.mae.isolated == ()
 
 
 def test_a_replaced_network_drops_samples_and_continues_the_version_count(learner, initial, stage):
