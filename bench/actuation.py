@@ -97,6 +97,7 @@ def learn(
     for count in range(round(seconds / SAMPLE_TIME)):
         if learner.mae is not None and learner.mae is not loop.mae:
             loop.use(learner.mae)
+            learner.note_accepted(loop.mae)
         row = loop.explore()
         learner.step(count * SAMPLE_TIME, row[1], row[3], row[2])
         watched.note()

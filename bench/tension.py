@@ -117,6 +117,7 @@ def explore(
         nonlocal count
         if learner.mae is not loop.mae:
             loop.use(learner.mae)
+            learner.note_accepted(loop.mae)
         row = loop.explore()
         learner.step(count * SAMPLE_TIME, row[1], row[3], row[2])
         count += 1

@@ -33,6 +33,7 @@ from musculoskeletal_ae.estimation.detectors.joint_disagreement import GAP_LEARN
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
 from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.health import HealthMonitor
+from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
 from musculoskeletal_ae.estimation.joint_check import JointCheck
 from musculoskeletal_ae.estimation.lengths.checked_calibration import CheckedCalibration
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthTrust
@@ -99,6 +100,7 @@ class Estimator:
         suspects: The latched finding and its verification.
         calibration: The running length calibration, or None.
         contact: The contact estimator.
+        healthy_torque: Measures the external torque that is wrongly estimated without contact.
         mounting: Checks the direction of gravity.
         sample: The last sample; None before the first.
         output: Results of the last message with an estimate; None before the first, and from the
@@ -131,6 +133,7 @@ class Estimator:
         self.suspects = SuspectHandling(robot)
         self.calibration: CheckedCalibration | None = None
         self.contact = ContactEstimator(robot)
+        self.healthy_torque = HealthyTorque(robot.joint_count)
         self.mounting = MountingCheck(robot)
         self.sample: MuscleSample | None = None
         self.output: Output | None = None
@@ -184,15 +187,19 @@ class Estimator:
         """Use these settings from the next message on."""
         self.suspects.settings = settings
 
-    def use(self, mae: Mae) -> None:
+    def use(self, mae: Mae) -> Mae:
         """Use another network and its healthy statistics, without the isolated muscles.
 
         A running length calibration starts again, because its estimate depends on the network.
+
+        Returns:
+            The network with all muscles, and with the residual torque that was measured so far.
 
         Raises:
             numpy.linalg.LinAlgError: If the network's statistics are singular; the previous network
                 then stays in use.
         """
+        mae = self.healthy_torque.put_into(mae)
         reduced = mae.without(self.body.isolated)
         self.health.use(reduced)
         self.joint_check.use(reduced)
@@ -203,6 +210,7 @@ class Estimator:
         if self.calibration is not None:
             posture = self.calibration.posture
             self.calibration = CheckedCalibration(self.robot, reduced, posture)
+        return mae
 
     def isolate(self, muscles: Iterable[int]) -> None:
         """Isolate exactly these muscles (indices in T and l), and restore all others.
@@ -447,6 +455,7 @@ class Estimator:
             pull = sample.bone_tension * self.body.used
             contact = self.contact.step(estimate.state.theta, pull, sent_apart)
             if self.suspects.finding is None:
+                self.healthy_torque.step(contact.torque, self.contact.velocity, sent_apart)
                 self.mounting.step(estimate.state.theta, pull, contact.torque, dt)
         self.output = Output(
             sample, estimate.state, estimate.covariance, estimate.anomaly, detected, contact

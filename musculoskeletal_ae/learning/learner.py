@@ -176,8 +176,6 @@ class Learner:
             return
         if self.collector.has_jumped:  # since the last calibration of the lengths
             return
-        if not self.collector.is_anomaly:
-            self.keeper.observe(paired.message, paired.dt)
         for _ in self.collector.collect(paired):
             self.offset_history.accepted(time)
             self.joint_history.accepted(time)
@@ -234,11 +232,8 @@ class Learner:
         corrected (`offset_history`); all others are kept.
         """
         before, offsets = self.body, body.offsets
-        has_changed = offsets != before.offsets
-        if has_changed:
-            self.keeper.reset()
         self.collector.use_body(body)
-        if has_changed:
+        if offsets != before.offsets:
             if offsets.revoked:
                 self.offset_history.revoke(self._time)
                 self.collector.healthy.forget_newest(HELD_TIME)
@@ -246,7 +241,6 @@ class Learner:
             elif offsets.known:
                 self._use_known_offsets()
         if body.isolated != before.isolated:
-            self.keeper.isolate(body.isolated)
             self.scheduler.note_news()
 
     def use_joint_trust(self, trust: JointTrust) -> None:
@@ -288,7 +282,6 @@ class Learner:
     def reset(self) -> None:
         """Discard incomplete samples, for example after a backward jump of the clock."""
         self.collector.reset()
-        self.keeper.reset()
 
     # -- samples → checkpoints ------------------------------------------------------------------
 

@@ -41,12 +41,13 @@ class Candidates:
         queue: Queue in which the candidates from the topic wait; it validates them in small steps.
     """
 
-    def __init__(self, node: Shell, use: Callable[[Mae], None]) -> None:
+    def __init__(self, node: Shell, use: Callable[[Mae], Mae]) -> None:
         """Start without a network.
 
         Args:
             node: The estimator.
-            use: Called with each network that the estimator is to use from now on.
+            use: Called with each network that the estimator is to use from now on; returns it with
+                what the estimator has measured for it.
         """
         self._node, self._use = node, use
         self.validator = CheckpointValidator(node.robot)
@@ -80,8 +81,7 @@ class Candidates:
                 f'checkpoint version {in_use.version}: {reason}; returned to checkpoint version '
                 f'{before.version}'
             )
-            self._use(before)
-            self._publish(before)
+            self._publish(self._use(before))
             self._reject(in_use, reason)
         if waiting is not None:
             with suppress(CheckpointError):  # an unfit checkpoint has no version
@@ -95,8 +95,7 @@ class Candidates:
             return
         try:
             yield from self.validator.trial(mae)
-            complete = self.validator.with_detector(mae, time.monotonic())
-            self._accept(complete, message if complete is mae else None)
+            self._accept(self.validator.with_detector(mae, time.monotonic()))
         except CheckpointError as error:
             self._reject(mae, str(error))
             raise
@@ -112,16 +111,14 @@ class Candidates:
         self._accept(mae)
         self._node.needed.remove(CANDIDATES)
 
-    def _accept(self, mae: Mae, message: UInt8MultiArray | None = None) -> None:
+    def _accept(self, mae: Mae) -> None:
         try:
-            self._use(mae)
+            mae = self._use(mae)
         except (np.linalg.LinAlgError, FloatingPointError) as error:
             raise CheckpointError(f'the network cannot be evaluated ({error})') from error
         self.validator.take(mae, time.monotonic())
-        self._publish(mae, message)
+        self._publish(mae)
 
-    def _publish(self, mae: Mae, message: UInt8MultiArray | None = None) -> None:
+    def _publish(self, mae: Mae) -> None:
         self._node.checkpoint_version = mae.version
-        if message is None:
-            message = bytes_message(checkpoint.to_bytes(mae))
-        self._accepted.publish(message)
+        self._accepted.publish(bytes_message(checkpoint.to_bytes(mae)))

@@ -118,11 +118,12 @@ class Estimator(Shell):
 
     # -- parameters and services ----------------------------------------------------------------
 
-    def _use(self, mae: Mae) -> None:
-        self.core.use(mae)
+    def _use(self, mae: Mae) -> Mae:
+        mae = self.core.use(mae)
         if Evidence.NOT_CALIBRATED in self.core.trust.evidence:  # it waits for the first network
             self.core.calibrate_lengths(self.posture)
             self._publish_body()
+        return mae
 
     def _on_posture(self, posture: tuple[float, ...]) -> None:
         stated_theta(self.robot, posture)  # checks the posture

@@ -16,6 +16,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation import estimator
 from musculoskeletal_ae.estimation.finding import Finding
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.learning.learner import Learner
@@ -274,7 +275,7 @@ def test_an_anomaly_in_a_held_out_recording_is_reported_with_the_error_before_it
     length, nobody = initial.lengths(theta, tension), np.zeros(tension.shape, dtype=int)
     recording = Pairs(0.01 * np.arange(count), theta, length, tension, nobody)
     assert anomaly_in(arm26, recording, initial, 'default') == ''
-    monkeypatch.setattr(bag_learning, 'HealthMonitor', Monitor)
+    monkeypatch.setattr(estimator, 'HealthMonitor', Monitor)
     learner = Learner(arm26, initial)
     assert 'learning stopped 3.0 s after the start: an anomaly' in learn(learner, recording)
     text = anomaly_in(arm26, recording, initial, 'default')
