@@ -279,7 +279,7 @@ def test_the_repair_of_a_suspect_keeps_the_offsets(ruptured):
     # The larger deviation tells the other nodes that the estimator has confirmed the length.
     grown = ruptured.offsets.deviation > before.deviation
     assert np.flatnonzero(grown).tolist() == [2]
-    assert not ruptured.core.stream.displaced.muscles
+    assert not ruptured.core.stream.jumps.displaced
 
 
 @pytest.mark.parametrize('jump', [SEVERAL, 0.1 * np.eye(6)[4]])
