@@ -96,7 +96,7 @@ class HardwareEmulator(Arm):
             return
         self.reading = self.arm.sense()
         for reading in self.arm.faults.deliver(self.reading, now):
-            self.publish_state(*reading)
+            self.publish_state(reading.theta, **reading.muscles)
         if self.imu is not None:
             self._publish_imu(self.imu)
         if self.sensors.marker_rate > 0.0 and now >= self.pose_due:

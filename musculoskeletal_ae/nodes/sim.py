@@ -95,7 +95,9 @@ class Sim(Arm):
         state = arm.step(elapsed)
         temperature = np.full(self.robot.muscle_count, TEMPERATURE)
         read = arm.mae.transmission.reading(state.tension[0], state.slid[0])
-        self.publish_state(state.theta[0], state.length[0], read, temperature)
+        self.publish_state(
+            state.theta[0], length=state.length[0], tension=read, temperature=temperature
+        )
 
     def _lines(self) -> list[Line]:
         if self.arm is None:
