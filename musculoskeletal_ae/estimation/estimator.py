@@ -52,7 +52,6 @@ from musculoskeletal_ae.remedy import REPAIR, Step, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
-from musculoskeletal_ae.signals.heat import Heat
 from musculoskeletal_ae.signals.joint_stream import JointStream
 from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.limits import Persistence
@@ -127,9 +126,9 @@ class Estimator:
         self.trust = LengthTrust(robot.muscle_count)
         self.body = BodyState(self.trust.offsets, generation=first_generation)
         self.stream = MuscleStream(robot, self.body)
-        self.heat = Heat(robot)
         self.state = StateEstimator()
-        self.health = HealthMonitor(robot, preset, heat=self.heat)
+        self.health = HealthMonitor(robot, preset)
+        self.heat = self.health.heat
         self.suspects = SuspectHandling(robot)
         self.calibration: CheckedCalibration | None = None
         self.contact = ContactEstimator(robot)
