@@ -330,7 +330,7 @@ class Lab:
         self._to_learner.append(lambda: self.learner.note_rejected(mae.version, reason))
 
     def _use(self, mae: Mae) -> None:
-        self.estimator.use(mae)
+        mae = self.estimator.use(mae)
         self.validator.take(mae, self.now)
         self.controller.use(mae)
         self._to_learner.append(lambda: self.learner.note_accepted(mae))

@@ -33,7 +33,7 @@ from musculoskeletal_ae.signals.joint_series import judge_series
 from musculoskeletal_ae.signals.limits import length_range
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Presence, Row, possible_readings
-from musculoskeletal_ae.signals.wiring import Judgement, Wiring
+from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement
 
 MOST_REPEATED = 0.2  # largest share of messages that may repeat the previous message exactly
 QUIET = 3  # sensors that show at most this many different values count as free of noise
@@ -550,7 +550,7 @@ class Listening:
         moved: Bools = np.ptp(model, axis=0) > least
 
         straight = Wiring.straight(robot.muscle_count)
-        judgement, doubt = Judgement(straight, (straight,), (), 0.0), ''
+        judgement, doubt = WiringJudgement(straight, (straight,), (), 0.0), ''
         if moved.any():
             # On a moved arm, length offsets do not affect the comparison.
             readings = robot.muscle_lengths, theta, length, tension

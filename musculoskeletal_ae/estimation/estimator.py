@@ -41,7 +41,7 @@ from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
 from musculoskeletal_ae.estimation.mounting import MountingCheck
 from musculoskeletal_ae.estimation.repair_check import RepairCheck
-from musculoskeletal_ae.estimation.settings import Settings
+from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.estimation.state_estimator import Estimate, StateEstimator
 from musculoskeletal_ae.estimation.suspects import SuspectHandling
 from musculoskeletal_ae.estimation.verification import LONGEST
@@ -182,7 +182,7 @@ class Estimator:
 
     # -- settings and services ------------------------------------------------------------------
 
-    def configure(self, settings: Settings) -> None:
+    def configure(self, settings: EstimatorSettings) -> None:
         """Use these settings from the next message on."""
         self.suspects.settings = settings
 

@@ -109,7 +109,7 @@ class Frames:
         self._publisher.publish(self._message(transforms=transforms))
 
 
-class Arm(Shell):
+class ArmNode(Shell):
     """Base class of nodes that replace a real arm: they obey its commands and publish its state.
 
     Like real muscle modules, such a node obeys commands even while several nodes publish them.

@@ -29,7 +29,7 @@ from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.estimation.estimator import Output
 from musculoskeletal_ae.estimation.lengths.length_calibration import stated_theta
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
-from musculoskeletal_ae.estimation.settings import Settings
+from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.estimation.verification import VerificationVerdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
@@ -85,7 +85,7 @@ class Estimator(Shell):
         self.core.isolate([*self.muscles_to_isolate, *(() if found is None else found.isolated)])
         self.candidates.follow()
         self.follow_parameter(
-            'on_anomaly', lambda value: self.core.configure(Settings(on_anomaly=value))
+            'on_anomaly', lambda value: self.core.configure(EstimatorSettings(on_anomaly=value))
         )
         self.follow_muscle_messages(self._on_muscles)
         self.follow_posture('joint_states', self._on_joints, some=True)

@@ -34,7 +34,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.design.route_jumps import jump_warning
 from musculoskeletal_ae.estimation.network_validation import detector, message_errors
-from musculoskeletal_ae.estimation.network_validation.agreement import AgreementCheck, Comparison
+from musculoskeletal_ae.estimation.network_validation.agreement import Agreement, AgreementCheck
 from musculoskeletal_ae.estimation.network_validation.postures import PostureCheck
 from musculoskeletal_ae.estimation.network_validation.recent_messages import RecentMessages
 from musculoskeletal_ae.exceptions import GateError
@@ -184,7 +184,7 @@ class CheckpointValidator:
         """Return the errors of a network on the recent messages; {} if these are too few."""
         return message_errors.message_errors(mae, self._messages, self.isolated)
 
-    def agreement(self, mae: Mae) -> list[Comparison]:
+    def agreement(self, mae: Mae) -> list[Agreement]:
         """Compare a network with joint sensors or, without them, with the network in use.
 
         Return [] if no network is in use.
