@@ -106,7 +106,7 @@ class CheckpointKeeper:
         """Number a network and publish it as a candidate; save it if there is no estimator."""
         self._publish(self.numbered(mae))
         if self._in_use is None:
-            self._save_newest()
+            self._save_newest(self.publication.checkpoint)
 
     def restore(self, mae: Mae) -> None:
         """Save and publish a network that needs no decision, and keep its version.
@@ -114,7 +114,7 @@ class CheckpointKeeper:
         It comes from a user, from the disk or from the estimator.
         """
         self._publish(mae)
-        self._save_newest()
+        self._save_newest(self.publication.checkpoint)
 
     def _publish(self, mae: Mae) -> None:
         if mae.touch is not None and not mae.touch.time:
@@ -124,9 +124,9 @@ class CheckpointKeeper:
         self._highest_version = max(self._highest_version, mae.version)
         self.publication.offer(checkpoint.to_bytes(mae))
 
-    def _save_newest(self) -> None:
-        assert self.mae is not None
-        self._saved, self.checkpoint = self.mae, checkpoint.to_bytes(self.mae)
+    def _save_newest(self, data: bytes | None) -> None:
+        """Save the newest network, of which `data` is the content of a checkpoint."""
+        self._saved, self.checkpoint = self.mae, data
         self.store()
 
     def clear(self) -> None:
@@ -147,9 +147,11 @@ class CheckpointKeeper:
         if self.mae is None:
             return
         if mae.version == self.mae.version:
-            self.mae = _with_torque_of(mae, self.mae)
+            data, newest = self.publication.checkpoint, _with_torque_of(mae, self.mae)
+            if newest is not self.mae:
+                self.mae, data = newest, checkpoint.to_bytes(newest)
             if self._saved is not self.mae:
-                self._save_newest()
+                self._save_newest(data)
         else:
             self._return_if_rejected()
 
