@@ -18,8 +18,8 @@ from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
+from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.learning.margin import MARGIN
 from musculoskeletal_ae.learning.state import NETWORK, NEWEST
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae import checkpoint
@@ -225,7 +225,9 @@ def test_an_anomaly_and_learner_enable_stop_learning_for_a_time(host, graph):
     def learns_nothing():
         learner.learn(lambda: learner.node.core.trainer.ready, 'the end of the last update')
         samples, updates = learner.samples, learner.updates
-        learner.run(MARGIN + 2.0)  # longer than the time until the first samples after a pause
+        learner.run(
+            DETECTION_DELAY + 2.0
+        )  # longer than the time until the first samples after a pause
         assert (learner.samples, learner.updates) == (samples, updates)
 
     def learns_again():

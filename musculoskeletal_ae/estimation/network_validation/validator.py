@@ -33,6 +33,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.design.route_jumps import jump_warning
+from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.estimation.network_validation import detector, message_errors
 from musculoskeletal_ae.estimation.network_validation.agreement import Agreement, AgreementCheck
 from musculoskeletal_ae.estimation.network_validation.postures import PostureCheck
@@ -44,7 +45,6 @@ from musculoskeletal_ae.robot.robot import Robot
 PROOF = 10.0  # time in use without an anomaly after which a network is proven [s]
 MOST_USED = 20  # largest number of networks that are kept for a rollback
 RELEARNING_TIME = 600.0  # time after its repair during which a muscle may be relearned [s]
-DETECTION_DELAY = 2.0  # time before a detection in which messages may already be faulty [s]
 
 
 class CheckpointValidator:
