@@ -28,6 +28,7 @@ from bench.learned_arm import initial_network
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.experiments import online_learning
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_TIME, ClosedLoop
 from musculoskeletal_ae.experiments.resilience import IsolatingLoop
 from musculoskeletal_ae.learning.learner import Learner
@@ -94,10 +95,7 @@ def learn(
     """Explore and learn for a time [s]; return the learner and the number of stops."""
     loop = ClosedLoop(arm, initial, None, EXPLORATION_STREAM + seed)
     learner = Learner(arm.robot, initial, 'default', seed)
-    for count in range(round(seconds / SAMPLE_TIME)):
-        if learner.mae is not None and learner.mae is not loop.mae:
-            loop.use(learner.mae)
-        row = loop.explore()
+    for count, row in enumerate(online_learning.explore(loop, learner, seconds)):
         learner.step(count * SAMPLE_TIME, row[1], row[3], row[2])
         watched.note()
     return learner, loop.stops

@@ -330,7 +330,7 @@ class Lab:
         self._to_learner.append(lambda: self.learner.note_rejected(mae.version, reason))
 
     def _use(self, mae: Mae, unsuitable_because: str = '') -> None:
-        self.estimator.use(mae, unsuitable_because)
+        mae = self.estimator.use(mae, unsuitable_because)
         self.validator.take(mae, self.now)
         self.controller.use(mae)
         self._to_learner.append(lambda: self.learner.note_accepted(mae))

@@ -136,7 +136,9 @@ def holdable(study: Study, seed: int) -> Iterator[Array]:
             yield theta
 
 
-def can_exert(limits: reach.Limits, muscle_jacobian: MuscleJacobian, planned: Trajectory) -> bool:
+def can_exert(
+    limits: reach.ReachLimits, muscle_jacobian: MuscleJacobian, planned: Trajectory
+) -> bool:
     """Return whether the muscles can exert the torque of a trajectory at every moment.
 
     Args:
@@ -158,7 +160,7 @@ def exertable_path(study: Study, seed: int) -> list[Array]:
     Raises:
         MusculoskeletalError: If too few of the random postures qualify.
     """
-    arm, limits = study.arm(seed), reach.Limits(study.robot, study.network(seed))
+    arm, limits = study.arm(seed), reach.ReachLimits(study.robot, study.network(seed))
     path, duration = [arm.theta], motion.STARTING
     for theta in holdable(study, seed):
         straight = Trajectory.to(Setpoint.resting(path[-1]), theta, duration)

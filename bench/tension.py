@@ -29,6 +29,7 @@ from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import KIN, make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.experiments import online_learning
 from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,
     HELD_OUT_STREAM,
@@ -111,18 +112,9 @@ def explore(
     """
     observed = Observed(arm, initial, Settings(), seed)
     loop, learner = observed.loop, Learner(arm.robot, initial, 'default', seed)
-    count = 0
-
-    def step() -> tuple[Array, ...]:
-        nonlocal count
-        if learner.mae is not loop.mae:
-            loop.use(learner.mae)
-        row = loop.explore()
+    for count, row in enumerate(online_learning.explore(loop, learner, seconds)):
         learner.step(count * SAMPLE_TIME, row[1], row[3], row[2])
-        count += 1
-        return row
-
-    observed.run(step, seconds)
+        observed.shares.append(row[3] / arm.robot.tension.limit)
     error = estimation_error(learner.mae, held_out, 10)
     return observed.excess, loop.stops, len(learner.samples), error
 

@@ -51,7 +51,7 @@ MODULES = {
     'robot/joint_units.py': ['JointUnits', 'JointUnit'],
     'robot/kinematics.py': ['Kinematics'],
     'robot/routes.py': ['Routes'],
-    'design/checks.py': ['check_robot', 'RobotCheck', 'Finding', 'Setting'],
+    'design/checks.py': ['check_robot', 'RobotCheck', 'CheckFinding', 'Setting'],
     'design/holding_remedies.py': ['remedies'],
     'design/suggestion.py': ['suggest', 'write'],
     'robot/tension.py': ['holding_tension', 'least_tension'],

@@ -31,7 +31,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
 from musculoskeletal_ae.signals.joint_series import JointSeries, judge_series
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
-from musculoskeletal_ae.signals.muscle_readings import Row
+from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Row
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream
 from musculoskeletal_ae.signals.pairing import Pairing
 
@@ -62,7 +62,7 @@ class Streams(NamedTuple):
     """Sensor data and commands of one arm; missing topics are empty series."""
 
     joints: Series  # usable θ [rad], (N, D); NaN where a joint has no usable reading
-    muscles: Series  # length [m], tension [N], temperature [°C], (N, 3, M)
+    muscles: Series  # the quantities of muscle modules (`signals/muscle_readings.py`), (N, Q, M)
     length_commands: Series  # l_target [m], (N, M)
     tension_commands: Series  # T_target [N], (N, M)
     isolated: Series  # 1 for isolated muscles, else 0, (N, M)
@@ -104,11 +104,12 @@ class Streams(NamedTuple):
             theta.append(unknown if paired.theta is None else paired.theta)
             muscle.append(paired.message)
         values, time = self.muscles.values[muscle], time[muscle]
-        isolated = np.full(values[:, 0].shape, -1)
+        length, tension = values[:, Row.LENGTH], values[:, Row.TENSION]
+        isolated = np.full(length.shape, -1)
         if len(self.isolated.time):
             isolated[:] = self.isolated.values[_latched(self.isolated.time, time)]
         postures = np.array(theta).reshape(-1, self.joints.values.shape[1])
-        return Pairs(time, postures, values[:, 0], values[:, 1], isolated)
+        return Pairs(time, postures, length, tension, isolated)
 
 
 @dataclass
@@ -160,7 +161,7 @@ class _ArmStreams:
         self._offsets = _Stream((3, muscles), self._offset_rows)
         self.by_topic = {
             'joint_states': _Stream((robot.joint_count,), self._posture),
-            'muscle_states': _Stream((3, muscles), self._muscle_states),
+            'muscle_states': _Stream((len(QUANTITIES), muscles), self._muscle_states),
             'muscle_length_command': _Stream((muscles,), self._command),
             'muscle_tension_command': _Stream((muscles,), self._command),
             'body_state': self._body,
@@ -183,7 +184,10 @@ class _ArmStreams:
             self._note_unused_tension(reading)
         sample = stream.take(reading, now, delay=arrival.delay)
         self.had_offsets.append(stream.body.offsets.known)
-        return np.array([sample.length, sample.tension_read, sample.temperature])
+        values = sample.newest.copy()
+        values[Row.LENGTH], values[Row.TENSION] = sample.length, sample.tension_read
+        values[Row.TEMPERATURE] = sample.temperature
+        return values
 
     def _note_unused_tension(self, reading: Any) -> None:
         tension = muscle_rows(reading, self._robot.muscle_count)[Row.TENSION]

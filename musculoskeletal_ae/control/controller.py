@@ -515,10 +515,9 @@ class Controller:
             return f'the estimator has revoked the length offsets{of_muscles}'
         if self.watchdog.has_anomaly:
             return ''
-        displaced = self.stream.displaced
-        has_jumped = displaced.muscles and not displaced.is_unseen
-        if has_jumped and stream.body.offsets.known and now - self._jumped_at > REACTION_TIME:
-            return f'the lengths of {self.robot.names(sorted(displaced.muscles))} have jumped'
+        is_ignored = stream.has_jumped and now - self._jumped_at > REACTION_TIME
+        if is_ignored and stream.body.offsets.known:
+            return f'the lengths of {self.robot.names(sorted(stream.jumps.displaced))} have jumped'
         return ''
 
     def step(self, now: float, time: float | None = None) -> Command | None:

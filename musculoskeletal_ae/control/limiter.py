@@ -64,12 +64,11 @@ from musculoskeletal_ae.control.command import (
     unchanging,
 )
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.robot.model_errors import LARGEST
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 POSTURES = 200  # number of random postures from which the longest muscle lengths are computed
-#: largest difference that is expected between the lengths of a real muscle and of its model [m]
-LENGTH_MARGIN = 0.03
 LONGEST_INTERVAL = 0.05  # longest time between two messages from which dT/dt is computed [s]
 CONFIDENCE = 2.0  # number of standard deviations by which a measured tension may be too low
 #: gain of the tension feedback r [1/s]; its time constant of 0.2 s is long compared with the lag of
@@ -98,7 +97,7 @@ class CommandLimiter:
         self.offsets_known = True
         postures = robot.random_postures(POSTURES, np.random.default_rng(0))
         longest = robot.routes.relative_lengths(postures).max(axis=0)
-        self.slack_length: Array = longest + LENGTH_MARGIN
+        self.slack_length: Array = longest + LARGEST
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:

@@ -84,7 +84,7 @@ class FindingTexts(Strict, frozen=True, array_like=True):
 FINDINGS = read_table(__file__, 'findings.yaml', dict[str, FindingTexts])
 
 
-class Finding(NamedTuple):
+class CheckFinding(NamedTuple):
     """A fault or warning about a robot, with its remedy."""
 
     kind: str  # an identifier, such as 'wrong_sign'
@@ -142,8 +142,8 @@ class RobotCheck:
     required: float  # required stiffness [N·m/rad]
     matters: Array  # smallest moment arm at each joint that is taken into account [m], (D,)
     softest: Ints  # index of the softest joint in each posture that is held but not stiff
-    faults: tuple[Finding, ...] = ()  # reasons why the arm is not sound; empty if it is sound
-    warnings: tuple[Finding, ...] = ()  # questionable properties that do not make it unsound
+    faults: tuple[CheckFinding, ...] = ()  # reasons why the arm is not sound; empty if it is sound
+    warnings: tuple[CheckFinding, ...] = ()  # questionable properties that do not make it unsound
 
     @property
     def held(self) -> Bools:
@@ -372,17 +372,17 @@ def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int]
     return actions
 
 
-def _finding(key: str, **fields: object) -> Finding:
+def _finding(key: str, **fields: object) -> CheckFinding:
     """Return a finding with the texts that findings.yaml has under a key.
 
     `fields` are the values of the placeholders in these texts.
     """
     texts = FINDINGS[key]
     kind = key.partition(',')[0]
-    return Finding(kind, texts.message.format(**fields), texts.remedy.format(**fields))
+    return CheckFinding(kind, texts.message.format(**fields), texts.remedy.format(**fields))
 
 
-def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
+def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[CheckFinding]:
     """Yield a fault for each moment arm whose declared sign is wrong in too many postures."""
     for (muscle, joint), sign in read_declared_actions(robot.description).items():
         arm, terms = moment_arms[:, muscle, joint], arm_terms(robot, joint)
@@ -400,7 +400,7 @@ def _wrong_signs(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
 
 def _one_way_joints(
     robot: Robot, moment_arms: Array, matters: Array, *, is_suspended: bool = False
-) -> Iterator[Finding]:
+) -> Iterator[CheckFinding]:
     """Yield a fault for each joint that lacks necessary muscles in too many postures.
 
     A joint needs muscles on both sides, or on one side if it has a spring or a passive tendon. The
@@ -433,7 +433,7 @@ def _one_way_joints(
         yield _finding(key, joint=robot.joints[joint], missing=missing, acting=acting, terms=terms)
 
 
-def _useless_muscles(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[Finding]:
+def _useless_muscles(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[CheckFinding]:
     """Yield a fault for each muscle that has no effective moment arm at any joint."""
     along = ', or parallel to that of a prismatic joint' * bool(robot.units.slides.any())
     for muscle, arms in zip(robot.muscles, np.abs(moment_arms).max(axis=0), strict=True):
@@ -459,7 +459,7 @@ def main_actions(moment_arms: Array) -> tuple[Ints, Array]:
     return main, against.mean(axis=0)
 
 
-def _flipping_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
+def _flipping_muscles(robot: Robot, moment_arms: Array) -> Iterator[CheckFinding]:
     """Yield a warning for each muscle whose main action changes its sign within joint limits."""
     for m, (joint, against) in enumerate(zip(*main_actions(moment_arms), strict=True)):
         if against > TOLERATED_SHARE:
@@ -468,7 +468,7 @@ def _flipping_muscles(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
             yield _finding('flipping_muscle', **names, against=100 * against, terms=terms)
 
 
-def _millimetres(moment_arms: Array) -> Iterator[Finding]:
+def _millimetres(moment_arms: Array) -> Iterator[CheckFinding]:
     """Yield a fault if most route points seem to be in millimetres instead of metres.
 
     All other faults would then be consequences of this one.
@@ -478,7 +478,7 @@ def _millimetres(moment_arms: Array) -> Iterator[Finding]:
         yield _finding('other_units, points', arm=typical)
 
 
-def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
+def _other_units(robot: Robot, moment_arms: Array) -> Iterator[CheckFinding]:
     """Yield a warning for each moment arm or joint limit that looks like millimetres or degrees."""
     longest, units = np.abs(moment_arms).max(axis=0), robot.units
     slides, ends = units.slides, (units.to_position(robot.lower), units.to_position(robot.upper))
@@ -492,7 +492,7 @@ def _other_units(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
             yield _finding('other_units, limits', joint=robot.joints[j], wrong=wrong, **limits)
 
 
-def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
+def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[CheckFinding]:
     """Yield a warning about the joints at which all moment arms are shorter than 15 mm."""
     # Skip joints without muscles, which are reported as one-way joints.
     longest = np.abs(moment_arms).max(axis=(0, 1))
@@ -502,7 +502,7 @@ def _small_joints(robot: Robot, moment_arms: Array) -> Iterator[Finding]:
         yield _finding('small_joints', joints=each)
 
 
-def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
+def _jumping_muscles(robot: Robot) -> Iterator[CheckFinding]:
     """Yield a warning for each muscle whose length jumps where its tendon slips over an object."""
     for m, size, theta in jumping_muscles(robot):
         crossed, position = np.flatnonzero(robot.routes.crossed[m]), robot.units.to_position(theta)
@@ -510,7 +510,7 @@ def _jumping_muscles(robot: Robot) -> Iterator[Finding]:
         yield _finding('jumping_muscle', muscle=robot.muscles[m], size=1e3 * size, place=place)
 
 
-def _idle_objects(robot: Robot, theta: Array) -> Iterator[Finding]:
+def _idle_objects(robot: Robot, theta: Array) -> Iterator[CheckFinding]:
     """Yield a warning about objects of routes that the tendon touches in none of the postures."""
     described = [
         f'{muscle} ({written(item)["wrap"]} of {round(1e3 * item.radius, 1):g} mm on {item.link})'
@@ -523,7 +523,7 @@ def _idle_objects(robot: Robot, theta: Array) -> Iterator[Finding]:
         yield _finding('idle_object', objects=', '.join(idle))
 
 
-def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
+def _inertia_faults(robot: Robot, theta: Array) -> Iterator[CheckFinding]:
     """Yield a fault for each joint that moves almost no mass."""
     kin = robot.kinematics
     least = np.min([kin.joint_inertia(posture) for posture in theta], axis=0)
@@ -534,7 +534,7 @@ def _inertia_faults(robot: Robot, theta: Array) -> Iterator[Finding]:
         yield _finding('no_inertia', joint=robot.joints[j], moved=moved)
 
 
-def _holding_faults(check: RobotCheck) -> Iterator[Finding]:
+def _holding_faults(check: RobotCheck) -> Iterator[CheckFinding]:
     """Yield a fault if the arm is held in too few postures, and one if it is stiff in too few."""
     robot, stiffness, least = check.setting.robot, check.stiffness, check.required
     held, stiff = check.held, check.stiff

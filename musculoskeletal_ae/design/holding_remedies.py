@@ -20,7 +20,13 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.design import checks
-from musculoskeletal_ae.design.checks import REQUIRED_SHARE, Finding, RobotCheck, Setting, measure
+from musculoskeletal_ae.design.checks import (
+    REQUIRED_SHARE,
+    CheckFinding,
+    RobotCheck,
+    Setting,
+    measure,
+)
 from musculoskeletal_ae.robot.description import shown
 
 LEAST_GAIN = 0.01  # smallest gain of a suggested change, in the share of held or stiff postures
@@ -37,7 +43,7 @@ CHANGES = {
 }
 
 
-def remedies(check: RobotCheck, fault: Finding) -> list[str]:
+def remedies(check: RobotCheck, fault: CheckFinding) -> list[str]:
     """Return texts on remedies for an arm that is not held or not stiff in enough postures.
 
     Each text states the share of postures that are held or stiff with the remedy.

@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.driver.pace import Pace
-from musculoskeletal_ae.driver.verdict import FAULTS, ZERO_TOLERANCE, Verdict
+from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.message_reading import (
     joints_not_finite,
@@ -26,13 +26,14 @@ from musculoskeletal_ae.message_reading import (
     read_posture,
 )
 from musculoskeletal_ae.report import distinct
+from musculoskeletal_ae.robot import model_errors
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals import joint_sensors, wiring
 from musculoskeletal_ae.signals.joint_series import judge_series
 from musculoskeletal_ae.signals.limits import length_range
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Presence, Row, possible_readings
-from musculoskeletal_ae.signals.wiring import Judgement, Wiring
+from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement
 
 MOST_REPEATED = 0.2  # largest share of messages that may repeat the previous message exactly
 QUIET = 3  # sensors that show at most this many different values count as free of noise
@@ -54,8 +55,8 @@ TENSION_UNITS = {'kgf': 9.80665, 'lbf': 4.44822, 'kN': 1000.0}  # other units of
 #: value if their temperature is published in °F
 HOTTEST_AT_REST = 55.0
 # Lengths of healthy arms differ from the model. For the emulated individuals 0–9 of arm26 and
-# musashi_left_arm (notes/removed_benches.md), the offset is at most 42 mm (hence ZERO_TOLERANCE),
-# and lengths change by 0.31 to 1.55 times the model's changes.
+# musashi_left_arm (notes/removed_benches.md), lengths change by 0.31 to 1.55 times the model's
+# changes, and `model_errors.LARGEST` bounds the difference.
 SLOPES = 0.2, 2.2  # legal range of the change of l, divided by the change that the model predicts
 #: a column of an arm at rest is misplaced only if another muscle fits it better by this factor
 BETTER_AT_REST = 2.5
@@ -512,8 +513,8 @@ class Listening:
             slopes = [np.polyfit(model[:, m], length[:, m], 1)[0] for m in np.flatnonzero(moved)]
             return len(slopes) > 1 and all(SLOPES[0] < -slope < SLOPES[1] for slope in slopes)
         turned, literal = (np.abs(np.median(length + sign * model, axis=0)) for sign in (1, -1))
-        misfits = int((literal > ZERO_TOLERANCE).sum())
-        return self._zeroed and bool((turned <= ZERO_TOLERANCE).all()) and misfits > 1
+        misfits = int((literal > model_errors.LARGEST).sum())
+        return self._zeroed and bool((turned <= model_errors.LARGEST).all()) and misfits > 1
 
     def _judge_lengths(
         self, verdict: Verdict, theta: Array, length: Array, tension: Array
@@ -549,7 +550,7 @@ class Listening:
         moved: Bools = np.ptp(model, axis=0) > least
 
         straight = Wiring.straight(robot.muscle_count)
-        judgement, doubt = Judgement(straight, (straight,), (), 0.0), ''
+        judgement, doubt = WiringJudgement(straight, (straight,), (), 0.0), ''
         if moved.any():
             # On a moved arm, length offsets do not affect the comparison.
             readings = robot.muscle_lengths, theta, length, tension
@@ -586,7 +587,7 @@ class Listening:
             if not moved.any():
                 follows |= inverse[m] < fit[m, other] or own[m] <= BETTER_AT_REST * fit[m, other]
                 # Two muscles that are exchanged both misfit; if one misfits, its zero is wrong.
-                follows |= not self._zeroed or min(own[m], own[other]) <= ZERO_TOLERANCE
+                follows |= not self._zeroed or min(own[m], own[other]) <= model_errors.LARGEST
             if not follows:
                 verdict.failed('place', m, other=robot.muscles[other], doubt=doubt)
                 continue
@@ -602,7 +603,7 @@ class Listening:
                 verdict.passed('sign', m)
             if not self._zeroed:
                 continue
-            if abs(off) <= ZERO_TOLERANCE:
+            if abs(off) <= model_errors.LARGEST:
                 verdict.passed('zero', m)
             elif not moved.any() and inverse[m] < 0.3 * abs(off):
                 measured = f'l is {np.median(length[:, m]):+.3f} m'

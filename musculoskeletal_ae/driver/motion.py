@@ -20,7 +20,7 @@ from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.report import is_overloaded
 from musculoskeletal_ae.signals.joint_sensors import corrected, judge, sign_notes
 from musculoskeletal_ae.signals.muscle_readings import Row
-from musculoskeletal_ae.signals.wiring import Judgement
+from musculoskeletal_ae.signals.wiring import WiringJudgement
 
 RELEASE = 0.6  # wait after a release [s]
 MEAN = 0.3  # time over which readings are averaged [s]
@@ -243,12 +243,12 @@ class MotionTest(ABC):
         )
         verdict.notes += sign_notes(robot, judgement.right, remedy)
 
-    def _report_misplaced(self, order: Judgement) -> None:
+    def _report_misplaced(self, order: WiringJudgement) -> None:
         """Record muscles whose readings and commands are both misplaced."""
         moves = self._moves_like(order)
         self.verdict.failed('both misplaced', *order.wiring.misplaced, moves=moves)
 
-    def _moves_like(self, order: Judgement) -> str:
+    def _moves_like(self, order: WiringJudgement) -> str:
         names = self._robot.muscles
         moves = [f'{names[j]} moves like {names[k]}' for j, k in order.wiring.misplaced.items()]
         return ', and '.join(moves)

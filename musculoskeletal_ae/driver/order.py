@@ -14,7 +14,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.joint_sensors import JointFault, corrected
-from musculoskeletal_ae.signals.wiring import BETTER, Judgement, judge, square_misfits
+from musculoskeletal_ae.signals.wiring import BETTER, WiringJudgement, judge, square_misfits
 
 #: Exchanged muscles explain the lengths better than a fault of joint sensors if they reduce the
 #: misfit to less than this fraction.
@@ -23,7 +23,7 @@ JOINTS_BETTER = 0.8
 
 def judge_order(
     robot: Robot, theta: Array, length: Array, tension: Array, segments: Ints
-) -> Judgement:
+) -> WiringJudgement:
     """Judge by the joint angles whether columns of the readings are exchanged.
 
     The signs of the lengths must be right. `wrong_side` describes the arguments.

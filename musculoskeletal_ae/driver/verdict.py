@@ -10,6 +10,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.files import read_table
 from musculoskeletal_ae.report import load_text
+from musculoskeletal_ae.robot.model_errors import LARGEST
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.schema import Strict
 
@@ -17,8 +18,6 @@ from musculoskeletal_ae.schema import Strict
 #: of l, the MSC law, its clip at tension.max, and latency
 Check = Literal['rate', 'order', 'unit', 'sign', 'zero', 'law', 'clip', 'latency']
 CHECKS: tuple[Check, ...] = get_args(Check)
-#: largest length offset [m] of a healthy arm (`listening`)
-ZERO_TOLERANCE = 0.045
 OK, WRONG, OPEN = 'ok', 'WRONG', '-'
 POSITION_LAW = 'l → l_target, for as long as T is below T_max'
 LAW = 'T = min(T_max, T_bias + max(0, K (l − l_target))), T_bias {:g} N, K {:g} N/m'
@@ -208,7 +207,7 @@ class Verdict:
         """Explanations of the table: faults, checks that were not possible, and notes."""
         remarks = [f'{OPEN}: not judged']
         if (self._state[:, CHECKS.index('zero')] == OK).any():
-            tolerance = f'{1e3 * ZERO_TOLERANCE:.0f} mm'
+            tolerance = f'{1e3 * LARGEST:.0f} mm'
             remarks.append(
                 f'zero ok: within {tolerance} of the route; smaller errors are not found'
             )

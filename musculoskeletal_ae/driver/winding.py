@@ -384,7 +384,7 @@ class Winding(MotionTest):
         # The demand is averaged, because it is a nonlinear function of the noisy l.
         demand = self._demanded(readings[:, 0])
         clipped = np.minimum(demand, self._robot.tension.max).mean(axis=0)
-        length, tension, third = readings.mean(axis=0)
+        length, tension, third, *_ = readings.mean(axis=0)
         return _Reading(length, tension, third, clipped)
 
     def _off(self, reading: _Reading) -> Bools:

@@ -81,10 +81,14 @@ class Readings(NamedTuple):
     tension: Array  # muscle tensions [N], (M,)
     temperature: Array  # housing temperatures of the modules [°C], (M,)
 
+    @property
+    def muscles(self) -> dict[str, Array]:
+        """The readings of the muscle modules by the names of their quantities, (M,) each."""
+        return {name: value for name, value in self._asdict().items() if name != 'theta'}
+
     def message(self, robot: Robot) -> MuscleReading:
         """Return the readings of the muscle modules as a message of `muscle_states`."""
-        reported = {each.name for each in QUANTITIES} & set(self._fields)
-        return muscle_reading(robot, **{name: getattr(self, name) for name in reported})
+        return muscle_reading(robot, **self.muscles)
 
 
 #: names of the quantities whose sensors can be emulated as faulty

@@ -33,6 +33,7 @@ from musculoskeletal_ae.estimation.detectors.joint_disagreement import GAP_LEARN
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
 from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.health import HealthMonitor
+from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
 from musculoskeletal_ae.estimation.joint_check import JointCheck
 from musculoskeletal_ae.estimation.lengths.checked_calibration import CheckedCalibration
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthTrust
@@ -40,7 +41,7 @@ from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
 from musculoskeletal_ae.estimation.mounting import MountingCheck
 from musculoskeletal_ae.estimation.repair_check import RepairCheck
-from musculoskeletal_ae.estimation.settings import Settings
+from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.estimation.state_estimator import Estimate, StateEstimator
 from musculoskeletal_ae.estimation.suspects import SuspectHandling
 from musculoskeletal_ae.estimation.verification import LONGEST
@@ -51,7 +52,6 @@ from musculoskeletal_ae.remedy import REPAIR, Step, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
-from musculoskeletal_ae.signals.heat import Heat
 from musculoskeletal_ae.signals.joint_stream import JointStream
 from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.limits import Persistence
@@ -99,6 +99,7 @@ class Estimator:
         suspects: The latched finding and its verification.
         calibration: The running length calibration, or None.
         contact: The contact estimator.
+        healthy_torque: Measures the external torque that is wrongly estimated without contact.
         mounting: Checks the direction of gravity.
         unsuitable_because: Why the network in use fits this arm worse than the one before; '' if it
             does not.
@@ -127,12 +128,13 @@ class Estimator:
         self.trust = LengthTrust(robot.muscle_count)
         self.body = BodyState(self.trust.offsets, generation=first_generation)
         self.stream = MuscleStream(robot, self.body)
-        self.heat = Heat(robot)
         self.state = StateEstimator()
-        self.health = HealthMonitor(robot, preset, heat=self.heat)
+        self.health = HealthMonitor(robot, preset)
+        self.heat = self.health.heat
         self.suspects = SuspectHandling(robot)
         self.calibration: CheckedCalibration | None = None
         self.contact = ContactEstimator(robot)
+        self.healthy_torque = HealthyTorque(robot.joint_count)
         self.mounting = MountingCheck(robot)
         self.unsuitable_because = ''
         self.sample: MuscleSample | None = None
@@ -183,11 +185,11 @@ class Estimator:
 
     # -- settings and services ------------------------------------------------------------------
 
-    def configure(self, settings: Settings) -> None:
+    def configure(self, settings: EstimatorSettings) -> None:
         """Use these settings from the next message on."""
         self.suspects.settings = settings
 
-    def use(self, mae: Mae, unsuitable_because: str = '') -> None:
+    def use(self, mae: Mae, unsuitable_because: str = '') -> Mae:
         """Use another network and its healthy statistics, without the isolated muscles.
 
         A running length calibration starts again, because its estimate depends on the network.
@@ -197,10 +199,14 @@ class Estimator:
             unsuitable_because: Why it fits this arm worse than the network before; '' if it does
                 not.
 
+        Returns:
+            The network with all muscles, and with the residual torque that was measured so far.
+
         Raises:
             numpy.linalg.LinAlgError: If the network's statistics are singular; the previous network
                 then stays in use.
         """
+        mae = self.healthy_torque.put_into(mae)
         reduced = mae.without(self.body.isolated)
         self.unsuitable_because = unsuitable_because
         self.health.use(reduced)
@@ -212,6 +218,7 @@ class Estimator:
         if self.calibration is not None:
             posture = self.calibration.posture
             self.calibration = CheckedCalibration(self.robot, reduced, posture)
+        return mae
 
     def isolate(self, muscles: Iterable[int]) -> None:
         """Isolate exactly these muscles (indices in T and l), and restore all others.
@@ -456,6 +463,7 @@ class Estimator:
             pull = sample.bone_tension * self.body.used
             contact = self.contact.step(estimate.state.theta, pull, sent_apart)
             if self.suspects.finding is None:
+                self.healthy_torque.step(contact.torque, self.contact.velocity, sent_apart)
                 self.mounting.step(estimate.state.theta, pull, contact.torque, dt)
         self.output = Output(
             sample, estimate.state, estimate.covariance, estimate.anomaly, detected, contact

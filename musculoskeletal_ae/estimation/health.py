@@ -28,24 +28,20 @@ class HealthMonitor:
     Attributes:
         residual: The detector of the residual distance, which also names the most suspect muscle.
         joints: The detector of lengths that disagree with joint sensors.
+        heat: Thermal models of the muscle modules, which the caller updates.
     """
 
-    def __init__(
-        self,
-        robot: Robot,
-        preset: str = 'default',
-        heat: Heat | None = None,
-    ) -> None:
+    def __init__(self, robot: Robot, preset: str = 'default') -> None:
         """Start without a network.
 
         Args:
             robot: The nominal body.
             preset: Preset that provides the residual-based and physics-based detectors.
-            heat: Thermal models of the muscle modules, which the caller updates.
         """
         chosen = preset_named(preset)
         self.residual, by_physics = chosen.residual_detectors(robot)
         self.joints = JointDisagreement(robot)
+        self.heat = Heat(robot)
         self._exchange = ExchangeCheck(robot)
         self._detectors: list[Detector] = [
             LengthJump(),
@@ -55,7 +51,7 @@ class HealthMonitor:
             self.joints,
             FrozenSensor(robot),
             SaturatedSensor(robot),
-            ThermalDrift(heat or Heat(robot)),
+            ThermalDrift(self.heat),
         ]
 
     def use(self, mae: Mae) -> None:

@@ -13,11 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.estimation.contact import ContactEstimator
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION
-from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.friction import FrictionDirection
 
 MEMORY = 180.0  # largest time constant of the average; only time in motion counts [s]
 MOVING = 0.05  # norm of the joint velocities above which an arm moves [rad/s]
@@ -29,51 +26,35 @@ LEAST_SPREAD = 1e-3  # smallest σ [N·m]
 class HealthyTorque:
     """Measures the external torque σ that is wrongly estimated for a healthy moving arm.
 
-    The average covers the last minutes of motion. `use` must be called before `step`.
+    The average covers the last minutes of motion, with whichever networks the torque was estimated.
     """
 
-    def __init__(self, robot: Robot) -> None:
-        self._contact, self._direction = ContactEstimator(robot), FrictionDirection()
-        self._joint_count = robot.joint_count
-        self.start()
+    def __init__(self, joint_count: int) -> None:
+        self._square, self._time = np.zeros(joint_count), 0.0
 
-    def start(self) -> None:
-        """Restart the measurement, for example for another arm."""
-        self._square, self._time = np.zeros(self._joint_count), 0.0
+    def put_into(self, mae: Mae) -> Mae:
+        """Return a copy of a network that contains the residual torque σ measured here.
 
-    def use(self, mae: Mae) -> Mae:
-        """Use another network, and return a copy that contains the residual torque σ measured here.
-
-        A network that contains no σ is returned unchanged. Until the arm has moved, the copy has
-        the σ of the network itself.
+        A network that contains no σ is returned unchanged. Until the arm has moved, the measurement
+        continues from the σ of the network.
         """
         if (known := mae.touch) is None:
-            self._mae = mae
-        else:
-            if self._time == 0.0:
-                self._square, self._time = known.spread**2, known.time
-            spread = np.maximum(np.sqrt(self._square), LEAST_SPREAD)
-            self._mae = replace(mae, touch=replace(known, spread=spread, time=self._time))
-        self._contact.use(self._mae)
-        return self._mae
+            return mae
+        if self._time == 0.0:
+            self._square, self._time = known.spread**2, known.time
+            return mae
+        spread = np.maximum(np.sqrt(self._square), LEAST_SPREAD)
+        return replace(mae, touch=replace(known, spread=spread, time=self._time))
 
-    def reset(self) -> None:
-        """Restart the filters, for example after a jump of the clock, but not the measurement."""
-        self._contact.reset()
-        self._direction.reset()
-
-    def step(self, tension: Array, length: Array, dt: float) -> None:
-        """Update the residual torque σ with a message, if the arm moves.
+    def step(self, torque: Array, velocity: Array, dt: float) -> None:
+        """Update the residual torque σ with a message of the healthy arm, if the arm moves.
 
         Args:
-            tension: Tensions as read [N], (M,).
-            length: Muscle lengths [m], (M,).
+            torque: Estimated external torques at the joints [N·m], (D,).
+            velocity: Joint velocities [rad/s], (D,).
             dt: Time since the previous message [s].
         """
-        end = self._direction.end_tension(self._mae.transmission, tension, length)
-        theta = self._mae.estimate(end, length).theta
-        torque = self._contact.step(theta, end, dt).torque
-        if np.linalg.norm(self._contact.velocity) < MOVING:
+        if np.linalg.norm(velocity) < MOVING:
             return
         square = torque**2
         if self._time > LEAST_MOTION:

@@ -42,7 +42,7 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.estimation.finding import Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.joint_trust import NOT_USED, JointTrust, Trust
+from musculoskeletal_ae.signals.joint_trust import NOT_USED, JointTrust, SensorTrust
 
 SPACING = 0.5  # shortest time between two messages that count [s]
 #: a message counts if the estimate of a joint has moved by this much since the last one that
@@ -150,7 +150,7 @@ class JointCheck:
         if not joints:
             return ()
         self._usual = None
-        self._set(doubted, Trust.CONFIRMED)
+        self._set(doubted, SensorTrust.CONFIRMED)
         for message, (deviation, _) in zip(self._messages, self._compared, strict=True):
             message.theta[doubted] = deviation[doubted] = np.nan
         return joints
@@ -161,14 +161,14 @@ class JointCheck:
         Args:
             since: Time of the first of these readings [s], by index of the joint.
         """
-        if not since and Trust.IMPOSSIBLE not in self.trust.trust:
+        if not since and SensorTrust.IMPOSSIBLE not in self.trust.trust:
             return
         trust, begin = list(self.trust.trust), self.trust.since.copy()
         for j, each in enumerate(trust):
             if j in since and each not in NOT_USED:
-                trust[j], begin[j] = Trust.IMPOSSIBLE, since[j]
-            elif j not in since and each is Trust.IMPOSSIBLE:
-                trust[j] = Trust.TRUSTED
+                trust[j], begin[j] = SensorTrust.IMPOSSIBLE, since[j]
+            elif j not in since and each is SensorTrust.IMPOSSIBLE:
+                trust[j] = SensorTrust.TRUSTED
         if tuple(trust) != self.trust.trust:
             self.trust = JointTrust(tuple(trust), begin, self.trust.deviation)
 
@@ -219,11 +219,11 @@ class JointCheck:
             # At least the newer half of a window that exceeds the limit shows the change.
             rows = -(count // 2)
             if new.any() and self._explains(new, excess[rows:], usual):
-                self._set(new, Trust.DOUBTED, excess)
+                self._set(new, SensorTrust.DOUBTED, excess)
                 return
         agrees = doubted & self._agrees(excess, usual)
         if agrees.any():
-            self._set(agrees, Trust.TRUSTED)
+            self._set(agrees, SensorTrust.TRUSTED)
             self._give_up(agrees)
 
     def _compute_usual(self) -> _Usual:
@@ -308,7 +308,7 @@ class JointCheck:
         for place in range(max(-NEWEST, -len(self._messages)), -AGREEING):
             self._messages[place].theta[joints] = self._compared[place][0][joints] = np.nan
 
-    def _set(self, joints: Bools, trust: Trust, excess: Array | None = None) -> None:
+    def _set(self, joints: Bools, trust: SensorTrust, excess: Array | None = None) -> None:
         """Set the trust in some joints; with `excess`, a doubt begins.
 
         Args:

@@ -9,7 +9,7 @@ STOP, ISOLATE = ON_ANOMALY = ('stop', 'isolate')
 
 
 @dataclass(frozen=True)
-class Settings(CheckedSettings):
+class EstimatorSettings(CheckedSettings):
     """How the estimator reacts to an anomaly. `Estimator.configure` takes changed settings."""
 
     on_anomaly: str = settable(

@@ -42,7 +42,7 @@ from collections.abc import Iterable
 
 from musculoskeletal_ae.conditions import Reaction
 from musculoskeletal_ae.estimation.finding import Finding
-from musculoskeletal_ae.estimation.settings import ISOLATE, Settings
+from musculoskeletal_ae.estimation.settings import ISOLATE, EstimatorSettings
 from musculoskeletal_ae.estimation.verification import (
     ModuleLaw,
     Outcome,
@@ -78,7 +78,7 @@ class SuspectHandling:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self.settings = Settings()
+        self.settings = EstimatorSettings()
         self.finding: Finding | None = None
         self.suspect: int | None = None
         self.verification: Verification | None = None

@@ -8,15 +8,12 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.emulator.modules import Arm
-from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
+from musculoskeletal_ae.estimation.contact import Contact
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, columns
 from musculoskeletal_ae.experiments.study import Measured, Plot, Rows, Study
-from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.exploration_steps import TRIES, holdable_postures
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.friction import FrictionDirection
 
 CONTACT_STREAM = 7000
 #: numbers of postures with two pushes at rest, of collisions in motion, and of tests with `float`
@@ -39,24 +36,13 @@ INSIDE = 0.1  # distance of postures from the joint limits, relative to the join
 
 
 class ContactLoop(ClosedLoop):
-    """A closed loop that estimates external forces."""
-
-    def __init__(self, arm: Arm, mae: Mae, settings: Settings, seed: int) -> None:
-        """Connect an arm."""
-        self._contact, self._friction = ContactEstimator(arm.robot), FrictionDirection()
-        super().__init__(arm, mae, settings, seed)
-
-    def use(self, mae: Mae) -> None:
-        """Use a network for estimation, control and contact estimation."""
-        super().use(mae)
-        self._contact.use(mae)
+    """A closed loop whose arm is pushed."""
 
     def contact(self, exploring: bool = False) -> Contact:
         """Advance by one message, and return the contact estimate of this message."""
         _ = self.explore() if exploring else self.step()
-        length, transmission = self._read.length, self.mae.transmission
-        end = self._friction.end_tension(transmission, self._read.tension, length)
-        return self._contact.step(self.mae.estimate(end, length).theta, end, SAMPLE_TIME)
+        assert self.estimator.output is not None and self.estimator.output.contact is not None
+        return self.estimator.output.contact
 
     def contacts_during(self, duration: float, exploring: bool = False) -> list[Contact]:
         """Advance by `duration` [s]; return the contact estimate of each message."""
@@ -182,7 +168,8 @@ def _collisions(loop: ContactLoop, rng: np.random.Generator, count: int) -> Arra
         loop.push(force)
         detected = [each.is_contact for each in loop.contacts_during(MOVED, exploring=True)]
         loop.push(np.zeros(3))
-        delay = (detected.index(True) + 1) * SAMPLE_TIME if any(detected) else MOVED
+        # The first message was read before the push.
+        delay = detected.index(True) * SAMPLE_TIME if any(detected) else MOVED
         collisions.append((float(np.linalg.norm(force)), delay))
     return np.array(collisions).reshape(-1, 2).T
 

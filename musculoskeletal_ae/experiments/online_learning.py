@@ -133,6 +133,7 @@ def explore(loop: ClosedLoop, learner: Learner, duration: float) -> Iterator[tup
     for _ in range(round(duration / SAMPLE_TIME)):
         if learner.mae is not loop.mae:
             loop.use(learner.mae)
+            learner.note_accepted(loop.mae)
         yield loop.explore()
 
 

@@ -19,13 +19,20 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments import PAPER
-from musculoskeletal_ae.experiments.results import NOTHING, Results, Row, flat, individuals, read
+from musculoskeletal_ae.experiments.results import (
+    NOTHING,
+    ResultRow,
+    Results,
+    flat,
+    individuals,
+    read,
+)
 from musculoskeletal_ae.files import read_table, write_whole
 from musculoskeletal_ae.presets.names import PAPER_PRESET
 
 TEMPLATE = 'paper.md.jinja'  # a file in the folder of this module
 #: rows of the tables, by the name of the table in the template
-TABLES = read_table(__file__, 'paper.yaml', dict[str, tuple[Row, ...]])
+TABLES = read_table(__file__, 'paper.yaml', dict[str, tuple[ResultRow, ...]])
 #: pictures of the page: file name, and the plot of an experiment that it shows
 PICTURES = {
     'figure_5': ('online_learning', 'online_learning'),

@@ -10,11 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.control.command import LENGTH, Command
+from musculoskeletal_ae.control.command import LENGTH
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import Arm
+from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.exploration import Exploration
@@ -22,7 +24,8 @@ from musculoskeletal_ae.motion.exploration_steps import ExplorationStep
 from musculoskeletal_ae.motion.methods import first_command
 from musculoskeletal_ae.motion.ramps import RAMP_SHARE
 from musculoskeletal_ae.presets.names import PAPER_PRESET
-from musculoskeletal_ae.signals.friction import FrictionDirection, directions
+from musculoskeletal_ae.signals.body_state import Anomaly
+from musculoskeletal_ae.signals.friction import directions
 
 #: length that makes a switched-off muscle slack in any posture when added to its command [m]
 PAID_OUT = 0.1
@@ -57,23 +60,37 @@ class Motion(NamedTuple):
 
 
 class ClosedLoop:
-    """An emulated arm, a network and the controller, connected as the nodes connect them.
+    """An emulated arm, the estimator and the controller, connected as the nodes connect them.
 
-    Each message passes through sense → estimate → control → command. The network estimates; the
-    detectors of the estimator are not part of the loop.
+    Each message passes through sense → estimate → control → command.
+
+    Attributes:
+        arm: The arm.
+        estimator: The core of the estimator.
+        core: The core of the controller.
+        mae: The network in use.
+        stops: How often `explore` has ended a stop.
     """
 
-    def __init__(self, arm: Arm, mae: Mae, settings: Settings | None = None, seed: int = 0) -> None:
+    def __init__(
+        self,
+        arm: Arm,
+        mae: Mae,
+        settings: Settings | None = None,
+        seed: int = 0,
+        on_anomaly: str = 'stop',
+    ) -> None:
         """Connect an arm in its present posture; `seed` determines the exploration."""
         self.arm, self.core, self.stops = arm, Controller(arm.robot, settings, seed), 0
-        self._direction = FrictionDirection()
+        self.estimator = Estimator(arm.robot, mae.preset)
+        self.estimator.configure(EstimatorSettings(on_anomaly=on_anomaly))
         self._read, self._now = arm.sense(), 0.0
         self.use(mae)
 
     def use(self, mae: Mae) -> None:
         """Use a network for estimation and control."""
-        self.mae = mae
-        self.core.use(mae)
+        self.mae = self.estimator.use(mae)
+        self.core.use(self.mae)
 
     def step(self) -> tuple[Array, ...]:
         """Advance by one message; return a row of a recording."""
@@ -82,8 +99,8 @@ class ClosedLoop:
             core.take(read.message(arm.robot), now)
             core.estimated(self.estimate(read, now), now)
         command = core.step(now)
-        self.on_command(command, now)
         if command is not None:
+            self.estimator.commanded(now, **{command.kind: command.value})
             follow = arm.command_length if command.kind == LENGTH else arm.command_tension
             follow(command.value)
         arm.step(SAMPLE_TIME)
@@ -92,23 +109,29 @@ class ClosedLoop:
         sent = read.length if command is None else command.value
         return arm.theta, reading.theta, reading.length, reading.tension, sent
 
-    def estimate(self, read: Readings, now: float) -> Array:  # noqa: ARG002 (for subclasses)
-        """Estimate θ [rad] (D,) from the readings at `now` [s]."""
-        end = self._direction.end_tension(self.mae.transmission, read.tension, read.length)
-        known = self.arm.robot.actuation.known_tension(end)
-        return self.mae.estimate(known, read.length).theta
+    def estimate(self, read: Readings, now: float) -> Array:
+        """Estimate θ [rad] (D,) from the readings at `now` [s], and pass on the body state.
 
-    def on_command(self, command: Command | None, now: float) -> None:
-        """Do nothing; subclasses that need the command at `now` [s] override this."""
+        Raises:
+            MessageError: If the message cannot be used.
+        """
+        output = self.estimator.take(read.message(self.arm.robot), now, now)
+        if self.estimator.body is not self.core.stream.body:
+            self.core.use_body(self.estimator.body)
+        assert output is not None
+        return output.state.theta
 
     def explore(self) -> tuple[Array, ...]:
         """Explore for one message, and return a row of a recording.
 
-        If the controller has stopped, it is reset first, which succeeds as soon as the cause of the
-        stop has cleared.
+        If the arm has stopped, estimator and controller are reset first, which succeeds as soon as
+        the cause of the stop has cleared. A verification is not interrupted.
         """
-        core = self.core
+        core, estimator = self.core, self.estimator
         supervisor = core.supervisor
+        if estimator.body.anomaly is Anomaly.FOUND:
+            with suppress(MusculoskeletalError):  # refused while the suspect does not fit
+                estimator.reset()
         if not supervisor.is_running and core.reset(self._now) is None:
             self.stops += 1
         if supervisor.is_running and not supervisor.explores:

@@ -24,24 +24,16 @@ Every isolation in these hours counts as wrong.
   muscles can neither hold nor leave
 """
 
-from contextlib import suppress
 from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.command import Command
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import Readings
 from musculoskeletal_ae.emulator.modules import Arm
-from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.settings import Settings as EstimatorSettings
-from musculoskeletal_ae.exceptions import (
-    InfeasibleError,
-    MessageError,
-    MusculoskeletalError,
-)
+from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.detection import grasp_and_release
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, make_error_function
@@ -67,44 +59,28 @@ PUSH = (10.0, 30.0)  # range of the forces of pushes [N]
 
 
 class IsolatingLoop(ClosedLoop):
-    """A closed loop in which the estimator detects faulty muscles and isolates them."""
+    """A closed loop that isolates faulty muscles, and notes verdicts and errors."""
 
     def __init__(self, arm: Arm, mae: Mae, seed: int = 0) -> None:
         """Connect an arm at rest."""
-        self.estimator = Estimator(arm.robot, mae.preset)
-        self.estimator.configure(EstimatorSettings(on_anomaly='isolate'))
         #: isolated muscles and the reason, after each verification
         self.verdicts: list[tuple[tuple[int, ...], str]] = []
         self.error = np.nan  # ‖θ_est − θ‖ at the last message [rad]
-        super().__init__(arm, mae, Settings(), seed)
+        super().__init__(arm, mae, Settings(), seed, on_anomaly='isolate')
 
     @property
     def isolated(self) -> tuple[int, ...]:
         """Indices of the muscles that the controller does not use."""
         return self.core.stream.body.isolated
 
-    def use(self, mae: Mae) -> None:
-        """Use a network for estimation, detection and control."""
-        super().use(mae)
-        self.estimator.use(mae)
-
     def estimate(self, read: Readings, now: float) -> Array:
-        """Estimate θ [rad] (D,), and pass the body state on as the estimator node does."""
-        core, true = self.estimator, self.arm.theta
-        estimate = core.take(read.message(self.arm.robot), now, now)
-        assert estimate is not None
-        before = self.core.stream.body
-        if core.body is not before:
-            self.core.use_body(core.body)
-            if before.has_anomaly and not core.body.has_anomaly:
-                self.verdicts.append((core.body.isolated, core.suspects.last_verification))
-        self.error = float(np.linalg.norm(estimate.state.theta - true))
-        return estimate.state.theta
-
-    def on_command(self, command: Command | None, now: float) -> None:
-        """Inform the estimator of the command, which its detector compares with the sensors."""
-        if command is not None:
-            self.estimator.commanded(now, **{command.kind: command.value})
+        """Estimate θ [rad] (D,), and note the end of a verification and the error."""
+        core, before = self.estimator, self.core.stream.body
+        theta = super().estimate(read, now)
+        if before.has_anomaly and not core.body.has_anomaly:
+            self.verdicts.append((core.body.isolated, core.suspects.last_verification))
+        self.error = float(np.linalg.norm(theta - self.arm.theta))
+        return theta
 
     def run(self, duration: float) -> Array:
         """Advance by `duration` [s]; return ‖θ_est − θ‖ after each of the N steps [rad], (N,)."""
@@ -227,12 +203,7 @@ def isolations_of_healthy_arm(
             force = rng.uniform(*PUSH) * direction / np.linalg.norm(direction)
             wrench[:3] = force if n % every == 0 else 0.0
             arm.set_wrench(wrench)
-        loop.explore()
-        if loop.core.watchdog.has_anomaly and not loop.isolated:
-            # The arm stays stopped after two false alarms until a reset, which is refused while the
-            # suspect does not fit the rest of the arm.
-            with suppress(MusculoskeletalError):
-                loop.estimator.reset()
+        loop.explore()  # also resets the estimator, which stops the arm after two false alarms
     return [isolated for isolated, _ in loop.verdicts]
 
 

@@ -99,7 +99,7 @@ class Plot(Strict, frozen=True):
     caption: str
 
 
-class Result(Struct, frozen=True):
+class ExperimentResult(Struct, frozen=True):
     """Entries that every result.json has, besides the numbers of its experiment."""
 
     about: About
@@ -132,7 +132,7 @@ def _read_result(file: Path) -> dict[str, Any]:
         result: dict[str, Any] = msgspec.json.decode(file.read_bytes())
     except (MsgspecError, OSError, RecursionError) as error:
         raise fail(str(error)) from error
-    convert(result, Result, fail)
+    convert(result, ExperimentResult, fail)
     return result
 
 
@@ -174,7 +174,7 @@ class Cells(NamedTuple):
     verdict: str  # 'met', or by how much the goal is missed; '' without a goal or a number
 
 
-class Row(Strict, frozen=True):
+class ResultRow(Strict, frozen=True):
     """One row of the results table, which shows a quantity of an experiment.
 
     A key is the path of a value in result.json, with a dot between the names.
@@ -214,7 +214,7 @@ class Row(Strict, frozen=True):
 
 
 #: rows of the results table, by experiment
-ROWS = read_table(__file__, 'table.yaml', dict[str, tuple[Row, ...]])
+ROWS = read_table(__file__, 'table.yaml', dict[str, tuple[ResultRow, ...]])
 
 
 def table(results: Results) -> list[Cells]:

@@ -55,7 +55,7 @@ the elastic elements, friction proportional to tension, creep, sensor errors and
 """
 
 
-class Report(NamedTuple):
+class ExportReport(NamedTuple):
     """Differences between an exported model and the network, over the workspace.
 
     Lengths and moment arms are compared with those of the network. The joint torque that gravity
@@ -169,7 +169,7 @@ def loads_in_mjx(model: Any) -> str:
     return 'can load the model'
 
 
-def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> Report:
+def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> ExportReport:
     """Write `model.xml` and `report.txt` of a learned body into a new or empty directory.
 
     Raises:
@@ -183,7 +183,7 @@ def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> Report:
         return _write(robot, mae, out, seed)
 
 
-def _write(robot: Robot, mae: Mae, out: Path, seed: int) -> Report:
+def _write(robot: Robot, mae: Mae, out: Path, seed: int) -> ExportReport:
     robot = robot.with_elasticity(mae.elasticity)
     body = CalibratedBody.of_straight_lines(robot)
     fit_to_network(body, mae, seed, with_remainder=False)
@@ -212,7 +212,7 @@ def _write(robot: Robot, mae: Mae, out: Path, seed: int) -> Report:
     return report
 
 
-class Springs(NamedTuple):
+class SpringTable(NamedTuple):
     """Linear springs that represent M muscles; each field has the shape (M,)."""
 
     tension: Array  # T_mid [N]
@@ -221,7 +221,7 @@ class Springs(NamedTuple):
     error: Array  # largest error of the elongation between T_bias and T_limit [m]
 
 
-def _springs(robot: Robot, body: CalibratedBody) -> Springs:
+def _springs(robot: Robot, body: CalibratedBody) -> SpringTable:
     low, high, at_zero = robot.tension.bias, robot.tension.limit, robot.routes.length_at_zero
     mid = 0.5 * (low + high)
     rows = []
@@ -233,10 +233,10 @@ def _springs(robot: Robot, body: CalibratedBody) -> Springs:
         stiffness = 1.0 / float(law.compliance(at_zero[m], mid[m]))
         error = float(np.abs(middle + (tension - mid[m]) / stiffness - elongation).max())
         rows.append((mid[m], middle, stiffness, error))
-    return Springs(*map(np.array, zip(*rows, strict=True)))
+    return SpringTable(*map(np.array, zip(*rows, strict=True)))
 
 
-def _spec(robot: Robot, mae: Mae, springs: Springs) -> Any:
+def _spec(robot: Robot, mae: Mae, springs: SpringTable) -> Any:
     """Return the MjSpec of a robot with learned route points, tendon friction and actuators."""
     exact, once = Draw(0, NONE), np.zeros(robot.muscle_count, dtype=np.int64)
     spec, bodies = mujoco_model.skeleton(robot, exact)
@@ -294,10 +294,10 @@ def _compare(
     robot: Robot,
     mae: Mae,
     model: Any,
-    springs: Springs,
+    springs: SpringTable,
     warnings: tuple[str, ...],
     kept: dict[str, str],
-) -> tuple[Report, Array]:
+) -> tuple[ExportReport, Array]:
     """Compare an exported model with the network from which it was made.
 
     Args:
@@ -330,7 +330,7 @@ def _compare(
         torques[n] = kin.tree.of_theta((data.qfrc_bias - data.qfrc_passive)[tree], row)
     # At T_mid, the elongation of the spring is the same in all postures.
     off = theirs - springs.elongation - lengths
-    return Report(
+    return ExportReport(
         lengths=off.std(axis=0),
         arms=np.sqrt(((arms - jacobian) ** 2).sum(axis=2).mean(axis=0)),
         arm_size=np.sqrt((jacobian**2).sum(axis=2).mean(axis=0)),

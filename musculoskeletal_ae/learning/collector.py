@@ -99,13 +99,12 @@ class SampleCollector:
     @property
     def has_jumped(self) -> bool:
         """Whether lengths were observed to jump after the last length calibration."""
-        displaced = self._stream.displaced
-        return bool(displaced.muscles) and not displaced.is_unseen
+        return self._stream.has_jumped
 
     @property
     def jumps(self) -> int:
         """How often lengths have jumped."""
-        return self._stream.displaced.jumps
+        return self._stream.jumps.count
 
     @property
     def is_anomaly(self) -> bool:

@@ -12,7 +12,7 @@ keep tensions, lengths and the other angles. What happens next depends on the es
 from collections import deque
 
 from musculoskeletal_ae.learning.samples import SampleStore
-from musculoskeletal_ae.signals.joint_trust import JointTrust, Trust
+from musculoskeletal_ae.signals.joint_trust import JointTrust, SensorTrust
 
 MOST_RECENT = 400  # number of newest samples whose times are known
 
@@ -48,6 +48,6 @@ class JointHistory:
             self.given_up += len(self._removed[j])
         for j in [j for j in self._removed if trust.is_used[j]]:
             removed = self._removed.pop(j)
-            if trust.trust[j] is Trust.CONFIRMED and before.trust[j] is Trust.DOUBTED:
+            if trust.trust[j] is SensorTrust.CONFIRMED and before.trust[j] is SensorTrust.DOUBTED:
                 self.given_up -= self._samples.put_back_angles(j, removed)
         return new

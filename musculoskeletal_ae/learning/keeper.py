@@ -7,6 +7,8 @@
 
 The learner does not judge its networks. It saves a candidate when the estimator has accepted it. If
 the estimator rejects the newest one, the learner returns to the network that the estimator uses.
+The estimator adds the residual torque to a network that it accepts; it is saved, and continued in
+the next candidate.
 Without an estimator nobody rejects a network, and each one is saved at once.
 
 A save precedes everything that follows from it. A failed save is retried, and does not prevent the
@@ -14,11 +16,11 @@ publication.
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
-from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
+import numpy as np
+
 from musculoskeletal_ae.exceptions import StateError
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.learning.scheduler import is_recent
@@ -26,7 +28,6 @@ from musculoskeletal_ae.learning.state import StateStore
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 
 class Publication:
@@ -92,31 +93,8 @@ class CheckpointKeeper:
         self._in_use: Mae | None = None  # network of the estimator; None without an estimator
         self._rejected_version = -1  # version of the network that was rejected last
         self._highest_version = 0  # highest version so far, also of the estimator's decisions
-        self._isolated: tuple[int, ...] = ()  # muscles that published networks leave out
-        self._torque, self._has_torque = HealthyTorque(robot), robot.tension_source.is_known
         self._samples = samples
         self._state = None if directory is None else StateStore(directory, robot)
-
-    # -- messages and events --------------------------------------------------------------------
-
-    def observe(self, message: MuscleSample, dt: float) -> None:
-        """Learn the usual residual torque, which contact detection needs, from a healthy message.
-
-        Args:
-            message: The message.
-            dt: Time since the previous message [s].
-        """
-        # The residual torque cannot be computed without tensions.
-        if self.mae is not None and self._has_torque:
-            self._torque.step(message.tension_read, message.length, dt)
-
-    def reset(self) -> None:
-        """Restart the filter of the torque, for example after a backward jump of the clock."""
-        self._torque.reset()
-
-    def isolate(self, muscles: Iterable[int]) -> None:
-        """Set the isolated muscles of the networks that are published from now on."""
-        self._isolated = tuple(muscles)
 
     # -- networks -------------------------------------------------------------------------------
 
@@ -128,7 +106,7 @@ class CheckpointKeeper:
         """Number a network and publish it as a candidate; save it if there is no estimator."""
         self._publish(self.numbered(mae))
         if self._in_use is None:
-            self._save_newest()
+            self._save_newest(self.publication.checkpoint)
 
     def restore(self, mae: Mae) -> None:
         """Save and publish a network that needs no decision, and keep its version.
@@ -136,20 +114,23 @@ class CheckpointKeeper:
         It comes from a user, from the disk or from the estimator.
         """
         self._publish(mae)
-        self._save_newest()
+        self._save_newest(self.publication.checkpoint)
 
     def _publish(self, mae: Mae) -> None:
-        self.mae = mae = self._torque.use(mae.without(self._isolated))
+        if mae.touch is not None and not mae.touch.time:
+            # Updates do not measure the residual torque; earlier networks have it.
+            mae = _with_torque_of(self.mae, mae)
+        self.mae = mae
         self._highest_version = max(self._highest_version, mae.version)
         self.publication.offer(checkpoint.to_bytes(mae))
 
-    def _save_newest(self) -> None:
-        self._saved, self.checkpoint = self.mae, self.publication.checkpoint
+    def _save_newest(self, data: bytes | None) -> None:
+        """Save the newest network, of which `data` is the content of a checkpoint."""
+        self._saved, self.checkpoint = self.mae, data
         self.store()
 
     def clear(self) -> None:
         """Forget all networks of the learner."""
-        self._torque.start()
         self.mae = self._saved = self.checkpoint = None
         self.publication.offer(None)
 
@@ -166,8 +147,11 @@ class CheckpointKeeper:
         if self.mae is None:
             return
         if mae.version == self.mae.version:
+            data, newest = self.publication.checkpoint, _with_torque_of(mae, self.mae)
+            if newest is not self.mae:
+                self.mae, data = newest, checkpoint.to_bytes(newest)
             if self._saved is not self.mae:
-                self._save_newest()
+                self._save_newest(data)
         else:
             self._return_if_rejected()
 
@@ -264,3 +248,13 @@ class CheckpointKeeper:
             if self._state.not_used:
                 values['saved state not used'] = self._state.not_used
         return values
+
+
+def _with_torque_of(measured: Mae | None, mae: Mae) -> Mae:
+    """Return `mae` with the residual torque of another network, if both have one and it differs."""
+    if measured is None or measured.touch is None or mae.touch is None:
+        return mae
+    known = measured.touch
+    if known.time == mae.touch.time and np.array_equal(known.spread, mae.touch.spread):
+        return mae
+    return replace(mae, touch=replace(mae.touch, spread=known.spread, time=known.time))

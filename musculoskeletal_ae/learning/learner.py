@@ -10,8 +10,8 @@
 The estimator validates the candidates (`estimation/network_validation/`). Whatever it decides,
 training continues from the newest samples and weights.
 
-Isolated muscles are not learned: samples do not describe them, and the published network lists
-them.
+Muscles that the estimator has isolated are not learned: samples do not describe them. A network
+states without which muscles it was learned; nobody isolates a muscle because of that.
 
 The caller supplies the time: the ROS clock, recorded time or simulated time. All rules for
 collecting samples and starting updates use this time. A recording is therefore learned in the same
@@ -181,8 +181,6 @@ class Learner:
             return
         if self.collector.has_jumped:  # since the last calibration of the lengths
             return
-        if not self.collector.is_anomaly:
-            self.keeper.observe(paired.message, paired.dt)
         for _ in self.collector.collect(paired):
             self.offset_history.accepted(time)
             self.joint_history.accepted(time)
@@ -238,31 +236,17 @@ class Learner:
         present, learning pauses. Samples that were taken under wrong length offsets are dropped or
         corrected (`offset_history`); all others are kept.
         """
-        isolated_before = self.isolated
-        self._use_body(body)
-        if body.isolated != isolated_before:
-            self.scheduler.note_news()
-        self._publish_isolation()
-
-    def _use_body(self, body: BodyState) -> None:
-        offsets, has_changed = body.offsets, body.offsets != self.body.offsets
-        if has_changed:
-            self.keeper.reset()
+        before, offsets = self.body, body.offsets
         self.collector.use_body(body)
-        if has_changed:
+        if offsets != before.offsets:
             if offsets.revoked:
                 self.offset_history.revoke(self._time)
                 self.collector.healthy.forget_newest(HELD_TIME)
                 self.keeper.store()  # also saves which samples are held back
             elif offsets.known:
                 self._use_known_offsets()
-        self.keeper.isolate(body.isolated)
-
-    def isolate(self, muscles: Iterable[int]) -> None:
-        """Use the present body state with exactly these muscles isolated."""
-        body = self.body.with_isolated(muscles)
-        if body is not self.body:
-            self.use_body(body)
+        if body.isolated != before.isolated:
+            self.scheduler.note_news()
 
     def use_joint_trust(self, trust: JointTrust) -> None:
         """Use another trust in the joint sensors, whose times are those of the messages.
@@ -277,12 +261,6 @@ class Learner:
         if unused:
             self.reset()
         self._note_new_samples()
-
-    def _publish_isolation(self) -> None:
-        """Publish the network with the isolated muscles, except while an anomaly is present."""
-        mae = self.keeper.mae
-        if mae is not None and mae.isolated != self.isolated and not self.collector.is_anomaly:
-            self.keeper.use(mae)
 
     def relearn(self, muscles: Iterable[int]) -> None:
         """Relearn muscles (indices) from samples that will be collected from now on.
@@ -309,7 +287,6 @@ class Learner:
     def reset(self) -> None:
         """Discard incomplete samples, for example after a backward jump of the clock."""
         self.collector.reset()
-        self.keeper.reset()
 
     # -- samples → checkpoints ------------------------------------------------------------------
 
@@ -378,11 +355,7 @@ class Learner:
         Raises:
             StateError: If the backup cannot be made; nothing is changed then.
         """
-        successor = None
-        if mae is not None:
-            # Muscles that the estimator has isolated stay isolated in the new network.
-            isolated = {*mae.isolated, *self.isolated}
-            successor = self.keeper.numbered(mae.without(isolated))
+        successor = None if mae is None else self.keeper.numbered(mae)
         self.keeper.back_up()
         self.trainer.close()
         self.samples.clear()
@@ -396,9 +369,6 @@ class Learner:
             self._start(successor)
 
     def _start(self, mae: Mae) -> None:
-        body = self.body.with_isolated(mae.isolated)
-        if body is not self.body:
-            self._use_body(body)
         self.scheduler.statistics_hold = True
         self.trainer.begin(mae)
         self.keeper.publication.hurry()

@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Excludes messages shortly before and after an anomaly from learning.
 
-An anomaly is detected late, so messages of the last `MARGIN` seconds before the detection may
-already be wrong. Every message is therefore held back for `MARGIN` seconds. After the reset of an
+An anomaly is detected late, so messages of the last `DETECTION_DELAY` seconds before the detection
+may already be wrong. Every message is therefore held back for this time. After the reset of an
 anomaly, messages are ignored for the same time.
 """
 
 from collections import deque
 from typing import NamedTuple
 
+from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.learning.samples import Sample
 
-#: time before the detection of an anomaly and after its reset in which messages are not used [s]
-MARGIN = 2.0
 #: Largest number of messages held back, which bounds the memory if the clock stands still. Even at
-#: 1 kHz, fewer messages than this arrive within MARGIN.
+#: 1 kHz, fewer messages than this arrive within DETECTION_DELAY.
 MOST_WAITING = 5000
 
 
@@ -35,7 +34,7 @@ class Waiting(NamedTuple):
 
 
 class AnomalyMargin:
-    """Holds messages back until `MARGIN` has passed without an anomaly.
+    """Holds messages back until `DETECTION_DELAY` has passed without an anomaly.
 
     Attributes:
         is_anomaly: Whether an anomaly is present.
@@ -56,7 +55,7 @@ class AnomalyMargin:
         self._time += dt
 
     def hold(self, dt: float, reading: Sample, rest: Sample | None) -> list[Waiting]:
-        """Hold a message back; return the messages that have been held back for `MARGIN`.
+        """Hold a message back; return the messages that have been held back for `DETECTION_DELAY`.
 
         Args:
             dt: Time since the previous message [s].
@@ -65,7 +64,7 @@ class AnomalyMargin:
         """
         self._waiting.append(Waiting(self._time, dt, reading, rest))
         released = []
-        while self._waiting and self._time - self._waiting[0].time >= MARGIN:
+        while self._waiting and self._time - self._waiting[0].time >= DETECTION_DELAY:
             released.append(self._waiting.popleft())
         return released
 
@@ -76,7 +75,7 @@ class AnomalyMargin:
             lost = sum(waiting.rest is not None for waiting in self._waiting)
             self._waiting.clear()
         if self.is_anomaly and not is_anomaly:
-            self._closed_until = self._time + MARGIN
+            self._closed_until = self._time + DETECTION_DELAY
         self.is_anomaly = is_anomaly
         return lost
 

@@ -15,11 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.arrival import LONGEST_STEP
 from musculoskeletal_ae.bags.storage import LONGEST_PAUSE
 from musculoskeletal_ae.bags.streams import Pairs
-from musculoskeletal_ae.estimation.finding import Finding, observe
-from musculoskeletal_ae.estimation.health import HealthMonitor
+from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.learning.calibration import Reservoir
@@ -32,8 +30,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly
 from musculoskeletal_ae.signals.friction import directions
 from musculoskeletal_ae.signals.joint_stream import JointStream
-from musculoskeletal_ae.signals.muscle_readings import MuscleReading, muscle_reading
-from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
+from musculoskeletal_ae.signals.muscle_readings import muscle_reading
+from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 from musculoskeletal_ae.tables.table import Table
 
 #: Number of updates from a table of resting postures, and training steps in each of them. On a
@@ -158,15 +156,14 @@ def learn(
 ) -> str:
     """Pass a recording to a learner, message by message, as on a running arm.
 
-    This function plays the part of the estimator: it validates the networks, and the health monitor
+    This function plays the part of the estimator node: it validates the networks, and an estimator
     decides when learning has to stop. `progress` is called with the recorded seconds since its last
     call.
 
     Returns:
         A warning if learning stopped before the end of the recording, or ''.
     """
-    stream = MuscleStream(learner.robot, learner.body)
-    health = HealthMonitor(learner.robot, learner.trainer.preset.name)
+    estimator = Estimator(learner.robot, learner.trainer.preset.name)
     validator = CheckpointValidator(learner.robot)
     newest, stop = None, ''
     learner.reset()
@@ -174,74 +171,58 @@ def learn(
     steps = np.diff(recording.time, prepend=recording.time[:1])
     for dt, at, theta, length, tension, recorded in zip(steps, *recording, strict=True):
         isolated = isolated_in(recorded, learner.isolated)
-        if isolated != learner.isolated:
-            learner.isolate(isolated)
+        if isolated != estimator.body.isolated:
+            learner.use_body(learner.body.with_isolated(isolated))
+            estimator.isolate(isolated)
             validator.isolated = isolated
             validator.forget()
-            stream.use_body(learner.body)
-            health.reset()
-            newest = None
         if learner.mae is not newest:
+            _decide(validator, estimator, learner, at)
             newest = learner.mae
-            mae = _network_in_use(validator, learner, at).without(isolated)
-            stream.use_transmission(mae.transmission)
-            health.use(mae)
         reading = muscle_reading(learner.robot, length=length, tension=tension)
         learner.joints(at, theta)
-        sample = sample_of(stream, reading, at)
-        if sample is not None:
+        with suppress(RejectionError):  # the learner counts it
+            output = estimator.take(reading, at, at)
+            assert output is not None
+            sample = output.sample
             validator.message(sample.tension_read, sample.length, sample.sliding, at, theta)
-        finding = finding_in(health, mae, sample, min(dt, LONGEST_STEP))
-        if finding is not None:
+        finding = estimator.suspects.finding
+        if finding is not None and not stop:
             learner.use_body(learner.body.with_anomaly(Anomaly.FOUND, finding.muscle))
             if (before := validator.anomaly(True, at)) is not None:
-                learner.note_accepted(before)
+                learner.note_accepted(estimator.use(before))
                 learner.note_rejected(newest.version, 'an anomaly was detected soon after')
-            stop = stop or (
+            stop = (
                 f'learning stopped {at:.1f} s after the start: an anomaly begins there '
                 f'({learner.robot.muscles[finding.muscle]}: {finding.kind.identifier})'
             )
-        with suppress(RejectionError):  # the learner counts it
+        with suppress(RejectionError):
             learner.take(reading, at)
         learner.poll(at)
         if progress is not None:
             progress(float(without_pauses(dt)))
     if learner.mae is not newest:
-        _network_in_use(validator, learner, at)
+        _decide(validator, estimator, learner, at)
     return stop
 
 
-def _network_in_use(validator: CheckpointValidator, learner: Learner, now: float) -> Mae:
-    """Decide on the learner's newest network, tell the learner, and return the network to use."""
+def _decide(
+    validator: CheckpointValidator, estimator: Estimator, learner: Learner, now: float
+) -> None:
+    """Decide on the learner's newest network, tell the learner, and use the network if accepted."""
     mae = learner.mae
     if validator.is_in_use(mae):
-        return mae
+        return
     try:
         validator.check(mae)
     except GateError as error:
         learner.note_rejected(mae.version, str(error))
+        if estimator.mae is None:
+            estimator.use(mae)
     else:
+        mae = estimator.use(mae)
         validator.take(mae, now)
         learner.note_accepted(mae)
-    return mae if validator.mae is None else validator.mae
-
-
-def sample_of(stream: MuscleStream, reading: MuscleReading, time: float) -> MuscleSample | None:
-    """Return the sample of a message; None if it is implausible."""
-    try:
-        return stream.take(reading, time)
-    except RejectionError:
-        return None
-
-
-def finding_in(
-    health: HealthMonitor, mae: Mae, sample: MuscleSample | None, dt: float
-) -> Finding | None:
-    """Return the fault that the health monitor finds in a sample; None if it finds none."""
-    if sample is None:
-        return None
-    observation = observe(mae, sample.length, sample.motor_tension, sample.bone_tension, dt)
-    return health.step(observation)
 
 
 def errors(mae: Mae, recording: Pairs, at_rest: bool = False) -> Array:

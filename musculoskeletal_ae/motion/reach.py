@@ -11,7 +11,7 @@ the cheapest path through a roadmap of random postures, with
 where τ_missing,j is the torque of joint j that muscles and joint stops do not provide. Tensions
 are limited to T_bias + USED (T_limit − T_bias), so that the path keeps a reserve of tension. If no
 path can keep the reserve, the cost favours postures in which little torque is missing. On an edge,
-tendon friction opposes the motion (`Limits`).
+tendon friction opposes the motion (`ReachLimits`).
 
 A joint that is at a stop at the start is also at this stop in some postures of the roadmap. An edge
 is evaluated only if the cheapest path contains it (lazy roadmap, Bohlin and Kavraki 2000). Until
@@ -96,7 +96,7 @@ def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
     return _shortened(path, cost)[1:]
 
 
-class Limits:
+class ReachLimits:
     """The bone-side tensions that a moving arm may use.
 
         T_bias/loss ≤ T_end ≤ (T_bias + used (T_limit − T_bias))/loss,   loss = e^{μ s}
@@ -155,7 +155,7 @@ class PathCost:
 
     def __init__(self, robot: Robot, mae: Mae) -> None:
         self._robot, self._mae = robot, mae
-        self._limits = Limits(robot, mae)
+        self._limits = ReachLimits(robot, mae)
 
     def missing(self, postures: Array, direction: Array | None = None) -> Array:
         """Return the largest missing torque m of each posture [N·m], (N,).

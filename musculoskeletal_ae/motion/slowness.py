@@ -74,7 +74,7 @@ def exertion_slowness(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float
     if not robot.actuation.knows_tension or is_still:
         return 1.0
     factors, used = (SLOWER, 1.0) if robot.used.all() else (SLOWER_ISOLATED, reach.USED)
-    limits, bias, lag = reach.Limits(robot, mae, used), robot.tension.bias, max(lag, LEAST_LAG)
+    limits, bias, lag = reach.ReachLimits(robot, mae, used), robot.tension.bias, max(lag, LEAST_LAG)
     travelled = np.linalg.norm(np.diff(theta, axis=0), axis=1).cumsum()
     spacing = max(MOMENT_SPACING, travelled[-1] / MOST_EXERTIONS)
     marks = np.arange(0.0, travelled[-1], spacing)

@@ -109,7 +109,7 @@ class Frames:
         self._publisher.publish(self._message(transforms=transforms))
 
 
-class Arm(Shell):
+class ArmNode(Shell):
     """Base class of nodes that replace a real arm: they obey its commands and publish its state.
 
     Like real muscle modules, such a node obeys commands even while several nodes publish them.
@@ -169,26 +169,23 @@ class Arm(Shell):
             publisher = self.create_publisher(String, 'robot_description', LATCHED)
             publisher.publish(String(data=self.robot.description.urdf))
 
-    def publish_state(
-        self, theta: Array, length: Array, tension: Array, temperature: Array
-    ) -> None:
+    def publish_state(self, theta: Array, **values: Array) -> None:
         """Publish the state of the arm.
 
         Args:
             theta: θ [rad], (D,).
-            length: l [m], (M,).
-            tension: Tensions as the sensors of the muscle modules read them [N], (M,).
-            temperature: Temperatures of the muscle modules [°C], (M,).
+            values: The readings of the muscle modules, as for `reading_rows`; among them `length`
+                and `tension`.
         """
         stamp, motors, joints = self.get_clock().now().to_msg(), self._motors, self._joints
         if motors is not None and is_heard(motors):
-            effort = self.robot.tension_source.to_message(tension)
-            message = motor_message(self.motors, length, effort, stamp)
+            effort = self.robot.tension_source.to_message(values['tension'])
+            message = motor_message(self.motors, values['length'], effort, stamp)
             if motors is joints:
                 add_joints(message, self.robot.units, theta)
             motors.publish(message)
         if joints is not None and joints is not motors and is_heard(joints):
             joints.publish(posture_message(self.robot.units, theta, stamp))
         if self._muscles is not None and is_heard(self._muscles):
-            rows = reading_rows(self.robot, length=length, tension=tension, temperature=temperature)
+            rows = reading_rows(self.robot, **values)
             self._muscles.publish(array_message(rows, 'quantity', 'muscle'))

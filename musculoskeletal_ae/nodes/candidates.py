@@ -41,13 +41,14 @@ class Candidates:
         queue: Queue in which the candidates from the topic wait; it validates them in small steps.
     """
 
-    def __init__(self, node: Shell, use: Callable[[Mae, str], None]) -> None:
+    def __init__(self, node: Shell, use: Callable[[Mae, str], Mae]) -> None:
         """Start without a network.
 
         Args:
             node: The estimator.
             use: Called with each network that the estimator is to use from now on, and with the
-                reason why it fits this arm worse than the one before, or '' if it does not.
+                reason why it fits this arm worse than the one before, or '' if it does not. Returns
+                the network with what the estimator has measured for it.
         """
         self._node, self._use = node, use
         self.validator = CheckpointValidator(node.robot)
@@ -81,8 +82,7 @@ class Candidates:
                 f'checkpoint version {in_use.version}: {reason}; returned to checkpoint version '
                 f'{before.version}'
             )
-            self._use(before, '')
-            self._publish(before)
+            self._publish(self._use(before, ''))
             self._reject(in_use, reason)
         if waiting is not None:
             with suppress(CheckpointError):  # an unfit checkpoint has no version
@@ -96,8 +96,7 @@ class Candidates:
             return
         try:
             yield from self.validator.trial(mae)
-            complete = self.validator.with_detector(mae, time.monotonic())
-            self._accept(complete, message if complete is mae else None)
+            self._accept(self.validator.with_detector(mae, time.monotonic()))
         except CheckpointError as error:
             self._reject(mae, str(error))
             raise
@@ -113,18 +112,14 @@ class Candidates:
         self._accept(mae, unsuitable_because=self.validator.weakness(mae))
         self._node.needed.remove(CANDIDATES)
 
-    def _accept(
-        self, mae: Mae, message: UInt8MultiArray | None = None, unsuitable_because: str = ''
-    ) -> None:
+    def _accept(self, mae: Mae, unsuitable_because: str = '') -> None:
         try:
-            self._use(mae, unsuitable_because)
+            mae = self._use(mae, unsuitable_because)
         except (np.linalg.LinAlgError, FloatingPointError) as error:
             raise CheckpointError(f'the network cannot be evaluated ({error})') from error
         self.validator.take(mae, time.monotonic())
-        self._publish(mae, message)
+        self._publish(mae)
 
-    def _publish(self, mae: Mae, message: UInt8MultiArray | None = None) -> None:
+    def _publish(self, mae: Mae) -> None:
         self._node.checkpoint_version = mae.version
-        if message is None:
-            message = bytes_message(checkpoint.to_bytes(mae))
-        self._accepted.publish(message)
+        self._accepted.publish(bytes_message(checkpoint.to_bytes(mae)))

@@ -29,7 +29,7 @@ from musculoskeletal_ae.estimation.estimator import Estimator as Core
 from musculoskeletal_ae.estimation.estimator import Output
 from musculoskeletal_ae.estimation.lengths.length_calibration import stated_theta
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
-from musculoskeletal_ae.estimation.settings import Settings
+from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.estimation.verification import VerificationVerdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
@@ -84,11 +84,8 @@ class Estimator(Shell):
         self.follow_parameter('isolate_muscles', self._on_isolate_muscles)
         self.core.isolate([*self.muscles_to_isolate, *(() if found is None else found.isolated)])
         self.candidates.follow()
-        if found is None and (chosen := self.core.state.complete_mae) is not None:
-            # At its first start, the estimator isolates the muscles that the chosen network lacks.
-            self.core.isolate([*self.muscles_to_isolate, *chosen.isolated])
         self.follow_parameter(
-            'on_anomaly', lambda value: self.core.configure(Settings(on_anomaly=value))
+            'on_anomaly', lambda value: self.core.configure(EstimatorSettings(on_anomaly=value))
         )
         self.follow_muscle_messages(self._on_muscles)
         self.follow_posture('joint_states', self._on_joints, some=True)
@@ -121,11 +118,12 @@ class Estimator(Shell):
 
     # -- parameters and services ----------------------------------------------------------------
 
-    def _use(self, mae: Mae, unsuitable_because: str) -> None:
-        self.core.use(mae, unsuitable_because)
+    def _use(self, mae: Mae, unsuitable_because: str) -> Mae:
+        mae = self.core.use(mae, unsuitable_because)
         if Evidence.NOT_CALIBRATED in self.core.trust.evidence:  # it waits for the first network
             self.core.calibrate_lengths(self.posture)
             self._publish_body()
+        return mae
 
     def _on_posture(self, posture: tuple[float, ...]) -> None:
         stated_theta(self.robot, posture)  # checks the posture

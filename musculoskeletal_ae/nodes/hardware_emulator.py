@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.emulator.sensors import read_sensors
-from musculoskeletal_ae.nodes.arm import Arm, Markers
+from musculoskeletal_ae.nodes.arm import ArmNode, Markers
 from musculoskeletal_ae.parameters import naming_parameter
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
@@ -31,7 +31,7 @@ from musculoskeletal_ae.ros.messages import RELIABLE, serve
 PACE_TIME = 5.0  # time over which the real-time factor is averaged [s]
 
 
-class HardwareEmulator(Arm):
+class HardwareEmulator(ArmNode):
     """Passes commands and faults to the emulated arm; publishes its measurements."""
 
     def __init__(self, **options: Any) -> None:
@@ -96,7 +96,7 @@ class HardwareEmulator(Arm):
             return
         self.reading = self.arm.sense()
         for reading in self.arm.faults.deliver(self.reading, now):
-            self.publish_state(*reading)
+            self.publish_state(reading.theta, **reading.muscles)
         if self.imu is not None:
             self._publish_imu(self.imu)
         if self.sensors.marker_rate > 0.0 and now >= self.pose_due:

@@ -17,7 +17,7 @@ from dataclasses import replace
 from difflib import get_close_matches
 
 from musculoskeletal_ae.control.settings import Settings as ControlSettings
-from musculoskeletal_ae.estimation.settings import Settings as EstimationSettings
+from musculoskeletal_ae.estimation.settings import EstimatorSettings as EstimationSettings
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.parameters import (
     CHECKPOINT,

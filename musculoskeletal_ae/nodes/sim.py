@@ -20,7 +20,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.message_reading import read_target
-from musculoskeletal_ae.nodes.arm import Arm, Markers
+from musculoskeletal_ae.nodes.arm import ArmNode, Markers
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
@@ -32,7 +32,7 @@ from musculoskeletal_ae.simulation.simulation import Simulation
 TEMPERATURE = 25.0  # reported temperature of all modules [°C]
 
 
-class Sim(Arm):
+class Sim(ArmNode):
     """Passes commands and wrenches to the simulation of the learned body; publishes its states."""
 
     def __init__(self, **options: Any) -> None:
@@ -95,7 +95,9 @@ class Sim(Arm):
         state = arm.step(elapsed)
         temperature = np.full(self.robot.muscle_count, TEMPERATURE)
         read = arm.mae.transmission.reading(state.tension[0], state.slid[0])
-        self.publish_state(state.theta[0], state.length[0], read, temperature)
+        self.publish_state(
+            state.theta[0], length=state.length[0], tension=read, temperature=temperature
+        )
 
     def _lines(self) -> list[Line]:
         if self.arm is None:

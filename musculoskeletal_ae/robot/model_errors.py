@@ -25,6 +25,10 @@ SMOOTH = 0.003
 #: expected. Those of four arms with larger detours (`foreign`) differ by 1.4 to 2.1 times as much,
 #: 1.7 times on average.
 SHAPE_FACTOR = 1.7
+#: Largest difference between a length of a healthy arm and of its geometric model [m]. It was at
+#: most 42 mm for the emulated individuals 0 to 9 of arm26 and musashi_left_arm
+#: (notes/removed_benches.md).
+LARGEST = 0.045
 
 
 def length_variances(robot: Robot, theta: Array) -> Array:

@@ -4,7 +4,7 @@
 The estimator owns the body state. It publishes each change as a whole on the latched topic
 `body_state`, with the number of the change. All other nodes use the newest message. It states
 everything that they need, so that they compare it with no other message. Before the first message,
-they assume a healthy body; only the learner assumes the isolated muscles of its saved network.
+they assume a healthy body.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ class JointReading(Enum):
     FOREIGN = 'most other joint angles of the message are impossible'
 
 
-class Series(NamedTuple):
+class ImpossibleSeries(NamedTuple):
     """A series of impossible readings of one joint sensor.
 
     Attributes:
@@ -81,7 +81,7 @@ class Series(NamedTuple):
         return self.is_present(now) and self.until - self.since > LASTING
 
 
-_NONE = Series(-math.inf, -math.inf, 0, 0)
+_NONE = ImpossibleSeries(-math.inf, -math.inf, 0, 0)
 
 
 class JointChannel:
@@ -140,9 +140,11 @@ class JointChannel:
             if series is not _NONE and series.is_present(time):
                 self.series = series._replace(total=series.total + 1)
         elif not series.is_present(time):
-            self.series = Series(time, time, 1, 1)
+            self.series = ImpossibleSeries(time, time, 1, 1)
         else:
-            self.series = Series(series.since, time, series.impossible + 1, series.total + 1)
+            self.series = ImpossibleSeries(
+                series.since, time, series.impossible + 1, series.total + 1
+            )
 
 
 class JointStream:
@@ -229,7 +231,7 @@ class JointStream:
             self._channels[j].read_at = None
         return missing
 
-    def impossible(self, now: float) -> dict[int, Series]:
+    def impossible(self, now: float) -> dict[int, ImpossibleSeries]:
         """Return the lasting series of impossible readings, by index of the joint.
 
         Args:

@@ -19,7 +19,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools
 
 
-class Trust(IntEnum):
+class SensorTrust(IntEnum):
     """Whether a joint sensor is trusted; the numbers are published."""
 
     #: Its readings are used. If they were in doubt before, those of the doubtful time are given up.
@@ -34,7 +34,7 @@ class Trust(IntEnum):
 
 
 #: sensors whose readings are not used
-NOT_USED = frozenset({Trust.DOUBTED, Trust.IMPOSSIBLE})
+NOT_USED = frozenset({SensorTrust.DOUBTED, SensorTrust.IMPOSSIBLE})
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +51,7 @@ class JointTrust:
 
     ROWS: ClassVar[int] = 3  # number of rows of the published message
 
-    trust: tuple[Trust, ...]
+    trust: tuple[SensorTrust, ...]
     since: Array
     deviation: Array
 
@@ -59,7 +59,7 @@ class JointTrust:
     def full(cls, joint_count: int) -> JointTrust:
         """Return the trust in sensors that have never been in doubt."""
         unknown = np.full(joint_count, np.nan)
-        return cls((Trust.TRUSTED,) * joint_count, unknown, np.zeros(joint_count))
+        return cls((SensorTrust.TRUSTED,) * joint_count, unknown, np.zeros(joint_count))
 
     @cached_property
     def is_used(self) -> Bools:
@@ -74,7 +74,7 @@ class JointTrust:
     @cached_property
     def is_doubted(self) -> Bools:
         """Which joint sensors are in doubt because of the muscle lengths, (D,)."""
-        return np.array([each is Trust.DOUBTED for each in self.trust], dtype=bool)
+        return np.array([each is SensorTrust.DOUBTED for each in self.trust], dtype=bool)
 
     @cached_property
     def doubted(self) -> tuple[int, ...]:
@@ -88,7 +88,7 @@ class JointTrust:
             now: Time on the clock of `since` [s].
 
         Returns:
-            The numbers of `Trust`, the times since `since` [s] (0 if there is none) and the
+            The numbers of `SensorTrust`, the times since `since` [s] (0 if there is none) and the
             deviations [rad], (3, D).
         """
         age = np.nan_to_num(np.maximum(now - self.since, 0.0))
@@ -99,7 +99,7 @@ class JointTrust:
         """Return the trust that a message (3, D) received at `now` [s] describes.
 
         Raises:
-            ValueError: If a number in the message is not a `Trust`.
+            ValueError: If a number in the message is not a `SensorTrust`.
         """
-        trust = tuple(Trust(number) for number in rows[0].tolist())
+        trust = tuple(SensorTrust(number) for number in rows[0].tolist())
         return cls(trust, np.where(rows[1] > 0.0, now - rows[1], np.nan), rows[2])

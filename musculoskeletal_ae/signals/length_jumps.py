@@ -15,15 +15,14 @@ A failed read may be so close to the lengths before it that only the way back is
 more than half the legal one are therefore counted as well, if they come shortly before a jump or
 while its new level is not accepted yet.
 
-The muscles whose new level is accepted are displaced until the next length calibration
-(`DisplacedMuscles`), unless a rupture explains the jump (`PresumedRupture`).
+The muscles whose new level is accepted are displaced until the next length calibration, unless a
+rupture explains the jump (`PresumedRupture`).
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -33,82 +32,54 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.limits import LENGTH_JUMPED, LIMITS
 
-
-class JumpVerdict(NamedTuple):
-    """What the lengths of one message show.
-
-    Attributes:
-        problem: Reason and detail if the message is rejected, or None.
-        displaced: Muscles that are displaced from now on; usually none.
-        is_unseen: Whether the displaced muscles jumped during a pause of the messages, in which the
-            arm may have moved.
-    """
-
-    problem: tuple[str, str] | None = None
-    displaced: tuple[int, ...] = ()
-    is_unseen: bool = False
-
-
 #: smallest change of a length that may be a part of a jump, as a fraction of the legal change
 LARGE = 0.5
 
 
-class LargeChange(NamedTuple):
-    """A message in which lengths have changed by much.
+@dataclass(frozen=True)
+class Change:
+    """Changes of lengths that were too large, or nearly so, in one message or in several.
+
+    The sum over several messages shows whether a length is still at another level. The length
+    itself does not show this: a module whose length jumped winds in or pays out, which can bring
+    the length back to the previous value.
 
     Attributes:
-        at: Time of reception by a steady clock [s].
-        which: Muscles whose lengths have changed by more than `LARGE` of the legal change, (M,).
-        change: Changes of all lengths since the previous message [m], (M,).
-        allowed: Largest change that was legal [m].
-        pause: Time since the previous message [s].
-        is_jump: Whether any of the changes was too large.
-    """
-
-    at: float
-    which: Bools
-    change: Array
-    allowed: float
-    pause: float
-    is_jump: bool
-
-
-@dataclass
-class Jump:
-    """A jump whose new level is not accepted yet; arrays have the shape (M,).
-
-    The changes that were too large, or nearly so, are added up for each muscle. The sum shows
-    whether the length is still at another level. The length itself does not show this: a module
-    whose length jumped winds in or pays out, which can bring the length back to the previous value.
-
-    Attributes:
-        change: Sum of these changes [m].
-        allowed: The largest change that was legal at any of these changes [m].
-        winding: Length that the motors can have wound in during these changes [m].
-        is_unseen: Whether the first change followed a pause of the messages.
-        last_at: Time of the last change that was too large [s].
+        change: Sum of these changes [m], (M,); 0 for muscles whose length has changed little.
+        allowed: The largest change that was legal in any of the messages [m], (M,).
+        winding: Length that the motors can have wound in during these changes [m], (M,).
+        pause: Pause before the first message whose change was too large [s].
+        at: Time of reception of the last message [s].
+        jumped_at: Time of the last change that was too large [s]; −∞ if none was.
     """
 
     change: Array
     allowed: Array
     winding: Array
-    is_unseen: bool
-    last_at: float = math.inf
+    pause: float
+    at: float
+    jumped_at: float = -math.inf
 
-    @classmethod
-    def begin(cls, muscle_count: int, pause: float) -> Jump:
-        """Return a jump without any change; `pause` [s] is the pause before its first message."""
-        nothing = np.zeros(muscle_count)
-        return cls(nothing, nothing.copy(), nothing.copy(), pause > LIMITS.pause)
+    @property
+    def is_jump(self) -> bool:
+        """Whether any of the changes was too large."""
+        return self.jumped_at > -math.inf
 
-    def add(self, large: LargeChange) -> None:
-        """Add the changes of the muscles whose lengths have changed by much in one message."""
-        which = large.which
-        if large.is_jump:
-            self.last_at = large.at
-        self.change[which] += large.change[which]
-        self.allowed[which] = np.maximum(self.allowed[which], large.allowed)
-        self.winding[which] += LIMITS.step + LIMITS.speed * large.pause
+    @property
+    def is_unseen(self) -> bool:
+        """Whether the jump was during a pause of the messages, in which the arm may have moved."""
+        return self.pause > LIMITS.pause
+
+    def __add__(self, later: Change) -> Change:
+        """Return these changes and later ones together."""
+        return Change(
+            self.change + later.change,
+            np.maximum(self.allowed, later.allowed),
+            self.winding + later.winding,
+            self.pause if self.is_jump else later.pause,
+            later.at,
+            max(self.jumped_at, later.jumped_at),
+        )
 
     def remaining(self, used: Bools) -> Bools:
         """Return which muscles in `used` (M,) have not returned to their level before the jump."""
@@ -135,7 +106,7 @@ class PresumedRupture:
         #: time at which each of these muscles began to pull again [s], (M,); ∞ if it does not pull
         self._taut_since: Array = np.full(robot.muscle_count, math.inf)
 
-    def explains(self, jump: Jump, tension: Array, used: Bools) -> bool:
+    def explains(self, jump: Change, tension: Array, used: Bools) -> bool:
         """Return whether a rupture may have caused a jump; if so, remember the muscle.
 
         This is the case if a single tendon has jumped, is slack, and may have been wound in.
@@ -175,23 +146,37 @@ class LengthJumps:
 
     Lengths are compared as they were measured, without subtracting length offsets. A change of the
     offsets therefore does not look like a jump.
+
+    Attributes:
+        displaced: Indices of the muscles whose lengths have jumped since their last length
+            calibration; these lengths are not reliable.
+        newest: Those that are displaced since the last message.
+        count: Number of accepted jumps since the start.
+        is_unseen: Whether the last one was during a pause of the messages (`Change.is_unseen`).
     """
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
+        self.displaced: frozenset[int] = frozenset()
+        self.newest: tuple[int, ...] = ()
+        self.count, self.is_unseen = 0, False
+        self.reset()
+
+    def reset(self) -> None:
+        """Discard earlier messages; muscles remain displaced."""
         self._last: Array | None = None  # the last lengths, accepted or not [m], (M,)
         self._last_at = math.inf  # time of reception of the last message [s]
         self._last_delay = 0.0  # delay of the last message [s]
-        self._jump: Jump | None = None  # the jump whose new level is not accepted yet
+        self._jump: Change | None = None  # the jump whose new level is not accepted yet
         #: large changes within the last `LIMITS.glitch` that belong to no jump
-        self._large: list[LargeChange] = []
-        self._was_unseen = False  # `Jump.is_unseen` of the last accepted jump
-        self._rupture = PresumedRupture(robot)
+        self._large: list[Change] = []
+        self._was_unseen = False  # `Change.is_unseen` of the last accepted jump
+        self._rupture = PresumedRupture(self._robot)
 
     def step(
         self, length: Array, tension: Array, used: Bools, now: float, delay: float = 0.0
-    ) -> JumpVerdict:
-        """Return what the lengths of the newest message show.
+    ) -> tuple[str, str] | None:
+        """Return reason and detail if a message is to be rejected because of its lengths, or None.
 
         Args:
             length: Lengths as measured [m], (M,).
@@ -200,20 +185,28 @@ class LengthJumps:
             now: Time of reception by a steady clock [s].
             delay: How late the message is (`Arrival.delay`) [s].
         """
+        self.newest = ()
         if not self.follow(length, used, now, delay):
-            return JumpVerdict()
+            return None
         jump = self._jump
         if jump is None or not jump.remaining(used).any():
             self._jump = None
-            return JumpVerdict(None, self._rupture.refuted(tension, used, now), self._was_unseen)
-        if now - jump.last_at <= LIMITS.settled:
-            return JumpVerdict(self._problem(jump, used))
+            self._displace(self._rupture.refuted(tension, used, now))
+            return None
+        if now - jump.jumped_at <= LIMITS.settled:
+            return self._problem(jump, used)
         # The new level has lasted, so it is accepted.
         self._jump, self._was_unseen = None, jump.is_unseen
-        if self._rupture.explains(jump, tension, used):
-            return JumpVerdict()
-        muscles = np.flatnonzero(jump.remaining(used)).tolist()
-        return JumpVerdict(None, tuple(muscles), jump.is_unseen)
+        if not self._rupture.explains(jump, tension, used):
+            self._displace(tuple(np.flatnonzero(jump.remaining(used)).tolist()))
+        return None
+
+    def _displace(self, muscles: tuple[int, ...]) -> None:
+        self.newest = muscles
+        if muscles:
+            self.displaced |= set(muscles)
+            self.count += 1
+            self.is_unseen = self._was_unseen
 
     def follow(self, length: Array, used: Bools, now: float, delay: float = 0.0) -> bool:
         """Compare lengths with those before them; return False if there are none before them.
@@ -238,21 +231,27 @@ class LengthJumps:
         is_large: Bools = (np.abs(change) > LARGE * allowed) & used
         if is_large.any():
             is_jump = bool((np.abs(change[is_large]) > allowed).any())
-            self._note(LargeChange(now, is_large, change, allowed, pause, is_jump))
+            large = Change(
+                change=np.where(is_large, change, 0.0),
+                allowed=np.where(is_large, allowed, 0.0),
+                winding=np.where(is_large, LIMITS.step + LIMITS.speed * pause, 0.0),
+                pause=pause,
+                at=now,
+                jumped_at=now if is_jump else -math.inf,
+            )
+            self._note(large)
         return True
 
-    def _note(self, large: LargeChange) -> None:
+    def _note(self, large: Change) -> None:
         """Add a large change to the present jump, or begin one if the change is too large."""
-        self._large = [each for each in self._large if large.at - each.at <= LIMITS.glitch]
-        if self._jump is None and not large.is_jump:
-            self._large.append(large)
+        if self._jump is not None:
+            self._jump += large
             return
-        if self._jump is None:
-            self._jump = Jump.begin(len(large.change), large.pause)
-            for each in self._large:
-                self._jump.add(each)
-            self._large = []
-        self._jump.add(large)
+        self._large = [each for each in self._large if large.at - each.at <= LIMITS.glitch]
+        self._large.append(large)
+        if large.is_jump:
+            first, *later = self._large
+            self._jump, self._large = sum(later, first), []
 
     def jumping(self, used: Bools) -> tuple[int, ...]:
         """Return the muscles in `used` (M,) whose new level has not been accepted yet."""
@@ -264,40 +263,17 @@ class LengthJumps:
         """Return the pause between receptions or between sendings, whichever is longer [s]."""
         return longer_pause(max(now - self._last_at, 0.0), self._last_delay, delay)
 
-    def _problem(self, jump: Jump, used: Bools) -> tuple[str, str]:
+    def _problem(self, jump: Change, used: Bools) -> tuple[str, str]:
         """Return reason and detail of the rejection of a message."""
         muscle = int(np.abs(jump.change * used).argmax())
         return LENGTH_JUMPED, f'{self._robot.muscles[muscle]} by {1e3 * jump.change[muscle]:.0f} mm'
 
-    def calibrated(self) -> None:
-        """Discard presumed ruptures, because the length offsets have been calibrated."""
-        self._rupture.forget()
-
-
-@dataclass
-class DisplacedMuscles:
-    """Records muscles whose lengths have jumped since their last length calibration.
-
-    Attributes:
-        muscles: Indices of these muscles; their lengths are not reliable.
-        jumps: Number of accepted jumps since the start.
-        is_unseen: Whether the last jump was during a pause of the messages, in which the arm may
-            have moved.
-    """
-
-    muscles: frozenset[int] = frozenset()
-    jumps: int = 0
-    is_unseen: bool = False
-
-    def note(self, verdict: JumpVerdict) -> None:
-        """Record the muscles that are displaced from now on."""
-        if verdict.displaced:
-            self.muscles |= set(verdict.displaced)
-            self.jumps += 1
-            self.is_unseen = verdict.is_unseen
-
     def use_body(self, body: BodyState, is_calibrated: bool) -> None:
-        """Remove isolated muscles, or all muscles if new length offsets have been calibrated."""
+        """Follow the body state: isolated muscles are not displaced.
+
+        If new length offsets have been calibrated, no muscle is, and no rupture is presumed.
+        """
         if is_calibrated:
-            self.muscles = frozenset()
-        self.muscles -= set(body.isolated)
+            self._rupture.forget()
+            self.displaced = frozenset()
+        self.displaced -= set(body.isolated)

@@ -82,7 +82,7 @@ def possible_readings(robot: Robot) -> tuple[Array, Array]:
     return possible[0], possible[1]
 
 
-class Layout(NamedTuple):
+class ReadingLayout(NamedTuple):
     """The layout of a `MuscleReading`: no named dimensions and no offset."""
 
     dim: tuple[()] = ()
@@ -93,7 +93,7 @@ class MuscleReading(NamedTuple):
     """One reading of all muscle modules, with the fields of a `muscle_states` message."""
 
     data: Array  # (Q·M,): one row of M values for each of the Q quantities
-    layout: Layout = Layout()
+    layout: ReadingLayout = ReadingLayout()
 
 
 def reading_rows(robot: Robot, **values: Array) -> Array:

@@ -31,7 +31,7 @@ from musculoskeletal_ae.message_reading import muscle_rows, read_muscle_states
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.friction import FrictionDirection, Transmission
-from musculoskeletal_ae.signals.length_jumps import DisplacedMuscles, JumpVerdict, LengthJumps
+from musculoskeletal_ae.signals.length_jumps import LengthJumps
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence
 from musculoskeletal_ae.signals.muscle_readings import Row
 from musculoskeletal_ae.signals.plausibility import LevelCheck, TemperatureCheck
@@ -130,45 +130,12 @@ class MedianFilter:
         self._last.clear()
 
 
-class PlausiblePull:
-    """Filtered lengths and tensions of the last messages, accepted or not.
-
-    With these values, the limiter can relieve a muscle while messages are rejected.
-    """
-
-    def __init__(self, levels: LevelCheck, window: int) -> None:
-        self._levels = levels
-        self._last: deque[Array] = deque(maxlen=window)  # readings, (Q, M) each
-
-    def note(self, states: Array) -> None:
-        """Record the readings of a message, (Q, M)."""
-        self._last.append(states)
-
-    def median(self, offset: Array) -> Array | None:
-        """Return the medians of lengths and tensions of the last messages, or None if too few.
-
-        The result has the format of `RejectionError.pull`.
-
-        Args:
-            offset: Length offsets [m], (M,), which are subtracted from the lengths.
-        """
-        if len(self._last) < (self._last.maxlen or 0):
-            return None
-        return median_of_rows(
-            np.array([self._levels.plausible_pull(states, offset) for states in self._last])
-        )
-
-    def reset(self) -> None:
-        """Discard all messages."""
-        self._last.clear()
-
-
 class MuscleStream:
     """Turns the messages of one arm's muscle modules into samples.
 
     Attributes:
         body: Length offsets and isolated muscles.
-        displaced: Muscles whose lengths have jumped since their last length calibration.
+        jumps: The jumps of lengths, and the muscles that are displaced since then.
     """
 
     def __init__(self, robot: Robot, body: BodyState | None = None, window: int = 1) -> None:
@@ -186,17 +153,18 @@ class MuscleStream:
         self._levels = LevelCheck(robot)
         self._temperatures = TemperatureCheck(robot.muscle_count)
         self._median = MedianFilter(window)
-        self._pull = PlausiblePull(self._levels, window)
+        #: readings of the last messages, accepted or not, (Q, M) each
+        self._received: deque[Array] = deque(maxlen=window)
         self._implausible = Persistence()
-        self.displaced = DisplacedMuscles()
+        self.jumps = LengthJumps(robot)
         self.reset()
 
     def reset(self) -> None:
         """Discard earlier messages, for example after a jump of the clock."""
-        self._jumps = LengthJumps(self._robot)
+        self.jumps.reset()
         self._direction = FrictionDirection()
         self._median.reset()
-        self._pull.reset()
+        self._received.clear()
         self._time = math.inf  # reception of the last sample [s]
         self._sample_delay = 0.0  # delay of the last sample [s]
         self._delay = 0.0  # delay of the newest message, accepted or not [s]
@@ -214,15 +182,18 @@ class MuscleStream:
         is_calibrated = has_new_offsets and not body.offsets.revoked
         if has_new_offsets:  # the change of lengths is not a motion
             self._direction = FrictionDirection()
-        if is_calibrated:
-            self._jumps.calibrated()
-        self.displaced.use_body(body, is_calibrated)
+        self.jumps.use_body(body, is_calibrated)
         self.body = body
 
     @property
     def jumping(self) -> tuple[int, ...]:
         """Muscles whose lengths have jumped, while the new level has not been accepted yet."""
-        return self._jumps.jumping(self.body.used)
+        return self.jumps.jumping(self.body.used)
+
+    @property
+    def has_jumped(self) -> bool:
+        """Whether lengths were observed to jump after the last length calibration."""
+        return bool(self.jumps.displaced) and not self.jumps.is_unseen
 
     def implausible(self, now: float) -> str:
         """Return why messages have been implausible for longer than a glitch, or ''."""
@@ -257,8 +228,8 @@ class MuscleStream:
             with suppress(MessageError):  # a message of another shape has no readings
                 raw = muscle_rows(message, muscle_count)
                 self._follow(raw, time if now is None else now, delay)
-                self._pull.note(raw)
-                pull = self._pull.median(self.body.offsets.offset)
+                self._received.append(raw)
+                pull = self._plausible_pull()
             raise RejectionError(error.reason, str(error).partition(': ')[2], raw, pull) from error
         now = time if now is None else now
         self._delay = delay
@@ -266,12 +237,11 @@ class MuscleStream:
         offsets = self.body.offsets
         newest = states.copy()
         newest[Row.LENGTH] -= offsets.offset
-        self._pull.note(states)
-        verdict = self._judge(states, newest, now)
-        problem = verdict.problem
+        self._received.append(states)
+        problem = self._problem(states, newest, now)
         self._implausible.note('' if problem is None else ': '.join(problem), now - delay)
         if problem is not None:
-            raise RejectionError(*problem, states, self._pull.median(offsets.offset))
+            raise RejectionError(*problem, states, self._plausible_pull())
         pause = longer_pause(time - self._time, self._sample_delay, delay)
         if time < self._time or pause > LIMITS.pause:
             self._direction.reset()
@@ -292,7 +262,7 @@ class MuscleStream:
             temperature=self._temperatures.step(read[Row.TEMPERATURE], now - delay),
             usable=self.body.used,
             newest=newest,
-            jumped=verdict.displaced,
+            jumped=self.jumps.newest,
             missing=missing,
             tension_spread=self._transmission.spread(tension, sliding),
             delay=delay,
@@ -306,8 +276,15 @@ class MuscleStream:
         states[lacking] = 0.0
         return tuple(np.flatnonzero(lacking.any(axis=0)).tolist())
 
-    def _judge(self, read: Array, states: Array, now: float) -> JumpVerdict:
-        """Check all values for plausible levels, and the lengths for jumps.
+    def _plausible_pull(self) -> Array | None:
+        """Return the medians of plausible lengths and tensions, as in `RejectionError.pull`."""
+        if len(self._received) < (self._received.maxlen or 0):
+            return None
+        offset, plausible = self.body.offsets.offset, self._levels.plausible_pull
+        return median_of_rows(np.array([plausible(states, offset) for states in self._received]))
+
+    def _problem(self, read: Array, states: Array, now: float) -> tuple[str, str] | None:
+        """Return why a message is rejected: a value with an impossible level, or a jump; or None.
 
         Args:
             read: The readings, (Q, M).
@@ -318,12 +295,11 @@ class MuscleStream:
         problem = self._levels.problem(states, used, known)
         if problem is not None:
             self._follow(read, now, self._delay)
-            return JumpVerdict(problem)
-        verdict = self._jumps.step(read[Row.LENGTH], read[Row.TENSION], used, now, self._delay)
-        self.displaced.note(verdict)
+            return problem
+        problem = self.jumps.step(read[Row.LENGTH], read[Row.TENSION], used, now, self._delay)
         # While the length offsets are unknown, lengths are unreliable in any case, so that a jump
         # is no reason to reject the message.
-        return verdict if known else verdict._replace(problem=None)
+        return problem if known else None
 
     def _follow(self, read: Array, now: float, delay: float) -> None:
         """Note the plausible lengths of a message that is rejected because of other values.
@@ -337,4 +313,4 @@ class MuscleStream:
         if offsets.known:
             is_possible = np.isfinite(self._levels.plausible_pull(read, offsets.offset)[Row.LENGTH])
             length = np.where(is_possible, length, np.nan)
-        self._jumps.follow(length, self.body.used, now, delay)
+        self.jumps.follow(length, self.body.used, now, delay)

@@ -112,7 +112,7 @@ class Wiring(NamedTuple):
         return ', and '.join(parts)
 
 
-class Judgement(NamedTuple):
+class WiringJudgement(NamedTuple):
     """What the readings tell about the wiring.
 
     Attributes:
@@ -160,7 +160,7 @@ def single_faults(wiring: Wiring, columns: Iterable[int], signs: bool = True) ->
 
 def decide(
     wiring: Wiring, cost: float, others: Sequence[tuple[Wiring, float]], better: float = COST_BETTER
-) -> Judgement:
+) -> WiringJudgement:
     """Return the wiring that explains the readings best according to costs.
 
     Args:
@@ -171,10 +171,10 @@ def decide(
     """
     likely = sorted(others, key=lambda other: other[1])
     if not likely or cost <= better * likely[0][1]:
-        return Judgement(wiring, (wiring,), (), cost)
+        return WiringJudgement(wiring, (wiring,), (), cost)
     best, least = likely[0]
     equal = tuple(other for other, its in likely if its < better * least and cost > better * its)
-    return Judgement(best, equal, (), least)
+    return WiringJudgement(best, equal, (), least)
 
 
 def judge(
@@ -185,7 +185,7 @@ def judge(
     segments: Ints | None = None,
     used: Bools | None = None,
     signs: bool = True,
-) -> Judgement:
+) -> WiringJudgement:
     """Judge by measured joint angles whether columns are exchanged or have a wrong sign.
 
     Args:
@@ -236,7 +236,7 @@ def judge(
         if misfit(wiring.exchanged(j, k), (j, k)) < BETTER**2 * misfit(wiring, (j, k)):
             unclear |= {j, k}
     right = tuple(j for j in columns.tolist() if j not in unclear and j not in wiring.faulty)
-    return Judgement(wiring, alternatives, right, np.sqrt(misfit(wiring, columns.tolist())))
+    return WiringJudgement(wiring, alternatives, right, np.sqrt(misfit(wiring, columns.tolist())))
 
 
 def square_misfits(

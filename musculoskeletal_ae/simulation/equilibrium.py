@@ -39,7 +39,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import REVERSAL
-from musculoskeletal_ae.simulation.load import Load, Tree, hold
+from musculoskeletal_ae.simulation.load import Load, LoadTree, hold
 
 #: l_target of muscles without a command [m]; MSC then holds T_bias, and modules that follow
 #: positions hold their length
@@ -109,7 +109,7 @@ class Limbs(NamedTuple):
 
 
 @njit(cache=True)
-def handed(body: Body, tree: Tree, limbs: Limbs) -> Handle:
+def handed(body: Body, tree: LoadTree, limbs: Limbs) -> Handle:
     """Return a handle with the constants of the robot, which `advance` takes as an argument."""
     return Handle((body, tree, limbs))
 

@@ -31,7 +31,7 @@ from musculoskeletal_ae.robot.passive_tendons import Passive, add_passive
 from musculoskeletal_ae.robot.wrapping import Vector, cross, dot, plus
 
 
-class Tree(NamedTuple):
+class LoadTree(NamedTuple):
     """The J joints of pinocchio and their bodies; joint 0 is the root link."""
 
     parent: Ints  # index of the parent of each joint, (J,)
@@ -81,7 +81,7 @@ def polynomial(terms: Array, order: int, x: float) -> float:
 
 
 @njit(cache=True)
-def place(tree: Tree, theta: Array, pose: Array) -> None:
+def place(tree: LoadTree, theta: Array, pose: Array) -> None:
     """Fill `pose` (J, 6, 3, N) with six vectors of each joint in the root link's frame.
 
     The vectors are the three axes of the joint's frame, its origin, the joint axis, and mass times
@@ -118,7 +118,7 @@ def place(tree: Tree, theta: Array, pose: Array) -> None:
 
 
 @njit(cache=True)
-def hold(tree: Tree, theta: Array, wrench: Array, load: Array, gradient: Array) -> None:
+def hold(tree: LoadTree, theta: Array, wrench: Array, load: Array, gradient: Array) -> None:
     """Fill load [N·m] (D, N) and its gradient ∂load/∂θ [N·m/rad] (D, D, N) at θ [rad] (D, N).
 
     The wrench [N, N·m] (6, N) acts at the end effector's origin, in axes of the root link. The
@@ -199,7 +199,7 @@ class Load:
         effector = model.frames[kin.end_effector_frame]
         joint = int(effector.parentJoint)
         mass = np.array([inertia.mass for inertia in model.inertias])
-        self.tree = Tree(
+        self.tree = LoadTree(
             parent=kin.tree.parent,
             master=kin.tree.theta_index,
             terms=kin.tree.terms,

@@ -4,6 +4,7 @@
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,12 +12,11 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.arrival import LONGEST_STEP
 from musculoskeletal_ae.bags.check import recorded_wiring
 from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
-from musculoskeletal_ae.estimation.health import HealthMonitor
+from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.exceptions import (
     BagError,
@@ -30,10 +30,8 @@ from musculoskeletal_ae.learning.recordings import (
     REST_STEPS,
     count_postures,
     errors,
-    finding_in,
     isolated_in,
     learn_table,
-    sample_of,
     table_errors,
     unchanged,
     work,
@@ -49,7 +47,7 @@ from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_readings import muscle_reading, possible_readings
-from musculoskeletal_ae.signals.muscle_stream import MuscleStream
+from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.tables.columns import UNITS, Column
 from musculoskeletal_ae.tables.csv_file import looks_like_a_sequence, read_csv
 from musculoskeletal_ae.tables.table import Table, TableError
@@ -94,6 +92,8 @@ def train(args: Namespace) -> None:
     CheckpointValidator(robot).check(mae)
     steps = REST_STEPS if at_rest else STEPS
     learner = Learner(robot, mae, args.preset, args.seed, steps=steps, from_motion=from_motion)
+    # A recording that does not tell which muscles were isolated is of the arm of this network.
+    learner.use_body(learner.body.with_isolated(mae.isolated))
     before = [table_errors(mae, source.table) for source in sources]
     try:
         for source in sources:
@@ -448,26 +448,22 @@ def anomaly_in(
 ) -> str:
     """Return a warning about the first anomaly in a recording; '' if there is none.
 
-    The warning also states the error of the estimate before the anomaly. The health
-    monitor detects the anomaly with the learned network, as on a running arm. `progress` is called
-    after each message.
+    The warning also states the error of the estimate before the anomaly. An estimator detects the
+    anomaly with the learned network, as on a running arm. `progress` is called after each message.
     """
-    stream, health = MuscleStream(robot), HealthMonitor(robot, preset)
-    isolated: tuple[int, ...] | None = None
-    steps = np.diff(recording.time, prepend=recording.time[:1])
-    for row, (at, dt) in enumerate(zip(recording.time, steps)):
-        recorded = isolated_in(recording.isolated[row], mae.isolated)
-        if recorded != isolated:
-            isolated, reduced = recorded, mae.without(recorded)
-            stream.use_body(stream.body.with_isolated(recorded))
-            stream.use_transmission(reduced.transmission)
-            health.reset()
-            health.use(reduced)
+    estimator = Estimator(robot, preset)
+    estimator.use(mae)
+    for row, at in enumerate(recording.time):
+        isolated = isolated_in(recording.isolated[row], mae.isolated)
+        if isolated != estimator.body.isolated:
+            estimator.isolate(isolated)
         reading = muscle_reading(
             robot, length=recording.length[row], tension=recording.tension[row]
         )
-        finding = finding_in(health, reduced, sample_of(stream, reading, at), min(dt, LONGEST_STEP))
+        with suppress(RejectionError):
+            estimator.take(reading, at, at)
         progress()
+        finding = estimator.suspects.finding
         if finding is None:
             continue
         muscle = robot.muscles[finding.muscle]

@@ -19,7 +19,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.view import body
 from musculoskeletal_ae.view.body import MARKS, DrawnState
 from musculoskeletal_ae.view.controls import Controls, with_buttons
-from musculoskeletal_ae.view.readings import HTML, History, Readings
+from musculoskeletal_ae.view.readings import HTML, History, ReadingsPanel
 from musculoskeletal_ae.view.scene import RIGHT_PANEL, Scene
 from musculoskeletal_ae.view.visits import checked_visits
 
@@ -76,7 +76,7 @@ class Page:
         # Visitors must not open a tunnel to the internet.
         server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
         self._history = History()
-        self._readings: dict[int, Readings] = {}  # by the client id of the visitor
+        self._readings: dict[int, ReadingsPanel] = {}  # by the client id of the visitor
         self._configure_panel()
         self.scene = Scene(server, robot)
         self.controls = None if read_only else Controls(server, robot, self.scene, act)
@@ -91,7 +91,7 @@ class Page:
         look_at, position = self.scene.viewpoint(*window, is_narrow)
         # Set the position first, because the target of the camera moves with it.
         camera.position, camera.look_at = position, look_at
-        self._readings[client.client_id] = Readings(client.gui, self._robot, is_narrow)
+        self._readings[client.client_id] = ReadingsPanel(client.gui, self._robot, is_narrow)
         self.looked_at.set()
 
     def _on_disconnect(self, client: viser.ClientHandle) -> None:

@@ -35,7 +35,7 @@ VALUE_AXIS = {
 AXES = TIME_AXIS, VALUE_AXIS
 
 
-class Curve(NamedTuple):
+class Trace(NamedTuple):
     """One plot: title, line styles, and the indices of the values that it shows."""
 
     title: str
@@ -43,13 +43,13 @@ class Curve(NamedTuple):
     values: tuple[int, ...]
 
 
-def curves(unit: str) -> tuple[Curve, ...]:
+def curves(unit: str) -> tuple[Trace, ...]:
     """Return the plots; `unit` is the unit of the estimation error."""
     return (
-        Curve(f'error of the estimate [{unit}]', (GREEN,), (0,)),
-        Curve('A: mismatch between T and l', (BLUE,), (1,)),
+        Trace(f'error of the estimate [{unit}]', (GREEN,), (0,)),
+        Trace('A: mismatch between T and l', (BLUE,), (1,)),
         # There is no dashed line until the detector is calibrated.
-        Curve('d: A relative to its healthy spread (dashed: limit)', (BLUE, DASHED), (2, 3)),
+        Trace('d: A relative to its healthy spread (dashed: limit)', (BLUE, DASHED), (2, 3)),
     )
 
 
@@ -93,11 +93,11 @@ def scale_top(largest: float) -> float:
     return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= largest)
 
 
-class Readings:
+class ReadingsPanel:
     """The readings of one visitor, in a separate panel unless the window is narrow."""
 
     def __init__(self, gui: Any, robot: Robot, is_narrow: bool) -> None:
-        self._plots: list[tuple[Curve, Any]] = []
+        self._plots: list[tuple[Trace, Any]] = []
         self._tops: list[float] = []
         if is_narrow:
             self._status = gui.add_html('', order=-2.0)

@@ -11,8 +11,9 @@ from hypothesis.extra.numpy import arrays
 
 from musculoskeletal_ae.arrays import median_of_rows
 from musculoskeletal_ae.control.command import LENGTH, TENSION, Command, unchanging
-from musculoskeletal_ae.control.limiter import LENGTH_MARGIN, CommandLimiter
+from musculoskeletal_ae.control.limiter import CommandLimiter
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.robot.model_errors import LARGEST
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot.load('arm26')
@@ -106,7 +107,7 @@ def test_a_wrong_length_sensor_pays_out_to_the_longest_length_of_the_muscle_at_m
         held = unchanging(ROBOT, LENGTH, sample(0.0, BIAS))
         sent = limiter.limit(held, sample(5.0, BIAS), LIMIT, DT).value
     theta = ROBOT.random_postures(2000, np.random.default_rng(3))
-    assert (sent <= ROBOT.routes.relative_lengths(theta).max(axis=0) + 1.1 * LENGTH_MARGIN).all()
+    assert (sent <= ROBOT.routes.relative_lengths(theta).max(axis=0) + 1.1 * LARGEST).all()
 
 
 @hypothesis_settings(max_examples=40)

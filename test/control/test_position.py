@@ -179,6 +179,10 @@ def test_the_length_command_is_the_length_itself():
 class WithJointSensors(ClosedLoop):
     """A loop in which joint sensors replace the estimate."""
 
+    def use(self, mae):
+        self.mae = mae
+        self.core.use(mae)
+
     def estimate(self, read, now):  # noqa: ARG002
         return read.theta
 

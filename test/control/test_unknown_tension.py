@@ -30,6 +30,10 @@ COUNT, THETA = ROBOT.muscle_count, np.array([-0.3, -1.0])
 
 
 class WithJointSensors(ClosedLoop):
+    def use(self, mae):
+        self.mae = mae
+        self.core.use(mae)
+
     def estimate(self, read, now):  # noqa: ARG002
         return read.theta
 

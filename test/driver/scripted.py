@@ -37,6 +37,11 @@ class RecordedArm:
         """Do nothing: the recorded arm was moved, or it was not."""
 
 
+def muscle_rows(read: Any) -> np.ndarray:
+    """Return the rows l [m], T [N] and temperature [°C] of a reading of an emulated arm, (3, M)."""
+    return np.stack([read.length, read.tension, read.temperature])
+
+
 class Driver:
     """Publishes muscle_states and follows muscle_length_command, with the selected faults."""
 
@@ -69,7 +74,7 @@ class Driver:
             self._target = self._commands.popleft()[1]
         if self._target is not None and self.in_tension:
             for _ in range(round(PERIOD / self.law_period)):
-                rows = np.stack(self.arm.sense()[1:])
+                rows = muscle_rows(self.arm.sense())
                 self.arm.command_tension(self.in_tension(self._target, rows))
                 self.arm.step(self.law_period)
         else:
@@ -80,7 +85,7 @@ class Driver:
             return []
         self._sent = self.now
         read = self.arm.faults.deliver(self.arm.sense(), self.now)
-        return [(each.theta, self.publish(np.stack(each[1:]))) for each in read]
+        return [(each.theta, self.publish(muscle_rows(each))) for each in read]
 
     def command(self, target: np.ndarray) -> None:
         """Receive l_target [m], (M,); follow it after `late` seconds."""

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import yaml
 
-from driver.scripted import Driver, RecordedArm, array, joint_state, record
+from driver.scripted import Driver, RecordedArm, array, joint_state, muscle_rows, record
 from musculoskeletal_ae import message_reading
 from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.driver.listening import Listening
@@ -693,7 +693,7 @@ def test_a_driver_that_falls_silent_is_found():
 @pytest.mark.parametrize('share', [0.1, 0.3])
 def test_sensors_with_hardly_any_noise_are_no_fault(share):
     rng = np.random.default_rng(0)
-    steps, still = np.array([[1e-5], [0.5], [0.1]]), np.stack(recording(False)[-1][1:])
+    steps, still = np.array([[1e-5], [0.5], [0.1]]), muscle_rows(recording(False)[-1])
 
     def publish(_):
         return np.rint(still / steps + share * rng.normal(size=still.shape)) * steps
@@ -1005,7 +1005,7 @@ POSITION_FAULTS = {
 def test_each_fault_of_a_driver_that_follows_positions_is_detected(fault):
     driver = Driver(POSITION, 0)
     driver.listen(1.0)
-    home = np.stack(driver.arm.sense()[1:])
+    home = muscle_rows(driver.arm.sense())
     where, value, what = POSITION_FAULTS[fault]
     if value == 'half':
         value = lambda target: home[0] + 0.4 * (target - home[0])  # noqa: E731

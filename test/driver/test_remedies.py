@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from robots import copy_robot, read_muscles, write_muscles
 
-from driver.scripted import Driver, array, joint_state
+from driver.scripted import Driver, array, joint_state, muscle_rows
 from driver.test_faults import (
     BIAS,
     BICEPS,
@@ -866,7 +866,7 @@ def position(spoil):
 
     def make():
         driver = copy.deepcopy(_settled_position())
-        spoil(driver, np.stack(driver.arm.sense()[1:]))
+        spoil(driver, muscle_rows(driver.arm.sense()))
         return driver
 
     return make

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """External forces are exact with an exact network, and without a force there is no contact."""
 
-from dataclasses import dataclass, replace
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -163,43 +162,37 @@ def test_the_observer_is_stable_at_any_rate(dt):
     np.testing.assert_allclose(contact.force(), [0.0, 20.0, 0.0], atol=1.0)
 
 
-@dataclass
-class StatedPosture:
-    """A network with exact muscle lengths, whose estimate is always the posture `theta` [rad]."""
-
-    theta: np.ndarray
-    touch: TouchStatistics
-    exact = ExactMae(ARM)
-    friction, elasticity = exact.friction, None
-    transmission = exact.transmission
-
-    def estimate(self, *_):
-        return SimpleNamespace(theta=self.theta)
-
-    def muscle_jacobian(self, theta, tension):
-        return self.exact.muscle_jacobian(theta, tension)
-
-
-def test_healthy_torque_is_measured_in_motion_and_a_touch_hardly_counts():
-    unknown = TouchStatistics(np.zeros(10), np.zeros(5), 0.0)
-    core, image = HealthyTorque(ARM), StatedPosture(THETA.copy(), unknown)
-    core.use(image)
-    rng = np.random.default_rng(0)
-    tension, length = pulling(THETA)
+def test_healthy_torque_is_measured_in_motion_and_a_touch_hardly_counts(mae):
+    unknown = replace(mae, touch=TouchStatistics(np.zeros(10), np.zeros(5), 0.0))
+    core, rng = HealthyTorque(5), np.random.default_rng(0)
 
     def move(seconds, push=0.0):
-        for n in range(round(seconds / DT)):
-            image.theta[:] = THETA + 0.3 * np.sin(2.0 * n * DT)
-            noise = rng.normal(0.0, 20.0, 10)
-            core.step(tension + push + noise, length, DT)
+        for _ in range(round(seconds / DT)):
+            core.step(rng.normal(push, 2.0, 5), np.full(5, 0.3), DT)
 
-    for _ in range(100):
-        core.step(tension, length, DT)
-    assert core.use(image).touch.time == 0.0  # only motion counts, and the arm was at rest
+    assert core.put_into(mae) is mae  # it has no statistics
+    core.step(np.full(5, 9.0), np.zeros(5), DT)
+    assert core.put_into(unknown).touch.time == 0.0  # only motion counts, and the arm was at rest
     move(LEAST_MOTION + 2.0)
-    healthy = core.use(image).touch.spread
-    move(1.0, push=500.0)
-    assert (core.use(image).touch.spread < 1.5 * healthy).all()
+    healthy = core.put_into(unknown).touch
+    assert healthy.calibrated
+    np.testing.assert_allclose(healthy.spread, 2.0, rtol=0.1)
+    move(1.0, push=50.0)
+    assert (core.put_into(unknown).touch.spread < 1.5 * healthy.spread).all()
+
+
+def test_a_network_is_used_with_the_residual_torque_measured_so_far(robot, mae):
+    before = TouchStatistics(np.zeros(6), np.full(2, 0.3), LEAST_MOTION)
+    core, middle = Estimator(robot), 0.5 * (robot.lower + robot.upper)
+    core.use(replace(mae, touch=before))
+    for n in range(300):
+        theta = middle + 0.5 * np.sin(2.0 * n * DT)
+        tension, length = pulling(theta, robot=robot)
+        core.take(reading(states(tension, length)), n * DT, n * DT)
+    unmeasured = TouchStatistics(np.zeros(6), np.ones(2))
+    touch = core.use(replace(mae, touch=unmeasured)).touch
+    assert touch.time > LEAST_MOTION
+    assert (touch.spread != before.spread).all()
 
 
 def test_the_estimator_reports_contacts(robot, mae):

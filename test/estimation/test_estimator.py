@@ -13,7 +13,7 @@ from musculoskeletal_ae.estimation.detectors.missing_values import SILENT
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.module_commands import COMMAND_AGE
-from musculoskeletal_ae.estimation.settings import Settings
+from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 
@@ -156,7 +156,7 @@ def test_a_muscle_without_numbers_is_isolated_only_if_it_lacks_them_in_all_messa
     robot, mae, healthy, network
 ):
     core = Estimator(robot)
-    core.configure(Settings(on_anomaly='isolate'))
+    core.configure(EstimatorSettings(on_anomaly='isolate'))
     if network:
         core.use(mae)
     sound = states(healthy)

@@ -8,7 +8,7 @@ import pytest
 
 from musculoskeletal_ae.estimation.finding import observe
 from musculoskeletal_ae.estimation.joint_check import JointCheck
-from musculoskeletal_ae.signals.joint_trust import Trust
+from musculoskeletal_ae.signals.joint_trust import SensorTrust
 
 DT = 0.5
 
@@ -106,6 +106,6 @@ def test_the_changed_length_of_a_muscle_is_not_blamed_on_a_sensor(arm, muscle, c
 def test_a_sensor_that_the_user_confirms_is_trusted_with_its_new_readings(arm):
     arm.go(20.0, slip(0.3))
     assert arm.check.confirm() == (1,)
-    assert arm.check.trust.trust[1] is Trust.CONFIRMED
+    assert arm.check.trust.trust[1] is SensorTrust.CONFIRMED
     arm.go(60.0, slip(0.3))
     assert arm.doubted == ()

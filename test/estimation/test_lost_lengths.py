@@ -12,7 +12,7 @@ from readings import reading
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
-from musculoskeletal_ae.estimation.settings import Settings
+from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.remedy import REPAIR, Step, sentence
 from musculoskeletal_ae.signals.body_state import Anomaly
@@ -30,7 +30,7 @@ class MovingArm:
     def __init__(self, robot, mae, **detection):
         self.robot, self.core, self.time = robot, Estimator(robot), 0.0
         self.core.use(mae)
-        self.core.configure(Settings(**detection))
+        self.core.configure(EstimatorSettings(**detection))
         self.rng = np.random.default_rng(0)
         self.off, self.joint_off = np.zeros(robot.muscle_count), np.zeros(robot.joint_count)
         self.tension = robot.tension.bias + 20.0
@@ -279,7 +279,7 @@ def test_the_repair_of_a_suspect_keeps_the_offsets(ruptured):
     # The larger deviation tells the other nodes that the estimator has confirmed the length.
     grown = ruptured.offsets.deviation > before.deviation
     assert np.flatnonzero(grown).tolist() == [2]
-    assert not ruptured.core.stream.displaced.muscles
+    assert not ruptured.core.stream.jumps.displaced
 
 
 @pytest.mark.parametrize('jump', [SEVERAL, 0.1 * np.eye(6)[4]])
@@ -401,7 +401,7 @@ def test_joint_sensors_that_are_dead_decide_nothing(robot, mae):
 
 def isolated_for(arm, seconds):
     """Return an arm with joint sensors of which muscle 2 has ruptured and is isolated."""
-    arm.core.configure(Settings(on_anomaly='isolate'))
+    arm.core.configure(EstimatorSettings(on_anomaly='isolate'))
     arm.core.isolate([2])
     arm.off, arm.tense = -0.2 * np.eye(6)[2], 1.0 - np.eye(6)[2]
     arm.go(seconds)
@@ -459,7 +459,7 @@ def test_a_muscle_with_another_length_offset_can_be_restored_after_a_calibration
 
 @pytest.mark.parametrize(('on_anomaly', 'isolated'), [('stop', ()), ('isolate', (2,))])
 def test_one_wrong_length_revokes_no_other_offset(moved, on_anomaly, isolated):
-    moved.core.configure(Settings(on_anomaly=on_anomaly))
+    moved.core.configure(EstimatorSettings(on_anomaly=on_anomaly))
     for share in np.linspace(0.0, 1.0, 25):
         moved.off = -0.15 * share * np.eye(6)[2]
         moved.go(0.04)

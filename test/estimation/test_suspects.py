@@ -5,7 +5,7 @@ import pytest
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Finding
-from musculoskeletal_ae.estimation.settings import Settings
+from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.estimation.suspects import ACQUITTALS, WITHIN, SuspectHandling
 from musculoskeletal_ae.estimation.verification import Outcome, VerificationVerdict
 
@@ -15,7 +15,7 @@ DISTANCE = Finding(1, ConditionKind.RESIDUAL_DISTANCE, 'd = 9')
 @pytest.fixture
 def suspects(robot):
     handling = SuspectHandling(robot)
-    handling.settings = Settings(on_anomaly='isolate')
+    handling.settings = EstimatorSettings(on_anomaly='isolate')
     return handling
 
 
@@ -33,7 +33,7 @@ def suspects(robot):
     ],
 )
 def test_the_consequences_of_each_finding(suspects, kind, on_anomaly, latched, isolated, verified):
-    suspects.settings = Settings(on_anomaly=on_anomaly)
+    suspects.settings = EstimatorSettings(on_anomaly=on_anomaly)
     assert suspects.take(Finding(2, kind, ''), (), 0.0) == isolated
     assert (suspects.finding is not None) == latched
     assert (suspects.verification is not None) == verified
@@ -61,7 +61,7 @@ def test_the_first_finding_stays_latched(suspects, robot):
     ],
 )
 def test_only_a_jump_of_the_suspect_alone_is_explained_by_its_repair(suspects, kind, jump):
-    suspects.settings = Settings(on_anomaly='stop')
+    suspects.settings = EstimatorSettings(on_anomaly='stop')
     finding = Finding(1, kind, '')
     suspects.take(finding, (), 0.0)
     is_repair = jump == Finding(1, ConditionKind.LENGTH_JUMP, '')

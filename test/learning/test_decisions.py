@@ -3,12 +3,14 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.signals.body_state import Anomaly
 
 REASON = 'l by ①, brachialis: relative error 3 from the geometric model, limit 1.7'
@@ -168,10 +170,16 @@ def test_the_first_network_stays_if_it_is_rejected(scene):
     assert len(scene.published) == 1
 
 
-def test_the_isolated_muscles_stay_isolated_after_a_rejection(scene):
-    scene.learner.note_accepted(scene.published[-1])
-    scene.learner.isolate([2])
-    scene.wait()
-    scene.reject(scene.published[-1])
-    scene.wait()
-    assert scene.learner.mae.isolated == (2,)
+def test_the_residual_torque_of_the_estimator_is_saved_and_stays_in_the_next_candidate(
+    scene, initial
+):
+    unmeasured = TouchStatistics(np.zeros(6), np.ones(2))
+    candidate = scene.propose(replace(initial, touch=unmeasured))
+    measured = replace(unmeasured, spread=np.full(2, 0.3), time=90.0)
+    scene.learner.note_accepted(replace(candidate, touch=measured))
+    saved = checkpoint.from_bytes(scene.learner.checkpoint, scene.learner.robot)
+    assert saved.version == candidate.version
+    newer = scene.propose(replace(initial, touch=unmeasured))
+    for touch in (saved.touch, newer.touch):
+        assert touch.time == 90.0
+        np.testing.assert_array_equal(touch.spread, 0.3)

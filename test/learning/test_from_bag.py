@@ -17,6 +17,7 @@ from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.estimation import estimator
 from musculoskeletal_ae.estimation.finding import Finding
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.learning import recordings
@@ -112,12 +113,12 @@ def test_isolated_muscles_of_a_recording_are_neither_learned_nor_used(arm26, ini
     assert error(initial, recording) < 0.1 * error(initial, nothing_said)
     learner = Learner(arm26, initial, steps=1)
     learn(learner, part(recording, 0.0, 4.0))
-    assert learner.isolated == learner.mae.isolated == (2,)
+    assert learner.isolated == (2,)
     (known,) = learner.samples.known
     assert np.flatnonzero(~known).tolist() == [2]
     learn(learner, part(recording, 4.0, 5.0))
     assert learner.isolated == ()
-    learner.isolate((1,))
+    learner.use_body(learner.body.with_isolated((1,)))
     learn(learner, nothing_said)
     assert learner.isolated == (1,)
 
@@ -315,8 +316,7 @@ def test_an_anomaly_in_a_held_out_recording_is_reported_with_the_error_before_it
     length, nobody = initial.lengths(theta, tension), np.zeros(tension.shape, dtype=int)
     recording = Pairs(0.01 * np.arange(count), theta, length, tension, nobody)
     assert anomaly_in(arm26, recording, initial, 'default') == ''
-    monkeypatch.setattr(recordings, 'HealthMonitor', Monitor)
-    monkeypatch.setattr(recording_learning, 'HealthMonitor', Monitor)
+    monkeypatch.setattr(estimator, 'HealthMonitor', Monitor)
     learner = Learner(arm26, initial)
     assert 'learning stopped 3.0 s after the start: an anomaly' in learn(learner, recording)
     text = anomaly_in(arm26, recording, initial, 'default')

@@ -6,8 +6,6 @@ import numpy as np
 from learning.conftest import job
 from learning.test_learner import IdleTrainer
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.signals.body_state import Anomaly
 
 LOST = 2
 
@@ -36,39 +34,34 @@ def test_readings_of_an_isolated_muscle_do_not_change_its_body(learned):
     assert np.isfinite(update.loss)
 
 
-def test_isolated_muscles_and_samples_outlast_a_restart_of_the_learner(
+def test_isolated_muscles_are_left_out_of_samples_and_of_the_next_update(
     arm26, initial, stage, tmp_path
 ):
     learner = Learner(arm26, initial, trainer=IdleTrainer, directory=tmp_path)
     for _ in range(3):
         learner.accept(stage.sample())
-    learner.isolate((LOST,))
-    body = learner.body
-    learner.accept(stage.sample()._replace(isolated=body.isolated))
+    learner.use_body(learner.body.with_isolated((LOST,)))
+    learner.accept(stage.sample()._replace(isolated=learner.isolated))
     assert [known[LOST] for known in learner.samples.known] == [True] * 3 + [False]
     assert learner.trainer.jobs == []
-    data = learner.poll(0.0)
-    assert checkpoint.from_bytes(data, arm26).isolated == (LOST,)
+    learner.poll(0.0)
     assert learner.trainer.jobs[-1].isolated == (LOST,)
     learner.close()
     again = Learner(arm26, trainer=IdleTrainer, directory=tmp_path)
-    assert again.isolated == again.mae.isolated == (LOST,)
-    assert len(again.samples) == 4
     assert [sample.isolated for sample in again.samples.samples] == [()] * 3 + [(LOST,)]
-    again.isolate(())
-    assert checkpoint.from_bytes(again.checkpoint, arm26).isolated == ()
     again.close()
 
 
-def test_while_a_suspect_is_verified_nothing_is_published(arm26, initial):
-    learner = Learner(arm26, initial, trainer=IdleTrainer)
-    learner.use_body(learner.body.with_anomaly(Anomaly.FOUND, 0))
-    version = learner.mae.version
-    learner.isolate((LOST,))
-    learner.isolate(())  # the verification has found that the muscle is healthy
-    learner.use_body(learner.body.with_anomaly(Anomaly.ENDED, 0))
-    assert learner.mae.version == version
-    learner.use_body(learner.body.with_anomaly(Anomaly.FOUND, 0))
-    learner.isolate((LOST,))
-    learner.use_body(learner.body.with_anomaly(Anomaly.ENDED, 0))
-    assert learner.mae.isolated == (LOST,)
+def test_a_restarted_learner_isolates_nothing_and_keeps_its_network_as_it_was(
+    arm26, initial, tmp_path
+):
+    learner = Learner(arm26, initial.without((LOST,)), trainer=IdleTrainer, directory=tmp_path)
+    learner.close()
+    again = Learner(arm26, trainer=IdleTrainer, directory=tmp_path)
+    assert again.isolated == ()
+    assert again.mae.isolated == (LOST,)
+    saved = again.checkpoint
+    again.use_body(again.body.with_isolated((LOST,)))
+    again.use_body(again.body.with_isolated(()))
+    assert again.checkpoint == saved
+    again.close()

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from robots import write_robot
 
+from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.margin import MARGIN
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics
 from musculoskeletal_ae.robot.robot import Robot
@@ -107,12 +107,12 @@ def test_the_same_stream_gives_the_same_network(arm26, initial, stage):
 
 def test_a_rest_becomes_one_sample_and_the_same_posture_no_second_one(learner, stage):
     arm = Arm(learner, stage)
-    posture = arm.rest(1.0 + MARGIN + 0.5)
+    posture = arm.rest(1.0 + DETECTION_DELAY + 0.5)
     assert len(learner.samples) == 1
     arm.rest(5.0, posture)
     assert len(learner.samples) == 1
     assert learner.collector.rejected['like a stored one'] > 0
-    arm.rest(1.0 + MARGIN + 0.5)
+    arm.rest(1.0 + DETECTION_DELAY + 0.5)
     assert len(learner.samples) == 2
 
 
@@ -200,7 +200,7 @@ def test_an_anomaly_stops_learning_until_its_reset(learner, stage):
     assert learner.trainer.jobs == []
     assert len(learner.samples) == 2
     learner.use_body(learner.body.with_anomaly(Anomaly.ENDED, 0))
-    arm.rest(2.0 * MARGIN + 1.5)
+    arm.rest(2.0 * DETECTION_DELAY + 1.5)
     assert len(learner.samples) == 3
     assert learner.trainer.jobs
 
@@ -213,19 +213,19 @@ def test_a_disabled_learner_learns_nothing(learner, stage):
     assert learner.trainer.jobs == []
     assert len(learner.samples) == 2
     learner.enable(True)
-    arm.rest(MARGIN + 1.5)
+    arm.rest(DETECTION_DELAY + 1.5)
     assert len(learner.samples) == 3
 
 
 def test_nothing_is_learned_while_the_length_offsets_are_unknown(learner, stage):
     learner.use_body(learner.body.with_offsets(LengthOffsets.unknown(6)))
     arm = Arm(learner, stage)
-    arm.rest(2.0 * MARGIN)
+    arm.rest(2.0 * DETECTION_DELAY)
     assert len(learner.samples) == 0
     assert 'length offsets are unknown' in learner.report().message
     learner.use_body(learner.body.with_offsets(LengthOffsets.none(6)))
     # The learner first compares the new offsets with messages, so the first sample comes later.
-    arm.rest(3.0 * MARGIN)
+    arm.rest(3.0 * DETECTION_DELAY)
     assert len(learner.samples) == 1
 
 
@@ -259,13 +259,13 @@ def test_distinct_rests_are_counted_since_the_arm_was_changed(learner, stage):
     arm = Arm(learner, stage)
     for _ in range(3):
         posture = arm.rest(1.5)
-    arm.rest(MARGIN, posture)
+    arm.rest(DETECTION_DELAY, posture)
     for _ in range(2):
         learner.poll(arm.time)
         arm.rest(1.0, posture)
     assert learner.trainer.jobs[-1].healthy.rests == len(learner.samples) >= 3
     learner.relearn([0])
-    arm.rest(2.0 + MARGIN, posture)
+    arm.rest(2.0 + DETECTION_DELAY, posture)
     assert learner.trainer.jobs[-1].healthy.rests <= 1
 
 
@@ -282,10 +282,11 @@ def test_a_roll_back_does_not_restore_the_calibration_of_the_arm_before(learner,
     assert not calibrated(learner)
 
 
-def test_a_replaced_network_keeps_the_isolated_muscles(learner, initial):
-    learner.isolate((3,))
+def test_a_replaced_network_does_not_change_the_isolated_muscles(learner, initial):
+    learner.use_body(learner.body.with_isolated((3,)))
     learner.replace(initial)
-    assert learner.isolated == learner.mae.isolated == (3,)
+    assert learner.isolated == (3,)
+    assert learner.mae.isolated == ()
 
 
 def test_a_replaced_network_drops_samples_and_continues_the_version_count(learner, initial, stage):
@@ -359,7 +360,7 @@ def test_an_accelerometer_adds_the_direction_of_gravity_to_the_rests_it_is_recei
             arm.rest(0.1, last)
             for link in heard:
                 learner.imu(arm.time, link, UP)
-    arm.rest(MARGIN + 0.1)
+    arm.rest(DETECTION_DELAY + 0.1)
     for sample, heard in rests:
         reported = min(
             learner.samples.samples, key=lambda s: np.abs(s.length - sample.length).max()
@@ -377,7 +378,7 @@ def test_an_accelerometer_reading_in_motion_is_not_used_for_the_next_rest(arm26,
     for sample in between(start, end, 40):
         arm.send(sample)
         learner.imu(arm.time, 'forearm', UP)
-    arm.rest(1.0 + MARGIN + 0.1, end)
+    arm.rest(1.0 + DETECTION_DELAY + 0.1, end)
     assert len(learner.samples) >= 2
     assert not any(sample.gravity.size for sample in learner.samples.samples)
 
@@ -447,7 +448,7 @@ def test_impossible_joint_readings_are_never_learned(learner, stage, value, coun
     wrong = np.array([sample.theta[0], value])
     for _ in range(count):
         arm.send(sample._replace(theta=wrong))
-    arm.rest(MARGIN + 3.0, sample)
+    arm.rest(DETECTION_DELAY + 3.0, sample)
     assert len(learner.samples) == 1
     np.testing.assert_allclose(learner.samples.samples[0].theta, sample.theta, atol=1e-6)
 

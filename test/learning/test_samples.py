@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from readings import reading as message
 
+from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.collector import SampleCollector
-from musculoskeletal_ae.learning.margin import MARGIN
 from musculoskeletal_ae.learning.rest import RestDetector
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.signals.body_state import Anomaly, LengthOffsets
@@ -189,7 +189,7 @@ def middle(robot):
 
 def test_a_rest_counts_after_the_margin(messages, arm26):
     theta, _, _ = middle(arm26)
-    assert messages.rest(theta, MARGIN) == []
+    assert messages.rest(theta, DETECTION_DELAY) == []
     (sample,) = messages.rest(theta, 1.5)
     np.testing.assert_allclose(sample.theta, theta)
 
@@ -203,8 +203,8 @@ def test_samples_shortly_before_an_anomaly_are_not_learned(messages, arm26):
     assert collector.rejected['anomaly'] > 5
     observed = collector.healthy.time
     collector.use_body(collector.body.with_anomaly(Anomaly.ENDED, 0))
-    assert messages.rest(theta, MARGIN) == []
-    assert len(messages.rest(theta, MARGIN + 1.5)) == 1
+    assert messages.rest(theta, DETECTION_DELAY) == []
+    assert len(messages.rest(theta, DETECTION_DELAY + 1.5)) == 1
     assert collector.healthy.time > observed
 
 
@@ -233,26 +233,26 @@ def test_the_direction_of_friction_is_unknown_after_a_gap_in_the_stream(messages
     theta, pull, length = middle(arm26)
     for n in range(50):  # wind in all muscles, so that the direction of friction is known
         messages.send(theta, pull, length + 0.01 - 0.0002 * n)
-    (sample,) = messages.rest(theta, 1.0 + MARGIN + 0.1)
+    (sample,) = messages.rest(theta, 1.0 + DETECTION_DELAY + 0.1)
     assert (sample.direction > 0.5).all()
-    (sample,) = messages.rest(theta, 2.0 + MARGIN, tension=80.0, dt=LIMITS.pause + 1.0)
+    (sample,) = messages.rest(theta, 2.0 + DETECTION_DELAY, tension=80.0, dt=LIMITS.pause + 1.0)
     assert (sample.direction == 0.0).all()
 
 
 def test_a_sample_names_the_muscles_that_were_isolated_when_it_was_taken(messages, arm26):
     theta, _, _ = middle(arm26)
     collector = messages.collector
-    (healthy,) = messages.rest(theta, 2.0 + MARGIN)
+    (healthy,) = messages.rest(theta, 2.0 + DETECTION_DELAY)
     assert healthy.isolated == ()
     body = collector.body.with_isolated([2])
     collector.use_body(body)
-    (isolated,) = messages.rest(theta, 2.0 + MARGIN, tension=80.0)
+    (isolated,) = messages.rest(theta, 2.0 + DETECTION_DELAY, tension=80.0)
     assert isolated.isolated == (2,)
     assert isolated.length[2] == isolated.tension[2] == 0.0
     offsets = LengthOffsets(np.full(6, 0.003), np.zeros(6))
     body = body.with_isolated([]).with_offsets(offsets)
     collector.use_body(body)
-    (moved,) = messages.rest(theta, 2.0 + MARGIN, tension=100.0)
+    (moved,) = messages.rest(theta, 2.0 + DETECTION_DELAY, tension=100.0)
     assert moved.isolated == ()
     pull = np.full(6, 100.0)
     np.testing.assert_allclose(moved.length, arm26.muscle_lengths(theta, pull) - 0.003)

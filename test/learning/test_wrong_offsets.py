@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from learning.test_learner import Arm, IdleTrainer
+from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.margin import MARGIN
 from musculoskeletal_ae.learning.offset_history import OffsetHistory
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.body_state import LengthOffsets, Trust
 
 OFF = 0.08 * np.array([1.0, 0.9, -0.8, -0.9, 0.9, -1.0])
-POSTURE = 1.0 + MARGIN + 0.5  # duration of a rest that is long enough for a sample [s]
+POSTURE = 1.0 + DETECTION_DELAY + 0.5  # duration of a rest that is long enough for a sample [s]
 
 
 class ArmWithOffsets(Arm):

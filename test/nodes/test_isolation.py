@@ -124,15 +124,13 @@ def test_a_restarted_estimator_remembers_isolated_muscles(graph, arm26, trained)
     assert bodies[-1].isolated == (2,)
 
 
-def test_at_its_first_start_the_estimator_isolates_what_the_chosen_network_lacks(
-    graph, trained, tmp_path
-):
+def test_the_estimator_isolates_no_muscle_because_a_network_lacks_it(graph, trained, tmp_path):
     file = str(tmp_path / 'without.safetensors')
     checkpoint.save(trained['default'].without((4,)), file)
     bodies = graph.follow_body()
     graph.host(Estimator, robot='arm26', checkpoint=file)
     graph.wait(lambda: bodies, 'the body state')
-    assert bodies[-1].isolated == (4,)
+    assert bodies[-1].isolated == ()
 
 
 def test_a_stop_outlasts_a_restart_of_the_estimator_and_no_suspect_is_used_again(arm):

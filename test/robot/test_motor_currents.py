@@ -136,6 +136,10 @@ def test_the_driver_check_accepts_currents_and_names_wrong_units():
 
 
 class WithJointSensors(ClosedLoop):
+    def use(self, mae):
+        self.mae = mae
+        self.core.use(mae)
+
     def estimate(self, read, now):  # noqa: ARG002
         return read.theta
 

@@ -21,7 +21,7 @@ from robots import (
     write_robot,
 )
 
-from musculoskeletal_ae.design.checks import FINDINGS, Finding, check_robot
+from musculoskeletal_ae.design.checks import FINDINGS, CheckFinding, check_robot
 from musculoskeletal_ae.robot.robot import Robot
 
 from .test_check_robot import IDLE, drop_straighteners, in_millimetres
@@ -40,7 +40,7 @@ class Row(NamedTuple):
 
     write: Callable[[Path], object]  # writes a robot directory with the finding
     remedy: str  # a part of the remedy
-    edits: list[Callable[[Path, Finding], object]]
+    edits: list[Callable[[Path, CheckFinding], object]]
 
 
 def edited(edit):

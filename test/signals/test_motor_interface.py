@@ -16,6 +16,7 @@ from musculoskeletal_ae.message_reading import read_muscle_states
 from musculoskeletal_ae.robot.motors import Motors, MotorTopics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
+from musculoskeletal_ae.signals.muscle_readings import QUANTITIES
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 
 MOTORS = 'm0', 'm1', 'm2'
@@ -46,7 +47,7 @@ def joint_state(names=('m1', 'elbow', 'm0', 'gripper', 'm2'), stamp=1, **changes
 
 
 def states(message, motors=CONNECTED):
-    return np.reshape(MotorInterface(motors).reading(message).data, (3, -1))
+    return np.reshape(MotorInterface(motors).reading(message).data, (len(QUANTITIES), -1))
 
 
 def directly(robot):

@@ -177,18 +177,18 @@ def jump_together(stream, size=0.05, pause=0.0):
 def test_lengths_that_jump_together_are_all_named_and_displaced_until_new_offsets_are_found():
     stream = MuscleStream(ROBOT)
     assert jump_together(stream) == [0, 1, 2]
-    assert stream.displaced.muscles == {0, 1, 2}
-    assert not stream.displaced.is_unseen
+    assert stream.jumps.displaced == {0, 1, 2}
+    assert stream.has_jumped
     stream.use_body(HEALTHY.with_offsets(REVOKED))
-    assert stream.displaced.muscles == {0, 1, 2}
+    assert stream.jumps.displaced == {0, 1, 2}
     stream.use_body(HEALTHY.with_offsets(LengthOffsets.unknown(M)))
-    assert not stream.displaced.muscles
+    assert not stream.jumps.displaced
 
 
 def test_a_jump_during_a_pause_is_distinguished_from_one_between_messages():
     stream = MuscleStream(ROBOT)
     assert jump_together(stream, size=0.09, pause=2.0 * LIMITS.pause) == [0, 1, 2]
-    assert stream.displaced.is_unseen
+    assert stream.jumps.displaced and not stream.has_jumped
 
 
 def taken(stream, deliveries):
@@ -292,7 +292,7 @@ def test_an_isolated_muscle_is_no_longer_displaced():
     stream = MuscleStream(ROBOT)
     jump_together(stream)
     stream.use_body(stream.body.with_isolated([1]))
-    assert stream.displaced.muscles == {0, 2}
+    assert stream.jumps.displaced == {0, 2}
 
 
 def test_implausible_messages_are_a_fault_once_they_outlast_a_glitch():
@@ -366,7 +366,7 @@ def test_failed_reads_of_all_motors_of_a_moving_arm_do_not_reject_what_follows(f
             used.append(n)
     right = [n for n in range(len(time)) if n % 90 not in range(50, 50 + count)]
     assert set(right) <= set(used)
-    assert not stream.displaced.muscles
+    assert not stream.jumps.displaced
 
 
 @pytest.mark.parametrize('wrong', [{'length': (0, np.nan)}, {'tension': (0, 9e3)}])
@@ -380,4 +380,4 @@ def test_an_arm_that_moves_while_one_sensor_fails_has_no_jump_afterwards(wrong):
         except RejectionError as rejection:
             reasons.append(rejection.reason)
     assert len(reasons) == 500 and 'length jumped' not in reasons
-    assert not stream.displaced.muscles
+    assert not stream.jumps.displaced

@@ -24,7 +24,7 @@ from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
-from musculoskeletal_ae.signals.wiring import Judgement
+from musculoskeletal_ae.signals.wiring import WiringJudgement
 
 SHIFTED = 0.02  # use an estimated offset if it differs by more than this from the one in use [m]
 #: Reject a stated posture if a joint sensor differs by more than this [rad]. A larger difference is
@@ -99,7 +99,7 @@ class CheckedCalibration:
         return self._calibration.problem or self._problem
 
     @property
-    def wiring(self) -> Judgement | None:
+    def wiring(self) -> WiringJudgement | None:
         """What the newest fit tells about order and signs of the columns; None before the first."""
         return self._calibration.wiring
 

@@ -33,7 +33,7 @@ from musculoskeletal_ae.mae.residuals import anomaly, residuals
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_readings import Row
-from musculoskeletal_ae.signals.wiring import Judgement, Wiring, decide, single_faults
+from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement, decide, single_faults
 
 SPACING = 0.25  # time between two messages that are kept [s]
 USUAL_COUNT = 120  # number of messages whose median A is the usual one
@@ -159,7 +159,7 @@ class ExchangeCheck:
         changed = tuple(np.flatnonzero(has_changed).tolist())
         return finding_of(changed) if len(changed) > 1 else None
 
-    def _judge_silence(self) -> Judgement | None:
+    def _judge_silence(self) -> WiringJudgement | None:
         """Return which wiring makes lengths continue over the last silence; None if unknown."""
         if self._silence is None or self._mae is None:
             return None
@@ -180,12 +180,12 @@ class ExchangeCheck:
             if now > max(DISCONTINUOUS, CONTINUOUS * then, CONTINUOUS * elsewhere):
                 explaining.append((then, wiring))
         if not explaining:
-            return Judgement(straight, (straight,), (), 0.0)
+            return WiringJudgement(straight, (straight,), (), 0.0)
         explaining.sort()
         least, best = explaining[0]
-        return Judgement(best, tuple(wiring for _, wiring in explaining), (), least)
+        return WiringJudgement(best, tuple(wiring for _, wiring in explaining), (), least)
 
-    def _judge(self, observation: Observation) -> Judgement | None:
+    def _judge(self, observation: Observation) -> WiringJudgement | None:
         """Return which wiring restores the usual A; None if that cannot be judged."""
         mae, sample = self._mae, observation.sample
         if mae is None or mae.anomaly is None or not mae.anomaly.calibrated:

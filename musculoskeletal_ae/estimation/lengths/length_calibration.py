@@ -25,7 +25,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.remedy import Step, sentence
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import UNKNOWN, LengthOffsets
-from musculoskeletal_ae.signals.wiring import Judgement, judge
+from musculoskeletal_ae.signals.wiring import WiringJudgement, judge
 
 ENOUGH_WITH_ANGLES = 20.0  # required duration of gentle motion with measured joint angles [s]
 ENOUGH = 38.0  # required duration of gentle motion without measured joint angles [s]
@@ -82,7 +82,7 @@ class LengthCalibration:
         self._has_angles = False  # whether joint angles are measured most of the time
         self._problem = ''  # reason why the last fit is not reliable
         self.offsets: LengthOffsets | None = None
-        self.wiring: Judgement | None = None
+        self.wiring: WiringJudgement | None = None
 
     @property
     def is_standing(self) -> bool:

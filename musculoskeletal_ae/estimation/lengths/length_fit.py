@@ -23,7 +23,7 @@ from musculoskeletal_ae.estimation.lengths.length_moments import Moments
 from musculoskeletal_ae.gauss_newton import minimise_in_pieces
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.wiring import Judgement, Wiring, decide, single_faults
+from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement, decide, single_faults
 
 # Constants of the search for initial values.
 DRAWN_POSTURES = 3200  # number of random postures whose torques at the first moment are compared
@@ -107,7 +107,7 @@ class LengthFit:
             candidates.append(before.constants)
         return (yield from self._best(candidates, moments, ROUNDS))
 
-    def wiring(self, fit: Fit, moments: Moments) -> Generator[None, None, Judgement]:
+    def wiring(self, fit: Fit, moments: Moments) -> Generator[None, None, WiringJudgement]:
         """Judge whether columns are exchanged or have a wrong sign.
 
         Each wiring that differs by one fault is fitted to a few moments. The fit begins with the
@@ -120,7 +120,10 @@ class LengthFit:
             moments: The moments to which it was fitted.
         """
         wiring = Wiring.straight(self._robot.muscle_count)
-        judgement, columns = Judgement(wiring, (wiring,), (), fit.cost), np.flatnonzero(self.used)
+        judgement, columns = (
+            WiringJudgement(wiring, (wiring,), (), fit.cost),
+            np.flatnonzero(self.used),
+        )
         rows = _few(moments)
         for _ in range(MOST_FAULTS):
             wiring, coarse = judgement.wiring, list[tuple[float, Wiring]]()

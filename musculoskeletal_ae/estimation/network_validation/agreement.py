@@ -53,7 +53,7 @@ BY_SENSORS = 'joint sensors'  # source of a reference
 BY_NETWORK = 'the network in use'  # source of a reference
 
 
-class Comparison(NamedTuple):
+class Agreement(NamedTuple):
     """How much one quantity of a candidate network differs from its reference."""
 
     name: str
@@ -97,7 +97,7 @@ class AgreementCheck:
         self._in_use, self._isolated = in_use, tuple(isolated)
         self._has_learned = in_use.covariance is not None
 
-    def comparisons(self, mae: Mae) -> list[Comparison]:
+    def comparisons(self, mae: Mae) -> list[Agreement]:
         """Compare a candidate with the joint sensors, or else with the network in use."""
         if not self._messages.are_enough:
             theta, tension = self._postures.theta, self._postures.tension
@@ -139,7 +139,7 @@ class AgreementCheck:
         old = self._in_use.estimate(*self._messages.readings(self._in_use)).theta
         return new, old, np.flatnonzero(np.isfinite(self._messages.theta).all(axis=1))
 
-    def _with_network(self, mae: Mae, new: Array, old: Array, tension: Array) -> list[Comparison]:
+    def _with_network(self, mae: Mae, new: Array, old: Array, tension: Array) -> list[Agreement]:
         """Compare a candidate with the network in use.
 
         Args:
@@ -158,7 +158,7 @@ class AgreementCheck:
             self._shape(mae),
         ]
 
-    def _with_sensors(self, mae: Mae, new: Array, old: Array, rows: Ints) -> list[Comparison]:
+    def _with_sensors(self, mae: Mae, new: Array, old: Array, rows: Ints) -> list[Agreement]:
         """Compare a candidate and the network in use with joint sensors.
 
         Args:
@@ -185,14 +185,14 @@ class AgreementCheck:
             comparisons.append(self._shape(mae))
         return comparisons
 
-    def _angles(self, error: Array, limit: Array, source: str) -> Comparison:
+    def _angles(self, error: Array, limit: Array, source: str) -> Agreement:
         outside = self._robot.units.to_position
-        return Comparison('θ', self._robot.joints, outside(error), outside(limit), source)
+        return Agreement('θ', self._robot.joints, outside(error), outside(limit), source)
 
-    def _lengths(self, error: Array, limit: Array, source: str) -> Comparison:
-        return Comparison('l by ① at θ', self._robot.muscles, error, limit, source)
+    def _lengths(self, error: Array, limit: Array, source: str) -> Agreement:
+        return Agreement('l by ① at θ', self._robot.muscles, error, limit, source)
 
-    def _shape(self, mae: Mae) -> Comparison:
+    def _shape(self, mae: Mae) -> Agreement:
         """Compare the network `mae` with the network in use by how lengths change with posture.
 
         Both networks compute the muscle lengths at the same fixed states.
@@ -203,9 +203,7 @@ class AgreementCheck:
         difference = np.linalg.norm((new - old).std(axis=0)) / np.linalg.norm(old.std(axis=0))
         limit = SHAPE_MOVED if self._has_learned else SHAPE_MOVED_INITIAL
         error = np.array([difference])
-        return Comparison(
-            'change of l by ①', ('all muscles',), error, np.array([limit]), BY_NETWORK
-        )
+        return Agreement('change of l by ①', ('all muscles',), error, np.array([limit]), BY_NETWORK)
 
     def _length_error(self, mae: Mae, theta: Array, tension: Array, length: Array) -> Array:
         """Return the median error of the lengths that a network computes at known postures.

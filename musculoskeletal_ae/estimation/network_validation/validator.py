@@ -35,8 +35,9 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.design.route_jumps import jump_warning
+from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.estimation.network_validation import detector, message_errors
-from musculoskeletal_ae.estimation.network_validation.agreement import AgreementCheck, Comparison
+from musculoskeletal_ae.estimation.network_validation.agreement import Agreement, AgreementCheck
 from musculoskeletal_ae.estimation.network_validation.postures import PostureCheck
 from musculoskeletal_ae.estimation.network_validation.recent_messages import RecentMessages
 from musculoskeletal_ae.exceptions import GateError
@@ -46,7 +47,6 @@ from musculoskeletal_ae.robot.robot import Robot
 PROOF = 10.0  # time in use without an anomaly after which a network is proven [s]
 MOST_USED = 20  # largest number of networks that are kept for a rollback
 RELEARNING_TIME = 600.0  # time after its repair during which a muscle may be relearned [s]
-DETECTION_DELAY = 2.0  # time before a detection in which messages may already be faulty [s]
 
 
 class CheckpointValidator:
@@ -186,7 +186,7 @@ class CheckpointValidator:
         """Return the errors of a network on the recent messages; {} if these are too few."""
         return message_errors.message_errors(mae, self._messages, self.isolated)
 
-    def agreement(self, mae: Mae) -> list[Comparison]:
+    def agreement(self, mae: Mae) -> list[Agreement]:
         """Compare a network with joint sensors or, without them, with the network in use.
 
         Return [] if no network is in use.
