@@ -67,11 +67,12 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-POSTURES = 200  # number of random postures from which the longest muscle lengths are computed
-#: largest difference that is expected between the lengths of a real muscle and of its model [m]
+POSTURES = 200  # find the longest muscle lengths in this many random postures
+#: make a slack command longer than the modelled muscle by this, because a real muscle may be longer
+#: than its model [m]
 LENGTH_MARGIN = 0.03
-LONGEST_INTERVAL = 0.05  # longest time between two messages from which dT/dt is computed [s]
-CONFIDENCE = 2.0  # number of standard deviations by which a measured tension may be too low
+LONGEST_INTERVAL = 0.05  # assume dT/dt = 0 after a longer interval between two messages [s]
+CONFIDENCE = 2.0  # lower the tension limit by this many standard deviations of the measured tension
 #: gain of the tension feedback r [1/s]; its time constant of 0.2 s is long compared with the lag of
 #: a module, which is about 30 ms
 RELIEF = 5.0

@@ -16,7 +16,7 @@ from musculoskeletal_ae.robot.joint_units import SLIDE, JointUnits
 UNREACHABLE = ('refuse', 'nearest')  # legal values of the setting `unreachable`
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness', 'float')
 BY_TENSION = ('tension', 'float')  # methods that command tensions; all others command lengths
-MOST_STIFFNESS = 1000.0  # largest desired stiffness of a joint [N·m/rad]
+MOST_STIFFNESS = 1000.0  # refuse a larger desired stiffness of a revolute joint [N·m/rad]
 
 
 @dataclass(frozen=True)
