@@ -13,10 +13,10 @@ from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 
-TRIES = 1000  # largest number of random postures among which holdable ones are sought
-AT_LIMITS = 0.25  # fraction of each joint's random angles that are at one of its limits
-SMALL = 1e-9  # smallest torque by which torques are divided, to avoid a division by zero [N·m]
-PRESSES = 10  # number of random T_const from which the most strongly pressing one is chosen
+TRIES = 1000  # search at most this many random postures for holdable ones
+AT_LIMITS = 0.25  # place this fraction of each joint's random angles at one of its limits
+SMALL = 1e-9  # divide torques by at least this, to avoid a division by zero [N·m]
+PRESSES = 10  # draw this many random T_const, and use the one that presses most strongly
 
 
 class ExplorationStep(NamedTuple):

@@ -53,9 +53,9 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: gain of the rest feedback, which reduces posture error and needless tension at rest [1/s]
 FEEDBACK_GAIN = 0.5
-BLENDING = 0.3  # time in which the previous command is blended into the new plan [s]
-SETTLING = 0.8  # time after a trajectory for which the feedback of the motion continues [s]
-#: The limiter holds a muscle back if it has made the command longer by more than this [m].
+BLENDING = 0.3  # blend the previous command into a new plan over this time [s]
+SETTLING = 0.8  # continue the feedback of the motion for this time after a trajectory [s]
+#: Count a muscle as held back if the limiter has made its command longer by more than this [m].
 HELD_BACK = 1e-4
 
 

@@ -30,8 +30,8 @@ from musculoskeletal_ae.robot import stiffness as robot_stiffness
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import Exertion, TensionProgramme, least_tension
 
-# Number of quadratic programmes, each with G at the tension that the previous one found. A third
-# programme would change the tension by well under a newton.
+# Solve this many quadratic programmes, each with G at the tension that the previous one found. A
+# third programme would change the tension by well under a newton.
 SOLVES = 2
 
 # The following constants are those of the method `stiffness`.
@@ -40,7 +40,7 @@ SOLVES = 2
 # external force can reduce a muscle's tension by this margin before it falls to T_bias, where the
 # muscle is stiff in one direction only.
 MARGINS = (40.0, 30.0, 20.0, 10.0, 0.0)
-ITERATIONS = 6  # largest number of iterations of Gauss–Newton and of Frank–Wolfe
+ITERATIONS = 6  # stop Gauss–Newton and Frank–Wolfe after this many iterations
 # Weight of the distance from the initial tensions (at first the least tensions), relative to the
 # weight of the stiffness error. A reachable stiffness is missed by about this share.
 LEAST_TENSION_SHARE = 1e-3
@@ -50,7 +50,7 @@ SHARES = (1.0, 0.5, 0.25, 0.125)
 # Distance of a point from the present tensions along the gradient of K [N]. It is so large that the
 # feasible tensions nearest to the point are those at which a linear approximation of K is extreme.
 FAR = 1e5
-LEVELS = 8  # number of tensions from T_bias to T_limit at which the elongation is evaluated
+LEVELS = 8  # evaluate the elongation at this many tensions from T_bias to T_limit
 # Step of the finite difference of G [rad]. A larger step would average over the curvature of the
 # routes, and a smaller step would amplify the errors of the network.
 STEP = 0.05

@@ -29,7 +29,7 @@ from musculoskeletal_ae.motion.feedback import depends_on_limit
 from musculoskeletal_ae.motion.methods import Solution
 from musculoskeletal_ae.robot.robot import Robot
 
-# Fraction of a movement's duration in which the command changes. In the remaining time, the arm
+# Change the command in this fraction of a movement's duration. In the remaining time, the arm
 # settles and is sampled.
 RAMP_SHARE = 0.6
 PEAK = 1.5  # ratio of peak to mean speed of a ramp

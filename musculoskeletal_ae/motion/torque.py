@@ -15,14 +15,14 @@ from musculoskeletal_ae.robot.tension import least_tension
 # Gains of the method `tension`.
 POSITION_GAIN = 10.0  # K_p [N·m/rad]
 VELOCITY_GAIN = 0.5  # K_d [N·m·s/rad]
-SMOOTHING = 0.05  # time constant of the low-pass filter on the noisy estimate [s]
+SMOOTHING = 0.05  # smooth the noisy estimate with this time constant [s]
 
 # Method `float`, which compensates gravity, adds these springs and dampers to the holding torque:
 HOLD = 15.0  # stiffness of the spring that holds the arm at θ_held [N·m/rad]
-BAND = 0.05  # largest distance of the arm from θ_held [rad]
+BAND = 0.05  # move θ_held with the arm once the arm is this far from it [rad]
 DAMPING = 1.0  # damping of each joint [N·m·s/rad]
 WALL = 30.0  # stiffness of the wall near a joint limit [N·m/rad]
-WALL_AT = 0.05  # distance of the wall from the joint limit [rad]
+WALL_AT = 0.05  # begin the wall this far before the joint limit [rad]
 
 
 class TorqueControl(ActivityControl):
