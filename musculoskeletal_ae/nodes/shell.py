@@ -465,7 +465,7 @@ class Shell(Node):
 
     @property
     def intruders(self) -> str:
-        """A text on nodes that must not be there, or '' if there are none.
+        """The nodes that must not run beside those of this arm, as a text; '' if there are none.
 
         These are other publishers of topics that belong to this arm's nodes, and other nodes with
         the name of this node.

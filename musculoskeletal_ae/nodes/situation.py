@@ -199,7 +199,7 @@ class Situation:
 
     @property
     def suspects(self) -> tuple[str, ...]:
-        """Names of the muscles and joints that findings of the estimator concern."""
+        """Names of the muscles and joints in which the estimator has found a fault."""
         estimator = self._reports.get('estimator')
         present = () if estimator is None else estimator.conditions
         kinds = [(KINDS.get(each.identifier), each.subjects) for each in present]
