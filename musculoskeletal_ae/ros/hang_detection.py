@@ -24,10 +24,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-LONGEST_STALL = 10.0  # longest legal time without progress [s]
-LOOK_PERIOD = 0.5  # time between two checks [s]
+LONGEST_STALL = 10.0  # end the process after this time without progress [s]
+LOOK_PERIOD = 0.5  # check the progress at this interval [s]
 STALLED = 70  # exit status: EX_SOFTWARE of sysexits.h
-#: names of modules in which the main thread may stay for more than LONGEST_STALL
+#: do not end the process while its main thread runs code of these modules
 SLOW_MODULES = ('bdb', 'numba', 'pdb', '_pydevd_bundle')
 
 

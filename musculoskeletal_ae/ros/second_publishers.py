@@ -55,13 +55,15 @@ AUTHORS = {
 COMMANDS = frozenset(topic for topic, author in AUTHORS.items() if author == _CONTROLLER)
 SEVERAL = 'several publishers'  # rejection reason
 
-LOOK_PERIOD = 0.1  # time between checks of the graph [s]
-LOOKS = 20  # number of recent checks over which decreases of the sequence number are counted
-TURNS = 3  # number of decreases within LOOKS checks that proves two publishers of one name
-LEASE = 30.0  # time for which the graph keeps a killed node, plus a margin [s]
-NAMING = 1.0  # longest time for which the graph knows a publisher but not its node [s]
-#: time for which there may be more publishers than links, and without a message after which a link
-#: counts as having no sensor [s]
+LOOK_PERIOD = 0.1  # check the graph at this interval [s]
+LOOKS = 20  # count decreases of the sequence number over this many recent checks
+TURNS = 3  # count publishers of one name as two nodes after this many decreases within LOOKS checks
+#: count publishers of one name as two nodes if two of them have been in the graph for this time
+#: [s]; the graph keeps a killed node for up to 20 s
+LEASE = 30.0
+NAMING = 1.0  # wait at most this long until the graph knows the node of a publisher [s]
+#: report more publishers than links only after this time, and count a link as having no sensor
+#: after this time without a message [s]
 LINK_PATIENCE = 3.0
 #: name that the graph returns for a node of which it knows only a publisher
 UNNAMED = '_NODE_NAME_UNKNOWN_'
@@ -163,7 +165,7 @@ class Twins:
             self._others.use(now)
 
     def is_alone(self, now: float) -> bool:
-        """Whether no other node has reported under this name in the last NODE_SILENCE seconds."""
+        """Return whether no other node has reported under this name for NODE_SILENCE seconds."""
         return self._others.age(now) > NODE_SILENCE
 
 
