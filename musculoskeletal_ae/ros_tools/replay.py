@@ -65,17 +65,19 @@ from musculoskeletal_ae.signals.motor_interface import STATES
 
 #: depth of the QoS; a reader that is one second late still receives every message
 DEPTH = 1000
-SERVICE_PERIOD = 0.02  # longest time between two rounds in which services are answered [s]
-LONGEST_SLEEP = 0.002  # longest wait that uses time.sleep instead of answering services [s]
-#: time from the discovery of a subscriber until it can receive messages [s]
+SERVICE_PERIOD = 0.02  # answer services after at most this time [s]
+LONGEST_SLEEP = 0.002  # answer services instead of sleeping during any longer wait [s]
+#: wait this long after the discovery of a subscriber, until it can receive messages [s]
 SETTLE_TIME = 0.3
-LAP_GAP = 10_000_000  # time between the last message of a lap and the first of the next [ns]
+#: wait this recorded time between the last message of a lap and the first of the next [ns]
+LAP_GAP = 10_000_000
 WAIT = 2.0  # default of the longest wait for subscribers; playback may start without them [s]
 SEND_WAIT = 10.0  # default of the same wait for --as-trajectory, which needs a subscriber [s]
-CLOCK_PERIOD = 0.005  # recorded time between two messages on /clock [s]
-SLOW = 0.5  # share of the wanted speed below which playback counts as slow
-LOCKSTEP_LAG = 0.005  # in lockstep, recorded time makes up for at most this delay [s]
-#: shortest wall time between two messages on /clock that nodes can handle [s]
+CLOCK_PERIOD = 0.005  # publish /clock at this interval of recorded time [s]
+SLOW = 0.5  # count playback as slow below this share of the wanted speed
+LOCKSTEP_LAG = 0.005  # in lockstep, catch up with at most this delay [s]
+#: publish /clock at intervals of at least this wall time, because nodes cannot handle more messages
+#: [s]
 SHORTEST_CLOCK_PERIOD = 0.001
 
 
