@@ -49,7 +49,7 @@ class JumpVerdict(NamedTuple):
     is_unseen: bool = False
 
 
-#: smallest change of a length that may be a part of a jump, as a fraction of the legal change
+#: count a change of more than this fraction of the legal change as a possible part of a jump
 LARGE = 0.5
 
 

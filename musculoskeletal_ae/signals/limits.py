@@ -63,7 +63,7 @@ class Limits(NamedTuple):
 
 
 LIMITS = Limits()
-POSTURES = 500  # number of random postures over which `length_range` searches
+POSTURES = 500  # search this many random postures for the extremes of `length_range`
 
 #: reason under which messages with a jump of a length are counted
 LENGTH_JUMPED = 'length jumped'
