@@ -45,9 +45,10 @@ BUTTONS = {
     'call controller/explore true': EXPLORE,
     'call controller/explore': EXPLORE,
 }
-PUSH_STIFFNESS = 200.0  # force on the hand per distance by which the mouse drags it [N/m]
-MOST_PUSH = 60.0  # largest force of a push with the mouse [N]
-MOST_PAYLOAD = 5.0  # largest payload that a visitor can choose [kg]
+#: exert this force on the hand per distance by which the mouse drags it [N/m]
+PUSH_STIFFNESS = 200.0
+MOST_PUSH = 60.0  # exert at most this force by a push with the mouse [N]
+MOST_PAYLOAD = 5.0  # let visitors choose payloads of up to this mass [kg]
 #: requests after which values that are still being entered are not sent
 COMMANDS = (
     'controller/stop', 'controller/explore', 'end exploring', 'reset', 'hand', 'estimator/zero',
