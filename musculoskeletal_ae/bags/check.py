@@ -32,7 +32,7 @@ from musculoskeletal_ae.signals.muscle_readings import muscle_reading
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.signals.wiring import Wiring, judge
 
-MOST_REJECTED = 0.1  # largest share of rejected messages of a topic that is no fault
+MOST_REJECTED = 0.1  # report a fault if a larger share of a topic's messages is rejected
 #: reasons for which messages of a sound recording may be rejected: lengths were being calibrated,
 #: or another program publishes its own joints on the topic
 USUAL_REJECTIONS = 'length offsets unknown', 'missing joint', 'missing motor'

@@ -29,14 +29,15 @@ from musculoskeletal_ae.message_reading import MOST_ENTRIES, target_values
 
 # After a longer interruption, playback resumes instead of catching up.
 LONGEST_LAG = 1.0  # [s]
-SKIP_LEAD = 500_000_000  # recorded time between a skipped pause and the next message [ns]
+#: after a skipped pause, go on this recorded time before the next message [ns]
+SKIP_LEAD = 500_000_000
 
 TAUGHT_TOPIC = 'estimated_joint_states'
 # Standard deviation of the Gaussian weights that smooth a motion [s]. They keep the motion of a
 # hand, which takes longer, and remove noise, which varies faster.
 SMOOTHING = 0.15
-SPACING = 0.1  # time between two points of the trajectory [s]
-LEAD_TIME = 3.0  # duration of the motion to the first posture [s]
+SPACING = 0.1  # place the points of the trajectory at this interval [s]
+LEAD_TIME = 3.0  # move to the first posture in this time [s]
 SHORTEST_MOTION = 0.5  # shorter motions are refused [s]
 
 

@@ -30,8 +30,8 @@ from musculoskeletal_ae.bags.storage import (
 from musculoskeletal_ae.exceptions import BagError
 
 ROS1_MAGIC = b'#ROSBAG V'  # first bytes of a bag file of ROS 1
-MOST_HELD = 64 << 20  # largest size of the messages held in memory to sort them [bytes]
-_OVERHEAD = 100  # size counted for a message in addition to its data [bytes]
+MOST_HELD = 64 << 20  # hold messages of at most this size in memory to sort them [bytes]
+_OVERHEAD = 100  # count a message as this much larger than its data [bytes]
 
 
 @dataclass
