@@ -54,7 +54,7 @@ METHODS = {
     f'second_{PAPER_PRESET}': '#99D8C7',
     f'proposed_{PAPER_PRESET}': '#CC79A7',
 }
-APPROACHES = 5  # number of θ_eval, and number of starts for each of them
+APPROACHES = 5  # approach this many θ_eval, each from this many starts
 
 
 class Durations(NamedTuple):

@@ -24,7 +24,7 @@ from musculoskeletal_ae.motion.ramps import RAMP_SHARE
 from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.signals.friction import FrictionDirection, directions
 
-#: length that makes a switched-off muscle slack in any posture when added to its command [m]
+#: add this to the command of a switched-off muscle, to make it slack in any posture [m]
 PAID_OUT = 0.1
 SAMPLE_TIME = 0.01  # time between two messages [s]; the modules report at 100 Hz
 #: random seeds of the exploration, to which the individual's seed is added, and of held-out motion
