@@ -47,13 +47,13 @@ Fail = Callable[[str], RobotDescriptionError]
 #: URDF's types of joints that are neither revolute nor prismatic, by degrees of freedom
 OTHER_JOINTS = {1: 'continuous', 3: 'planar', 6: 'floating'}
 
-#: smallest legal eigenvalue of a stiffness matrix, relative to the largest one; rounding may make
+#: refuse a stiffness matrix with a lower eigenvalue, relative to the largest one; rounding may make
 #: an eigenvalue slightly negative
 LEAST_EIGENVALUE = -1e-9
 
 TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # tensions [N]
 STIFFNESS_DEFAULT = 10000.0  # K_stiff [N/m]
-SPEED_DEFAULT = 0.1  # speed of a position-controlled module [m/s]
+SPEED_DEFAULT = 0.1  # assume this speed of a position-controlled module that states none [m/s]
 #: scale of a motor current in `with_modules` [N per A]: 0.03 N·m/A, gear of 20, spool of 10 mm
 NEWTON_PER_AMPERE = 60.0
 NO_TENSION = (

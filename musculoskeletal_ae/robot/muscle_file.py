@@ -27,7 +27,7 @@ from musculoskeletal_ae.robot.joint_tree import MOST_TERMS
 from musculoskeletal_ae.schema import Strict
 
 STIFFNESS, POSITION = 'stiffness', 'position'  # values of `actuation`
-SHORTEST_AXIS = 1e-6  # length below which a vector defines no direction
+SHORTEST_AXIS = 1e-6  # refuse a shorter vector as an axis, because it defines no direction
 
 
 class ElasticEntry(Strict, frozen=True):

@@ -18,13 +18,16 @@ import pinocchio as pin
 from musculoskeletal_ae.exceptions import RobotDescriptionError, printable
 from musculoskeletal_ae.robot.joint_tree import Coupling
 
-#: largest number of links and joints; recursive parsers overflow their stack at thousands of links
+#: refuse a file with more links and joints; recursive parsers overflow their stack at thousands of
+#: links
 MOST_PARTS = 2000
-#: largest depth of nested elements; the parser that MuJoCo and pinocchio use has the same limit
+#: refuse elements that are nested more deeply; the parser that MuJoCo and pinocchio use has the
+#: same limit
 DEEPEST = 500
 #: elements below <robot> that only a preprocessor understands, besides xacro's own elements
 PREPROCESSED = 'include', 'macro', 'property'
-LARGEST = 1e6  # largest absolute value of any number except efforts and velocities [SI units]
+#: refuse any number of a larger absolute value, except efforts and velocities [SI units]
+LARGEST = 1e6
 
 LIMITED = 'revolute', 'prismatic'  # types of joints that need limits
 ONE_AXIS = *LIMITED, 'continuous'  # types of joints with one axis
