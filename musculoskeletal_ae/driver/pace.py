@@ -20,12 +20,12 @@ from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.report import is_overloaded
 
-RATE_TOLERANCE = 0.2  # tolerated relative error of the rate
-#: lowest rate at which the motion test may begin [Hz], if the expected rate is not lower. A muscle
-#: that runs away is then noticed within 33 ms, and `motion.MEAN` averages 9 readings.
+RATE_TOLERANCE = 0.2  # tolerate this relative error of the rate
+#: Begin the motion test only at this rate or above [Hz], unless the expected rate is lower. A
+#: muscle that runs away is then noticed within 33 ms, and `motion.MEAN` averages 9 readings.
 LEAST_RATE = 30.0
-LONGEST_STALL = 1.0  # longest gap that an overload of this computer may explain [s]
-LEAST_LOST = 0.05  # fraction of lost messages above which the loss is reported
+LONGEST_STALL = 1.0  # blame the driver for any longer gap, even if this computer is overloaded [s]
+LEAST_LOST = 0.05  # report a loss of more than this fraction of the messages
 
 
 class _Message(NamedTuple):

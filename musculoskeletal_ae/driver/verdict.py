@@ -17,7 +17,7 @@ from musculoskeletal_ae.schema import Strict
 #: of l, the MSC law, its clip at tension.max, and latency
 Check = Literal['rate', 'order', 'unit', 'sign', 'zero', 'law', 'clip', 'latency']
 CHECKS: tuple[Check, ...] = get_args(Check)
-#: largest length offset [m] of a healthy arm (`listening`)
+#: report a larger length offset [m]; those of healthy arms are smaller (`listening`)
 ZERO_TOLERANCE = 0.045
 OK, WRONG, OPEN = 'ok', 'WRONG', '-'
 POSITION_LAW = 'l → l_target, for as long as T is below T_max'
@@ -210,7 +210,8 @@ class Verdict:
         if (self._state[:, CHECKS.index('zero')] == OK).any():
             tolerance = f'{1e3 * ZERO_TOLERANCE:.0f} mm'
             remarks.append(
-                f'zero ok: within {tolerance} of the route; smaller errors are not found'
+                f'zero ok: l agrees with the modelled route to {tolerance}; this check cannot '
+                'detect smaller errors'
             )
         remarks += [
             f'fault: {fault.check} of {self._subject(fault)}: {fault.observation}\n'
