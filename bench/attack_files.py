@@ -26,8 +26,8 @@ from robots import chain
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
-LONGEST = 5.0  # longest legal CPU time for one file [s]
-MOST_MEMORY = 300  # largest memory that reading one file may add to the peak of the process [MB]
+LONGEST = 5.0  # report a file that takes more CPU time [s]
+MOST_MEMORY = 300  # report a file that adds more to the peak memory of the process [MB]
 NASTY: tuple[object, ...] = (
     0.0, -1.0, 1e-300, 1e300, -1e300, float('nan'), float('inf'), 2**70, '', '\x1b[2J', [], {},
 )  # fmt: skip

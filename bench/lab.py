@@ -44,15 +44,15 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.muscle_readings import MuscleReading
 
-CORES = 2  # number of cores of the simulated computer
+CORES = 2  # simulate a computer with this many cores
 WAIT = 0.0008  # mean time until a process gets the processor, for each process per core [s]
 STALL_EVERY = 10.0  # mean time between two stalls of a process [s]
 STALL = 0.015  # mean duration of a stall, for each process per core [s]
-HANDLING = 0.0005  # time in which a node handles a message [s]
-QUEUE = 10  # largest number of messages that wait in a subscription; older ones are dropped
-#: time by which the publisher's clock is ahead of the steady clock [s]; no node may depend on it
+HANDLING = 0.0005  # let a node handle a message in this time [s]
+QUEUE = 10  # let at most this many messages wait in a subscription; drop older ones
+#: set the publisher's clock ahead of the steady clock by this time [s]; no node may depend on it
 AHEAD = 1.7e9
-RESTARTING = 2.0  # time that a node takes to start again [s]
+RESTARTING = 2.0  # let a node take this time to start again [s]
 ESTIMATOR, CONTROLLER, LEARNER = 'estimator', 'controller', 'learner'
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 TICK = os.sysconf('SC_CLK_TCK')  # /proc counts CPU time in ticks: ticks per second
 PAGE = os.sysconf('SC_PAGE_SIZE')  # /proc counts memory in pages: bytes per page
-PATIENCE = 20.0  # longest wait for the end of a process [s]
+PATIENCE = 20.0  # kill a process that has not ended after this time [s]
 
 
 def cpu(pid: int) -> float:
