@@ -20,7 +20,7 @@ CORRECTION = 0.3  # correct no joint by more than this [rad]
 #: Do not correct smaller estimated errors [rad]. This is about the error of the estimate itself.
 #: Without this dead band, an arm with friction would never rest.
 DEADBAND = 0.03
-RELIEF_INTERVAL = 0.1  # compute the needless tension no more often than once in this time [s]
+RELIEF_INTERVAL = 0.1  # compute the needless tension at intervals of at least this time [s]
 PROPORTIONAL = 0.7  # proportional gain k_p in motion
 INTEGRAL = 4.0  # integral gain k_i in motion [1/s]
 #: count the arm as resting once the feedback in motion has been off for this time [s]

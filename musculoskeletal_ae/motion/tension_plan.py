@@ -25,7 +25,7 @@ from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.signals.friction import slid
 
 TURNING = 0.005  # treat a tendon's sliding direction as certain well above this speed [m/s]
-AHEAD = 0.2  # compute T_K once in this time, for the setpoint that is this time ahead [s]
+AHEAD = 0.2  # compute T_K at this interval, for the setpoint that is this time ahead [s]
 
 
 class Stiffening:
