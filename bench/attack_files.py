@@ -35,7 +35,7 @@ KINDS = ('urdf', 'muscles', 'table', 'checkpoint', 'state', 'metadata', 'mcap')
 
 
 class Attempt(NamedTuple):
-    """Outcome of reading one file: `used`, `refused`, or the description of a finding."""
+    """Outcome of reading one file: `used`, `refused`, or a description of what went wrong."""
 
     kind: str
     outcome: str
@@ -44,7 +44,7 @@ class Attempt(NamedTuple):
 
     @property
     def broken(self) -> bool:
-        """Whether the outcome is a finding."""
+        """Whether the file was neither used nor refused, or took too much time or memory."""
         sound = self.outcome in ('used', 'refused')
         return not sound or self.seconds > LONGEST or self.memory > MOST_MEMORY
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kills of a learner by SIGKILL at random moments, with a check of its saved state.
+"""Kills a learner by SIGKILL at random times, and checks its saved state.
 
 A child process runs the `Learner` of the node, with its training process, on random samples. It
 reports each accepted sample and each published network. After a kill, the next child must load all

@@ -85,7 +85,8 @@ AFTER = 20.0  # measure the true error over this time [s]
 #: much [rad]
 WELL, WELL_RAD = 1.5, 0.02
 HOLDABLE = 4  # choose the posture to hold among this many holdable ones
-SEEDS, REALITIES = (0, 1, 2, 3, 4), (KIN, FOREIGN)  # of the complete table
+#: individuals and emulator models of the complete table
+SEEDS, REALITIES = (0, 1, 2, 3, 4), (KIN, FOREIGN)
 PAGE_FACTS = ('true', 'after', 'false', 'well', 'error', 'tension')
 
 

@@ -47,8 +47,8 @@ HELD_OUT = 300.0  # duration of the held-out motion [s]
 AFTER = 30.0  # move for this time after a calibration [s]
 LONGEST = 120.0  # end a calibration after this time [s]
 SETTLING = 20.0  # let the arm hang for this time until it is still [s]
-#: standard deviation of the error of the posture that is stated to the calibration [rad], the same
-#: for each joint
+#: state postures to the calibration with errors of this standard deviation [rad], the same for each
+#: joint
 STATED = 0.0
 #: report a calibration that takes longer than this [s], or after which the error exceeds the
 #: earlier error by more than this factor

@@ -33,10 +33,10 @@ from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.signals.wiring import Wiring, judge
 
 MOST_REJECTED = 0.1  # report a fault if a larger share of a topic's messages is rejected
-#: reasons for which messages of a sound recording may be rejected: lengths were being calibrated,
-#: or another program publishes its own joints on the topic
+#: do not report these reasons of rejection as a fault: lengths were being calibrated, or another
+#: program publishes its own joints on the topic
 USUAL_REJECTIONS = 'length offsets unknown', 'missing joint', 'missing motor'
-READINGS = 'joint_states', 'muscle_states'  # topics of sensors, which do not pause
+READINGS = 'joint_states', 'muscle_states'  # report a pause of these topics as a fault
 _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 
 

@@ -27,8 +27,7 @@ from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
 from musculoskeletal_ae.message_reading import MOST_ENTRIES, target_values
 
-# After a longer interruption, playback resumes instead of catching up.
-LONGEST_LAG = 1.0  # [s]
+LONGEST_LAG = 1.0  # after a longer interruption, resume playback instead of catching up [s]
 #: after a skipped pause, go on this recorded time before the next message [ns]
 SKIP_LEAD = 500_000_000
 
@@ -38,7 +37,7 @@ TAUGHT_TOPIC = 'estimated_joint_states'
 SMOOTHING = 0.15
 SPACING = 0.1  # place the points of the trajectory at this interval [s]
 LEAD_TIME = 3.0  # move to the first posture in this time [s]
-SHORTEST_MOTION = 0.5  # shorter motions are refused [s]
+SHORTEST_MOTION = 0.5  # refuse a shorter motion [s]
 
 
 def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:

@@ -236,7 +236,7 @@ class _ArmStreams:
         return body
 
 
-#: reasons of rejection that another number or names of muscles or joints explain
+#: suspect the recording of another robot if messages are rejected for one of these reasons
 OTHER_ROBOT = 'wrong length', 'missing joint', 'missing motor', 'wrong layout'
 CHOOSE_ROBOT = 'choose the robot that was recorded'
 CHECK_DRIVER = (

@@ -81,10 +81,10 @@ class Settings(CheckedSettings):
     )
 
     # Durations that experiments vary, and users do not.
-    #: of the second movement of method `second`, and of the movement after a new checkpoint [s]
+    #: duration of the second movement of method `second`, and of that after a new checkpoint [s]
     second_duration: float = 2.0
-    #: of a movement to a target with method `stiffness`, or with method `proposed` of preset
-    #: `default`; extended if muscle modules or muscles are too weak; 0 for first_duration [s]
+    #: duration of a movement to a target with method `stiffness`, or with method `proposed` of
+    #: preset `default`; extended if muscle modules or muscles are too weak; 0 for first_duration [s]
     target_duration: float = 1.2
 
     def desired_stiffness(self, units: JointUnits) -> Array:

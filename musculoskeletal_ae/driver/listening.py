@@ -45,8 +45,9 @@ BEYOND_SHARE = 0.95  # judge this by the excess that this share of the messages 
 #: report a fault if |T − T_bias| exceeds the smaller of these while nothing is commanded, [N] and
 #: relative to T_bias; they cover errors of the sensor and of its zero
 RESTING_TENSION, RESTING_SHARE = 15.0, 0.5
-PULLS = 0.3, 3.0  # usual range of T / T_bias at rest
-USUAL = 10.0, 60.0  # usual temperatures of modules at rest [°C]
+PULLS = 0.3, 3.0  # reinterpret units or rows only if T / T_bias at rest is then in this range
+#: reinterpret them only if the temperatures of modules at rest are then in this range [°C]
+USUAL = 10.0, 60.0
 #: T is in another unit if all muscles, converted from that unit to N, are within this fraction of
 #: T_bias
 UNIT_TOLERANCE = 0.3

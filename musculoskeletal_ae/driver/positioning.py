@@ -38,8 +38,8 @@ OUTWARDS = 0.005  # move the target outwards by this [m]
 FOLLOWS = 0.0015  # tolerate this difference of l and l_target at rest [m]
 #: report a fault if the change of l, divided by that of l_target, is outside this range
 SHARES = 0.7, 1.4
-#: rise of T that is permitted while the arm is held, even where T exceeds the highest test tension
-#: at rest [N]
+#: permit T to rise by this while the arm is held, even where T exceeds the highest test tension at
+#: rest [N]
 RISE = 20.0
 RUN_AWAY = 0.03  # release a muscle whose l is further away from l_target than this [m]
 

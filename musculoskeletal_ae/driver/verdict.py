@@ -46,7 +46,7 @@ FAULTS = read_table(__file__, 'faults.yaml', dict[str, FaultTexts])
 
 
 class Fault(NamedTuple):
-    """A fault of the driver."""
+    """A fault that a check has found in the driver."""
 
     check: str
     muscles: tuple[int, ...]  # indices of the affected muscles; all for a fault of the whole driver

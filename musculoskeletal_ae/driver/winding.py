@@ -57,7 +57,8 @@ SLACK = 0.01  # set l_target this far beyond l after winding in [m]
 RUN_AWAY = 0.05  # release a muscle that shortens by more than this [m]
 #: accept an error of T up to the larger of these: [N], and relative to the demand
 TENSION_TOLERANCE, TENSION_SHARE = 10.0, 0.1
-LENGTH_ERROR = 2.0e-4  # two standard deviations of noise and resolution of l [m]
+#: expect errors of l of up to this: two standard deviations of noise and resolution [m]
+LENGTH_ERROR = 2.0e-4
 #: report a fault if the change of T, divided by that of the demand, is outside this range
 SLOPES = 0.7, 1.4
 #: to check the clip, demand this beyond tension.max [N]; accept this excess of T, relative to it

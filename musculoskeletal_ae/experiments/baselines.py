@@ -78,7 +78,7 @@ class PolynomialFilter:
     DEGREE = 3
     MODEL_SAMPLES = 20_000
     PRIOR_ROWS = 20.0  # weigh the prior like this many samples
-    TENSION_SCALE = 1.0 / 200.0  # gives a_m the magnitude of the other coefficients
+    TENSION_SCALE = 1.0 / 200.0  # scale tensions by this, so that a_m is as large as c_mk
     #: standard deviation of a joint's random walk [rad/√s]; with 0.2 instead, the error differs by
     #: about 1 %
     WALK = 0.5

@@ -140,7 +140,7 @@ def _bound(arm: Arm) -> float:
 def measure(study: Study, seed: int) -> Measured:
     """Measure the errors and tensions of every control method on one individual."""
     networks = {'default': study.network(seed), PAPER_PRESET: study.network(seed, PAPER_PRESET)}
-    # The approaches of a shortened run begin on the way to a start.
+    # In a shortened run, the arm has not yet reached the start when an approach begins.
     count, durations = study.number(APPROACHES), Durations(*map(study.seconds, DURATIONS))
     ended = protocol(study.arm(seed), networks, seed, count, durations)
     errors = {name: np.linalg.norm(offset, axis=-1) for name, offset in ended.offset.items()}

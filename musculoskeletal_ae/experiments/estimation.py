@@ -275,7 +275,7 @@ def deactivated(_: Study, rows: Rows) -> Plot:
 
 
 def appearance(study: Study, rows: Rows) -> Plot:
-    """Draw the true and the estimated postures at several moments of the experiment."""
+    """Draw the true and the estimated postures at several times of the experiment."""
     seed, (_, trace) = first_individual(rows)
     moments = {name: step for step, name in enumerate(trace['moments'])}
     title = f'individual {seed}, estimated from lengths and tensions'

@@ -137,7 +137,7 @@ def ranked_bars(
 def pictures(
     robot: Robot, motions: Mapping[str, Motion], moments: Mapping[str, int], title: str
 ) -> Any:
-    """Draw arms in a grid: a row for each motion, and a column for each moment (index of a step).
+    """Draw arms in a grid: a row for each motion, and a column for each step in `moments`.
 
     Bones are grey; muscles are green at T_bias and red at T_limit.
     """

@@ -86,7 +86,7 @@ def _errors(name: str, motion: Motion, arm: Motion) -> dict[str, float]:
 
 
 def simulation_pictures(study: Study, rows: Rows) -> Plot:
-    """Draw the arm and its simulators at several moments."""
+    """Draw the arm and its simulators at several times."""
     seed, (_, traces) = first_individual(rows)
     arm = traces[study.preset]['arm']
     # Times near the ends of cycles, where the arm rests at the random tensions of the third step.

@@ -36,7 +36,7 @@ from musculoskeletal_ae.robot.drawing import SHORTEST_BONE
 from musculoskeletal_ae.robot.robot import Robot
 
 POSTURES = 1000  # compare the model and the network in this many postures
-#: damping of a joint, multiplied by its `joint_gear` [N·m·s/rad]; chosen for a stable simulation
+#: multiply this damping by the `joint_gear` of a joint [N·m·s/rad]; chosen for a stable simulation
 DAMPING = 0.05
 THIN = 0.008  # draw bones as capsules of this radius [m]
 TIMESTEP = 0.002  # let the exported model advance by this time in a step [s]

@@ -36,23 +36,24 @@ SOLVES = 2
 
 # The following constants are those of the method `stiffness`.
 
-# Candidates for the margin of T_low above T_bias [N]; the largest feasible margin is used. An
-# external force can reduce a muscle's tension by this margin before it falls to T_bias, where the
-# muscle is stiff in one direction only.
+# Raise T_low above T_bias by the largest of these margins that is feasible [N]. An external force
+# can reduce a muscle's tension by this margin before it falls to T_bias, where the muscle is stiff
+# in one direction only.
 MARGINS = (40.0, 30.0, 20.0, 10.0, 0.0)
 ITERATIONS = 6  # stop Gauss–Newton and Frank–Wolfe after this many iterations
-# Weight of the distance from the initial tensions (at first the least tensions), relative to the
-# weight of the stiffness error. A reachable stiffness is missed by about this share.
+# Weigh the distance from the initial tensions (at first the least tensions) by this, relative to
+# the stiffness error. A reachable stiffness is missed by about this share.
 LEAST_TENSION_SHARE = 1e-3
-# Step lengths of the line search towards a corner of the feasible tensions. The full step need not
-# be the best, because K is concave in each tension.
+# Try these step lengths in the line search towards a corner of the feasible tensions. The full step
+# need not be the best, because K is concave in each tension.
 SHARES = (1.0, 0.5, 0.25, 0.125)
-# Distance of a point from the present tensions along the gradient of K [N]. It is so large that the
-# feasible tensions nearest to the point are those at which a linear approximation of K is extreme.
+# Project a point at this distance from the present tensions along the gradient of K [N]. At so
+# large a distance, the feasible tensions nearest to the point are those at which a linear
+# approximation of K is extreme.
 FAR = 1e5
 LEVELS = 8  # evaluate the elongation at this many tensions from T_bias to T_limit
-# Step of the finite difference of G [rad]. A larger step would average over the curvature of the
-# routes, and a smaller step would amplify the errors of the network.
+# Compute finite differences of G with this step [rad]. A larger step would average over the
+# curvature of the routes, and a smaller step would amplify the errors of the network.
 STEP = 0.05
 
 

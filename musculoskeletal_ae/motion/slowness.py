@@ -20,11 +20,11 @@ SHARE = 0.7
 #: still contains at least one instant, even of a trajectory of 10 000 points
 MOST_MOMENTS = 12_500
 
-#: factors by which a motion may be slowed until its tensions suffice, in ascending order
+#: try these factors of slowing a motion, in ascending order, until its tensions suffice
 SLOWER = tuple(1.1**k for k in range(17))
-#: The same factors for an arm with isolated muscles. Such an arm may fall where an arm with all
-#: muscles only deviates from its trajectory. It therefore needs more reserve, to which the large
-#: steps between these factors add.
+#: Try these factors instead for an arm with isolated muscles. Such an arm may fall where an arm
+#: with all muscles only deviates from its trajectory. It therefore needs more reserve, and the
+#: large steps between the factors provide a part of it.
 SLOWER_ISOLATED = (1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6)
 #: plan motions for at least this lag λ [s]; λ is measured only after the motion has begun
 LEAST_LAG = 0.02

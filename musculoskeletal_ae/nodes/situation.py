@@ -177,7 +177,7 @@ class Situation:
         return {name: age for name, age in silence.items() if age > NODE_SILENCE}
 
     def level(self) -> Level:
-        """Return the level of the whole arm."""
+        """Return the level of the whole arm: that of the worst condition."""
         return conditions.worst(condition for _, condition in self._all())
 
     def trouble(self) -> str:

@@ -22,7 +22,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.gauss_newton import minimise_each
 from musculoskeletal_ae.robot.robot import Robot
 
-#: standard deviations of a marker's pose measured by a typical camera, σ_p [m] and σ_R [rad], (6,)
+#: by default, expect a typical camera to measure a marker with σ_p [m] and σ_R [rad], (6,)
 SPREADS = np.repeat([0.002, 0.01], 3)
 #: standard deviations that leave the orientation free
 POSITION_ONLY = np.repeat([0.002, 100.0], 3)

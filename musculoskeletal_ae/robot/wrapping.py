@@ -34,7 +34,7 @@ from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics
 
 TINY = 1e-12  # divide by at least this, and count a smaller distance as zero
-#: distance from the surface, divided by the radius, within which a point counts as outside
+#: count a point as outside if it is less than this beneath the surface, relative to the radius
 RIM = 1e-6
 Vector = tuple[float, float, float] | Array
 

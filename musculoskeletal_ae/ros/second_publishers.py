@@ -53,7 +53,7 @@ AUTHORS = {
     CLOCK: 'the source of time',
 }
 COMMANDS = frozenset(topic for topic, author in AUTHORS.items() if author == _CONTROLLER)
-SEVERAL = 'several publishers'  # rejection reason
+SEVERAL = 'several publishers'  # reason under which rejected messages are counted
 
 LOOK_PERIOD = 0.1  # check the graph at this interval [s]
 LOOKS = 20  # count decreases of the sequence number over this many recent checks
@@ -67,7 +67,7 @@ NAMING = 1.0  # wait at most this long until the graph knows the node of a publi
 LINK_PATIENCE = 3.0
 #: name that the graph returns for a node of which it knows only a publisher
 UNNAMED = '_NODE_NAME_UNKNOWN_'
-#: how messages to users call such a node
+#: name of such a node in messages to users
 NAMELESS = 'a node that has not announced its name yet'
 
 
@@ -183,7 +183,7 @@ class LinkSensors:
     def __init__(self) -> None:
         self.problem = ''
         self._heard_at: dict[str, float] = {}  # time of the last message [s], by link
-        self._too_many_since = math.inf  # [s]
+        self._too_many_since = math.inf  # time since which there are too many publishers [s]
 
     def take(self, link: str, now: float) -> None:
         """Record that a message about a link arrived at `now` [s]."""

@@ -71,8 +71,9 @@ LONGEST_SLEEP = 0.002  # answer services instead of sleeping during any longer w
 SETTLE_TIME = 0.3
 #: wait this recorded time between the last message of a lap and the first of the next [ns]
 LAP_GAP = 10_000_000
-WAIT = 2.0  # default of the longest wait for subscribers; playback may start without them [s]
-SEND_WAIT = 10.0  # default of the same wait for --as-trajectory, which needs a subscriber [s]
+WAIT = 2.0  # by default, wait at most this long for subscribers, and then play without them [s]
+#: by default, wait at most this long for the subscriber that --as-trajectory needs [s]
+SEND_WAIT = 10.0
 CLOCK_PERIOD = 0.005  # publish /clock at this interval of recorded time [s]
 SLOW = 0.5  # count playback as slow below this share of the wanted speed
 LOCKSTEP_LAG = 0.005  # in lockstep, catch up with at most this delay [s]

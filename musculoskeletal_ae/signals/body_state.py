@@ -71,7 +71,7 @@ class LengthOffsets:
     trust: Ints = field(default_factory=lambda: np.zeros(0, dtype=int))
 
     def __post_init__(self) -> None:
-        """Complete a missing trust."""
+        """Set a missing trust from the standard deviations: offsets below UNKNOWN are known."""
         if len(self.trust) != len(self.offset):
             is_known = self.deviation < UNKNOWN
             object.__setattr__(self, 'trust', np.where(is_known, Trust.KNOWN, Trust.UNKNOWN))

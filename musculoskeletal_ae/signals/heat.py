@@ -32,13 +32,13 @@ LONGEST = 10.0  # let one update cover at most this time [s]
 #: Attribute a larger change of a housing's temperature between two updates to the sensor or to
 #: another source of heat [°C], because the motor cannot cause it.
 JUMP = 2.0
-NOISE = 0.1  # standard deviation of the mean of c₂ over EVERY [°C]
+NOISE = 0.1  # expect this standard deviation of the mean of c₂ over EVERY [°C]
 RATIO = 0.4  # assumed ratio r: typical of small motors, which vary widely
-#: initial estimate of how much warmer than the air the housing becomes while T_limit is held [°C]
+#: at first, assume that holding T_limit makes the housing this much warmer than the air [°C]
 RISE = 80.0
-WINDING_TIME = 30.0  # initial estimate of the winding's time constant τ₁ [s]
-HOUSING_TIME = 800.0  # initial estimate of the housing's time constant τ₂ [s]
-AIR = 25.0  # initial estimate of the air temperature c_a [°C]
+WINDING_TIME = 30.0  # at first, assume this time constant τ₁ of the winding [s]
+HOUSING_TIME = 800.0  # at first, assume this time constant τ₂ of the housing [s]
+AIR = 25.0  # at first, assume this air temperature c_a [°C]
 #: initial standard deviations of c₁ − c₂ [°C], c₂ [°C], log κ, log τ₁, log τ₂ and c_a [°C]
 SPREAD = np.array([5.0, 0.2, 0.7, 0.5, 0.5, 5.0])
 #: standard deviations of the process noise of the same quantities, per √s
