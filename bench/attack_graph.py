@@ -110,7 +110,7 @@ class Process:
             self.memory.append((time.monotonic() - self.started, memory(self.process.pid)))
 
     def kill(self) -> None:
-        """End the process by SIGKILL."""
+        """Kill the process by SIGKILL."""
         self.process.kill()
         self.process.wait()
 

@@ -102,7 +102,7 @@ class Child:
                     self.up.set()
 
     def kill(self) -> None:
-        """End the process by SIGKILL."""
+        """Kill the process by SIGKILL."""
         self._process.kill()
         self._process.wait()
         self._reader.join()

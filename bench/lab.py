@@ -214,7 +214,7 @@ class Lab:
         return self.now + self.clock_shift
 
     def run(self, seconds: float) -> None:
-        """Let a time pass [s]."""
+        """Run the laboratory for a time [s]."""
         for _ in range(round(seconds / SAMPLE_TIME)):
             self.step()
 

@@ -52,7 +52,7 @@ TENSION_SENSOR = FAULTY | NOT_FOLLOWING | {
 JOINT = frozenset({
     'joint_sensors_doubted', 'joint_readings_impossible', 'joint_readings_missing',
 })  # fmt: skip
-#: messages are rejected, and say why: a true symptom of readings that jump
+#: statements that messages are rejected, and why: true symptoms of readings that jump
 REJECTED = frozenset({
     'implausible_muscle_states', 'readings_rejected', 'stale_muscle_states', 'stale_estimate',
 })  # fmt: skip

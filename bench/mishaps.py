@@ -140,7 +140,7 @@ class Course:
         self.true_at: float | None = None  # time of the first true statement [s]
         self.first_true = ''
         self.advised_at: float | None = None  # time of the first advice [s]
-        self.started_at = lab.now  # time from which times are stated [s]
+        self.started_at = lab.now  # zero of the times in the result [s]
         self.mended_at: float | None = None
         self.is_found_by_advice = False
         self.false: dict[str, dict[str, Any]] = {}  # the first of each false statement
@@ -157,12 +157,12 @@ class Course:
     # -- time -----------------------------------------------------------------------------------
 
     def run(self, seconds: float) -> None:
-        """Let a time pass [s], and watch."""
+        """Run the laboratory for a time [s], and watch statements and tensions."""
         for _ in range(round(seconds / SAMPLE_TIME)):
             self.step()
 
     def step(self) -> None:
-        """Let one sample period pass, and watch."""
+        """Simulate one sample period, and watch statements and tensions."""
         lab = self.lab
         lab.step()
         self.peak = max(self.peak, float((lab.arm.tension / lab.arm.robot.tension.limit).max()))

@@ -28,7 +28,7 @@ def memory(pid: int) -> float:
 
 
 def end_processes(processes: Collection[subprocess.Popen[Any]], asked: signal.Signals) -> None:
-    """Send a signal to processes, and kill those that have not ended PATIENCE seconds later."""
+    """End processes by a signal, and kill those that have not ended PATIENCE seconds later."""
     for process in processes:
         process.send_signal(asked)
     for process in processes:

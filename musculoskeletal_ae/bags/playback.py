@@ -120,7 +120,7 @@ class Timeline:
         self._recorded, self._steady = recorded, now
 
     def hold(self, paused: bool, now: float) -> None:
-        """Pause playback, or resume it if `paused` is False, when the steady clock reads `now` [s].
+        """Hold playback, or resume it if `paused` is False, when the steady clock reads `now` [s].
 
         Neither changes the recorded time that has been reached.
         """

@@ -369,12 +369,15 @@ def _deliver(
 
 
 def _check_fit(bag: Bag, used: Mapping[str, _Stream], warnings: Sequence[str]) -> None:
-    """Raise a BagError if all messages of a topic were rejected.
+    """Check that no topic has had all its messages rejected.
 
     Args:
         bag: The recording.
         used: The stream of accepted messages of each topic, by the topic's name in warnings.
         warnings: A text for each reason for which messages of a topic were rejected.
+
+    Raises:
+        BagError: If all messages of a topic were rejected.
     """
     for label, stream in used.items():
         reasons = [text.partition(f' {label}: ')[2] for text in warnings if f' {label}: ' in text]

@@ -136,7 +136,7 @@ class Activities:
         return others.get(activity)
 
     def leave(self) -> None:
-        """End the present activity, because another activity or a stop follows."""
+        """Leave the present activity, because another activity or a stop follows."""
         if self.entered is not None:
             self.entered.leave()
         self.entered = None

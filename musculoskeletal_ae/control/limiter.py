@@ -133,7 +133,7 @@ class CommandLimiter:
             self._last_length = self.command.value, 0.0
 
     def shift(self, offset: Array) -> None:
-        """Convert the last commands to new length offsets, which are larger by `offset` [m], (M,).
+        """Shift the last commands to new length offsets, which are larger by `offset` [m], (M,).
 
         Corrected lengths are shorter by the same amount, and so are the stored length commands.
         """

@@ -53,12 +53,12 @@ class SafeStop:
         self._robot, self._settings = robot, settings
 
     def enter(self) -> None:
-        """Start a stop."""
+        """Enter a stop."""
         self.leave()
         self.is_entered = True
 
     def leave(self) -> None:
-        """End a stop."""
+        """Leave a stop."""
         self.is_entered = False
         self._held = 0.0  # counted time since the start of the stop (see `step`) [s]
         self._wound_from: float | None = None  # suspect's command before it was wound in [m]

@@ -171,7 +171,7 @@ class HeatLimit:
         self.heat.step(tension, sample.temperature, elapsed)
 
     def lower(self, highest: float, fall: Array | float) -> None:
-        """Update the tension limits.
+        """Lower the tension limits by at most `fall`, or raise them, as the temperatures require.
 
         Args:
             highest: Temperature limit of the windings [°C].

@@ -265,7 +265,7 @@ class Listening:
                 verdict.failed('stuck', *np.flatnonzero(stuck).tolist())
 
     def _judge_values(self, verdict: Verdict, states: Array) -> bool:
-        """Check from the ranges of possible values that rows, units and signs are right.
+        """Judge by the ranges of possible values whether rows, units and signs are right.
 
         Return False if they are wrong; the fault is then in the verdict.
 
@@ -316,7 +316,7 @@ class Listening:
         return False
 
     def _possible(self, states: Array) -> Bools:
-        """Return which readings are possible at rest, (Q, M); `states` are readings, (Q, M)."""
+        """Return which of the readings `states` (Q, M) are possible at rest, (Q, M)."""
         possible: Bools = (states >= self._low) & (states <= self._high)
         # Friction can make single currents negative, but not all of them by so much.
         pushes = states[Row.TENSION] < -PULLS[0] * self._robot.tension.bias
@@ -338,7 +338,7 @@ class Listening:
         return fault.replace('tension', 'current')
 
     def _judge_rest(self, verdict: Verdict, states: Array) -> None:
-        """Check the tensions and temperatures of modules that have received no command.
+        """Judge the tensions and temperatures of modules that have received no command.
 
         Args:
             verdict: Receives the results.
@@ -364,7 +364,7 @@ class Listening:
     def _judge_lengths_and_joints(
         self, verdict: Verdict, theta: Array, length: Array, tension: Array
     ) -> None:
-        """Compare the lengths with the model, and find faults of lengths or of joint sensors.
+        """Judge lengths and joint sensors by the model, and find which of them have faults.
 
         If several lengths have faults, and a single fault of the joint sensors explains all of
         them, only that fault is reported.
@@ -451,7 +451,7 @@ class Listening:
     def _judge_joint_signs(
         self, verdict: Verdict, theta: Array, length: Array, tension: Array
     ) -> None:
-        """Record which joint sensors have the right sign, if a hand has moved the arm.
+        """Judge the signs of the joint sensors, if a hand has moved the arm.
 
         Args:
             verdict: Receives the results.
@@ -522,7 +522,7 @@ class Listening:
     def _judge_lengths(
         self, verdict: Verdict, theta: Array, length: Array, tension: Array
     ) -> float:
-        """Compare the lengths with the geometric model, and report the faults of lengths.
+        """Judge the lengths by the geometric model, and report their faults.
 
         Args:
             verdict: Receives the results.

@@ -128,7 +128,7 @@ class MotionTest(ABC):
 
     @abstractmethod
     def _try(self, m: int) -> Wait:
-        """Check the responses of muscle m."""
+        """Try muscle m, and check its responses."""
 
     @abstractmethod
     def _run_away(self, states: Array, start: Array) -> RunAwayError | None:
@@ -141,7 +141,7 @@ class MotionTest(ABC):
 
     @abstractmethod
     def _release(self, error: RunAwayError) -> Wait:
-        """Pay out the muscle that has run away, within RELEASE seconds.
+        """Release the muscle that has run away: pay it out within RELEASE seconds.
 
         A test may pay out all muscles instead.
         """
@@ -174,7 +174,7 @@ class MotionTest(ABC):
                 self.verdict.failed(error.fault, error.muscle, **error.values)
 
     def _report_order(self, winds: dict[int, int]) -> None:
-        """Record that commands wind in other muscles: `winds[m]` is moved by the command of m."""
+        """Report that commands wind in other muscles: `winds[m]` is moved by the command of m."""
         names = self._robot.muscles
         (first, other), *more = winds.items()
         moves = [f'winding in {names[first]} moved the readings of {names[other]}']
@@ -204,7 +204,7 @@ class MotionTest(ABC):
         return wrong_side(self._robot, *messages, tested, winds, faults)
 
     def _judge_joints(self) -> None:
-        """Compare the joint sensors with the lengths, unless the lengths are wrong."""
+        """Judge the joint sensors by the lengths, unless the lengths are wrong."""
         verdict, robot = self.verdict, self._robot
         if not self._history or {'order', 'unit', 'sign'} & verdict.wrong:
             return
@@ -244,7 +244,7 @@ class MotionTest(ABC):
         verdict.notes += sign_notes(robot, judgement.right, remedy)
 
     def _report_misplaced(self, order: Judgement) -> None:
-        """Record muscles whose readings and commands are both misplaced."""
+        """Report muscles whose readings and commands are both misplaced."""
         moves = self._moves_like(order)
         self.verdict.failed('both misplaced', *order.wiring.misplaced, moves=moves)
 

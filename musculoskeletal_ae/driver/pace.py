@@ -54,7 +54,7 @@ class Pace:
         self._messages.append(_Message(came, self._awake.at(came), sent, number))
 
     def judge(self, verdict: Verdict, now: float) -> None:
-        """Check the rate and the gaps until `now` [s], and add the results to `verdict`."""
+        """Judge the rate and the gaps until `now` [s], and add the results to `verdict`."""
         came, came_awake, sent, number = map(np.array, zip(*self._messages))
         is_dated = bool(np.isfinite(sent).all() and (np.diff(sent) >= 0.0).all())
         is_numbered = is_dated and bool((number > 0).all() and (np.diff(number) > 0).all())
@@ -97,7 +97,7 @@ class Pace:
                 )
 
     def _judge_low(self, verdict: Verdict, rate: float) -> None:
-        """Report that the rate [Hz] is lower than expected, unless an overload may explain it."""
+        """Judge a rate [Hz] that is too low: report it, unless an overload may explain it."""
         if not is_overloaded():
             verdict.failed('rate', rate=rate, wanted=self._rate)
             return

@@ -208,7 +208,7 @@ class Winding(MotionTest):
         return None
 
     def _release(self, error: RunAwayError) -> Wait:
-        """Pay out all muscles, because the arm may be falling.
+        """Release all muscles by paying them out, because the arm may be falling.
 
         Every target moves away from the newest l, because l may change in the wrong direction. If
         a tension still rises, the sign of the commands is wrong, so that no more are sent.
@@ -399,7 +399,7 @@ class Winding(MotionTest):
     def _wind(
         self, m: int, level: float, home: float, latency: list[float]
     ) -> Generator[None, None, _Reading]:
-        """Demand a tension of a muscle, and return the reading that results.
+        """Wind a muscle in until it should have a tension, and return the reading that results.
 
         If the arm yields, so that the muscle shortens, l_target moves further inwards, until the
         demand or the distance FURTHEST is reached.
@@ -480,7 +480,7 @@ class Winding(MotionTest):
             self._judge_latency(m, min(half + whole))
 
     def _judge_law(self, m: int, home: _Reading, last: _Reading, out: _Reading) -> None:
-        """Check the law at the highest demand, and with l_target beyond l."""
+        """Judge whether T obeys the law at the highest demand, and with l_target beyond l."""
         failed = self.verdict.failed
         asked, got = last.demand[m] - home.demand[m], last.tension[m] - home.tension[m]
         if asked < 0.25 * (self._highest - self._bias)[m]:

@@ -93,7 +93,7 @@ def teach(
     stream: Iterable[tuple[Array, ...]],
     view: JointView = lambda _learner, _n, _true, read: read,
 ) -> None:
-    """Feed the messages of a recording to a learner one by one, as the learner node does.
+    """Teach a learner the messages of a recording one by one, as the learner node does.
 
     For each message, `view` returns the joint angles [rad] that the learner receives, or None. By
     default, these are the joint-sensor readings.
@@ -105,7 +105,7 @@ def teach(
 def teach_and_evaluate(
     learner: Learner, stream: Iterable[tuple[Array, ...]], held_out: Recording
 ) -> tuple[Curve, Recording]:
-    """Feed messages to a learner, and evaluate it on the held-out motion after each update.
+    """Teach a learner messages, and evaluate it on the held-out motion after each update.
 
     Returns:
         The course of learning, and a recording of the messages.

@@ -48,7 +48,7 @@ SMALLER = 0.9  # multiply the width of a picture by this until the file is small
 
 
 def update_page(page: Path, measured: Path | None = None) -> list[Path]:
-    """Rewrite the page; return the files that were written.
+    """Update the page; return the files that were written.
 
     Args:
         page: File of the page; results and pictures are in the folder of the same name beside it.

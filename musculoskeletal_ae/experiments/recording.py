@@ -130,7 +130,7 @@ class ClosedLoop:
         self.wait(duration)
 
     def check(self) -> None:
-        """Raise a MusculoskeletalError if the controller has stopped."""
+        """Check that the controller runs; raise a MusculoskeletalError if it has stopped."""
         condition = self.core.supervisor.condition
         if condition is not None:
             raise MusculoskeletalError(f'control stopped: {condition.text}')
@@ -140,7 +140,7 @@ class ClosedLoop:
         self.core.target(dict(zip(self.arm.robot.joints, ((t, 0.0) for t in theta.tolist()))))
 
     def wait(self, duration: float) -> None:
-        """Advance the time by `duration` [s]."""
+        """Wait for `duration` [s] of simulated time."""
         for _ in range(round(duration / SAMPLE_TIME)):
             self.step()
 
@@ -152,7 +152,7 @@ def record(
     duration: float,
     script: Script | None = None,
 ) -> Recording:
-    """Drive an arm through the three steps of exploration with a fixed list of commands.
+    """Record an arm while a fixed list of commands drives it through the steps of exploration.
 
     Every command is computed by method `first`. Method `second` would need the current tension,
     which a fixed list cannot contain. The step of `second` is therefore replaced by `first` with

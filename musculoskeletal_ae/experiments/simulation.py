@@ -56,7 +56,7 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def simulate(robot: Robot, mae: Mae, preset: str, recording: Recording) -> Motion:
-    """Let a network's simulator follow the commands of a recording, and return its motion.
+    """Simulate the commands of a recording with a network, and return the motion.
 
     The simulator starts in the first posture of the recording.
     """

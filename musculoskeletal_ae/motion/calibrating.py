@@ -57,7 +57,7 @@ class Calibrating(ActivityControl):
         self._robot = robot
 
     def enter(self, _: Inputs) -> None:
-        """Start from the present posture."""
+        """Enter the activity, starting from the present posture."""
         self._ramp, self._rested = None, 0.0
 
     def step(self, inputs: Inputs) -> Command | None:
@@ -71,7 +71,7 @@ class Calibrating(ActivityControl):
         return Command(LENGTH, self._ramp.step(inputs.dt))
 
     def leave(self) -> None:
-        """Discard the present motion."""
+        """Leave the activity, and discard its motion."""
         self._ramp = None
 
     def _goal(self, inputs: Inputs) -> Array:

@@ -87,7 +87,7 @@ class RestFeedback:
         self._robot = robot
 
     def reset(self) -> None:
-        """Set the corrections c and r to zero."""
+        """Reset the corrections c and r to zero."""
         self.correction: Array = np.zeros(self._robot.joint_count)
         self.relief: Array = np.zeros(self._robot.muscle_count)
 

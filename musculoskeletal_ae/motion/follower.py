@@ -157,7 +157,7 @@ class Follower(ActivityControl):
     # -- the activity ---------------------------------------------------------------------------
 
     def enter(self, _: Inputs) -> None:
-        """Start following, or continue after a pause, from the present tensions."""
+        """Enter the activity, or continue it after a pause, from the present tensions."""
         self._held = self._blend = self._desired = None
         self.progress.return_to_end()  # plan the tensions of the held posture again
         self.plan.reset()
@@ -165,7 +165,7 @@ class Follower(ActivityControl):
         self.winches.forget()
 
     def leave(self) -> None:
-        """Discard the trajectories."""
+        """Leave the activity, and discard the trajectories."""
         self.progress.discard()
 
     def step(self, inputs: Inputs) -> Command | None:

@@ -150,7 +150,7 @@ class StiffnessModel(NamedTuple):
 
     @classmethod
     def read(cls, robot: Robot, mae: Mae, theta: Array, tension: Array) -> StiffnessModel:
-        """Compute the model from the network at the posture θ [rad], (D,), and T [N], (M,)."""
+        """Read the model from the network at the posture θ [rad], (D,), and T [N], (M,)."""
 
         def jacobian(postures: Array) -> Array:
             return mae.muscle_jacobian(postures, np.tile(tension, (len(postures), 1)))

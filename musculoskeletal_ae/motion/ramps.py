@@ -197,7 +197,7 @@ class RampedTarget(ActivityControl):
         self.ramps.pursue(self._goals())
 
     def enter(self, inputs: Inputs) -> None:
-        """Start from the present tensions."""
+        """Enter the activity, starting from the present tensions."""
         self.ramps.start_from(inputs.length)
         self.ramps.pursue(self._goals())
 
@@ -206,7 +206,7 @@ class RampedTarget(ActivityControl):
         return self.ramps.step(inputs)
 
     def leave(self) -> None:
-        """End the activity; the target is kept for the next time."""
+        """Leave the activity; the target is kept for the next time."""
 
     @property
     def has_arrived(self) -> bool:

@@ -58,7 +58,7 @@ class TorqueControl(ActivityControl):
         self._target = theta, effort
 
     def enter(self, inputs: Inputs) -> None:
-        """Start from the present tensions."""
+        """Enter the activity, starting from the present tensions."""
         self._command = np.maximum(inputs.tension, self._robot.tension.bias)
         self._smooth = None
 
@@ -69,7 +69,7 @@ class TorqueControl(ActivityControl):
         return self._command_towards(*self._target, inputs)
 
     def leave(self) -> None:
-        """End the activity; the target is kept for the next time."""
+        """Leave the activity; the target is kept for the next time."""
 
     @property
     def has_arrived(self) -> bool:
@@ -128,7 +128,7 @@ class GravityCompensation(TorqueControl):
         self._theta: Array | None = None  # the last posture [rad], (D,)
 
     def enter(self, inputs: Inputs) -> None:
-        """Hold the present posture, starting from the present tensions."""
+        """Enter the activity in the present posture, starting from the present tensions."""
         super().enter(inputs)
         self.held = None
 

@@ -79,6 +79,6 @@ class Winches:
         self._squares += float(speed[is_usable] @ speed[is_usable])
 
     def forget(self) -> None:
-        """Discard the last length after a pause; the estimate of the lag remains."""
+        """Forget the last length after a pause; the estimate of the lag remains."""
         self._length, self._since = None, 0.0
         self._speed = np.zeros_like(self._speed)

@@ -87,7 +87,7 @@ class StopRecording:
                 self._latched[left[1]] = left
 
     def save(self, cause: str, most: int) -> None:
-        """Write the kept messages in the background, and delete the oldest recordings.
+        """Save the kept messages in the background, and delete the oldest recordings.
 
         Nothing happens while an earlier recording is still being written.
 

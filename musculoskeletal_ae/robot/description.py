@@ -206,7 +206,7 @@ def refusal(file: Path, problem: str) -> RobotDescriptionError:
 
 
 def load_description(robot: str | Path) -> RobotDescription:
-    """Read and check a robot description: a shipped name such as 'arm26', or a directory.
+    """Load and check a robot description: a shipped name such as 'arm26', or a directory.
 
     Raises:
         RobotDescriptionError: If the description is invalid; the message names the file, the entry
@@ -298,9 +298,9 @@ def _columns(rows: list[dict[str, float]]) -> dict[str, Array]:
 
 
 def _check_joints(joints: tuple[str, ...], model: pin.Model, fail: Fail) -> None:
-    """Raise an error if a joint in `joints` of muscles.yaml is not legal.
+    """Check that every joint in `joints` of muscles.yaml is legal.
 
-    It has to be a revolute or prismatic joint of robot.urdf with finite limits.
+    A legal joint is a revolute or prismatic joint of robot.urdf with finite limits.
     """
     for i, name in enumerate(joints):
         if problem := _joint_problem(name, model):

@@ -87,7 +87,7 @@ def _within(line: Line, middle: Array, reach: float) -> Line:
 
 
 def save_picture(lines: Sequence[Line], path: Path, title: str = '', whole: bool = True) -> None:
-    """Draw lines in true proportions, seen from the front and from the side, and save them.
+    """Save a picture of lines in true proportions, seen from the front and from the side.
 
     Args:
         lines: The lines.

@@ -123,7 +123,7 @@ def read_mimics(root: ET.Element) -> dict[str, Coupling]:
 
 
 def _check_expanded(file: Path, root: ET.Element) -> None:
-    """Reject a file that still contains macros, which the URDF parser would ignore."""
+    """Check that a file contains no macros, which the URDF parser would ignore."""
     for problem in _preprocessor_parts(root):
         remedy = 'expand it to a new file first:  xacro FILE > NEW.urdf'
         raise RobotDescriptionError(f'{file}: this is a xacro, not a URDF ({problem}); {remedy}')
@@ -146,7 +146,7 @@ def _preprocessor_parts(root: ET.Element) -> Iterator[str]:
 
 
 def _limit_mimics(parts: list[ET.Element]) -> bool:
-    """Change continuous joints with <mimic> into revolute ones; return whether there are any.
+    """Limit continuous joints with <mimic>, as revolute joints; return whether there are any.
 
     Pinocchio represents a continuous joint by two coordinates, which cannot follow the single
     coordinate of the mimicked joint. A revolute joint must have limits. They are so wide that they
@@ -167,10 +167,10 @@ def _limit_mimics(parts: list[ET.Element]) -> bool:
 
 
 def _check_tree(file: Path, parts: list[ET.Element]) -> None:
-    """Reject links and joints that do not form a tree.
+    """Check that links and joints form a tree.
 
-    Pinocchio's parser would only report them on stderr. If several joints have the same child, it
-    would use the last one.
+    Pinocchio's parser would only report faults on stderr. If several joints have the same child,
+    it would use the last one.
     """
     links, held = {part.get('name') for part in parts if part.tag == 'link'}, set[str | None]()
     for (tag, name), count in Counter((part.tag, part.get('name')) for part in parts).items():

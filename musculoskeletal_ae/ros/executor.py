@@ -108,7 +108,7 @@ class LeanExecutor(SingleThreadedExecutor):
         super().wake()
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
-        """Schedule a function or coroutine for the next *full round*, and return its task."""
+        """Create and return a task that runs a function or coroutine in the next *full round*."""
         self._is_changed = True
         return super().create_task(callback, *args, **kwargs)
 

@@ -45,7 +45,7 @@ def waited_for_processor() -> float:
 
 
 def end_process() -> None:
-    """Dump the stacks of all threads, and end the process immediately."""
+    """End the process immediately, after dumping the stacks of all threads."""
     problem = f'no progress for {LONGEST_STALL:g} s; the process ends'
     print(f'{problem}. Stacks of all threads:', file=sys.stderr)
     faulthandler.dump_traceback(all_threads=True)
@@ -85,7 +85,7 @@ class ProgressWatch:
         self._thread.start()
 
     def note(self) -> None:
-        """Record that the main thread makes progress."""
+        """Note that the main thread makes progress."""
         self._quiet = 0.0
 
     def stop(self) -> None:

@@ -129,7 +129,8 @@ class CheckDriver:
         if listening.count:
             if is_first:
                 text = f'listening for {chosen.seconds:g} s'
-                if chosen.move or chosen.seconds >= COUNTDOWN:  # otherwise too short to follow it
+                # Give an instruction only if there is time to follow it.
+                if chosen.move or chosen.seconds >= COUNTDOWN:
                     has_joint_sensors = node.count_publishers(JOINTS) > 0
                     text += f': {_instruction(self.robot, chosen, has_joint_sensors)}'
                 _say(text)

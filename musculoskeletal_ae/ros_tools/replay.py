@@ -160,7 +160,7 @@ class Replay(Node):
             serve(self, Trigger, f'replay/{work.__name__}', work)
 
     def play(self, progress: tqdm, again: bool) -> None:
-        """Publish all messages from start to stop; if `again`, repeat until the process ends."""
+        """Play all messages from start to stop; if `again`, repeat until the process ends."""
         self._lap(progress)
         while again:
             self._wait(self._stop + LAP_GAP, progress)
@@ -434,7 +434,7 @@ def parse(arguments: list[str]) -> Namespace:
 
 
 def _check_combination(parser: Parser, options: Namespace) -> None:
-    """Exit with an error if options contradict each other or would have no effect."""
+    """Check that options fit together and have an effect; otherwise, exit with an error."""
     if options.rate != 1 and not options.clock:
         parser.error(
             '--rate other than 1 needs --clock, and nodes with use_sim_time, because nodes with '

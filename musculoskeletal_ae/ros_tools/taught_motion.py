@@ -31,7 +31,7 @@ SENDINGS = 3  # try at most this often to send a trajectory
 
 
 def send_taught_motion(bag: Bag, options: Namespace, arguments: list[str]) -> int:
-    """Publish a hand-guided motion as one trajectory, and return the exit status 0.
+    """Send a hand-guided motion as one trajectory, and return the exit status 0.
 
     Raises:
         MusculoskeletalError: If the bag has no hand-guided motion, or the trajectory is not
@@ -106,7 +106,7 @@ class _Answers:
 
 
 def _send(node: Node, spinner: Spinner, message: JointTrajectory, topic: str, wait: float) -> None:
-    """Publish a trajectory to the connected nodes, and wait until one has used it.
+    """Send a trajectory to the connected nodes, and wait until one has used it.
 
     Raises:
         MusculoskeletalError: If there is no subscriber, or the trajectory was lost or refused.

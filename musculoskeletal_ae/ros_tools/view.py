@@ -229,7 +229,7 @@ class View(Node):
             time.sleep(max(0.0, begun + PERIOD - time.monotonic()))
 
     def _show(self, now: float) -> None:
-        """Read the newest messages and show them; `now` is monotonic time [s]."""
+        """Show the newest messages; `now` is monotonic time [s]."""
         self._take()
         self.situation.forget_ended()
         posture = {arm: at for arm in ARM_TOPICS if (at := self._newest(arm)) is not None}
@@ -289,7 +289,7 @@ class View(Node):
         self.page.follow(self.payload, self._newest('played', math.inf))
 
     def _show_reset_outcome(self) -> None:
-        """Tell visitors, SETTLE_TIME after a reset, whether the arm has stopped again."""
+        """Show visitors, SETTLE_TIME after a reset, whether the arm has stopped again."""
         if time.monotonic() > self.reset_at + SETTLE_TIME:
             self.reset_at = math.inf
             trouble, is_stopped = self.situation.trouble(), self.situation.is_stopped

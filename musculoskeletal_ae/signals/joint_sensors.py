@@ -35,7 +35,7 @@ BEYOND = 0.3  # let a correct θ exceed the joint limits by at most this [rad]
 #: than this fraction.
 BETTER = 0.8
 MOST_SAMPLES = 600  # use at most this many messages, evenly distributed
-LEAST_SAMPLES = 20  # judge sensors by no fewer messages than this
+LEAST_SAMPLES = 20  # judge sensors only by at least this many messages
 STUCK_TIME = 5.0  # count a reading as stuck only if it repeats for at least this time [s]
 #: count a repeated reading as stuck if the lengths show that its joint moves by more than this
 #: [rad]

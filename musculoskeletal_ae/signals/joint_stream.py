@@ -133,7 +133,7 @@ class JointChannel:
         return JointReading.JUMPED
 
     def note(self, time: float, value: float, kind: JointReading) -> None:
-        """Record a reading [rad] received at `time` [s], and how it was judged in the end."""
+        """Note a reading [rad] received at `time` [s], and how it was judged in the end."""
         series = self.series
         if kind is JointReading.USABLE:
             self._accepted = value

@@ -242,7 +242,7 @@ class LengthJumps:
         return True
 
     def _note(self, large: LargeChange) -> None:
-        """Add a large change to the present jump, or begin one if the change is too large."""
+        """Note a large change: add it to the present jump, or begin one if it is too large."""
         self._large = [each for each in self._large if large.at - each.at <= LIMITS.glitch]
         if self._jump is None and not large.is_jump:
             self._large.append(large)
@@ -290,7 +290,7 @@ class DisplacedMuscles:
     is_unseen: bool = False
 
     def note(self, verdict: JumpVerdict) -> None:
-        """Record the muscles that are displaced from now on."""
+        """Note the muscles that are displaced from now on."""
         if verdict.displaced:
             self.muscles |= set(verdict.displaced)
             self.jumps += 1

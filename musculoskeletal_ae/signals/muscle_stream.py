@@ -139,7 +139,7 @@ class PlausiblePull:
         self._last: deque[Array] = deque(maxlen=window)  # readings, (Q, M) each
 
     def note(self, states: Array) -> None:
-        """Record the readings of a message, (Q, M)."""
+        """Note the readings of a message, (Q, M)."""
         self._last.append(states)
 
     def median(self, offset: Array) -> Array | None:
@@ -200,7 +200,7 @@ class MuscleStream:
         self._delay = 0.0  # delay of the newest message, accepted or not [s]
 
     def use_transmission(self, transmission: Transmission) -> None:
-        """From now on, compute motor-side and bone-side tensions by this transmission."""
+        """Use a transmission to compute motor-side and bone-side tensions from now on."""
         if self._robot.tension_source.is_current and transmission.drive is None:
             unknown = Transmission.unknown(self._robot.description.tension.limit)
             transmission = replace(unknown, friction=transmission.friction)
@@ -294,7 +294,7 @@ class MuscleStream:
         )
 
     def _judge(self, read: Array, states: Array, now: float) -> JumpVerdict:
-        """Check all values for plausible levels, and the lengths for jumps.
+        """Judge whether all values have plausible levels, and whether lengths jump.
 
         Args:
             read: The readings, (Q, M).

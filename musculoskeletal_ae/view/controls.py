@@ -262,7 +262,7 @@ class Controls:
         return False
 
     def _show(self, theta: Array) -> None:
-        """Set the sliders to a posture θ [rad] (D,)."""
+        """Show a posture θ [rad] (D,) on the sliders."""
         positions = self._robot.units.to_position(theta)
         for joint, position, slider in zip(self._robot.joints, positions, self.sliders):
             near = round(np.clip(position, slider.min, slider.max) / slider.step) * slider.step
