@@ -195,7 +195,7 @@ class Lab:
         self.estimator = Estimator(robot)
         self.controller = Controller(robot, seed=EXPLORATION_STREAM + seed)
         self.learner = Learner(robot, initial, seed=seed, steps=STEPS, trainer=Seldom)
-        self.validator = CheckpointValidator(robot)  # of the estimator
+        self.validator = CheckpointValidator(robot)  # validates networks for the estimator
         self.rejected_networks: list[str] = []  # why the estimator rejected networks
         self._candidate: Mae | None = None  # newest network that the learner published
         #: reliable messages that wait for controller and learner, and estimates and command

@@ -68,7 +68,7 @@ from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.robot.robot import Robot
 
 LEARNING = 180.0  # let an individual learn for this time before its mishaps [s]
-#: let the individual of this seed, whose network is the wrong one, learn for this time [s]
+#: learn for this time with the individual of this seed, whose network serves as the wrong one [s]
 OTHER_LEARNING, OTHER_SEED = 90.0, 990
 LOOK = 0.1  # read the statements at this interval [s]
 GOAL = 5.0  # count a true statement as in time within this time after the first effect [s]

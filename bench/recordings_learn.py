@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models that estimate θ in recordings: that of this package, and others to compare it with.
+"""Models that estimate θ in recordings: a network of this package, and others for comparison.
 
 Every model maps lengths (and efforts) to θ. All are trained on rest samples; `polynomial` may also
 receive all rows of a run.

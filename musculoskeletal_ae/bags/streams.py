@@ -338,8 +338,8 @@ def _deliver(
 ) -> None:
     """Read messages, and pass each one to the functions for its topic.
 
-    The functions receive the decoded message, and when messages of its sender arrived, in the time
-    since the bag's start.
+    The functions receive the decoded message, and an `Arrival` with the times [s], since the start
+    of the bag, at which messages of its sender arrived.
 
     Args:
         messages: The messages to read.

@@ -111,7 +111,7 @@ class TimedMessages:
         longest = max(
             (self._bunched[name].longest for name in topics if name in self._bunched), default=0
         )
-        waiting: list[tuple[int, int, BagMessage]] = []  # a heap
+        waiting: list[tuple[int, int, BagMessage]] = []  # heap, ordered by best time
         for n, message in enumerate(self.bag.messages(topics, start, stop + longest)):
             # Later messages of the bag have best times after this time.
             while waiting and waiting[0][0] < message.log_time - longest:

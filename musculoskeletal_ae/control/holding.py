@@ -24,7 +24,7 @@ from musculoskeletal_ae.motion import reach
 from musculoskeletal_ae.robot.robot import Robot
 
 AWAY = 0.5  # report a joint that rests further than this away from its target [rad]
-LASTING = 5.0  # report it only once it has been away for this time [s]
+LASTING = 5.0  # report a joint only once it has been away for this time [s]
 #: state these causes where the check finds no other
 POSSIBLE_CAUSES = (
     'possible causes: a payload or contact, tendon friction, a muscle that pulls less than its '

@@ -41,12 +41,12 @@ TEMPERATURES = -20.0, 130.0  # count temperatures outside this range as impossib
 #: let l exceed its range by this distance, with and without length calibration [m]
 BEYOND = 0.1, 1.0
 BEYOND_JOINT = 0.3  # report a fault if θ exceeds the joint limits by more than this [rad]
-BEYOND_SHARE = 0.95  # judge this by the excess that this share of the messages does not exceed
+BEYOND_SHARE = 0.95  # judge θ by the excess that this share of the messages does not exceed
 #: report a fault if |T − T_bias| exceeds the smaller of these while nothing is commanded, [N] and
 #: relative to T_bias; they cover errors of the sensor and of its zero
 RESTING_TENSION, RESTING_SHARE = 15.0, 0.5
 PULLS = 0.3, 3.0  # reinterpret units or rows only if T / T_bias at rest is then in this range
-#: reinterpret them only if the temperatures of modules at rest are then in this range [°C]
+#: reinterpret units or rows only if temperatures at rest are then in this range [°C]
 USUAL = 10.0, 60.0
 #: T is in another unit if all muscles, converted from that unit to N, are within this fraction of
 #: T_bias

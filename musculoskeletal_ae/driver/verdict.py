@@ -72,7 +72,7 @@ class Verdict:
         self._remedies: list[tuple[tuple[Check, ...], str]] = []
         #: observations of checks that failed while this computer was overloaded, by check
         self._excused: dict[str, list[str]] = {}
-        self._load = ''  # load of this computer at the first of these observations
+        self._load = ''  # load of this computer at the first excused observation
         #: why the motion test must not begin although no fault was found; empty if it may begin
         self.obstacle = ''
 

@@ -83,7 +83,7 @@ OFF_KEYS = 'detection_s', 'detected_share', 'named_share'  # keys reported for s
 def measure(study: Study, seed: int) -> Measured:
     """Measure the estimates of one individual, and the detection of its ruptured muscles."""
     robot = study.robot
-    # A muscle needs half of its time even in a shortened run.
+    # Even in a shortened run, a muscle needs half of its usual time.
     most, slot = (1, 0.5 * SLOT) if study.quick else (None, SLOT)
     plan = GraspAndRupture(robot, study.held_out_time, seed, most=most, slot=slot)
     driven_by = study.network(None, 'default')

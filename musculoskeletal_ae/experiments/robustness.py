@@ -62,7 +62,7 @@ QUICK = ('friction',)
 ABLATION_INDIVIDUALS = 2  # remove effects of this many individuals
 #: label of a run with all effects and another exploration, which shows the difference between runs
 REPEATED = 'nothing: another run'
-OTHER_RUN = 1000  # add this to the seed of exploration and training of that run
+OTHER_RUN = 1000  # add this to the seed of exploration and training of the repeated run
 
 
 def measure(study: Study, seed: int) -> Measured:

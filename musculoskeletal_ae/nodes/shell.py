@@ -583,7 +583,7 @@ class Shell(Node):
 
 
 def _signs(conditions: Iterable[Condition]) -> frozenset[tuple[str, str, tuple[str, ...]]]:
-    """Return what distinguishes conditions, without the values in their texts."""
+    """Return identifiers, levels and subjects of conditions, without the values in their texts."""
     return frozenset((each.identifier, each.level, each.subjects) for each in conditions)
 
 

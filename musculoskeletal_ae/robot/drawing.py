@@ -15,7 +15,7 @@ from musculoskeletal_ae.figures import save_figure
 from musculoskeletal_ae.robot.robot import Robot
 
 SHORTEST_BONE = 1e-3  # draw no shorter bone, because it connects two joints in the same place [m]
-BONE_WIDTH, MUSCLE_WIDTH = 0.02, 0.006  # [m]
+BONE_WIDTH, MUSCLE_WIDTH = 0.02, 0.006  # draw lines of these widths [m]
 BONE_COLOUR = (0.8, 0.8, 0.75)  # red, green, blue
 BALL_SIZE = 1.7  # draw a ball of this diameter, divided by the width of its line
 

@@ -100,7 +100,7 @@ class Record(Node):
                 qos.reliability = ReliabilityPolicy.BEST_EFFORT
             elif policy == QoSPolicyKind.DURABILITY:
                 qos.durability = DurabilityPolicy.VOLATILE
-            else:  # the subscription requests no other policy
+            else:  # no other policy of the subscription can be weakened
                 continue
             self.destroy_subscription(before)
             self._subscribe(name, qos)

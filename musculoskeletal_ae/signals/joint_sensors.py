@@ -43,8 +43,8 @@ STUCK_MOTION = 0.2
 #: count a repeated reading as stuck if the lengths show that its joint is further away from it than
 #: this [rad]
 STUCK_OFFSET = 0.5
-#: believe this motion or distance only if it leaves at most this fraction of the mean square of the
-#: misfit of l
+#: believe in a hidden motion or distance of a joint only if it leaves at most this fraction of the
+#: mean square of the misfit of l
 STUCK_EXPLAINED = 0.5
 DEGREES, SIGN, ORDER, STUCK = 'degrees', 'joint sign', 'joint order', 'joint stuck'
 

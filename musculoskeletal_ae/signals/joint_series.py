@@ -44,9 +44,9 @@ LEAST_REPEATED = 3  # count equal readings as a constant only if there are at le
 #: lasts although at most the share NOISY of the other readings repeat the one before. Otherwise, a
 #: sensor may have slipped.
 RETURNING, NOISY = 0.5, 0.1
-#: If more than this share of the readings of a joint is far outside its limits, or if it gets there
-#: without a jump more often than this, its unit, sign or zero is wrong, and no single reading is to
-#: blame. `joint_sensors.py` judges these.
+#: Assume that the unit, sign or zero of a joint is wrong, and blame no single reading, if more than
+#: this share of its readings is far outside its limits, or if more than this share of its steps
+#: over the limits is no jump. `joint_sensors.py` then finds the fault.
 WRONG_SCALE = 0.5
 #: Whole turns are subtracted from the readings of a joint if at least this share of those readings
 #: is then within the limits and continuous with the reading before
