@@ -40,9 +40,9 @@ from musculoskeletal_ae.robot.robot import Robot
 
 EXPLORED, HELD_OUT = 300.0, 60.0  # durations of the exploration and of the held-out motion [s]
 TARGETS, HELD = 5, 4.0  # number of targets, and default time for each of them [s]
-RUPTURES = 3  # number of muscles that rupture, one after another
-MOVING = 4.0  # time for which the arm explores before a rupture [s]
-LATEST = 10.0  # longest wait for an isolation after a rupture [s]
+RUPTURES = 3  # rupture this many muscles, one after another
+MOVING = 4.0  # explore for this time before a rupture [s]
+LATEST = 10.0  # wait at most this long for an isolation after a rupture [s]
 #: kinds of muscle modules, each with the entries of muscles.yaml that describe it
 KINDS = {
     'stiffness': {'actuation': 'stiffness'},

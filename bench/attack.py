@@ -41,15 +41,15 @@ from musculoskeletal_ae.robot.robot import Robot
 if TYPE_CHECKING:
     from bench.attack_graph import Attack
 
-JITTER = 0.03  # longest delay from computing to publishing a command on a loaded machine [s]
-RELIEF = 0.3  # paying out may exceed the rate limit for this time after an excess tension [s]
-SILENT = 10.0  # longest legal time between two reports of a node under attack [s]
-GROWTH = 1.2  # largest legal ratio of a node's memory to its memory at the age YOUNG
-YOUNG = 300.0  # age of a node at which its memory is measured for GROWTH [s]
-#: A tension may exceed ABOVE times tension.limit for at most MOMENT [s].
+JITTER = 0.03  # allow this delay from computing to publishing a command on a loaded machine [s]
+RELIEF = 0.3  # let paying out exceed the rate limit for this time after an excess tension [s]
+SILENT = 10.0  # report a longer time between two reports of a node under attack [s]
+GROWTH = 1.2  # report a node whose memory exceeds this multiple of its memory at the age YOUNG
+YOUNG = 300.0  # measure the memory of a node for GROWTH at this age [s]
+#: Report a tension that exceeds ABOVE times tension.limit for longer than MOMENT [s].
 ABOVE, MOMENT = 1.1, 0.5
-STILL = 0.002  # largest length by which a muscle of a stopped arm may be wound in [m]
-MOST_MEMORY = 500.0  # largest legal memory of a node at any time [MB]
+STILL = 0.002  # report a muscle of a stopped arm that is wound in by more than this [m]
+MOST_MEMORY = 500.0  # report a node that uses more memory at any time [MB]
 
 
 class Size(NamedTuple):
@@ -69,7 +69,7 @@ FULL = Size(None, 2000, messages=100_000, node_kills=40, learner_kills=50, files
 QUICK = Size(1, 2, messages=300, node_kills=1, learner_kills=0, files=7, episodes=1, rate=50.0)
 SEEDS = 0, 1, 2, 3, 4
 GRAPH, KILLS, FILES = PARTS = 'graph', 'kills', 'files'
-EVENTS_IN_A_ROW = 50  # number of random events between two recoveries of the arm
+EVENTS_IN_A_ROW = 50  # recover the arm after this many random events
 
 
 class Row(NamedTuple):

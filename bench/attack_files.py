@@ -26,8 +26,8 @@ from robots import chain
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
-LONGEST = 5.0  # longest legal CPU time for one file [s]
-MOST_MEMORY = 300  # largest memory that reading one file may add to the peak of the process [MB]
+LONGEST = 5.0  # report a file that takes more CPU time [s]
+MOST_MEMORY = 300  # report a file that adds more to the peak memory of the process [MB]
 NASTY: tuple[object, ...] = (
     0.0, -1.0, 1e-300, 1e300, -1e300, float('nan'), float('inf'), 2**70, '', '\x1b[2J', [], {},
 )  # fmt: skip
@@ -35,7 +35,7 @@ KINDS = ('urdf', 'muscles', 'table', 'checkpoint', 'state', 'metadata', 'mcap')
 
 
 class Attempt(NamedTuple):
-    """Outcome of reading one file: `used`, `refused`, or the description of a finding."""
+    """Outcome of reading one file: `used`, `refused`, or a description of what went wrong."""
 
     kind: str
     outcome: str
@@ -44,7 +44,7 @@ class Attempt(NamedTuple):
 
     @property
     def broken(self) -> bool:
-        """Whether the outcome is a finding."""
+        """Whether the file was neither used nor refused, or took too much time or memory."""
         sound = self.outcome in ('used', 'refused')
         return not sound or self.seconds > LONGEST or self.memory > MOST_MEMORY
 

@@ -66,10 +66,10 @@ SERVICES = {
     'rcl_interfaces/srv/ListParameters': ListParameters,
 }
 OWN = QoSProfile(depth=1000)
-JUDGE_PERIOD = 0.25  # time between two checks of the status line [s]
-PATIENCE = 90.0  # longest wait for an expected event [s]
-COOLING = 900.0  # longest additional wait for overheated windings to cool [s]
-WARM = 40.0  # temperature of a winding above which the emulated arm is reset [°C]
+JUDGE_PERIOD = 0.25  # check the status line at this interval [s]
+PATIENCE = 90.0  # wait at most this long for an expected event [s]
+COOLING = 900.0  # wait at most this much longer for overheated windings to cool [s]
+WARM = 40.0  # reset the emulated arm if a winding is warmer [°C]
 LENGTH, TENSION = 'muscle_length_command', 'muscle_tension_command'
 
 FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-300, 1e9, -1e9, 1e308, -1e308, math.nan, math.inf, -math.inf)
@@ -110,7 +110,7 @@ class Process:
             self.memory.append((time.monotonic() - self.started, memory(self.process.pid)))
 
     def kill(self) -> None:
-        """End the process by SIGKILL."""
+        """Kill the process by SIGKILL."""
         self.process.kill()
         self.process.wait()
 
@@ -370,8 +370,8 @@ class Attack:
         for node, name, value in HEALTHY:
             self.call(SetParameters, f'{node}/set_parameters', set_request(name, value))
         self.call(Trigger, 'estimator/restore')
-        # Otherwise spare the arm the reset: it jumps to its first posture, and the jump of the
-        # lengths would require their calibration.
+        # Reset the arm only if necessary: a reset puts it into its first posture, and the jump of
+        # the lengths would require their calibration.
         if self.levels['hardware_emulator'][1].level != DiagnosticStatus.OK or self.is_warm():
             self.call(Trigger, 'hardware_emulator/reset')
         self.call(SetBool, 'learner/enable', SetBool.Request(data=True))

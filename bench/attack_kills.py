@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kills of a learner by SIGKILL at random moments, with a check of its saved state.
+"""Kills a learner by SIGKILL at random times, and checks its saved state.
 
 A child process runs the `Learner` of the node, with its training process, on random samples. It
 reports each accepted sample and each published network. After a kill, the next child must load all
@@ -24,10 +24,12 @@ from musculoskeletal_ae.learning.trainer import TrainerProcess
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.robot.robot import Robot
 
-LONGEST = 6.0  # latest time of a kill [s]; by then, a child has started, trained and saved
-SPACING = 0.02  # time between two samples [s]
-STEPS = 20  # training steps of an update; few, so that many saves are interrupted by a kill
-DEADLINE = 60.0  # longest wait for a child to start [s]
+#: kill a child no later than this after its start [s]; by then, it has started, trained and saved
+LONGEST = 6.0
+SPACING = 0.02  # accept a sample at this interval [s]
+#: train for this many steps in an update; they are few, so that a kill interrupts many saves
+STEPS = 20
+DEADLINE = 60.0  # wait at most this long for a child to start [s]
 
 
 def samples(robot: Robot, life: int) -> Iterator[Sample]:
@@ -100,7 +102,7 @@ class Child:
                     self.up.set()
 
     def kill(self) -> None:
-        """End the process by SIGKILL."""
+        """Kill the process by SIGKILL."""
         self._process.kill()
         self._process.wait()
         self._reader.join()

@@ -29,8 +29,9 @@ from musculoskeletal_ae.ros.messages import LATCHED, array_message, bytes_messag
 from musculoskeletal_ae.signals.body_state import Anomaly, BodyState, LengthOffsets
 
 MOMENTS = 'holding', 'exploring'
-LASTING = 4.0  # duration of an attack [s]
-REPORT_TIME = 2.0  # longest time from the start of a problem to its report in the status line [s]
+LASTING = 4.0  # attack for this time [s]
+#: report a violation if the status line says OK this long after a problem has begun [s]
+REPORT_TIME = 2.0
 #: steps that end the faults of the emulated arm
 REPAIRS = {
     Step.REPAIR_MUSCLE,
@@ -43,7 +44,7 @@ REPAIRS = {
     Step.CHECK_JOINT_SENSOR,
     Step.REPAIR_SENSOR,
 }
-OFFSET = 0.08  # absolute value of false length offsets [m]
+OFFSET = 0.08  # publish false length offsets of this absolute value [m]
 
 
 class Scene:

@@ -52,7 +52,7 @@ from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
 HELD_OUT = 40.0  # duration of the held-out motion [s]
-STEPS = 400, 1200  # number of training steps of each update
+STEPS = 400, 1200  # train for these numbers of steps in the updates
 #: function that returns the joint angles which the learner receives, by its source of θ
 VIEWS: dict[str, JointView] = {
     SENSOR: lambda _learner, _n, _true, read: read,

@@ -40,9 +40,10 @@ PAGES = (
 BACKGROUND = 'Ctrl-C ends it'
 #: variables that the commands get from the environment, besides those of pip
 KEPT = ('LANG', 'ROS_DOMAIN_ID', 'GIT_CONFIG_GLOBAL', 'TMPDIR')
-START_PATIENCE = 1800  # longest wait for the first status line, installation included [s]
-COMMAND_PATIENCE = 900  # longest duration of all commands of a page after that [s]
-#: longest duration of a `ros2` command [s]; if the system has ended, the command would never end
+START_PATIENCE = 1800  # wait at most this long for the first status line, installation included [s]
+#: wait at most this long for all commands of a page after the first status line [s]
+COMMAND_PATIENCE = 900
+#: end a `ros2` command after this time [s]; if the system has ended, the command would never end
 ANSWER_PATIENCE = 300
 #: what `bringup.sh` installs into a clone; the other files that a page creates are removed
 INSTALLED = ('/.venv', '/.cache', '/build', '/install', '/log', '__pycache__', '*.egg-info')

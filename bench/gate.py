@@ -44,8 +44,8 @@ from musculoskeletal_ae.signals.friction import directions
 from musculoskeletal_ae.signals.limits import LIMITS as SIGNAL_LIMITS
 from musculoskeletal_ae.signals.limits import share_outside
 
-LOAD = 3.6  # mass of the payload [kg]
-MINUTE = 60.0  # [s]; the payload is added or removed after each minute
+LOAD = 3.6  # let the arm carry a payload of this mass [kg]
+MINUTE = 60.0  # add or remove the payload at this interval [s]
 
 MESSAGES = {
     'change of l in 10 ms [m]': SIGNAL_LIMITS.step + SIGNAL_LIMITS.speed * SAMPLE_TIME,

@@ -44,15 +44,16 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.muscle_readings import MuscleReading
 
-CORES = 2  # number of cores of the simulated computer
-WAIT = 0.0008  # mean time until a process gets the processor, for each process per core [s]
-STALL_EVERY = 10.0  # mean time between two stalls of a process [s]
-STALL = 0.015  # mean duration of a stall, for each process per core [s]
-HANDLING = 0.0005  # time in which a node handles a message [s]
-QUEUE = 10  # largest number of messages that wait in a subscription; older ones are dropped
-#: time by which the publisher's clock is ahead of the steady clock [s]; no node may depend on it
+CORES = 2  # simulate a computer with this many cores
+#: let a process wait for the processor for this mean time, for each process per core [s]
+WAIT = 0.0008
+STALL_EVERY = 10.0  # stall a process at this mean interval [s]
+STALL = 0.015  # let a stall take this mean time, for each process per core [s]
+HANDLING = 0.0005  # let a node handle a message in this time [s]
+QUEUE = 10  # let at most this many messages wait in a subscription; drop older ones
+#: set the publisher's clock ahead of the steady clock by this time [s]; no node may depend on it
 AHEAD = 1.7e9
-RESTARTING = 2.0  # time that a node takes to start again [s]
+RESTARTING = 2.0  # let a node take this time to start again [s]
 ESTIMATOR, CONTROLLER, LEARNER = 'estimator', 'controller', 'learner'
 
 
@@ -194,7 +195,7 @@ class Lab:
         self.estimator = Estimator(robot)
         self.controller = Controller(robot, seed=EXPLORATION_STREAM + seed)
         self.learner = Learner(robot, initial, seed=seed, steps=STEPS, trainer=Seldom)
-        self.validator = CheckpointValidator(robot)  # of the estimator
+        self.validator = CheckpointValidator(robot)  # validates networks for the estimator
         self.rejected_networks: list[str] = []  # why the estimator rejected networks
         self._candidate: Mae | None = None  # newest network that the learner published
         #: reliable messages that wait for controller and learner, and estimates and command
@@ -213,7 +214,7 @@ class Lab:
         return self.now + self.clock_shift
 
     def run(self, seconds: float) -> None:
-        """Let a time pass [s]."""
+        """Run the laboratory for a time [s]."""
         for _ in range(round(seconds / SAMPLE_TIME)):
             self.step()
 

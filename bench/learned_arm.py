@@ -21,8 +21,8 @@ from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-#: time between two updates [s], and training steps of each. The learned network is as accurate as
-#: that of the node, but learning takes less CPU time.
+#: Update at this interval [s], with this many training steps. The learned network is as accurate
+#: as that of the node, but learning takes less CPU time.
 SELDOM, STEPS = 20.0, 400
 
 

@@ -29,7 +29,7 @@ BODIES: dict[str, tuple[int | str, ...]] = {
     '17x40': (4, 4, 'neck'),
     '39x74': (3, 3, 3, 3, 3, 'held'),
 }
-BELOW = 0.8  # vertical distance from one pair of arms to the next [m]
+BELOW = 0.8  # mount each pair of arms this far below the one above [m]
 WRIST = """<r>
   <joint name="wrist_flexion" type="revolute"><parent link="forearm"/><child link="carpus"/>
     <origin xyz="0 0 -0.20"/><axis xyz="1 0 0"/>
@@ -47,7 +47,8 @@ WRIST_WIRES = {
         'flexor_carpi_ulnaris': 225, 'flexor_carpi_radialis': 315},
     3: {'extensor_carpi': 90, 'flexor_carpi_ulnaris': 210, 'flexor_carpi_radialis': 330},
 }  # fmt: skip
-WRIST_RADIUS = 0.044  # distance of the wrist's tendons from the long axis of the forearm [m]
+#: place the wrist's tendons at this distance from the long axis of the forearm [m]
+WRIST_RADIUS = 0.044
 NECK = """<r>
   <joint name="neck_pitch" type="revolute"><parent link="torso"/><child link="neck_pitch_link"/>
     <origin xyz="0 0 0.10"/><axis xyz="0 1 0"/>

@@ -26,14 +26,14 @@ from musculoskeletal_ae.remedy import Step
 
 Rng = np.random.Generator
 
-#: what a node says about itself in consequence of something else, and statements that only quote a
-#: reading or an estimate beyond its limits
+#: never count these as false: they describe what a node itself does in consequence of something
+#: else, or only quote a reading or an estimate beyond its limits
 SELF = frozenset({
     'tension_above_limit', 'implausible_estimate',
     'anomaly_detected', 'not_exploring', 'calibrating', 'learning_waits', 'gentle_only',
     'length_offsets_unknown', 'trajectory_slowed', 'nothing_to_learn',
 })  # fmt: skip
-#: statements that a muscle is faulty, without saying what of it
+#: statements that a muscle is faulty, which do not name the faulty part
 FAULTY = frozenset({'residual_distance', 'muscle_isolated'})
 RUPTURE = FAULTY | {'slack_tendon'}
 #: names a jammed or weak motor, a wrong tension or length reading, and lost commands as causes
@@ -52,7 +52,7 @@ TENSION_SENSOR = FAULTY | NOT_FOLLOWING | {
 JOINT = frozenset({
     'joint_sensors_doubted', 'joint_readings_impossible', 'joint_readings_missing',
 })  # fmt: skip
-#: messages are rejected, and say why: a true symptom of readings that jump
+#: statements that messages are rejected, and why: true symptoms of readings that jump
 REJECTED = frozenset({
     'implausible_muscle_states', 'readings_rejected', 'stale_muscle_states', 'stale_estimate',
 })  # fmt: skip
@@ -73,9 +73,9 @@ SOFTWARE = frozenset({
     Step.EXPLORE_GENTLY, Step.RESTORE_MUSCLES, Step.WAIT_UNTIL_COOL, Step.REPORT_LOG,
 })  # fmt: skip
 
-SHOWN_ANGLE = 0.1  # a wrong joint angle can be seen from this error on [rad]
-SHOWN_LENGTH = 0.02  # a wrong length can be seen from this error on [m]
-SHOWN_TENSION = 20.0  # a wrong tension can be seen from this error on [N]
+SHOWN_ANGLE = 0.1  # count a wrong joint angle as visible from this error on [rad]
+SHOWN_LENGTH = 0.02  # count a wrong length as visible from this error on [m]
+SHOWN_TENSION = 20.0  # count a wrong tension as visible from this error on [N]
 
 
 def _at_once(_: Lab) -> bool:

@@ -67,22 +67,26 @@ from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.robot.robot import Robot
 
-LEARNING = 180.0  # time in which an individual learns before its mishaps [s]
-OTHER_LEARNING, OTHER_SEED = 90.0, 990  # of the individual whose network is the wrong one
-LOOK = 0.1  # time between two looks at the statements [s]
-GOAL = 5.0  # longest time from the first effect to the first true statement [s]
-PATIENCE = 30.0  # a person finds an unstated fault by this time after its first effect [s]
-LONGEST_WAIT = 75.0  # longest time for the first effect and PATIENCE together [s]
-REACTION = 5.0  # time from the first statement that advises something to the first step [s]
-BETWEEN = 0.5  # time between two steps of a remedy [s]
-SETTLING = 4.0  # time after the steps of a remedy until the operator reads the statements again [s]
-QUIET = 3.0  # the arm is well when it has explored without a condition for this time [s]
-CALIBRATION = 60.0  # longest time for which an operator waits for a length calibration [s]
-COOLING = 240.0  # time for which an operator waits for motors to cool, in all [s]
-AFTER = 20.0  # time in which the true error is measured [s]
-WELL, WELL_RAD = 1.5, 0.02  # a larger error than this multiple or this much more is not well
-HOLDABLE = 4  # number of postures from which the one to hold is chosen
-SEEDS, REALITIES = (0, 1, 2, 3, 4), (KIN, FOREIGN)  # of the complete table
+LEARNING = 180.0  # let an individual learn for this time before its mishaps [s]
+#: learn for this time with the individual of this seed, whose network serves as the wrong one [s]
+OTHER_LEARNING, OTHER_SEED = 90.0, 990
+LOOK = 0.1  # read the statements at this interval [s]
+GOAL = 5.0  # count a true statement as in time within this time after the first effect [s]
+PATIENCE = 30.0  # let a person find an unstated fault this long after its first effect [s]
+LONGEST_WAIT = 75.0  # wait at most this long for the first effect and PATIENCE together [s]
+REACTION = 5.0  # take the first step this long after the first statement that advises something [s]
+BETWEEN = 0.5  # take the steps of a remedy at this interval [s]
+SETTLING = 4.0  # read the statements again this long after the steps of a remedy [s]
+QUIET = 3.0  # count the arm as well once it has explored without a condition for this time [s]
+CALIBRATION = 60.0  # wait at most this long for a length calibration [s]
+COOLING = 240.0  # wait at most this long for motors to cool, in all [s]
+AFTER = 20.0  # measure the true error over this time [s]
+#: count a case as not well if the error has grown to more than this multiple, and by more than this
+#: much [rad]
+WELL, WELL_RAD = 1.5, 0.02
+HOLDABLE = 4  # choose the posture to hold among this many holdable ones
+#: individuals and emulator models of the complete table
+SEEDS, REALITIES = (0, 1, 2, 3, 4), (KIN, FOREIGN)
 PAGE_FACTS = ('true', 'after', 'false', 'well', 'error', 'tension')
 
 
@@ -136,7 +140,7 @@ class Course:
         self.true_at: float | None = None  # time of the first true statement [s]
         self.first_true = ''
         self.advised_at: float | None = None  # time of the first advice [s]
-        self.started_at = lab.now  # time from which times are stated [s]
+        self.started_at = lab.now  # zero of the times in the result [s]
         self.mended_at: float | None = None
         self.is_found_by_advice = False
         self.false: dict[str, dict[str, Any]] = {}  # the first of each false statement
@@ -153,12 +157,12 @@ class Course:
     # -- time -----------------------------------------------------------------------------------
 
     def run(self, seconds: float) -> None:
-        """Let a time pass [s], and watch."""
+        """Run the laboratory for a time [s], and watch statements and tensions."""
         for _ in range(round(seconds / SAMPLE_TIME)):
             self.step()
 
     def step(self) -> None:
-        """Let one sample period pass, and watch."""
+        """Simulate one sample period, and watch statements and tensions."""
         lab = self.lab
         lab.step()
         self.peak = max(self.peak, float((lab.arm.tension / lab.arm.robot.tension.limit).max()))

@@ -26,11 +26,11 @@ from bench.attack_graph import NODES, OWN, Attack
 from bench.attack_kinds import Scene
 from bench.processes import end_processes
 
-WATCHED = 15.0  # time for which the status line is watched while the mishap lasts [s]
-ERROR_TIME = 10.0  # time in which the true error is measured [s]
+WATCHED = 15.0  # watch the status line for this time while the mishap lasts [s]
+ERROR_TIME = 10.0  # measure the true error over this time [s]
 #: statements that blame the computer; false unless other programs use it up
 OVERLOADED = 'overloaded|stop other programs'
-BUSY = 8  # number of programs that keep the computer busy
+BUSY = 8  # keep the computer busy with this many programs
 
 
 class GraphMishap(NamedTuple):

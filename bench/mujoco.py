@@ -91,9 +91,9 @@ HEAD = (
 )  # fmt: skip
 NODES_HEAD = 'model', 'joints', 'muscles', *KINDS[ALL_NODES], 'sum', 'arrived'
 MOTIONS, DURATION, TRIES = 4, 2.0, 400
-MOMENTS = 25  # number of moments at which the torque of a motion is evaluated
-LEAST_TORQUE = 1e-6  # missing torque from which on the muscles are too weak for a motion [N·m]
-HOLDING = 5.0  # time for which a posture is held [s]
+MOMENTS = 25  # evaluate the torque of a motion at this many instants
+LEAST_TORQUE = 1e-6  # count the muscles as too weak for a motion if more torque is missing [N·m]
+HOLDING = 5.0  # hold a posture for this time [s]
 ARM_POSTURES = 300
 RATE = 100.0  # rate of muscle_states with --nodes [Hz]
 LISTS = 'joints', 'muscles', 'without'
@@ -139,7 +139,7 @@ def holdable(study: Study, seed: int) -> Iterator[Array]:
 def can_exert(
     limits: reach.ReachLimits, muscle_jacobian: MuscleJacobian, planned: Trajectory
 ) -> bool:
-    """Return whether the muscles can exert the torque of a trajectory at every moment.
+    """Return whether the muscles can exert the torque of a trajectory throughout the motion.
 
     Args:
         limits: The bone-side tensions that the arm may use.

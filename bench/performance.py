@@ -33,11 +33,11 @@ from musculoskeletal_ae.robot.robot import Robot
 ARM = 'musashi_left_arm'
 LARGE = 'musashi_upper_body'
 RATES, SIZES = (100.0, 200.0, 500.0), ('arm26', ARM, LARGE)
-EXPLORING = 60.0  # duration of the exploration that provides the samples of the timed update [s]
+EXPLORING = 60.0  # explore for this time to get the samples of the timed update [s]
 #: rate of muscle_states for start-up, memory, late messages and profiles [Hz]
 FLAME_RATE = 200.0
-STARTING = 60.0  # longest wait for the first command [s]
-SETTLING = 15.0  # running time of the nodes before memory or a profile is measured [s]
+STARTING = 60.0  # wait at most this long for the first command [s]
+SETTLING = 15.0  # let the nodes run for this time before memory or a profile is measured [s]
 
 #: CPU times [µs] of the first version that was measured (commit be0daee), by row of the table; the
 #: machine had two cores and was idle otherwise

@@ -54,14 +54,14 @@ from browser import Browser  # noqa: E402 - the tests' own browser
 SIZE = 1280, 720  # size of the page [pixels]
 SCALE, COLOURS = 0.75, 128  # size of the pictures relative to the page; number of colours
 SCALED = round(SCALE * SIZE[0]), round(SCALE * SIZE[1])
-LEARNING = 60.0  # time for which the running system is recorded before the rupture [s]
-MOVING_ON = 25.0  # time for which it is recorded after the isolation [s]
-EVERY = 1.0  # time between two pictures while the arm learns [s]
-EVERY_LATER = 0.4  # time between two pictures around the rupture [s]
-FRAME = 110  # time for which a picture of the film is shown [ms]
-LAST = 1500  # time for which the last picture is shown [ms]
-SETTLE = 3.0  # time from the first status until the whole page is drawn [s]
-PATIENCE = 600.0  # longest wait for the start and for each event of the film [s]
+LEARNING = 60.0  # record the running system for this time before the rupture [s]
+MOVING_ON = 25.0  # record the system for this time after the isolation [s]
+EVERY = 1.0  # take a picture at this interval while the arm learns [s]
+EVERY_LATER = 0.4  # take a picture at this interval around the rupture [s]
+FRAME = 110  # show a picture of the film for this time [ms]
+LAST = 1500  # show the last picture for this time [ms]
+SETTLE = 3.0  # wait this long after the first status, until the whole page is drawn [s]
+PATIENCE = 600.0  # wait at most this long for the start and for each event of the film [s]
 KINDS = ('film', 'simulation')
 LOAD = -50.0  # vertical force on the hand of the simulated arm [N], as in the paper's simulation
 

@@ -23,8 +23,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros.messages import array_message
 
 ROBOT = 'arm26'
-PATIENCE = 120.0  # longest wait on a busy machine [s]
-LARGEST_DIFFERENCE = 1e-9  # largest legal difference of two estimates [rad]
+PATIENCE = 120.0  # wait at most this long for an estimate, because the machine may be busy [s]
+LARGEST_DIFFERENCE = 1e-9  # report a larger difference of two estimates [rad]
 START = 'from musculoskeletal_ae.executables import estimator; raise SystemExit(estimator())'
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 TICK = os.sysconf('SC_CLK_TCK')  # /proc counts CPU time in ticks: ticks per second
 PAGE = os.sysconf('SC_PAGE_SIZE')  # /proc counts memory in pages: bytes per page
-PATIENCE = 20.0  # longest wait for the end of a process [s]
+PATIENCE = 20.0  # kill a process that has not ended after this time [s]
 
 
 def cpu(pid: int) -> float:
@@ -28,7 +28,7 @@ def memory(pid: int) -> float:
 
 
 def end_processes(processes: Collection[subprocess.Popen[Any]], asked: signal.Signals) -> None:
-    """Send a signal to processes, and kill those that have not ended PATIENCE seconds later."""
+    """End processes by a signal, and kill those that have not ended PATIENCE seconds later."""
     for process in processes:
         process.send_signal(asked)
     for process in processes:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models that estimate θ in recordings: that of this package, and others to compare it with.
+"""Models that estimate θ in recordings: a network of this package, and others for comparison.
 
 Every model maps lengths (and efforts) to θ. All are trained on rest samples; `polynomial` may also
 receive all rows of a run.
@@ -149,7 +149,7 @@ class Statics:
     #: standard deviations of the IMU's orientation in the prior, and of θ in a rest sample [rad]
     TILT, NOISE = 0.02, 0.015
     ROUNDS = 15
-    CONVERGED = 1e-10  # largest step at which the postures count as found [rad]
+    CONVERGED = 1e-10  # count the postures as found once a step is no larger than this [rad]
 
     def __init__(self, robot: Robot, rests: list[Run]) -> None:
         """Fit the unknowns to the rest samples of runs with different payloads."""

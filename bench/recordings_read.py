@@ -41,7 +41,7 @@ URDF = """<robot name="{name}">
   <link name="head"/>
 </robot>
 """
-REST = 0.2  # time at the end of a pose over which a rest sample is averaged [s]
+REST = 0.2  # average a rest sample over this time at the end of a pose [s]
 
 
 @dataclass(frozen=True)

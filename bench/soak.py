@@ -41,15 +41,17 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-PART = 300.0  # robot time of each recording [s]
-REPORT = 1800.0  # robot time between two reports [s]
-#: robot time from which on the error is checked [s]; before, the network has just begun to learn
+PART = 300.0  # record for this robot time at once [s]
+REPORT = 1800.0  # report at this interval of robot time [s]
+#: check the error from this robot time on [s]; before, the network has just begun to learn
 SETTLED = 1800.0
-TOLERATED = 1.2  # largest legal ratio of an error, or of the memory, to its earlier value
-#: robot time from which on memory is checked [s]; before, imports, the sample store and the
-#: reservoir of messages fill it
+#: report an error, or a memory, that exceeds its earlier value by more than this factor
+TOLERATED = 1.2
+#: check the memory from this robot time on [s]; before, imports, the sample store and the reservoir
+#: of messages fill it
 FILLED = 7200.0
-SLOWER = 1.5  # largest legal ratio of the median update times in the last and the first quarter
+#: report updates in the last quarter whose median time exceeds that of the first by this factor
+SLOWER = 1.5
 
 
 class RareTrainer(Trainer):

@@ -45,10 +45,11 @@ from musculoskeletal_ae.motion.exploration_steps import TRIES, holdable_postures
 from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.robot.robot import Robot
 
-#: A tension may exceed ALLOWED times tension.limit for at most LONGEST [s].
+#: Report a tension that exceeds ALLOWED times tension.limit for longer than LONGEST [s].
 ALLOWED, LONGEST = 1.1, 0.5
-EXPLORED = 60.0  # duration of the exploration [s]
-TARGETS, HELD = 4, 4.0  # number of targets of each method, and time for each target [s]
+EXPLORED = 60.0  # explore for this time [s]
+#: move to this many targets with each method, and stay at each for this time [s]
+TARGETS, HELD = 4, 4.0
 HELD_OUT = 60.0  # duration of the held-out motion [s]
 HEAD = (
     f'{"seed":>5} {"what":<12} {"max/limit":>9} {"longest":>8} {"above":>7} {"above":>7} '

@@ -36,7 +36,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-MANY, LONGEST = 4096, 0.05  # number of arms in a batch; longest duration of a round [s]
+#: time a batch of this many arms; end a round of calls after about this time [s]
+MANY, LONGEST = 4096, 0.05
 
 
 class Row(NamedTuple):

@@ -49,7 +49,7 @@ KINDS = {
     'plain node, torch': ('hardware_emulator', 'plain'),
     'messages alone': tuple(f'bare_{name}' for name in (*NODES, 'learner')),
 }
-WARM_UP = 8.0  # time from the first command to the beginning of a measurement [s]
+WARM_UP = 8.0  # begin a measurement this long after the first command [s]
 PLAIN = """
 import contextlib, sys, numpy as np, rclpy, torch
 from rclpy.node import Node

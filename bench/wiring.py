@@ -43,14 +43,14 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.signals.wiring import Wiring
 
-MINUTES = 2.0  # duration of the exploration that is learned [min]
-BEFORE = 10.0  # duration of the exploration before the restart [s]
-RESTART = 0.5  # time without messages [s]
-LONGEST = 180.0  # longest time in which the advice is followed [s]
-NOTHING = 60.0  # time after which the advice has ended if nothing is reported [s]
-AFTER = 10.0  # duration of the exploration after the advice [s]
-REFUSING = 15.0  # time for which a calibration may go on after it has enough data [s]
-OFFSET = 0.1  # largest length offset after a restart of a driver that loses its offsets [m]
+MINUTES = 2.0  # learn from an exploration of this duration [min]
+BEFORE = 10.0  # explore for this time before the restart [s]
+RESTART = 0.5  # publish no messages for this time [s]
+LONGEST = 180.0  # follow the advice for at most this time [s]
+NOTHING = 60.0  # count the advice as ended if nothing is reported for this time [s]
+AFTER = 10.0  # explore for this time after the advice [s]
+REFUSING = 15.0  # let a calibration go on for at most this time after it has enough data [s]
+OFFSET = 0.1  # let a driver that loses its offsets restart with offsets of up to this length [m]
 
 
 class Driver:

@@ -41,16 +41,17 @@ from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-LEAST, MOST = 0.05, 0.13  # range of the magnitudes of the length offsets [m]
-MINUTES = 10.0  # duration of the exploration [min]
+LEAST, MOST = 0.05, 0.13  # draw length offsets of a magnitude in this range [m]
+MINUTES = 10.0  # explore for this time [min]
 HELD_OUT = 300.0  # duration of the held-out motion [s]
-AFTER = 30.0  # duration of the motion after a calibration [s]
-LONGEST = 120.0  # longest duration of a calibration [s]
-SETTLING = 20.0  # time until the arm hangs still [s]
-#: standard deviation of the error of the posture that is stated to the calibration [rad], the same
-#: for each joint
+AFTER = 30.0  # move for this time after a calibration [s]
+LONGEST = 120.0  # end a calibration after this time [s]
+SETTLING = 20.0  # let the arm hang for this time until it is still [s]
+#: state postures to the calibration with errors of this standard deviation [rad], the same for each
+#: joint
 STATED = 0.0
-#: largest legal time of a calibration [s], and ratio of the errors after and before it
+#: report a calibration that takes longer than this [s], or after which the error exceeds the
+#: earlier error by more than this factor
 GOALS = {'sensors': (30.0, 1.2), 'none': (60.0, 1.5), 'posture': (30.0, 1.5)}
 
 

@@ -27,11 +27,11 @@ from musculoskeletal_ae.robot.motors import NO_MOTORS, motor_topics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.wiring import Wiring, judge
 
-MOST_REJECTED = 0.1  # largest share of rejected messages of a topic that is no fault
-#: reasons for which messages of a sound recording may be rejected: lengths were being calibrated,
-#: or another program publishes its own joints on the topic
+MOST_REJECTED = 0.1  # report a fault if a larger share of a topic's messages is rejected
+#: do not report these reasons of rejection as a fault: lengths were being calibrated, or another
+#: program publishes its own joints on the topic
 USUAL_REJECTIONS = 'length offsets unknown', 'missing joint', 'missing motor'
-READINGS = 'joint_states', 'muscle_states'  # topics of sensors, which do not pause
+READINGS = 'joint_states', 'muscle_states'  # report a pause of these topics as a fault
 _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 
 
@@ -212,7 +212,7 @@ def _contents(bag: Bag, times: dict[str, array[int]]) -> list[str]:
 
 class _Fit(NamedTuple):
     faults: list[str]  # reasons why the bag does not fit the robot
-    notes: list[str]  # on unused messages
+    notes: list[str]  # remarks on unused messages
     motion: str = ''  # text on the motion that can be learned from
     has_its_messages: bool = False  # whether the messages have the joints and muscles of the robot
 

@@ -12,8 +12,8 @@ from musculoskeletal_ae.signals.joint_sensors import (
     stuck_sensors,
 )
 
-#: duration of the parts of a recording that are judged separately, because lengths may drift from
-#: one part to the next [s]
+#: judge parts of a recording with this duration separately, because lengths may drift from one part
+#: to the next [s]
 SEGMENT = 30.0
 #: by kind of fault, what was observed and what to do
 TEXTS = {

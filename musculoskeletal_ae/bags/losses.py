@@ -22,7 +22,7 @@ class Losses:
         self._gaps: Counter[str] = Counter()  # missing numbers by topic since the last `settle`
 
     def note(self, topic: str, number: int) -> None:
-        """Record the sequence number of a received message."""
+        """Note the sequence number of a received message."""
         if number in UNNUMBERED:
             return
         # A restarted publisher begins with a small number again, which gives no positive gap.

@@ -33,13 +33,13 @@ from musculoskeletal_ae.bags.storage import (
 from musculoskeletal_ae.exceptions import BagError
 
 MAGIC = b'\x89MCAP0\r\n'  # first and last bytes of a file
-LARGEST_RECORD = 64 << 20  # largest size of a record or a decompressed chunk [bytes]
-# A file may decompress to at most MOST_EXPANDED bytes plus LARGEST_EXPANSION times its size. A
-# malicious file of a few kB could otherwise take hours to read.
+LARGEST_RECORD = 64 << 20  # refuse a larger record or decompressed chunk [bytes]
+# Refuse a file that decompresses to more than MOST_EXPANDED bytes plus LARGEST_EXPANSION times its
+# size. A malicious file of a few kB could otherwise take hours to read.
 MOST_EXPANDED, LARGEST_EXPANSION = 8 << 20, 100
 
 _JUMP = 'record again without `replay --loop`, a second publisher of /clock, or other jumps of time'
-_LONGEST_QOS = 10_000  # largest length of the QoS profiles, as YAML [characters]
+_LONGEST_QOS = 10_000  # ignore longer QoS profiles, as YAML [characters]
 
 
 class _Span(NamedTuple):

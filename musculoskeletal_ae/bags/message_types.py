@@ -20,8 +20,7 @@ CDR = 'cdr'  # the message encoding of ROS 2
 MSG = 'ros2msg'  # the encoding of definitions in .msg format
 #: whether a CDR message is little-endian, by its first two bytes
 _LITTLE_ENDIAN = {b'\0\0': False, b'\0\1': True}
-#: largest size of a definition [bytes]; those of the types in the interface are several times
-#: shorter
+#: refuse a longer definition [bytes]; those of the types in the interface are several times shorter
 _LONGEST_DEFINITION = 1 << 16
 
 

@@ -27,17 +27,17 @@ from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
 from musculoskeletal_ae.message_reading import MOST_ENTRIES, target_values
 
-# After a longer interruption, playback resumes instead of catching up.
-LONGEST_LAG = 1.0  # [s]
-SKIP_LEAD = 500_000_000  # recorded time between a skipped pause and the next message [ns]
+LONGEST_LAG = 1.0  # after a longer interruption, resume playback instead of catching up [s]
+#: after a skipped pause, go on this recorded time before the next message [ns]
+SKIP_LEAD = 500_000_000
 
 TAUGHT_TOPIC = 'estimated_joint_states'
 # Standard deviation of the Gaussian weights that smooth a motion [s]. They keep the motion of a
 # hand, which takes longer, and remove noise, which varies faster.
 SMOOTHING = 0.15
-SPACING = 0.1  # time between two points of the trajectory [s]
-LEAD_TIME = 3.0  # duration of the motion to the first posture [s]
-SHORTEST_MOTION = 0.5  # shorter motions are refused [s]
+SPACING = 0.1  # place the points of the trajectory at this interval [s]
+LEAD_TIME = 3.0  # move to the first posture in this time [s]
+SHORTEST_MOTION = 0.5  # refuse a shorter motion [s]
 
 
 def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
@@ -120,7 +120,7 @@ class Timeline:
         self._recorded, self._steady = recorded, now
 
     def hold(self, paused: bool, now: float) -> None:
-        """Pause playback, or resume it if `paused` is False, when the steady clock reads `now` [s].
+        """Hold playback, or resume it if `paused` is False, when the steady clock reads `now` [s].
 
         Neither changes the recorded time that has been reached.
         """

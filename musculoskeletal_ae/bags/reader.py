@@ -30,8 +30,8 @@ from musculoskeletal_ae.bags.storage import (
 from musculoskeletal_ae.exceptions import BagError
 
 ROS1_MAGIC = b'#ROSBAG V'  # first bytes of a bag file of ROS 1
-MOST_HELD = 64 << 20  # largest size of the messages held in memory to sort them [bytes]
-_OVERHEAD = 100  # size counted for a message in addition to its data [bytes]
+MOST_HELD = 64 << 20  # hold messages of at most this size in memory to sort them [bytes]
+_OVERHEAD = 100  # count a message as this much larger than its data [bytes]
 
 
 @dataclass
@@ -45,7 +45,7 @@ class Bag:
 
     @classmethod
     def open(cls, path: str | Path) -> Bag:
-        """Read and check a whole recording.
+        """Open a recording, after reading and checking it as a whole.
 
         If the recorder was killed, the recording is read up to its last complete record, and
         `unfinished` says why the rest is missing.
@@ -119,7 +119,7 @@ class Bag:
 def _open_file(path: Path) -> StorageFile:
     """Open an mcap or sqlite3 file, or raise a BagError."""
     with open_file(path) as stream:
-        head = stream.read(len(sqlite3_file.MAGIC))  # the longest of them
+        head = stream.read(len(sqlite3_file.MAGIC))  # long enough for the magic of any format
     if not head:
         raise BagError(path, 'the file is empty', 'record again')
     if head.startswith(sqlite3_file.MAGIC):

@@ -42,7 +42,7 @@ EMPTY = 'contains no complete message', 'record again, or use another recording'
 CONVERT = 'convert it with `rosbags-convert` (of the Python package rosbags) or `ros2 bag convert`'
 
 _TOPIC_NAME = re.compile(r'(/[A-Za-z_]\w*)+', re.ASCII)
-_LONGEST_NAME = 256  # largest length of a topic's name [characters]
+_LONGEST_NAME = 256  # refuse a longer name of a topic [characters]
 
 
 @contextmanager

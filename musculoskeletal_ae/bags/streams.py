@@ -263,7 +263,7 @@ class _ArmStreams:
         return body
 
 
-#: reasons of rejection that another number or names of muscles or joints explain
+#: suspect the recording of another robot if messages are rejected for one of these reasons
 OTHER_ROBOT = 'wrong length', 'missing joint', 'missing motor', 'wrong layout'
 CHOOSE_ROBOT = 'choose the robot that was recorded'
 CHECK_DRIVER = (
@@ -365,8 +365,8 @@ def _deliver(
 ) -> None:
     """Read messages, and pass each one to the functions for its topic.
 
-    The functions receive the decoded message, and when messages of its sender arrived, in the time
-    since the bag's start.
+    The functions receive the decoded message, and an `Arrival` with the times [s], since the start
+    of the bag, at which messages of its sender arrived.
 
     Args:
         messages: The messages to read.
@@ -396,12 +396,15 @@ def _deliver(
 
 
 def _check_fit(bag: Bag, used: Mapping[str, _Stream], warnings: Sequence[str]) -> None:
-    """Raise a BagError if all messages of a topic were rejected.
+    """Check that no topic has had all its messages rejected.
 
     Args:
         bag: The recording.
         used: The stream of accepted messages of each topic, by the topic's name in warnings.
         warnings: A text for each reason for which messages of a topic were rejected.
+
+    Raises:
+        BagError: If all messages of a topic were rejected.
     """
     for label, stream in used.items():
         reasons = [text.partition(f' {label}: ')[2] for text in warnings if f' {label}: ' in text]

@@ -30,7 +30,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LATEST, LONGEST_PAUSE, BagMessage
 from musculoskeletal_ae.report import duration
 
-# The log times of a topic count as bunched if all of these conditions hold.
+# The log times of a topic count as bunched if all of the following conditions hold.
 FEW = 20  # it has at least this number of messages
 BUNCHED = 50_000_000  # the delays of its messages differ by more than this [ns]
 MANY = 0.1  # more than this fraction of its messages was written together with the message before
@@ -111,7 +111,7 @@ class TimedMessages:
         longest = max(
             (self._bunched[name].longest for name in topics if name in self._bunched), default=0
         )
-        waiting: list[tuple[int, int, BagMessage]] = []  # a heap
+        waiting: list[tuple[int, int, BagMessage]] = []  # heap, ordered by best time
         for n, message in enumerate(self.bag.messages(topics, start, stop + longest)):
             # Later messages of the bag have best times after this time.
             while waiting and waiting[0][0] < message.log_time - longest:

@@ -260,13 +260,16 @@ def _innermost(topics: Iterable[str], nested: Sequence[str]) -> str | None:
 
 
 def _compare_type(bag: Bag, name: str, expected: str, leave_out: str = '') -> None:
-    """Raise a BagError if a topic does not have the expected type or cannot be decoded.
+    """Compare the type of a topic with the expected one, and check that it can be decoded.
 
     Args:
         bag: The recording.
         name: Recorded name of the topic.
         expected: The message type that it must have.
         leave_out: Text that is appended to the remedy in the error message.
+
+    Raises:
+        BagError: If the topic has another type, or cannot be decoded.
     """
     topic = bag.topics[name]
     if topic.is_of_ros1:

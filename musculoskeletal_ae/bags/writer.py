@@ -19,7 +19,7 @@ from musculoskeletal_ae.bags.storage import EMPTY, BagTopic
 from musculoskeletal_ae.exceptions import BagError
 
 COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
-_LARGEST_CHUNK = 1 << 20  # size at which a chunk ends and the next one begins [bytes]
+_LARGEST_CHUNK = 1 << 20  # end a chunk at this size, and begin the next one [bytes]
 
 
 class BagWriter:

@@ -34,7 +34,7 @@ class ActivityControl(ABC):
 
     @abstractmethod
     def enter(self, inputs: Inputs, /) -> None:
-        """Start the activity, or restart it after a pause, from the present tensions."""
+        """Enter the activity, or restart it after a pause, from the present tensions."""
 
     @abstractmethod
     def step(self, inputs: Inputs, /) -> Command | None:
@@ -42,7 +42,7 @@ class ActivityControl(ABC):
 
     @abstractmethod
     def leave(self) -> None:
-        """End the activity, because another activity or a stop follows."""
+        """Leave the activity, because another activity or a stop follows."""
 
     @property
     def needs_trajectory(self) -> bool:

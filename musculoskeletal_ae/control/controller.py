@@ -56,17 +56,19 @@ from musculoskeletal_ae.signals.body_state import Anomaly, BodyState
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence, check_posture
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
-WINDOW = 3  # number of messages in the median filter against outliers
+WINDOW = 3  # take the median of this many messages, so that a single outlier has no effect
 RESTORE = 'call estimator/restore to use isolated muscles again'
 GUIDED = (
     'with method `float`, the arm is guided by hand; set the parameter `method` to another method'
 )
-#: longest time that the estimator needs to revoke the length offsets after a jump of lengths [s]
+#: stop the arm if the lengths have jumped and the estimator has not revoked the length offsets
+#: within this time [s]
 REACTION_TIME = 1.0
-#: longest time that a length calibration needs for its first estimate [s]; if messages arrive at
-#: 10 Hz, it needs 3.5 s
+#: count the estimate as stale only if a length calibration brings none within this time [s]; if
+#: messages arrive at 10 Hz, it needs 3.5 s
 FIRST_ESTIMATE = 5.0
-APPROACHES = 3  # number of further attempts to reach a target if an arm with isolated muscles falls
+#: let an arm with isolated muscles that falls start towards its target again at most this often
+APPROACHES = 3
 
 
 @dataclass
@@ -134,7 +136,7 @@ class Activities:
         return others.get(activity)
 
     def leave(self) -> None:
-        """End the present activity, because another activity or a stop follows."""
+        """Leave the present activity, because another activity or a stop follows."""
         if self.entered is not None:
             self.entered.leave()
         self.entered = None

@@ -28,8 +28,8 @@ AWAY = 0.5  # report a joint that rests further than this away from its target [
 #: report a joint that rests further away than an earlier distance by more than this [rad]; updates
 #: of the network changed the estimate of healthy resting arms by up to 0.19 rad
 CARRIED = 0.25
-LASTING = 5.0  # report it after this time [s]
-#: what may be the cause where nothing more is known
+LASTING = 5.0  # report a joint only once it has been away for this time [s]
+#: state these causes where the check finds no other
 POSSIBLE_CAUSES = (
     'possible causes: a payload or contact, tendon friction, a muscle that pulls less than its '
     'sensor reads, or a base that is mounted otherwise than in robot.urdf'

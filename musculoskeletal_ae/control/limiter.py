@@ -68,9 +68,9 @@ from musculoskeletal_ae.robot.model_errors import LARGEST
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-POSTURES = 200  # number of random postures from which the longest muscle lengths are computed
-LONGEST_INTERVAL = 0.05  # longest time between two messages from which dT/dt is computed [s]
-CONFIDENCE = 2.0  # number of standard deviations by which a measured tension may be too low
+POSTURES = 200  # find the longest muscle lengths in this many random postures
+LONGEST_INTERVAL = 0.05  # assume dT/dt = 0 after a longer interval between two messages [s]
+CONFIDENCE = 2.0  # lower the tension limit by this many standard deviations of the measured tension
 #: gain of the tension feedback r [1/s]; its time constant of 0.2 s is long compared with the lag of
 #: a module, which is about 30 ms
 RELIEF = 5.0
@@ -131,7 +131,7 @@ class CommandLimiter:
             self._last_length = self.command.value, 0.0
 
     def shift(self, offset: Array) -> None:
-        """Convert the last commands to new length offsets, which are larger by `offset` [m], (M,).
+        """Shift the last commands to new length offsets, which are larger by `offset` [m], (M,).
 
         Corrected lengths are shorter by the same amount, and so are the stored length commands.
         """

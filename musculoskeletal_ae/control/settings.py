@@ -17,7 +17,7 @@ from musculoskeletal_ae.robot.joint_units import SLIDE, JointUnits
 UNREACHABLE = ('refuse', 'nearest')  # legal values of the setting `unreachable`
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness', 'float')
 BY_TENSION = ('tension', 'float')  # methods that command tensions; all others command lengths
-MOST_STIFFNESS = 1000.0  # largest desired stiffness of a joint [N·m/rad]
+MOST_STIFFNESS = 1000.0  # refuse a larger desired stiffness of a revolute joint [N·m/rad]
 
 
 def _most_stiffness(radian: float) -> float:
@@ -90,10 +90,11 @@ class Settings(CheckedSettings):
     )
 
     # Durations that experiments vary, and users do not.
-    #: of the second movement of method `second`, and of the movement after a new checkpoint [s]
+    #: duration of the second movement of method `second`, and of that after a new checkpoint [s]
     second_duration: float = 2.0
-    #: of a movement to a target with method `stiffness`, or with method `proposed` of preset
-    #: `default`; extended if muscle modules or muscles are too weak; 0 for first_duration [s]
+    #: duration of a movement to a target with method `stiffness`, or with method `proposed` of
+    #: preset `default` [s]; extended if muscle modules or muscles are too weak; 0 for
+    #: first_duration
     target_duration: float = 1.2
 
     def desired_stiffness(self, units: JointUnits) -> Array:

@@ -22,7 +22,8 @@ from musculoskeletal_ae.signals.heat import soon
 if TYPE_CHECKING:
     from musculoskeletal_ae.control.controller import Controller
 
-#: fraction of the requested speed below which a slowed trajectory is reported by its duration [%]
+#: below this share of the requested speed, state the duration of a slowed trajectory instead of its
+#: speed [%]
 LEAST_SHARE = 10.0
 #: report a tension limit that heat lowers below this share of `tension.limit`; a healthy arm that
 #: explores may be some newtons below it all the time
@@ -38,9 +39,9 @@ DOING = {
     Activity.GRAVITY_COMPENSATION: 'gravity compensation',
 }
 _OF_READINGS = ConditionKind.IMPLAUSIBLE_ESTIMATE, ConditionKind.STALE_ESTIMATE
-#: what follows from each cause: a faulty muscle makes readings and estimates implausible, and
-#: without usable readings there are no estimates. While the first cause is present, the others need
-#: no remedy of their own.
+#: conditions that follow from each cause, and need no remedy of their own while it is present: a
+#: faulty muscle makes readings and estimates implausible, and without usable readings there are no
+#: estimates
 CONSEQUENCES = {
     ConditionKind.ANOMALY: (ConditionKind.IMPLAUSIBLE_MUSCLE_STATES, *_OF_READINGS),
     ConditionKind.IMPLAUSIBLE_MUSCLE_STATES: (ConditionKind.STALE_MUSCLE_STATES, *_OF_READINGS),
@@ -124,7 +125,7 @@ def _exploration(core: Controller) -> Iterator[Condition]:
 
 
 def _target(core: Controller) -> Iterator[Condition]:
-    """Yield what is not as the target demands."""
+    """Yield every way in which the arm deviates from what its target demands."""
     target, robot, kind = core.target_state, core.robot, ConditionKind
     if target.clamped:
         yield kind.TARGET_CLAMPED.condition(', '.join(target.clamped), target.clamped)

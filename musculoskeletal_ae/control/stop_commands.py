@@ -28,9 +28,9 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_readings import Row
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-PAYING_OUT = 1.5  # shortest duration of the release before a suspect is wound in [s]
-LARGEST_RISE = 30.0  # rise of a suspect's tension at which winding in ends [N]
-SPEED = 0.02  # speed at which a suspect is wound in [m/s]
+PAYING_OUT = 1.5  # pay the muscles out for at least this time before a suspect is wound in [s]
+LARGEST_RISE = 30.0  # stop winding a suspect in once its tension has risen by this [N]
+SPEED = 0.02  # wind a suspect in at this speed [m/s]
 
 
 class SafeStop:
@@ -53,12 +53,12 @@ class SafeStop:
         self._robot, self._settings = robot, settings
 
     def enter(self) -> None:
-        """Start a stop."""
+        """Enter a stop."""
         self.leave()
         self.is_entered = True
 
     def leave(self) -> None:
-        """End a stop."""
+        """Leave a stop."""
         self.is_entered = False
         self._held = 0.0  # counted time since the start of the stop (see `step`) [s]
         self._wound_from: float | None = None  # suspect's command before it was wound in [m]

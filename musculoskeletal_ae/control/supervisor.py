@@ -16,7 +16,7 @@ from enum import Enum
 from musculoskeletal_ae.conditions import Action, Clears, Condition, ConditionKind
 from musculoskeletal_ae.remedy import Step
 
-RESUME = 0.2  # time without a cause after which a paused arm continues [s]
+RESUME = 0.2  # continue a paused arm after this time without a cause [s]
 
 
 class Activity(Enum):

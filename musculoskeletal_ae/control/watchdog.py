@@ -26,15 +26,15 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.heat import Heat, soon
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-#: smallest pace of the messages' clock by which age limits are extended; below it, the steps of a
-#: stopped arm follow the steady clock
+#: extend age limits no further if the messages' clock is slower than this share of real time; the
+#: steps of a stopped arm then follow the steady clock
 SLOWEST = 0.05
-PACE_SPAN = 1.0  # time constant of the average pace of the messages' clock [s]
-OVERHEATED = 20.0  # excess over temperature_limit at which the arm stops [°C]
-#: ratio of a tension to tension.limit above which the arm stops after OVERLOAD_TIME; during this
-#: time, the limiter pays out the muscle
+PACE_SPAN = 1.0  # average the pace of the messages' clock with this time constant [s]
+OVERHEATED = 20.0  # stop the arm if a winding is this far above temperature_limit [°C]
+#: stop the arm if a tension exceeds this multiple of tension.limit for OVERLOAD_TIME; meanwhile,
+#: the limiter pays out the muscle
 OVERLOAD = 1.1
-OVERLOAD_TIME = 0.2  # time after which an overload stops the arm [s]
+OVERLOAD_TIME = 0.2  # stop the arm after an overload of this duration [s]
 
 
 class ControlStep(NamedTuple):
@@ -171,7 +171,7 @@ class HeatLimit:
         self.heat.step(tension, sample.temperature, elapsed)
 
     def lower(self, highest: float, fall: Array | float) -> None:
-        """Update the tension limits.
+        """Lower the tension limits by at most `fall`, or raise them, as the temperatures require.
 
         Args:
             highest: Temperature limit of the windings [°C].

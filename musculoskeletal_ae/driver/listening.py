@@ -35,36 +35,40 @@ from musculoskeletal_ae.signals.motor_interface import MotorInterface
 from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Presence, Row, possible_readings
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement
 
-MOST_REPEATED = 0.2  # largest share of messages that may repeat the previous message exactly
-QUIET = 3  # sensors that show at most this many different values count as free of noise
-TEMPERATURES = -20.0, 130.0  # range of possible temperatures [°C]
-#: distance by which l may exceed its range, with and without length calibration [m]
+#: report a fault if a larger share of the messages repeats the previous message exactly
+MOST_REPEATED = 0.2
+QUIET = 3  # count sensors that show at most this many different values as free of noise
+TEMPERATURES = -20.0, 130.0  # count temperatures outside this range as impossible [°C]
+#: let l exceed its range by this distance, with and without length calibration [m]
 BEYOND = 0.1, 1.0
-BEYOND_JOINT = 0.3  # distance by which θ may exceed the joint limits [rad]
-BEYOND_SHARE = 0.95  # share of the messages of which θ must not exceed them by more
-#: tolerance of |T − T_bias| while nothing is commanded, [N] and relative to T_bias, for errors of
-#: the sensor and of its zero; the smaller tolerance applies
+BEYOND_JOINT = 0.3  # report a fault if θ exceeds the joint limits by more than this [rad]
+BEYOND_SHARE = 0.95  # judge θ by the excess that this share of the messages does not exceed
+#: report a fault if |T − T_bias| exceeds the smaller of these while nothing is commanded, [N] and
+#: relative to T_bias; they cover errors of the sensor and of its zero
 RESTING_TENSION, RESTING_SHARE = 15.0, 0.5
-PULLS = 0.3, 3.0  # usual range of T / T_bias at rest
-USUAL = 10.0, 60.0  # usual temperatures of modules at rest [°C]
+PULLS = 0.3, 3.0  # reinterpret units or rows only if T / T_bias at rest is then in this range
+#: reinterpret units or rows only if temperatures at rest are then in this range [°C]
+USUAL = 10.0, 60.0
 #: T is in another unit if all muscles, converted from that unit to N, are within this fraction of
 #: T_bias
 UNIT_TOLERANCE = 0.3
 TENSION_UNITS = {'kgf': 9.80665, 'lbf': 4.44822, 'kN': 1000.0}  # other units of tension [N]
-#: highest plausible temperature of modules without commands [°C]; modules above 13 °C exceed this
-#: value if their temperature is published in °F
+#: doubt the unit of a higher temperature of modules without commands [°C]; modules above 13 °C
+#: exceed this value if their temperature is published in °F
 HOTTEST_AT_REST = 55.0
 # Lengths of healthy arms differ from the model. For the emulated individuals 0–9 of arm26 and
 # musashi_left_arm (notes/removed_benches.md), lengths change by 0.31 to 1.55 times the model's
 # changes, and `model_errors.LARGEST` bounds the difference.
-SLOPES = 0.2, 2.2  # legal range of the change of l, divided by the change that the model predicts
+#: report a fault if the change of l, divided by the modelled change, is outside this range
+SLOPES = 0.2, 2.2
 #: a column of an arm at rest is misplaced only if another muscle fits it better by this factor
 BETTER_AT_REST = 2.5
-MOVED = 0.04  # smallest range of l that allows a check of its sign and slope [m]
-#: fraction of the misfit that a correction of angles may leave; with more, the lengths are blamed
+MOVED = 0.04  # check sign and slope of l only if its range is larger than this [m]
+#: blame the joint sensors if correcting their angles leaves at most this fraction of the misfit;
+#: otherwise, blame the lengths
 JOINTS_BETTER = 0.8
-MOVED_JOINT = 0.2  # smallest range of θ that allows a check of its sign [rad]
-MOST_SAMPLES = 400  # largest number of messages that are compared with the model
+MOVED_JOINT = 0.2  # check the sign of θ only if its range is larger than this [rad]
+MOST_SAMPLES = 400  # compare at most this many messages with the model
 #: units in which values may have been published by mistake, in SI units or °C
 UNITS = {
     'length': {'mm': 1e-3, 'cm': 1e-2},
@@ -262,7 +266,7 @@ class Listening:
                 verdict.failed('stuck', *np.flatnonzero(stuck).tolist())
 
     def _judge_values(self, verdict: Verdict, states: Array) -> bool:
-        """Check from the ranges of possible values that rows, units and signs are right.
+        """Judge by the ranges of possible values whether rows, units and signs are right.
 
         Return False if they are wrong; the fault is then in the verdict.
 
@@ -313,7 +317,7 @@ class Listening:
         return False
 
     def _possible(self, states: Array) -> Bools:
-        """Return which readings are possible at rest, (Q, M); `states` are readings, (Q, M)."""
+        """Return which of the readings `states` (Q, M) are possible at rest, (Q, M)."""
         possible: Bools = (states >= self._low) & (states <= self._high)
         # Friction can make single currents negative, but not all of them by so much.
         pushes = states[Row.TENSION] < -PULLS[0] * self._robot.tension.bias
@@ -335,7 +339,7 @@ class Listening:
         return fault.replace('tension', 'current')
 
     def _judge_rest(self, verdict: Verdict, states: Array) -> None:
-        """Check the tensions and temperatures of modules that have received no command.
+        """Judge the tensions and temperatures of modules that have received no command.
 
         Args:
             verdict: Receives the results.
@@ -361,7 +365,7 @@ class Listening:
     def _judge_lengths_and_joints(
         self, verdict: Verdict, theta: Array, length: Array, tension: Array
     ) -> None:
-        """Compare the lengths with the model, and find faults of lengths or of joint sensors.
+        """Judge lengths and joint sensors by the model, and find which of them have faults.
 
         If several lengths have faults, and a single fault of the joint sensors explains all of
         them, only that fault is reported.
@@ -390,7 +394,7 @@ class Listening:
                 what, names = explanation
                 verdict.failed(what, names=', '.join(names))
                 return
-            # A single angle changes the lengths of several muscles.
+            # A single wrong angle makes several lengths look wrong, so name the angle first.
             names = self._suspected_signs(theta, length, tension)
             if names and self._look_exchanged(lengths_verdict, theta):
                 # On a symmetric arm, the reversed sign of one joint sensor looks like several
@@ -448,7 +452,7 @@ class Listening:
     def _judge_joint_signs(
         self, verdict: Verdict, theta: Array, length: Array, tension: Array
     ) -> None:
-        """Record which joint sensors have the right sign, if a hand has moved the arm.
+        """Judge the signs of the joint sensors, if a hand has moved the arm.
 
         Args:
             verdict: Receives the results.
@@ -519,7 +523,7 @@ class Listening:
     def _judge_lengths(
         self, verdict: Verdict, theta: Array, length: Array, tension: Array
     ) -> float:
-        """Compare the lengths with the geometric model, and report the faults of lengths.
+        """Judge the lengths by the geometric model, and report their faults.
 
         Args:
             verdict: Receives the results.

@@ -22,21 +22,21 @@ from musculoskeletal_ae.signals.joint_sensors import corrected, judge, sign_note
 from musculoskeletal_ae.signals.muscle_readings import Row
 from musculoskeletal_ae.signals.wiring import WiringJudgement
 
-RELEASE = 0.6  # wait after a release [s]
-MEAN = 0.3  # time over which readings are averaged [s]
-SETTLE = 1.5  # time in which the arm comes to rest after a motion [s]
-HOLD = 0.5  # time for which a demand is held [s]
-SPEED = 0.01  # speed at which a target continues inwards [m/s]
-RELEASE_SPEED = 0.03  # speed at which a target returns [m/s]
-ABOVE_BIAS = 40.0  # default of the highest tension, above T_bias [N]
-#: excess over the highest or the demanded tension at which a muscle is released [N]
+RELEASE = 0.6  # wait this long after a release [s]
+MEAN = 0.3  # average readings over this time [s]
+SETTLE = 1.5  # give the arm this time to come to rest after a motion [s]
+HOLD = 0.5  # hold a demand for this time [s]
+SPEED = 0.01  # move a target further inwards at this speed [m/s]
+RELEASE_SPEED = 0.03  # move a target back at this speed [m/s]
+ABOVE_BIAS = 40.0  # by default, test up to this tension above T_bias [N]
+#: release a muscle whose tension exceeds the highest or the demanded tension by this [N]
 RUN_AWAY_TENSION = 60.0
-MOMENT = 0.1  # time for which a muscle may exceed a limit, for example because the arm falls [s]
-LATEST = 0.1  # longest time from a command to the first response [s]
-#: longest time for which a moving target advances between two messages [s], so that it does not
-#: jump after a gap
+MOMENT = 0.1  # let a muscle exceed a limit for this time, for example because the arm falls [s]
+LATEST = 0.1  # report a longer time from a command to the first response [s]
+#: let a moving target advance for at most this time between two messages, so that it does not jump
+#: after a gap [s]
 LONGEST_ADVANCE = 0.05
-RESPONSE = 4.0, 0.0006  # changes of T [N] and l [m] above noise that count as a response
+RESPONSE = 4.0, 0.0006  # count changes of T [N] and l [m] above noise by this as a response
 
 Wait = Generator[None, None, None]  # each step takes one message
 
@@ -128,7 +128,7 @@ class MotionTest(ABC):
 
     @abstractmethod
     def _try(self, m: int) -> Wait:
-        """Check the responses of muscle m."""
+        """Try muscle m, and check its responses."""
 
     @abstractmethod
     def _run_away(self, states: Array, start: Array) -> RunAwayError | None:
@@ -141,7 +141,7 @@ class MotionTest(ABC):
 
     @abstractmethod
     def _release(self, error: RunAwayError) -> Wait:
-        """Pay out the muscle that has run away, within RELEASE seconds.
+        """Release the muscle that has run away: pay it out within RELEASE seconds.
 
         A test may pay out all muscles instead.
         """
@@ -174,7 +174,7 @@ class MotionTest(ABC):
                 self.verdict.failed(error.fault, error.muscle, **error.values)
 
     def _report_order(self, winds: dict[int, int]) -> None:
-        """Record that commands wind in other muscles: `winds[m]` is moved by the command of m."""
+        """Report that commands wind in other muscles: `winds[m]` is moved by the command of m."""
         names = self._robot.muscles
         (first, other), *more = winds.items()
         moves = [f'winding in {names[first]} moved the readings of {names[other]}']
@@ -204,7 +204,7 @@ class MotionTest(ABC):
         return wrong_side(self._robot, *messages, tested, winds, faults)
 
     def _judge_joints(self) -> None:
-        """Compare the joint sensors with the lengths, unless the lengths are wrong."""
+        """Judge the joint sensors by the lengths, unless the lengths are wrong."""
         verdict, robot = self.verdict, self._robot
         if not self._history or {'order', 'unit', 'sign'} & verdict.wrong:
             return
@@ -244,7 +244,7 @@ class MotionTest(ABC):
         verdict.notes += sign_notes(robot, judgement.right, remedy)
 
     def _report_misplaced(self, order: WiringJudgement) -> None:
-        """Record muscles whose readings and commands are both misplaced."""
+        """Report muscles whose readings and commands are both misplaced."""
         moves = self._moves_like(order)
         self.verdict.failed('both misplaced', *order.wiring.misplaced, moves=moves)
 

@@ -16,8 +16,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.joint_sensors import JointFault, corrected
 from musculoskeletal_ae.signals.wiring import BETTER, WiringJudgement, judge, square_misfits
 
-#: Exchanged muscles explain the lengths better than a fault of joint sensors if they reduce the
-#: misfit to less than this fraction.
+#: Blame exchanged muscles instead of joint sensors if the exchange reduces the misfit to less than
+#: this fraction.
 JOINTS_BETTER = 0.8
 
 

@@ -20,12 +20,12 @@ from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.report import is_overloaded
 
-RATE_TOLERANCE = 0.2  # tolerated relative error of the rate
-#: lowest rate at which the motion test may begin [Hz], if the expected rate is not lower. A muscle
-#: that runs away is then noticed within 33 ms, and `motion.MEAN` averages 9 readings.
+RATE_TOLERANCE = 0.2  # tolerate this relative error of the rate
+#: Begin the motion test only at this rate or above [Hz], unless the expected rate is lower. A
+#: muscle that runs away is then noticed within 33 ms, and `motion.MEAN` averages 9 readings.
 LEAST_RATE = 30.0
-LONGEST_STALL = 1.0  # longest gap that an overload of this computer may explain [s]
-LEAST_LOST = 0.05  # fraction of lost messages above which the loss is reported
+LONGEST_STALL = 1.0  # blame the driver for any longer gap, even if this computer is overloaded [s]
+LEAST_LOST = 0.05  # report a loss of more than this fraction of the messages
 
 
 class _Message(NamedTuple):
@@ -54,7 +54,7 @@ class Pace:
         self._messages.append(_Message(came, self._awake.at(came), sent, number))
 
     def judge(self, verdict: Verdict, now: float) -> None:
-        """Check the rate and the gaps until `now` [s], and add the results to `verdict`."""
+        """Judge the rate and the gaps until `now` [s], and add the results to `verdict`."""
         came, came_awake, sent, number = map(np.array, zip(*self._messages))
         is_dated = bool(np.isfinite(sent).all() and (np.diff(sent) >= 0.0).all())
         is_numbered = is_dated and bool((number > 0).all() and (np.diff(number) > 0).all())
@@ -97,7 +97,7 @@ class Pace:
                 )
 
     def _judge_low(self, verdict: Verdict, rate: float) -> None:
-        """Report that the rate [Hz] is lower than expected, unless an overload may explain it."""
+        """Judge a rate [Hz] that is too low: report it, unless an overload may explain it."""
         if not is_overloaded():
             verdict.failed('rate', rate=rate, wanted=self._rate)
             return

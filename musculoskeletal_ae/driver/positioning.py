@@ -32,15 +32,16 @@ from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
 
-STEP = 0.003  # first step inwards, by which latency is measured [m]
-FURTHEST = 0.015  # largest distance by which the target moves inwards [m]
-OUTWARDS = 0.005  # distance by which the target moves outwards [m]
-FOLLOWS = 0.0015  # tolerated difference of l and l_target at rest [m]
-SHARES = 0.7, 1.4  # legal ratios of the change of l to the change of l_target
-#: rise of T that is permitted while the arm is held, even where T exceeds the highest test tension
-#: at rest [N]
+STEP = 0.003  # first move the target inwards by this, to measure the latency [m]
+FURTHEST = 0.015  # move the target inwards by at most this [m]
+OUTWARDS = 0.005  # move the target outwards by this [m]
+FOLLOWS = 0.0015  # tolerate this difference of l and l_target at rest [m]
+#: report a fault if the change of l, divided by that of l_target, is outside this range
+SHARES = 0.7, 1.4
+#: permit T to rise by this while the arm is held, even where T exceeds the highest test tension at
+#: rest [N]
 RISE = 20.0
-RUN_AWAY = 0.03  # distance of l from l_target that ends a test [m]
+RUN_AWAY = 0.03  # release a muscle whose l is further away from l_target than this [m]
 
 
 class Positioning(MotionTest):

@@ -45,7 +45,7 @@ FAULTS = read_table(__file__, 'faults.yaml', dict[str, FaultTexts])
 
 
 class Fault(NamedTuple):
-    """A fault of the driver."""
+    """A fault that a check has found in the driver."""
 
     check: str
     muscles: tuple[int, ...]  # indices of the affected muscles; all for a fault of the whole driver
@@ -71,7 +71,7 @@ class Verdict:
         self._remedies: list[tuple[tuple[Check, ...], str]] = []
         #: observations of checks that failed while this computer was overloaded, by check
         self._excused: dict[str, list[str]] = {}
-        self._load = ''  # load of this computer at the first of these observations
+        self._load = ''  # load of this computer at the first excused observation
         #: why the motion test must not begin although no fault was found; empty if it may begin
         self.obstacle = ''
 
@@ -209,7 +209,8 @@ class Verdict:
         if (self._state[:, CHECKS.index('zero')] == OK).any():
             tolerance = f'{1e3 * LARGEST:.0f} mm'
             remarks.append(
-                f'zero ok: within {tolerance} of the route; smaller errors are not found'
+                f'zero ok: l agrees with the modelled route to {tolerance}; this check cannot '
+                'detect smaller errors'
             )
         remarks += [
             f'fault: {fault.check} of {self._subject(fault)}: {fault.observation}\n'

@@ -50,35 +50,38 @@ from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
 
-#: smallest demand above T_bias whose response can be distinguished from noise [N]
+#: demand at least this above T_bias, because noise hides the response to less [N]
 LEAST_ABOVE_BIAS = 20.0
-FURTHEST = 0.025  # largest distance by which a muscle is wound in [m]
-SLACK = 0.01  # distance by which l_target is set beyond l after winding in [m]
-RUN_AWAY = 0.05  # shortening at which a muscle is released [m]
-#: tolerance of T [N], and relative to the demand; the larger one applies
+FURTHEST = 0.025  # wind a muscle in by at most this [m]
+SLACK = 0.01  # set l_target this far beyond l after winding in [m]
+RUN_AWAY = 0.05  # release a muscle that shortens by more than this [m]
+#: accept an error of T up to the larger of these: [N], and relative to the demand
 TENSION_TOLERANCE, TENSION_SHARE = 10.0, 0.1
-LENGTH_ERROR = 2.0e-4  # two standard deviations of noise and resolution of l [m]
-SLOPES = 0.7, 1.4  # legal range of the change of T, divided by that of the demand
-CLIP = 20.0, 0.05  # demand beyond tension.max [N], and tolerance relative to tension.max
+#: expect errors of l of up to this: two standard deviations of noise and resolution [m]
+LENGTH_ERROR = 2.0e-4
+#: report a fault if the change of T, divided by that of the demand, is outside this range
+SLOPES = 0.7, 1.4
+#: to check the clip, demand this beyond tension.max [N]; accept this excess of T, relative to it
+CLIP = 20.0, 0.05
 #: If a muscle becomes taut at an l_target within this distance of −l [m], the sign of l or of the
 #: command is wrong.
 MIRROR_TOLERANCE = 0.008
-#: highest demand, and tension at which all muscles are released, while the arm is held before the
-#: first test; relative to the range from T_bias to the highest test tension. Healthy emulated arms
-#: that still swing reach 0.81. If K is large, T is noisy, and ALARM is raised by the excess.
+#: While the arm is held before the first test, demand at most HELD, and release all muscles above
+#: ALARM; both are fractions of the range from T_bias to the highest test tension. Healthy emulated
+#: arms that still swing reach 0.81. If K is large, T is noisy, and ALARM is raised by the excess.
 HELD, ALARM = 0.5, 0.9
-OSCILLATES = 6  # T oscillates if it crosses its mean more often than this within MEAN
-#: distance of l_target beyond l at the start of a release [m], and its growth [m/s]; small at
-#: first, because commands of wrong sign wind in
+OSCILLATES = 6  # count T as oscillating if it crosses its mean more often than this within MEAN
+#: start a release with l_target this far beyond l [m], and increase the distance at this speed
+#: [m/s]; it is small at first, because commands of wrong sign wind in
 PAY_OUT = 0.003, 0.3
-#: distance of every l_target beyond the largest l while a wrong order is searched [m]; no module
+#: set every l_target this far beyond the largest l while a wrong order is searched [m]; no module
 #: then pulls, whichever command it follows
 CLEAR = 0.005
-#: share of the range from T_bias to ALARM by which the demand may rise within LONGEST_ADVANCE while
-#: a wrong order is searched
+#: let the demand rise by at most this share of the range from T_bias to ALARM within
+#: LONGEST_ADVANCE while a wrong order is searched
 SEARCH_SHARE = 0.5
-CONFIRMATIONS = 3  # successive messages in which a tension must have risen to be a response
-MOST_BEYOND = 0.3  # highest demand beyond tension.max, relative to tension.max
+CONFIRMATIONS = 3  # count a rise of tension as a response only in this many successive messages
+MOST_BEYOND = 0.3  # demand at most this much beyond tension.max, relative to tension.max
 
 
 class _Reading(NamedTuple):
@@ -205,7 +208,7 @@ class Winding(MotionTest):
         return None
 
     def _release(self, error: RunAwayError) -> Wait:
-        """Pay out all muscles, because the arm may be falling.
+        """Release all muscles by paying them out, because the arm may be falling.
 
         Every target moves away from the newest l, because l may change in the wrong direction. If
         a tension still rises, the sign of the commands is wrong, so that no more are sent.
@@ -396,7 +399,7 @@ class Winding(MotionTest):
     def _wind(
         self, m: int, level: float, home: float, latency: list[float]
     ) -> Generator[None, None, _Reading]:
-        """Demand a tension of a muscle, and return the reading that results.
+        """Wind a muscle in until it should have a tension, and return the reading that results.
 
         If the arm yields, so that the muscle shortens, l_target moves further inwards, until the
         demand or the distance FURTHEST is reached.
@@ -477,7 +480,7 @@ class Winding(MotionTest):
             self._judge_latency(m, min(half + whole))
 
     def _judge_law(self, m: int, home: _Reading, last: _Reading, out: _Reading) -> None:
-        """Check the law at the highest demand, and with l_target beyond l."""
+        """Judge whether T obeys the law at the highest demand, and with l_target beyond l."""
         failed = self.verdict.failed
         asked, got = last.demand[m] - home.demand[m], last.tension[m] - home.tension[m]
         if asked < 0.25 * (self._highest - self._bias)[m]:

@@ -77,12 +77,12 @@ class PolynomialFilter:
     name = 'polynomial mapping, EKF'
     DEGREE = 3
     MODEL_SAMPLES = 20_000
-    PRIOR_ROWS = 20.0  # weight of the prior, as a number of samples
-    TENSION_SCALE = 1.0 / 200.0  # gives a_m the magnitude of the other coefficients
+    PRIOR_ROWS = 20.0  # weigh the prior like this many samples
+    TENSION_SCALE = 1.0 / 200.0  # scale tensions by this, so that a_m is as large as c_mk
     #: standard deviation of a joint's random walk [rad/√s]; with 0.2 instead, the error differs by
     #: about 1 %
     WALK = 0.5
-    LEAST_NOISE = 5e-4  # lower bound of the standard deviation of a length [m]
+    LEAST_NOISE = 5e-4  # assume at least this standard deviation of a length [m]
 
     def __init__(self, robot: Robot) -> None:
         """Fit the mapping to the geometric model."""

@@ -47,11 +47,11 @@ from musculoskeletal_ae.experiments.study import (
 from musculoskeletal_ae.robot.robot import Robot
 
 SWEEP = np.radians(np.linspace(-120.0, 30.0, 151))  # angles of the shoulder [rad]
-POINTS = 101  # number of points of a tension curve
-COLUMNS = 5  # number of panels in a row of a plot
-WORN = 0.5  # factor on the stiffening rate of the worn element
+POINTS = 101  # draw a tension curve with this many points
+COLUMNS = 5  # draw this many panels in a row of a plot
+WORN = 0.5  # multiply the stiffening rate of the worn element by this
 WORN_FRICTION = 0.4  # capstan exponent of the tendon with high friction (mean of others: 0.1)
-SMALL = 1e-9  # avoids a division by zero [m]
+SMALL = 1e-9  # divide by at least this, to avoid a division by zero [m]
 
 
 def measure(study: Study, seed: int) -> Measured:

@@ -16,23 +16,23 @@ from musculoskeletal_ae.motion.exploration_steps import TRIES, holdable_postures
 from musculoskeletal_ae.robot.robot import Robot
 
 CONTACT_STREAM = 7000
-#: numbers of postures with two pushes at rest, of collisions in motion, and of tests with `float`
+#: push twice in this many resting postures, make this many collisions, and test `float` this often
 POSTURES, COLLISIONS, FLOATS = 15, 20, 4
-#: largest number of tries for each collision; a try fails if the arm hardly moves, or if a contact
-#: is detected before the push
+#: try each collision at most this often; a try fails if the arm hardly moves, or if a contact is
+#: detected before the push
 TRIES_PER_COLLISION = 20
-HEALTHY = 3600.0  # duration of healthy exploration, shared by the individuals [s]
-LEAST, MOST = 10.0, 50.0  # range of the external forces [N]
-LIGHT, FIRM = 15.0, 20.0  # range of the forces that guide an arm in method `float` [N]
-MOVE = 4.0  # duration of the motion to a posture [s]
-PUSH = 1.5  # duration of a push at rest [s]
-EVALUATED = 0.5  # duration of the last part of a push, over which estimates are averaged [s]
-APART = 3.0  # longest time between collisions [s]
-WARM_UP = 5.0  # duration of the exploration before contacts of the healthy arm are counted [s]
-FLOATING = 30.0  # duration of the drift test [s]
-MOVED = 1.0  # duration of a collision, and of guiding the hand [s]
+HEALTHY = 3600.0  # explore without contact for this time, shared by the individuals [s]
+LEAST, MOST = 10.0, 50.0  # push with forces in this range [N]
+LIGHT, FIRM = 15.0, 20.0  # guide an arm in method `float` with forces in this range [N]
+MOVE = 4.0  # move to a posture in this time [s]
+PUSH = 1.5  # push a resting arm for this time [s]
+EVALUATED = 0.5  # average estimates over the last part of a push, of this duration [s]
+APART = 3.0  # wait at most this long between collisions [s]
+WARM_UP = 5.0  # explore for this time before contacts of the healthy arm are counted [s]
+FLOATING = 30.0  # test the drift for this time [s]
+MOVED = 1.0  # push for this time in a collision, and to guide the hand [s]
 SOON = 0.1  # a collision should be detected within this time [s]
-INSIDE = 0.1  # distance of postures from the joint limits, relative to the joint ranges
+INSIDE = 0.1  # keep postures away from the joint limits by this fraction of the joint ranges
 
 
 class ContactLoop(ClosedLoop):

@@ -54,7 +54,7 @@ METHODS = {
     f'second_{PAPER_PRESET}': '#99D8C7',
     f'proposed_{PAPER_PRESET}': '#CC79A7',
 }
-APPROACHES = 5  # number of θ_eval, and number of starts for each of them
+APPROACHES = 5  # approach this many θ_eval, each from this many starts
 
 
 class Durations(NamedTuple):
@@ -140,7 +140,7 @@ def _bound(arm: Arm) -> float:
 def measure(study: Study, seed: int) -> Measured:
     """Measure the errors and tensions of every control method on one individual."""
     networks = {'default': study.network(seed), PAPER_PRESET: study.network(seed, PAPER_PRESET)}
-    # The approaches of a shortened run begin on the way to a start.
+    # In a shortened run, the arm has not yet reached the start when an approach begins.
     count, durations = study.number(APPROACHES), Durations(*map(study.seconds, DURATIONS))
     ended = protocol(study.arm(seed), networks, seed, count, durations)
     errors = {name: np.linalg.norm(offset, axis=-1) for name, offset in ended.offset.items()}

@@ -22,16 +22,17 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
 
 PAYLOAD = 3.6  # mass of the dumbbell in the paper (§IV-B) [kg]
-GRASPING = 60.0  # time from grasp to release, and from release to grasp [s]
+GRASPING = 60.0  # grasp or release the payload at this interval [s]
 #: a muscle carries tension if T exceeds T_bias by this much [N], far beyond the sensor's noise
 CARRYING = 10.0
 #: time for each muscle [s]: wait until it carries tension, rupture, repair, recover
 SLOT = 20.0
-LATEST_RUPTURE = 14.0  # latest time of the rupture, from the beginning of the slot [s]
-RUPTURE_TIME = 3.0  # time from the rupture until the muscle is repaired [s]
-SLACKENING = 0.1  # time after a rupture until no tension is left [s]
-RECOVERY = 2.0  # time after a repair in which the arm swings back [s]
-#: longest random wait before a rupture [s], so that muscles rupture both in motion and at rest
+LATEST_RUPTURE = 14.0  # rupture a muscle no later than this after the beginning of its slot [s]
+RUPTURE_TIME = 3.0  # repair a muscle this long after its rupture [s]
+SLACKENING = 0.1  # expect no tension from this time after a rupture on [s]
+RECOVERY = 2.0  # let the arm swing back for this time after a repair [s]
+#: wait for a random time of up to this before a rupture [s], so that muscles rupture both in motion
+#: and at rest
 LONGEST_WAIT = 5.0
 
 

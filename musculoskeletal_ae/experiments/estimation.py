@@ -68,11 +68,11 @@ from musculoskeletal_ae.experiments.study import (
 from musculoskeletal_ae.signals.friction import directions
 
 HEALTHY_STREAM = 9500
-#: duration of the healthy motion in which alarms are false, shared by the individuals [s]
+#: count false alarms over this duration of healthy motion, shared by the individuals [s]
 HEALTHY_TIME = 3600.0
-PLOT_START = 60.0  # time that plots show before the grasp [s]
-PLOT_TAIL = 3.0  # time that plots show after the repair [s]
-OFF_TIME = 40.0  # duration of the motion before muscles are switched off [s]
+PLOT_START = 60.0  # begin plots this long before the grasp [s]
+PLOT_TAIL = 3.0  # end plots this long after the repair [s]
+OFF_TIME = 40.0  # move for this time before muscles are switched off [s]
 #: times of the pictures [s], at ends of the motion's cycles without and with the payload; a
 #: shortened run has pictures of those times that its shorter motion reaches
 MOMENTS = {'after 10 s': 9.9, 'after 20 s': 19.9, 'payload grasped': 29.9, 'payload, 40 s': 39.9}
@@ -83,7 +83,7 @@ OFF_KEYS = 'detection_s', 'detected_share', 'named_share'  # keys reported for s
 def measure(study: Study, seed: int) -> Measured:
     """Measure the estimates of one individual, and the detection of its ruptured muscles."""
     robot = study.robot
-    # A muscle needs half of its time even in a shortened run.
+    # Even in a shortened run, a muscle needs half of its usual time.
     most, slot = (1, 0.5 * SLOT) if study.quick else (None, SLOT)
     plan = GraspAndRupture(robot, study.held_out_time, seed, most=most, slot=slot)
     driven_by = study.network(None, 'default')
@@ -275,7 +275,7 @@ def deactivated(_: Study, rows: Rows) -> Plot:
 
 
 def appearance(study: Study, rows: Rows) -> Plot:
-    """Draw the true and the estimated postures at several moments of the experiment."""
+    """Draw the true and the estimated postures at several times of the experiment."""
     seed, (_, trace) = first_individual(rows)
     moments = {name: step for step, name in enumerate(trace['moments'])}
     title = f'individual {seed}, estimated from lengths and tensions'

@@ -50,8 +50,8 @@ HIDDEN = {
     'fewer units: 50, 20': (50, 20),
     'fewer units: 20, 10': (20, 10),
 }
-TRAININGS = 3  # number of trainings of each layout, which differ in the random seed
-QUICK_STEPS = 100  # number of steps of a shortened initial training
+TRAININGS = 3  # train each layout this often, with different random seeds
+QUICK_STEPS = 100  # in a shortened run, end the initial training after this many steps
 ERRORS = 'before_rad', 'after_rad'  # numbers whose range over the trainings is reported
 
 

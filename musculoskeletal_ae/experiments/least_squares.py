@@ -29,10 +29,10 @@ from musculoskeletal_ae.gauss_newton import minimise_each
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
-ROUNDS = 30  # largest number of Gauss–Newton steps
+ROUNDS = 30  # take at most this many Gauss–Newton steps
 USUAL_STEP = 0.1  # typical step of a joint, as a share of its range
 EVERY = np.s_[::10]  # every tenth message of a recording, because least squares is slow
-DIFFERENCE = 1e-4  # step of finite differences [rad]
+DIFFERENCE = 1e-4  # compute finite differences with this step [rad]
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-STEP = 0.02  # time step of the simulation [s]
-FORCED = 30.0  # angle to which the shoulder is forced [deg]
+STEP = 0.02  # simulate in steps of this time [s]
+FORCED = 30.0  # force the shoulder to this angle [deg]
 
 
 class Phase(NamedTuple):

@@ -63,11 +63,11 @@ from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-DURATIONS = (1.0, 2.0)  # durations of the motions [s]
-MOTIONS, CIRCLES = 6, 3  # numbers of motions of each duration, and of circles
-STARTING = 3.0  # duration of the motion to the first posture [s]
-REST = 0.6  # duration of the rest after a motion [s]
-SETTLED = 0.5  # time after the end of a motion at which the settled error is read [s]
+DURATIONS = (1.0, 2.0)  # move in each of these times [s]
+MOTIONS, CIRCLES = 6, 3  # make this many motions of each duration, and this many circles
+STARTING = 3.0  # move to the first posture in this time [s]
+REST = 0.6  # rest for this time after a motion [s]
+SETTLED = 0.5  # read the settled error this long after the end of a motion [s]
 OURS = 'trajectory'
 METHODS = {
     OURS: plots.AFTER,
@@ -79,12 +79,12 @@ METHODS = {
 #: control methods of a shortened run; all but OURS are only measured in motions of DURATIONS[0]
 QUICK_METHODS = OURS, 'tension', 'second'
 RADIUS, SPEED = 0.05, 0.1  # radius of a circle [m], and speed of the hand along it [m/s]
-EVERY = 2  # number of messages from one pose to the next
-NEAR = 0.002  # largest distance at which a pose counts as reachable [m]
+EVERY = 2  # send a pose with every second message
+NEAR = 0.002  # count a pose as reachable if the hand comes this close [m]
 #: maps a time [s] to the desired pose of the hand
 Place = Callable[[float], pin.SE3]
-SETTLING_TIME = 4.0  # longest settling time [s]
-WITHIN = 0.05  # distance from the target within which the arm has settled [rad]
+SETTLING_TIME = 4.0  # wait at most this long for the arm to settle [s]
+WITHIN = 0.05  # count the arm as settled within this distance from the target [rad]
 LAP = 2.0 * np.pi * RADIUS / SPEED  # duration of a circle [s]
 
 

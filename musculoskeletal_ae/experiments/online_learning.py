@@ -63,16 +63,16 @@ from musculoskeletal_ae.presets.registry import PRESETS, preset_named
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
 CURVE_STRIDE = 10  # every tenth held-out message is evaluated after each update
-#: duration of the first part of a run, whose mean error is the initial guess of b in the
-#: exponential fit [s]
+#: use the mean error over this first part of a run as the initial guess of b in the exponential fit
+#: [s]
 FIRST_ERRORS = 10.0
 PUBLISHED_MINUTES = 10.0
 PUBLISHED = (0.324, 0.154)  # the paper's fit at the start and after ten minutes [rad]
 #: numbers of steps of a shortened initial training, by preset; after fewer steps, checkpoint
 #: validation rejects the network of preset `paper`
 QUICK_STEPS = {PAPER_PRESET: 600, DEFAULT: 300}
-NOTE_EVERY = 25  # number of mini-batches from one record of the training errors to the next
-TEST_STATES = 1000  # number of test states
+NOTE_EVERY = 25  # record the training errors after every 25th mini-batch
+TEST_STATES = 1000  # test a network on this many states
 COLOURS = {PAPER_PRESET: plots.AS_PRINTED, 'default': plots.AFTER}
 
 #: function that returns the θ [rad] (D,) that the learner receives, or None. Its arguments are the
@@ -93,7 +93,7 @@ def teach(
     stream: Iterable[tuple[Array, ...]],
     view: JointView = lambda _learner, _n, _true, read: read,
 ) -> None:
-    """Feed the messages of a recording to a learner one by one, as the learner node does.
+    """Teach a learner the messages of a recording one by one, as the learner node does.
 
     For each message, `view` returns the joint angles [rad] that the learner receives, or None. By
     default, these are the joint-sensor readings.
@@ -105,7 +105,7 @@ def teach(
 def teach_and_evaluate(
     learner: Learner, stream: Iterable[tuple[Array, ...]], held_out: Recording
 ) -> tuple[Curve, Recording]:
-    """Feed messages to a learner, and evaluate it on the held-out motion after each update.
+    """Teach a learner messages, and evaluate it on the held-out motion after each update.
 
     Returns:
         The course of learning, and a recording of the messages.

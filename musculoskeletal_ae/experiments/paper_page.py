@@ -48,14 +48,14 @@ PICTURES = {
     'figure_13_motion': ('loss_change', 'loss_change'),
     'layers': ('layers', 'layers'),
 }
-LARGEST = 60_000  # largest size of a picture [bytes]
-WIDEST = 1000  # largest width of a picture [pixels]
-COLOURS = 128  # number of colours; a small palette makes small files
-SMALLER = 0.9  # factor by which the width of a picture is reduced until the file is small enough
+LARGEST = 60_000  # shrink a picture to at most this size [bytes]
+WIDEST = 1000  # shrink a picture to at most this width [pixels]
+COLOURS = 128  # reduce pictures to this many colours; a small palette makes small files
+SMALLER = 0.9  # multiply the width of a picture by this until the file is small enough
 
 
 def update_page(page: Path, measured: Path | None = None) -> list[Path]:
-    """Rewrite the page; return the files that were written.
+    """Update the page; return the files that were written.
 
     Args:
         page: File of the page; results and pictures are in the folder of the same name beside it.

@@ -18,7 +18,7 @@ BEFORE, AFTER, AS_PRINTED, TRUE, MARK = '#D55E00', '#009E73', '#CC79A7', '#22222
 #: colours of results before and after learning
 WHEN = {'before': BEFORE, 'after': AFTER}
 DPI = 110
-POINTS = 1500  # largest number of points of a drawn line
+POINTS = 1500  # draw a line with at most this many points
 
 #: positions of legends that never hide data
 LEGENDS: dict[str, dict[str, Any]] = {
@@ -26,7 +26,7 @@ LEGENDS: dict[str, dict[str, Any]] = {
     'above': {'loc': 'lower right', 'bbox_to_anchor': (1.0, 1.0), 'ncols': 4, 'frameon': False},
     'below': {'loc': 'upper center', 'bbox_to_anchor': (0.5, -0.16), 'ncols': 2},
 }
-MARGIN = 0.03  # free space around an arm [m]
+MARGIN = 0.03  # leave this free space around an arm [m]
 HEADER = 0.9  # height of the titles [inch]
 VIEW = (12.0, -35.0)  # elevation and azimuth of the camera [deg]: mainly from the front
 STYLES: dict[str, dict[str, Any]] = {
@@ -137,7 +137,7 @@ def ranked_bars(
 def pictures(
     robot: Robot, motions: Mapping[str, Motion], moments: Mapping[str, int], title: str
 ) -> Any:
-    """Draw arms in a grid: a row for each motion, and a column for each moment (index of a step).
+    """Draw arms in a grid: a row for each motion, and a column for each step in `moments`.
 
     Bones are grey; muscles are green at T_bias and red at T_limit.
     """

@@ -27,7 +27,7 @@ from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.signals.body_state import Anomaly
 from musculoskeletal_ae.signals.friction import directions
 
-#: length that makes a switched-off muscle slack in any posture when added to its command [m]
+#: add this to the command of a switched-off muscle, to make it slack in any posture [m]
 PAID_OUT = 0.1
 SAMPLE_TIME = 0.01  # time between two messages [s]; the modules report at 100 Hz
 #: random seeds of the exploration, to which the individual's seed is added, and of held-out motion
@@ -153,7 +153,7 @@ class ClosedLoop:
         self.wait(duration)
 
     def check(self) -> None:
-        """Raise a MusculoskeletalError if the controller has stopped."""
+        """Check that the controller runs; raise a MusculoskeletalError if it has stopped."""
         condition = self.core.supervisor.condition
         if condition is not None:
             raise MusculoskeletalError(f'control stopped: {condition.text}')
@@ -163,7 +163,7 @@ class ClosedLoop:
         self.core.target(dict(zip(self.arm.robot.joints, ((t, 0.0) for t in theta.tolist()))))
 
     def wait(self, duration: float) -> None:
-        """Advance the time by `duration` [s]."""
+        """Wait for `duration` [s] of simulated time."""
         for _ in range(round(duration / SAMPLE_TIME)):
             self.step()
 
@@ -175,7 +175,7 @@ def record(
     duration: float,
     script: Script | None = None,
 ) -> Recording:
-    """Drive an arm through the three steps of exploration with a fixed list of commands.
+    """Record an arm while a fixed list of commands drives it through the steps of exploration.
 
     Every command is computed by method `first`. Method `second` would need the current tension,
     which a fixed list cannot contain. The step of `second` is therefore replaced by `first` with

@@ -44,18 +44,19 @@ from musculoskeletal_ae.motion.progress import FALLEN
 from musculoskeletal_ae.robot.tension import holding_tension
 
 EVERY = 10  # every tenth message of the held-out motion is evaluated
-TARGETS = 2  # number of targets that the arm approaches without each muscle
-MOVING = 12.0  # duration of healthy motion before a fault [s]
-LATEST_VERDICT = 10  # longest wait for the end of the first verification after a fault [s]
-AFTERWARDS = 6.0  # duration of the motion after this wait [s]
-#: longest time to a target [s]; it allows for slow winches, and for further approaches if the arm
-#: falls
+TARGETS = 2  # approach this many targets without each muscle
+MOVING = 12.0  # explore for this time before a fault [s]
+#: wait at most this long after a fault for the end of the first verification [s]
+LATEST_VERDICT = 10
+AFTERWARDS = 6.0  # continue for this time after the wait for the first verification [s]
+#: wait at most this long for the arm to reach a target [s]; this allows for slow winches, and for
+#: further approaches if the arm falls
 LONGEST_APPROACH = 60
-SETTLING = 4  # after this time at rest, the arm has arrived [s]
-STILL = 0.02  # the arm rests if no joint moves more than this in a second [rad]
-HEALTHY_TIME = 18_000.0  # duration of healthy exploration, shared by the individuals [s]
-PUSH_EVERY = 10.0  # time from one push to the next [s]
-PUSH = (10.0, 30.0)  # range of the forces of pushes [N]
+SETTLING = 4  # count the arm as arrived after this time at rest [s]
+STILL = 0.02  # count the arm as at rest if no joint moves more than this in a second [rad]
+HEALTHY_TIME = 18_000.0  # let healthy arms explore for this time, shared by the individuals [s]
+PUSH_EVERY = 10.0  # push at this interval [s]
+PUSH = (10.0, 30.0)  # push with forces in this range [N]
 
 
 class IsolatingLoop(ClosedLoop):

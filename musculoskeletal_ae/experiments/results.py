@@ -272,7 +272,7 @@ def failures(results: Results) -> list[str]:
 
 
 def update_readme(readme: Path, measured: Path | None = None) -> list[Path]:
-    """Rewrite the results table of a page; return the written files.
+    """Update the results table of a page; return the written files.
 
     The numbers come from the folder of results beside the page. If `measured` is a folder, its
     result.json files are first copied there.

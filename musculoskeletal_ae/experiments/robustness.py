@@ -59,10 +59,10 @@ ABLATED = {
 }
 #: keys of ABLATED whose effects a shortened run removes; a full run does this for every key in turn
 QUICK = ('friction',)
-ABLATION_INDIVIDUALS = 2  # number of individuals whose effects are removed
+ABLATION_INDIVIDUALS = 2  # remove effects of this many individuals
 #: label of a run with all effects and another exploration, which shows the difference between runs
 REPEATED = 'nothing: another run'
-OTHER_RUN = 1000  # number that is added to the seed of exploration and training of this run
+OTHER_RUN = 1000  # add this to the seed of exploration and training of the repeated run
 
 
 def measure(study: Study, seed: int) -> Measured:

@@ -28,7 +28,7 @@ EXPERIMENTS = {
     name: import_module(f'musculoskeletal_ae.experiments.{name}').EXPERIMENT for name in NAMES
 }
 LEARNING = 'online_learning'
-POLL = 0.5  # longest time between two reports [s]
+POLL = 0.5  # report after at most this time [s]
 Part = tuple[str, int]  # an experiment and a seed, or a preset to train and -1
 
 # Threads of the numeric libraries would compete with the processes for the cores.

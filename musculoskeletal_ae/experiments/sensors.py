@@ -38,7 +38,7 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 
-CAMERA = 10  # number of muscle messages for each message of the camera or the accelerometer
+CAMERA = 10  # receive one message of the camera or the accelerometer for this many muscle messages
 SIGHTED = 10  # the camera detects the marker in one of this many samples
 
 

@@ -32,7 +32,7 @@ from musculoskeletal_ae.simulation.simulation import Simulation
 #: the errors in the paper before and after learning
 PUBLISHED = {'rad': (0.335, 0.162), 'n': (105.0, 92.2)}
 CYCLE = 10.0  # duration of the exploration's three steps [s]
-MOMENTS = 5  # number of moments that the pictures show
+MOMENTS = 5  # draw the arm at this many instants
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -56,7 +56,7 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def simulate(robot: Robot, mae: Mae, preset: str, recording: Recording) -> Motion:
-    """Let a network's simulator follow the commands of a recording, and return its motion.
+    """Simulate the commands of a recording with a network, and return the motion.
 
     The simulator starts in the first posture of the recording.
     """
@@ -86,7 +86,7 @@ def _errors(name: str, motion: Motion, arm: Motion) -> dict[str, float]:
 
 
 def simulation_pictures(study: Study, rows: Rows) -> Plot:
-    """Draw the arm and its simulators at several moments."""
+    """Draw the arm and its simulators at several times."""
     seed, (_, traces) = first_individual(rows)
     arm = traces[study.preset]['arm']
     # Times near the ends of cycles, where the arm rests at the random tensions of the third step.

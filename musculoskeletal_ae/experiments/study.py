@@ -27,9 +27,9 @@ from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot
 
 HELD_OUT = 300.0  # duration of the held-out motion [s]
-#: duration of a motion in a shortened run, as a share of the whole one, and its upper limit [s]
+#: in a shortened run, shorten a motion to this share of the whole one, and to at most this time [s]
 QUICK_SHARE, QUICK_LIMIT = 0.25, 10.0
-DIGITS = 6  # significant digits of results; further digits are noise
+DIGITS = 6  # round results to this many significant digits; further digits are noise
 
 
 class RestSamples(NamedTuple):

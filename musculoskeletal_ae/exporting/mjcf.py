@@ -38,11 +38,11 @@ from musculoskeletal_ae.robot.description import RoutePoint
 from musculoskeletal_ae.robot.drawing import SHORTEST_BONE
 from musculoskeletal_ae.robot.robot import Robot
 
-POSTURES = 1000  # number of postures in which the model and the network are compared
-#: damping of a joint, multiplied by its `joint_gear` [N·m·s/rad]; chosen for a stable simulation
+POSTURES = 1000  # compare the model and the network in this many postures
+#: multiply this damping by the `joint_gear` of a joint [N·m·s/rad]; chosen for a stable simulation
 DAMPING = 0.05
-THIN = 0.008  # radius of the capsules that draw bones [m]
-TIMESTEP = 0.002  # time step of the exported model [s]
+THIN = 0.008  # draw bones as capsules of this radius [m]
+TIMESTEP = 0.002  # let the exported model advance by this time in a step [s]
 LEGEND = """\
 length      standard deviation of the difference of lengths
 moment arm  difference of dl/dq (norm over all joints, root mean square over the postures), and the

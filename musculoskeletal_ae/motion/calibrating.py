@@ -14,13 +14,13 @@ from musculoskeletal_ae.motion.ramps import Ramp
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme
 
-SPEED = 0.05  # fastest change of a length command [m/s]
-DURATION = 1.5  # duration of a step, which takes longer if SPEED requires it [s]
-REST = 0.25  # duration of the rest after a step [s]
-REACH = 0.7  # largest change of each joint in a step [rad]
-INSIDE = 0.1  # smallest distance of goals from the joint limits, as a fraction of the joint range
-GOALS = 20  # number of random goals among which a holdable goal is sought
-SHARE = 0.6  # highest tension, as a fraction of the range from T_bias to T_limit
+SPEED = 0.05  # change length commands no faster than this [m/s]
+DURATION = 1.5  # take this time for a step, or longer if SPEED requires it [s]
+REST = 0.25  # rest for this time after a step [s]
+REACH = 0.7  # move no joint further than this in one step [rad]
+INSIDE = 0.1  # keep goals away from the joint limits by this fraction of the joint range
+GOALS = 20  # try this many random goals in search of a holdable one
+SHARE = 0.6  # permit tensions up to this fraction of the range from T_bias to T_limit
 
 
 def gentle_limit(robot: Robot) -> Array:
@@ -57,7 +57,7 @@ class Calibrating(ActivityControl):
         self._robot = robot
 
     def enter(self, _: Inputs) -> None:
-        """Start from the present posture."""
+        """Enter the activity, starting from the present posture."""
         self._ramp, self._rested = None, 0.0
 
     def step(self, inputs: Inputs) -> Command | None:
@@ -71,7 +71,7 @@ class Calibrating(ActivityControl):
         return Command(LENGTH, self._ramp.step(inputs.dt))
 
     def leave(self) -> None:
-        """Discard the present motion."""
+        """Leave the activity, and discard its motion."""
         self._ramp = None
 
     def _goal(self, inputs: Inputs) -> Array:

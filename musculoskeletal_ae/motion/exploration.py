@@ -49,7 +49,7 @@ class Exploring(ActivityControl):
         self._theta: Array | None = None  # present target [rad], (D,)
 
     def enter(self, inputs: Inputs) -> None:
-        """Start the exploration, or continue it after a pause, from the present tensions."""
+        """Enter the exploration, or continue it after a pause, from the present tensions."""
         self.ramps.start_from(inputs.length)
         self._steps = self._steps or iter(self.stream)
 
@@ -69,7 +69,7 @@ class Exploring(ActivityControl):
         return self.ramps.step(inputs)
 
     def leave(self) -> None:
-        """End the exploration; the next exploration starts with another posture."""
+        """Leave the exploration; the next exploration starts with another posture."""
         self._steps = self._theta = None
 
     @property

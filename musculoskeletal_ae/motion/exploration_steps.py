@@ -13,21 +13,21 @@ from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension, least_tension
 
-TRIES = 1000  # largest number of random postures among which holdable ones are sought
-AT_LIMITS = 0.25  # fraction of each joint's random angles that are at one of its limits
-#: number of random postures after which postures with the support of joint stops are sought instead
+TRIES = 1000  # search at most this many random postures for holdable ones
+AT_LIMITS = 0.25  # place this fraction of each joint's random angles at one of its limits
+#: seek postures with the support of joint stops after this many random postures without success
 TRIES_WITHOUT_STOPS = 200
-TRIES_WITH_STOPS = 5  # number of random postures near which such postures are sought
-LEAST_SPREAD = 0.1  # smallest mean spread of these postures, relative to the ranges of the joints
-LEAST_FREE = 0.3  # smallest share of joints that are away from their limits in these postures
-SETTLING_STEPS = 40  # largest number of steps towards a posture with the support of stops
-LARGEST_STEP = 0.2  # largest change of a joint in one of these steps [rad]
-LEAST_STIFFNESS = 0.05  # smallest stiffness of these steps, relative to the largest
-AT_STOP = 1e-3  # distance from a limit up to which its stop supports a joint [rad]
-STOP_TORQUE = 100.0  # largest torque with which a stop supports a joint [N·m]
-BALANCED = 1e-3  # missing torque up to which a posture is held, relative to the largest torque
-SMALL = 1e-9  # smallest torque by which torques are divided, to avoid a division by zero [N·m]
-PRESSES = 10  # number of random T_const from which the most strongly pressing one is chosen
+TRIES_WITH_STOPS = 5  # seek such postures near this many random ones
+LEAST_SPREAD = 0.1  # refuse them if their mean spread is less than this share of the joint ranges
+LEAST_FREE = 0.3  # refuse them if less than this share of the joints is away from its limits
+SETTLING_STEPS = 40  # move towards a posture with the support of stops in at most this many steps
+LARGEST_STEP = 0.2  # turn a joint by at most this in one of these steps [rad]
+LEAST_STIFFNESS = 0.05  # let the stiffness of a step be at least this share of the largest
+AT_STOP = 1e-3  # let a stop support a joint up to this distance from the limit [rad]
+STOP_TORQUE = 100.0  # let a stop support a joint with at most this torque [N·m]
+BALANCED = 1e-3  # count a posture as held if it lacks at most this share of the largest torque
+SMALL = 1e-9  # divide torques by at least this, to avoid a division by zero [N·m]
+PRESSES = 10  # draw this many random T_const, and use the one that presses most strongly
 
 
 class ExplorationStep(NamedTuple):

@@ -13,17 +13,18 @@ from musculoskeletal_ae.control.command import Pull
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-#: A change of a tension limit by more than this requires a new plan, if the planned tension is also
-#: nearer to the limit than this [N].
+#: Plan again if a tension limit changes by more than this, and a planned tension is nearer to the
+#: limit than this [N].
 REPLAN = 5.0
-CORRECTION = 0.3  # largest correction of a joint [rad]
-#: Largest estimated error that is not corrected [rad]. It is about as large as the error of the
-#: estimate. Without this dead band, an arm with friction would never rest.
+CORRECTION = 0.3  # correct no joint by more than this [rad]
+#: Do not correct smaller estimated errors [rad]. This is about the error of the estimate itself.
+#: Without this dead band, an arm with friction would never rest.
 DEADBAND = 0.03
-RELIEF_INTERVAL = 0.1  # shortest time between two computations of the needless tension [s]
+RELIEF_INTERVAL = 0.1  # compute the needless tension at intervals of at least this time [s]
 PROPORTIONAL = 0.7  # proportional gain k_p in motion
 INTEGRAL = 4.0  # integral gain k_i in motion [1/s]
-SETTLING = 0.5  # time after the end of the feedback in motion until the arm counts as resting [s]
+#: count the arm as resting once the feedback in motion has been off for this time [s]
+SETTLING = 0.5
 
 
 def depends_on_limit(tension: Array, before: Array, limit: Array) -> bool:
@@ -86,7 +87,7 @@ class RestFeedback:
         self._robot = robot
 
     def reset(self) -> None:
-        """Set the corrections c and r to zero."""
+        """Reset the corrections c and r to zero."""
         self.correction: Array = np.zeros(self._robot.joint_count)
         self.relief: Array = np.zeros(self._robot.muscle_count)
 

@@ -53,9 +53,9 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: gain of the rest feedback, which reduces posture error and needless tension at rest [1/s]
 FEEDBACK_GAIN = 0.5
-BLENDING = 0.3  # time in which the previous command is blended into the new plan [s]
-SETTLING = 0.8  # time after a trajectory for which the feedback of the motion continues [s]
-#: The limiter holds a muscle back if it has made the command longer by more than this [m].
+BLENDING = 0.3  # blend the previous command into a new plan over this time [s]
+SETTLING = 0.8  # continue the feedback of the motion for this time after a trajectory [s]
+#: Count a muscle as held back if the limiter has made its command longer by more than this [m].
 HELD_BACK = 1e-4
 
 
@@ -157,7 +157,7 @@ class Follower(ActivityControl):
     # -- the activity ---------------------------------------------------------------------------
 
     def enter(self, _: Inputs) -> None:
-        """Start following, or continue after a pause, from the present tensions."""
+        """Enter the activity, or continue it after a pause, from the present tensions."""
         self._held = self._blend = self._desired = None
         self.progress.return_to_end()  # plan the tensions of the held posture again
         self.plan.reset()
@@ -165,7 +165,7 @@ class Follower(ActivityControl):
         self.winches.forget()
 
     def leave(self) -> None:
-        """Discard the trajectories."""
+        """Leave the activity, and discard the trajectories."""
         self.progress.discard()
 
     def step(self, inputs: Inputs) -> Command | None:

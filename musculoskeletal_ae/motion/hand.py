@@ -25,22 +25,25 @@ from musculoskeletal_ae.motion.trajectory import STOPPING, Setpoint, Trajectory
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-#: tolerances [m] and [rad] of the inverse kinematics: for a whole pose, and for a position only,
-#: with which any orientation is legal
+#: end the search of the inverse kinematics within these distances [m] and angles [rad]: for a whole
+#: pose, and for a position only, with which any orientation is legal
 WHOLE, POSITION = np.repeat([2e-4, 2e-3], 3), np.repeat([2e-4, 100.0], 3)
 FAR = 0.005  # a pose is unreachable if the hand remains further away than this [m]
 TURNED = 0.05  # a pose is unreachable if the hand's orientation differs by more than this [rad]
-HAND_SPEED = 0.25  # largest speed of the hand on the way to a single pose [m/s]
-SHORTEST = 0.3  # shortest duration of a movement to a single pose [s]
+HAND_SPEED = 0.25  # move the hand to a single pose no faster than this [m/s]
+SHORTEST = 0.3  # take at least this time for a movement to a single pose [s]
 PEAK = 1.875  # ratio of peak to mean speed of a minimum-jerk motion
-PATH_INTERVAL = 0.25  # longest interval between two poses that form a path [s]
-PATH_SPEED = 1.0  # highest speed of the hand between two poses that form a path [m/s]
-INTERVAL_WEIGHT = 0.2  # weight of the newest interval in the average interval of a path
-JOINING = 0.1  # shortest time to join a path [s]
-RETURNING = 2.0 * STOPPING  # time to come to rest at the last pose of a path [s]
-TWIST_TIMEOUT = 0.3  # duration of the motion by one twist [s]
-STARTING = 0.1  # duration of the acceleration to a twist [s]
-DAMPING = 0.02  # damping of the inverse Jacobian [m]; limits the speed of joints near singularities
+PATH_INTERVAL = 0.25  # count poses as a path if they arrive within this time of each other [s]
+#: count poses as a path only if the hand needs no more than this speed between them [m/s]
+PATH_SPEED = 1.0
+INTERVAL_WEIGHT = 0.2  # give the newest interval this weight in the average interval of a path
+JOINING = 0.1  # take at least this time to join a path [s]
+#: come to rest at the last pose of a path within this time after passing it [s]
+RETURNING = 2.0 * STOPPING
+TWIST_TIMEOUT = 0.3  # move the hand for this time by one twist [s]
+STARTING = 0.1  # accelerate to a twist in this time [s]
+#: damp the inverse Jacobian by this length, to limit joint speeds near singularities [m]
+DAMPING = 0.02
 
 
 class Hand:

@@ -30,29 +30,30 @@ from musculoskeletal_ae.robot import stiffness as robot_stiffness
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import Exertion, TensionProgramme, least_tension
 
-# Number of quadratic programmes, each with G at the tension that the previous one found. A third
-# programme would change the tension by well under a newton.
+# Solve this many quadratic programmes, each with G at the tension that the previous one found. A
+# third programme would change the tension by well under a newton.
 SOLVES = 2
 
 # The following constants are those of the method `stiffness`.
 
-# Candidates for the margin of T_low above T_bias [N]; the largest feasible margin is used. An
-# external force can reduce a muscle's tension by this margin before it falls to T_bias, where the
-# muscle is stiff in one direction only.
+# Raise T_low above T_bias by the largest of these margins that is feasible [N]. An external force
+# can reduce a muscle's tension by this margin before it falls to T_bias, where the muscle is stiff
+# in one direction only.
 MARGINS = (40.0, 30.0, 20.0, 10.0, 0.0)
-ITERATIONS = 6  # largest number of iterations of Gauss–Newton and of Frank–Wolfe
-# Weight of the distance from the initial tensions (at first the least tensions), relative to the
-# weight of the stiffness error. A reachable stiffness is missed by about this share.
+ITERATIONS = 6  # stop Gauss–Newton and Frank–Wolfe after this many iterations
+# Weigh the distance from the initial tensions (at first the least tensions) by this, relative to
+# the stiffness error. A reachable stiffness is missed by about this share.
 LEAST_TENSION_SHARE = 1e-3
-# Step lengths of the line search towards a corner of the feasible tensions. The full step need not
-# be the best, because K is concave in each tension.
+# Try these step lengths in the line search towards a corner of the feasible tensions. The full step
+# need not be the best, because K is concave in each tension.
 SHARES = (1.0, 0.5, 0.25, 0.125)
-# Distance of a point from the present tensions along the gradient of K [N]. It is so large that the
-# feasible tensions nearest to the point are those at which a linear approximation of K is extreme.
+# Project a point at this distance from the present tensions along the gradient of K [N]. At so
+# large a distance, the feasible tensions nearest to the point are those at which a linear
+# approximation of K is extreme.
 FAR = 1e5
-LEVELS = 8  # number of tensions from T_bias to T_limit at which the elongation is evaluated
-# Step of the finite difference of G [rad]. A larger step would average over the curvature of the
-# routes, and a smaller step would amplify the errors of the network.
+LEVELS = 8  # evaluate the elongation at this many tensions from T_bias to T_limit
+# Compute finite differences of G with this step [rad]. A larger step would average over the
+# curvature of the routes, and a smaller step would amplify the errors of the network.
 STEP = 0.05
 
 
@@ -149,7 +150,7 @@ class StiffnessModel(NamedTuple):
 
     @classmethod
     def read(cls, robot: Robot, mae: Mae, theta: Array, tension: Array) -> StiffnessModel:
-        """Compute the model from the network at the posture θ [rad], (D,), and T [N], (M,)."""
+        """Read the model from the network at the posture θ [rad], (D,), and T [N], (M,)."""
 
         def jacobian(postures: Array) -> Array:
             return mae.muscle_jacobian(postures, np.tile(tension, (len(postures), 1)))

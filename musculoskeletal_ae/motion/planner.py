@@ -28,11 +28,11 @@ from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 
-#: Distance by which a point may exceed a joint limit [rad]. The points of a replayed motion are
-#: estimated postures. The estimate of an arm that is held against a joint stop exceeds the limit by
-#: less than this.
+#: Refuse a point that exceeds a joint limit by more than this [rad]; clip any other to the limit.
+#: The points of a replayed motion are estimated postures. The estimate of an arm that is held
+#: against a joint stop exceeds the limit by less than this.
 TOLERANCE = 0.01
-SAME = 1e-6  # relative difference below which two poses count as equal
+SAME = 1e-6  # count two poses as equal below this relative difference
 
 
 class Plan(NamedTuple):
@@ -177,7 +177,7 @@ class Planner:
         )
         if not nearest:
             raise MessageError('not holdable', problem)
-        return held, f'{problem}; the arm moves there'
+        return held, f'{problem}; the arm goes to that posture instead'
 
     def _clipped(self, points: TrajectoryPoints) -> TrajectoryPoints:
         """Return the points clipped to the joint limits.

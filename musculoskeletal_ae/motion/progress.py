@@ -9,12 +9,12 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.robot import Robot
 
-FALLEN = 0.2  # error above which an arm with isolated muscles has fallen [rad]
-#: time for which a trajectory must have ended before the arm can count as fallen, and for which the
-#: error must exceed LOST before the arm counts as having lost its trajectory [s]
+FALLEN = 0.2  # count an arm with isolated muscles as fallen above this error at its goal [rad]
+#: wait this long after the end of a trajectory before the arm can count as fallen; count its
+#: trajectory as lost once the error has exceeded LOST for this time [s]
 FALLING = 2.0
-#: An arm with isolated muscles has lost its trajectory if the error exceeds this for the time
-#: FALLING [rad].
+#: Count the trajectory of an arm with isolated muscles as lost if the error exceeds this for the
+#: time FALLING [rad].
 LOST = 0.4
 
 

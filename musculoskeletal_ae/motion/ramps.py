@@ -29,7 +29,7 @@ from musculoskeletal_ae.motion.feedback import depends_on_limit
 from musculoskeletal_ae.motion.methods import Solution
 from musculoskeletal_ae.robot.robot import Robot
 
-# Fraction of a movement's duration in which the command changes. In the remaining time, the arm
+# Change the command in this fraction of a movement's duration. In the remaining time, the arm
 # settles and is sampled.
 RAMP_SHARE = 0.6
 PEAK = 1.5  # ratio of peak to mean speed of a ramp
@@ -197,7 +197,7 @@ class RampedTarget(ActivityControl):
         self.ramps.pursue(self._goals())
 
     def enter(self, inputs: Inputs) -> None:
-        """Start from the present tensions."""
+        """Enter the activity, starting from the present tensions."""
         self.ramps.start_from(inputs.length)
         self.ramps.pursue(self._goals())
 
@@ -206,7 +206,7 @@ class RampedTarget(ActivityControl):
         return self.ramps.step(inputs)
 
     def leave(self) -> None:
-        """End the activity; the target is kept for the next time."""
+        """Leave the activity; the target is kept for the next time."""
 
     @property
     def has_arrived(self) -> bool:

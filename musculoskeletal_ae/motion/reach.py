@@ -31,19 +31,20 @@ from musculoskeletal_ae.motion.trajectory import Setpoint
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-NOTABLE = 0.05  # missing torque above which a posture is not holdable [N·m]
-HALVINGS = 6  # bisection steps in the search for the last holdable posture of a path
+NOTABLE = 0.05  # count a posture as not holdable if it lacks more torque than this [N·m]
+HALVINGS = 6  # search for the last holdable posture of a path with this many bisection steps
 
-PRICE = 20.0  # cost of missing torque, per radian of the path [1/(N·m)]
-USED = 0.85  # fraction of the tension range above T_bias that a path may use
-POSTURES = 300  # number of random postures of the roadmap
-NEIGHBOURS = 12  # number of neighbours of each posture to which the roadmap has edges
-LOOKS = 40  # largest number of paths of which all edges are evaluated
-SPACING = 0.15  # distance between the evaluated postures of an edge [rad]
-#: change of a muscle's length per angle above which its sliding direction is certain [m/rad]
+PRICE = 20.0  # count a missing torque of 1 N·m as this much more path length [1/(N·m)]
+USED = 0.85  # let a path use this fraction of the tension range above T_bias
+POSTURES = 300  # draw this many random postures for the roadmap
+NEIGHBOURS = 12  # connect each posture of the roadmap with this many neighbours
+LOOKS = 40  # evaluate all edges of at most this many paths
+SPACING = 0.15  # evaluate postures of an edge that are at most this far apart [rad]
+#: treat the sliding direction of a muscle as certain well above this change of length per angle
+#: [m/rad]
 CERTAIN = 0.005
-AT_STOP = 0.05  # distance from a stop below which a joint rests at it [rad]
-STOP = 100.0  # largest torque with which a stop supports a joint [N·m]
+AT_STOP = 0.05  # count a joint as resting at a stop that is nearer than this [rad]
+STOP = 100.0  # let a stop support a joint with at most this torque [N·m]
 
 
 def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
@@ -130,11 +131,11 @@ class ReachLimits:
         return np.minimum(self._low + resistance, self._high) / loss, self._high / loss
 
     def missing_in_motion(self, jacobian: Array, at: Setpoint, lag: float, slower: float) -> float:
-        """Return the largest missing torque [N·m] at one moment of a motion.
+        """Return the largest missing torque [N·m] at one instant of a motion.
 
         Args:
             jacobian: G [m/rad], (M, D).
-            at: The moment of the motion.
+            at: The setpoint at this instant.
             lag: Time λ by which the muscle modules lag behind their commands [s].
             slower: Factor by which the motion is slowed; ∞ for a very slow motion.
         """

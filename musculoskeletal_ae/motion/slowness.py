@@ -13,23 +13,23 @@ from musculoskeletal_ae.motion import reach
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.robot import Robot
 
-#: fraction of the rate limit that the lengths of a trajectory may use; the remaining fraction is
+#: let the lengths of a trajectory use this fraction of the rate limit; the remaining fraction is
 #: for tensions and feedback
 SHARE = 0.7
-#: largest number of moments of a trajectory at which the network is evaluated; even if a trajectory
-#: has 10 000 points, each piece between two points contains at least one moment
+#: evaluate the network at no more instants of a trajectory than this; each piece between two points
+#: still contains at least one instant, even of a trajectory of 10 000 points
 MOST_MOMENTS = 12_500
 
-#: factors by which a motion may be slowed until its tensions suffice, in ascending order
+#: try these factors of slowing a motion, in ascending order, until its tensions suffice
 SLOWER = tuple(1.1**k for k in range(17))
-#: The same factors for an arm with isolated muscles. Such an arm may fall where an arm with all
-#: muscles only deviates from its trajectory. It therefore needs more reserve, to which the large
-#: steps between these factors add.
+#: Try these factors instead for an arm with isolated muscles. Such an arm may fall where an arm
+#: with all muscles only deviates from its trajectory. It therefore needs more reserve, and the
+#: large steps between the factors provide a part of it.
 SLOWER_ISOLATED = (1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6)
-#: smallest lag λ for which a motion is planned [s]; λ is measured only after the motion has begun
+#: plan motions for at least this lag λ [s]; λ is measured only after the motion has begun
 LEAST_LAG = 0.02
-MOMENT_SPACING = 0.06  # shortest motion between moments at which tensions are computed [rad]
-#: largest number of moments at which tensions are computed; 500 moments take about 30 ms
+MOMENT_SPACING = 0.06  # compute tensions at instants that are at least this motion apart [rad]
+#: compute tensions at no more instants than this; 500 instants take about 30 ms
 MOST_EXERTIONS = 500
 
 
@@ -42,7 +42,7 @@ def slowness(robot: Robot, mae: Mae, trajectory: Trajectory, settings: Settings)
     starts in motion keeps its initial speed. It may therefore need a larger factor than the
     returned one.
     """
-    # Skip moments of very long trajectories, which would otherwise delay a command by 0.1 s.
+    # Skip instants of very long trajectories, which would otherwise delay a command by 0.1 s.
     time, theta = (part[:: 1 + len(part) // MOST_MOMENTS] for part in trajectory.path)
     length = mae.lengths(theta, np.tile(robot.tension.bias, (len(theta), 1)))
     speed = np.diff(length, axis=0) * robot.used / np.diff(time)[:, None]
@@ -56,8 +56,8 @@ def exertion_slowness(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float
         τ(s) = τ_hold(θ) + (τ(θ, θ̇, θ̈) − τ_hold(θ))/s²
         T_low(s) = (T_bias + K_stiff λ max(dl/dt, 0)/s)/loss
 
-    The factor s is the smallest of `SLOWER` for which the missing torque, at every moment of the
-    motion, is at most `reach.NOTABLE` above that of a very slow motion. If no factor suffices, s is
+    The factor s is the smallest of `SLOWER` for which the missing torque, throughout the motion,
+    is at most `reach.NOTABLE` above that of a very slow motion. If no factor suffices, s is
     the largest of `SLOWER`. If the muscle modules provide no tensions, s is 1. An arm without
     isolated muscles may use all tensions up to T_limit. For an arm with isolated muscles, the
     factors are those of `SLOWER_ISOLATED`, and the highest tension is that of `reach.Limits`, which

@@ -24,8 +24,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.signals.friction import slid
 
-TURNING = 0.005  # scale of the speed at which a tendon's sliding direction becomes certain [m/s]
-AHEAD = 0.2  # T_K is computed at this interval, for a setpoint that is the same time ahead [s]
+TURNING = 0.005  # treat a tendon's sliding direction as certain well above this speed [m/s]
+AHEAD = 0.2  # compute T_K at this interval, for the setpoint that is this time ahead [s]
 
 
 class Stiffening:

@@ -15,14 +15,14 @@ from musculoskeletal_ae.robot.tension import least_tension
 # Gains of the method `tension`.
 POSITION_GAIN = 10.0  # K_p [N·m/rad]
 VELOCITY_GAIN = 0.5  # K_d [N·m·s/rad]
-SMOOTHING = 0.05  # time constant of the low-pass filter on the noisy estimate [s]
+SMOOTHING = 0.05  # smooth the noisy estimate with this time constant [s]
 
 # Method `float`, which compensates gravity, adds these springs and dampers to the holding torque:
 HOLD = 15.0  # stiffness of the spring that holds the arm at θ_held [N·m/rad]
-BAND = 0.05  # largest distance of the arm from θ_held [rad]
+BAND = 0.05  # move θ_held with the arm once the arm is this far from it [rad]
 DAMPING = 1.0  # damping of each joint [N·m·s/rad]
 WALL = 30.0  # stiffness of the wall near a joint limit [N·m/rad]
-WALL_AT = 0.05  # distance of the wall from the joint limit [rad]
+WALL_AT = 0.05  # begin the wall this far before the joint limit [rad]
 
 
 class TorqueControl(ActivityControl):
@@ -58,7 +58,7 @@ class TorqueControl(ActivityControl):
         self._target = theta, effort
 
     def enter(self, inputs: Inputs) -> None:
-        """Start from the present tensions."""
+        """Enter the activity, starting from the present tensions."""
         self._command = np.maximum(inputs.tension, self._robot.tension.bias)
         self._smooth = None
 
@@ -69,7 +69,7 @@ class TorqueControl(ActivityControl):
         return self._command_towards(*self._target, inputs)
 
     def leave(self) -> None:
-        """End the activity; the target is kept for the next time."""
+        """Leave the activity; the target is kept for the next time."""
 
     @property
     def has_arrived(self) -> bool:
@@ -128,7 +128,7 @@ class GravityCompensation(TorqueControl):
         self._theta: Array | None = None  # the last posture [rad], (D,)
 
     def enter(self, inputs: Inputs) -> None:
-        """Hold the present posture, starting from the present tensions."""
+        """Enter the activity in the present posture, starting from the present tensions."""
         super().enter(inputs)
         self.held = None
 

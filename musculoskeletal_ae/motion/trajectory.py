@@ -28,13 +28,13 @@ from musculoskeletal_ae.message_reading import TrajectoryPoints
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 
-BEYOND = 0.02  # largest allowed excess over the joint limits between points [rad]
-STOPPING = 0.3  # time in which a cancelled motion comes to rest [s]
-SAMPLES = 200  # approximate number of moments at which a whole trajectory is evaluated
-WITHIN = 5  # smallest number of moments at which each piece is evaluated
-AT_ONCE = 0.01  # time that replaces a requested time of 0 [s]
-#: smallest distance between two successive times, relative to the later one; in a shorter piece of
-#: the curve, rounding errors of the time would matter
+BEYOND = 0.02  # refuse a curve that exceeds the joint limits by more than this between points [rad]
+STOPPING = 0.3  # bring a cancelled motion to rest in this time [s]
+SAMPLES = 200  # evaluate a whole trajectory at about this many instants
+WITHIN = 5  # evaluate each piece at no fewer instants than this
+AT_ONCE = 0.01  # replace a requested time of 0 by this time [s]
+#: Refuse two successive times that are closer than this, relative to the later one: in a shorter
+#: piece of the curve, rounding errors of the time would matter.
 RESOLUTION = 1e-11
 # Matrices that give the coefficients c of u(τ) = Σ c_k τ^k, τ in [0, 1], from position, velocity
 # and acceleration at both ends.
@@ -50,7 +50,7 @@ QUINTIC = np.array(
 
 
 class Setpoint(NamedTuple):
-    """Desired motion at one moment or at N moments; each array is (D,) or (N, D)."""
+    """Desired motion at one instant or at N instants; each array is (D,) or (N, D)."""
 
     theta: Array  # joint angles [rad]
     velocity: Array  # joint velocities [rad/s]
@@ -184,7 +184,7 @@ class Trajectory:
 
     @property
     def path(self) -> tuple[Array, Array]:
-        """The curve at N moments, several in each piece: times [s], (N,), and θ [rad], (N, D)."""
+        """The curve at N instants, several in each piece: times [s], (N,), and θ [rad], (N, D)."""
         share = np.linspace(0.0, 1.0, max(WITHIN, SAMPLES // (len(self.time) - 1)), endpoint=False)
         inner = self.time[:-1, None] + np.diff(self.time)[:, None] * share
         theta = share[:, None] ** np.arange(6.0) @ self.coefficients  # (K−1, n, D)

@@ -9,10 +9,10 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.robot.robot import Robot
 
-WINDING = 0.03  # winding speed above which a muscle contributes to the measurement [m/s]
-LAGS = 2.0e-3  # weight of the initial guess λ = 0 [m²/s²]
-LARGEST_LAG = 0.1  # upper bound of the measured lag [s]
-SPAN = 0.0095  # shortest time over which a speed is computed, so that noise is small [s]
+WINDING = 0.03  # measure the lag only at muscles that move faster than this [m/s]
+LAGS = 2.0e-3  # give the initial guess λ = 0 this weight [m²/s²]
+LARGEST_LAG = 0.1  # report no larger lag than this [s]
+SPAN = 0.0095  # compute a speed over no less than this time, so that noise is small [s]
 
 
 class Winches:
@@ -79,6 +79,6 @@ class Winches:
         self._squares += float(speed[is_usable] @ speed[is_usable])
 
     def forget(self) -> None:
-        """Discard the last length after a pause; the estimate of the lag remains."""
+        """Forget the last length after a pause; the estimate of the lag remains."""
         self._length, self._since = None, 0.0
         self._speed = np.zeros_like(self._speed)

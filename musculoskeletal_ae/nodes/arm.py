@@ -34,8 +34,8 @@ from musculoskeletal_ae.ros.second_publishers import COMMANDS, MOTOR_COMMAND
 from musculoskeletal_ae.signals.motor_interface import STATES
 from musculoskeletal_ae.signals.muscle_readings import reading_rows
 
-MARKER_RATE = 10.0  # rate of the markers [Hz]
-NAME_HEIGHT = 0.018  # height of the muscles' names [m]
+MARKER_RATE = 10.0  # publish markers at this rate [Hz]
+NAME_HEIGHT = 0.018  # draw the muscles' names at this height [m]
 #: colour of the bones of these arms: red, green, blue and opacity
 BONE_COLOURS = {'estimated': (0.0, 0.62, 0.45, 0.5), 'sim': (0.58, 0.40, 0.74, 0.5)}
 HARDWARE_COLOUR = (*BONE_COLOUR, 1.0)  # colour of the bones of all arms not in BONE_COLOURS

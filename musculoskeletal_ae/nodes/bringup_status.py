@@ -34,12 +34,12 @@ from musculoskeletal_ae.report import (
 )
 from musculoskeletal_ae.ros.messages import RELIABLE, SENSOR
 
-#: time after the first estimate during which problems are not shown, because most of them end by
-#: themselves while the nodes start [s]
+#: hide problems for this time after the start and after the first estimate, because most of them
+#: end by themselves while the nodes start [s]
 SETTLING = 4.0
-#: shortest time between two lines before the first estimate [s]
-WAITING_INTERVAL = 5.0
-LAST_REPORT_WAIT = 5.0  # longest wait for the learner's report after the end of a recording [s]
+WAITING_INTERVAL = 5.0  # wait at least this long between two lines before the first estimate [s]
+#: wait at most this long for the learner's report after the end of a recording [s]
+LAST_REPORT_WAIT = 5.0
 
 
 class BringupStatus(Shell):
@@ -69,9 +69,9 @@ class BringupStatus(Shell):
         self.started: float | None = None
         self.ended: float | None = None  # when the end of the recording was first reported [s]
         self.ended_report = math.inf  # arrival of that report, as `Situation.heard_at` counts [s]
-        #: the last line before the first estimate without the load, and whether it had a load
+        #: the last line that was printed before the first estimate, and whether it stated the load
         self.waiting = '', False
-        self.waiting_since = -math.inf  # when it was printed [s]
+        self.waiting_since = -math.inf  # when that line was printed [s]
         self.printed_hint = ''
         self.follow_posture('joint_states', self._on_measured_posture, some=True)
         self.follow_posture('estimated_joint_states', self._on_estimate)
@@ -103,7 +103,7 @@ class BringupStatus(Shell):
         return Report('' if self.situation.trouble() else 'all nodes are OK', {})
 
     def _print(self) -> None:
-        if is_reader_gone():  # end it all, because the arm would otherwise go on unseen
+        if is_reader_gone():  # ends the whole run, which nobody would see any more
             sys.exit(CLOSED)
         now = time.monotonic()
         self.situation.forget_ended()

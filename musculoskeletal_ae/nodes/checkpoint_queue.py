@@ -14,10 +14,11 @@ from musculoskeletal_ae.reception import Reception
 
 CANDIDATES = 'mae_checkpoint'  # topic of the networks that the learner proposes
 ACCEPTED = 'accepted_checkpoint'  # topic of the networks that the estimator has accepted
-REJECTED = 'rejected_checkpoint'  # topic of the versions that it has rejected, with the reasons
-#: Time between steps [s]. A step takes a few milliseconds, at most a quarter of this time.
+REJECTED = 'rejected_checkpoint'  # topic of the versions that the estimator has rejected
+#: Run a step at this interval [s]. A step takes a few milliseconds, at most a quarter of this
+#: time.
 STEP_PERIOD = 0.02
-LARGEST = 64 << 20  # largest size of a checkpoint [bytes]; a typical checkpoint has half a MB
+LARGEST = 64 << 20  # refuse a larger checkpoint [bytes]; a typical one has half a MB
 
 
 class CheckpointQueue:
@@ -48,8 +49,8 @@ class CheckpointQueue:
         """
         self._reception, self._topic = reception, topic
         self._handle, self._unfit = handle, unfit
-        self._next: UInt8MultiArray | None = None  # the one that waits
-        self._present: UInt8MultiArray | None = None  # the one that is being processed
+        self._next: UInt8MultiArray | None = None  # the checkpoint that waits
+        self._present: UInt8MultiArray | None = None  # the checkpoint that is being processed
         self._steps: Iterator[None] | None = None
         clock = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer: Any = node.create_timer(STEP_PERIOD, self._step, clock=clock)

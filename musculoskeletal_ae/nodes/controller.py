@@ -319,7 +319,7 @@ class Controller(Shell):
         self.memory.note(supervisor.condition if supervisor.is_latched else None)
 
     def _record_stop(self) -> None:
-        """Save a recording of the last seconds before a latched stop, once for each stop."""
+        """Record the last seconds before a latched stop, once for each stop."""
         supervisor = self.core.supervisor
         if not supervisor.is_latched or supervisor.condition is None:
             self.recorded = None

@@ -126,7 +126,7 @@ class Estimator(Shell):
         return mae
 
     def _on_posture(self, posture: tuple[float, ...]) -> None:
-        stated_theta(self.robot, posture)  # checks the posture
+        stated_theta(self.robot, posture)  # raises if the posture is not legal
         self.posture = posture
 
     def _on_isolate_muscles(self, names: tuple[str, ...]) -> None:

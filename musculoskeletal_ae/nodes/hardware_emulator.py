@@ -28,7 +28,7 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.ros.messages import RELIABLE, serve
 
-PACE_TIME = 5.0  # time over which the real-time factor is averaged [s]
+PACE_TIME = 5.0  # average the real-time factor over this time [s]
 
 
 class HardwareEmulator(ArmNode):

@@ -32,7 +32,7 @@ from musculoskeletal_ae.ros.second_publishers import SEVERAL, LinkSensors, publi
 
 IMU = 'imu'  # topic of the accelerometers
 MOST_DIGITS = 15  # reject a version of a network with more digits
-POLL_PERIOD = 0.05  # time between checks of the training process [s]
+POLL_PERIOD = 0.05  # check the training process at this interval [s]
 JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
 
 

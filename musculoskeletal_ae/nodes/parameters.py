@@ -174,7 +174,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {
 #: executables that run several nodes in one process, and the names of these nodes
 COMBINED = {'combined': ('estimator', 'controller')}
 
-#: what states now what a parameter of this name stated before
+#: former parameters, and what replaces each of them
 MOVED = dict.fromkeys(
     (
         'motor_state_topic', 'motor_command_topic', 'motor_names', 'motor_command_order',

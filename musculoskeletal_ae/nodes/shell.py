@@ -210,7 +210,7 @@ class Shell(Node):
     def create_subscription(  # type: ignore[override]
         self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **options: Any
     ) -> Any:
-        """Subscribe; count exceptions that escape the callback.
+        """Create a subscription; count exceptions that escape its callback.
 
         rclpy calls this method for /clock as well.
         """
@@ -226,7 +226,7 @@ class Shell(Node):
     def create_publisher(  # type: ignore[override]
         self, msg_type: Any, topic: str, qos_profile: Any, **options: Any
     ) -> Any:
-        """Advertise; report subscribers with incompatible QoS."""
+        """Create a publisher; report subscribers with incompatible QoS."""
         events = PublisherEventCallbacks(
             incompatible_qos=lambda event: self._on_incompatible(topic, 'subscriber needs', event)
         )
@@ -276,7 +276,7 @@ class Shell(Node):
     def create_service(  # type: ignore[override]
         self, srv_type: Any, srv_name: str, callback: Any, **options: Any
     ) -> Any:
-        """Offer a service that responds even if an exception escapes its callback."""
+        """Create a service that responds even if an exception escapes its callback."""
 
         def answer(request: Any, response: Any) -> Any:
             try:
@@ -465,7 +465,7 @@ class Shell(Node):
 
     @property
     def intruders(self) -> str:
-        """A text on nodes that must not be there, or '' if there are none.
+        """The nodes that must not run beside those of this arm, as a text; '' if there are none.
 
         These are other publishers of topics that belong to this arm's nodes, and other nodes with
         the name of this node.
@@ -583,7 +583,7 @@ class Shell(Node):
 
 
 def _signs(conditions: Iterable[Condition]) -> frozenset[tuple[str, str, tuple[str, ...]]]:
-    """Return what distinguishes conditions, without the values in their texts."""
+    """Return identifiers, levels and subjects of conditions, without the values in their texts."""
     return frozenset((each.identifier, each.level, each.subjects) for each in conditions)
 
 

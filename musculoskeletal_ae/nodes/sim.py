@@ -29,7 +29,7 @@ from musculoskeletal_ae.ros.second_publishers import MOTOR_COMMAND
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-TEMPERATURE = 25.0  # reported temperature of all modules [°C]
+TEMPERATURE = 25.0  # report this temperature of all modules [°C]
 
 
 class Sim(ArmNode):

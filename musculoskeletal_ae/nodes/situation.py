@@ -176,7 +176,7 @@ class Situation:
         return {name: age for name, age in silence.items() if age > NODE_SILENCE}
 
     def level(self) -> Level:
-        """Return the level of the whole arm."""
+        """Return the level of the whole arm: that of the worst condition."""
         return conditions.worst(condition for _, condition in self._all())
 
     def trouble(self) -> str:
@@ -198,7 +198,7 @@ class Situation:
 
     @property
     def suspects(self) -> tuple[str, ...]:
-        """Names of the muscles and joints that findings of the estimator concern."""
+        """Names of the muscles and joints in which the estimator has found a fault."""
         estimator = self._reports.get('estimator')
         present = () if estimator is None else estimator.conditions
         kinds = [(KINDS.get(each.identifier), each.subjects) for each in present]

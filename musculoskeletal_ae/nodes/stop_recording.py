@@ -23,13 +23,13 @@ from musculoskeletal_ae.bags.topics import TOPICS, Topic
 from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
-SECONDS = 10.0  # duration of a recording [s]
-MOST = 50_000  # largest number of messages in a recording
-MOST_BYTES = 32 << 20  # largest total size of the messages in a recording [bytes]
-LARGEST_MESSAGE = 4 << 20  # largest recorded message [bytes]; a typical network has half a MB
+SECONDS = 10.0  # record this time before a stop [s]
+MOST = 50_000  # keep at most this many messages
+MOST_BYTES = 32 << 20  # keep messages of at most this total size [bytes]
+LARGEST_MESSAGE = 4 << 20  # leave out a larger message [bytes]; a typical network has half a MB
 FILE = 'cause.txt'  # file in the bag's directory with the cause of the stop; written last
-#: pattern for the names of the bags' directories; it also matches bags that are incomplete because
-#: the process was killed
+#: count the directories whose names match this pattern as recordings, of which the oldest ones are
+#: deleted; it also matches bags that are incomplete because the process was killed
 NAMES = f'stop_{"[0-9]" * 8}-{"[0-9]" * 6}-{"[0-9]" * 6}'
 
 
@@ -87,7 +87,7 @@ class StopRecording:
                 self._latched[left[1]] = left
 
     def save(self, cause: str, most: int) -> None:
-        """Write the kept messages in the background, and delete the oldest recordings.
+        """Save the kept messages in the background, and delete the oldest recordings.
 
         Nothing happens while an earlier recording is still being written.
 

@@ -28,27 +28,26 @@ Kinded = tuple[str, Array]  # kind and value of a command
 
 LENGTH, TENSION = 'length', 'tension'  # kinds of commands
 
-DESIRED_SHARE = 0.3  # tension of a well-tensed arm, relative to T_limit
-#: largest length by which rest feedback pays out a needlessly tense muscle under stiffness control
-#: [m]; it covers length errors and the tension that friction retains in a tendon
+DESIRED_SHARE = 0.3  # assume and prefer tensions of this share of T_limit, as in a well-tensed arm
+#: let rest feedback pay out a needlessly tense muscle under stiffness control by at most this [m];
+#: it covers length errors and the tension that friction retains in a tendon
 RELIEF = 0.01
-#: largest length by which rest feedback pays out a muscle with a position-controlled module [m];
-#: such a module turns length errors of an untrained network into slack or into tension
+#: let rest feedback pay out a muscle with a position-controlled module by at most this [m]; such a
+#: module turns length errors of an untrained network into slack or into tension
 SLACK = 0.03
-#: A tendon can stretch by a certain length before its tension reaches T_limit. A command to a
-#: position-controlled module may use this fraction of that length; the remainder covers errors of
-#: L_e and the age of T.
+#: Let a command to a position-controlled module use this fraction of the length by which its tendon
+#: can stretch before the tension reaches T_limit. The remainder covers errors of L_e and the age of
+#: T.
 SHARE = 0.7
-#: time for which a rise of the tension is extrapolated [s]; it covers the age of T and the lag of
-#: the module
+#: extrapolate a rise of the tension by this time [s]; it covers the age of T and the lag of the
+#: module
 AHEAD = 0.04
-#: fraction of the tension error that one length command to a position-controlled module corrects
+#: correct this fraction of the tension error by one length command to a position-controlled module
 ADMITTANCE = 0.5
-#: speed at which a position-controlled module may wind in again beyond a length at which its
-#: tension exceeded T_limit [m/s]
+#: let a position-controlled module wind in again at this speed beyond a length at which its tension
+#: exceeded T_limit [m/s]
 RECOVERY = 0.01
-#: largest distance by which a suspect muscle under stiffness control is wound in [m]
-DEPTH = 0.015
+DEPTH = 0.015  # wind a suspect muscle under stiffness control in by at most this [m]
 
 
 class Actuation(ABC):

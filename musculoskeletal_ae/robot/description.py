@@ -48,13 +48,13 @@ Fail = Callable[[str], RobotDescriptionError]
 #: URDF's types of joints that are neither revolute nor prismatic, by degrees of freedom
 OTHER_JOINTS = {1: 'continuous', 3: 'planar', 6: 'floating'}
 
-#: smallest legal eigenvalue of a stiffness matrix, relative to the largest one; rounding may make
+#: refuse a stiffness matrix with a lower eigenvalue, relative to the largest one; rounding may make
 #: an eigenvalue slightly negative
 LEAST_EIGENVALUE = -1e-9
 
 TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # tensions [N]
 STIFFNESS_DEFAULT = 10000.0  # K_stiff [N/m]
-SPEED_DEFAULT = 0.1  # speed of a position-controlled module [m/s]
+SPEED_DEFAULT = 0.1  # assume this speed of a position-controlled module that states none [m/s]
 #: scale of a motor current in `with_modules` [N per A]: 0.03 N·m/A, gear of 20, spool of 10 mm
 NEWTON_PER_AMPERE = 60.0
 NO_TENSION = (
@@ -216,7 +216,7 @@ def refusal(file: Path, problem: str) -> RobotDescriptionError:
 
 
 def load_description(robot: str | Path) -> RobotDescription:
-    """Read and check a robot description: a shipped name such as 'arm26', or a directory.
+    """Load and check a robot description: a shipped name such as 'arm26', or a directory.
 
     Raises:
         RobotDescriptionError: If the description is invalid; the message names the file, the entry
@@ -311,10 +311,10 @@ def _columns(rows: list[dict[str, float]]) -> dict[str, Array]:
 def _check_joints(
     joints: tuple[str, ...], mimics: Container[str], model: pin.Model, fail: Fail
 ) -> None:
-    """Raise an error if a joint in `joints` of muscles.yaml is not legal.
+    """Check that every joint in `joints` of muscles.yaml is legal.
 
-    It has to be a revolute or prismatic joint of robot.urdf with finite limits. `mimics` are the
-    joints that follow another one by a <mimic>.
+    A legal joint is a revolute or prismatic joint of robot.urdf with finite limits. `mimics` are
+    the joints that follow another one by a <mimic>.
     """
     for i, name in enumerate(joints):
         if problem := _joint_problem(name, model, mimics):

@@ -14,11 +14,10 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.figures import save_figure
 from musculoskeletal_ae.robot.robot import Robot
 
-#: length below which a bone is not drawn, because it connects two joints in the same place [m]
-SHORTEST_BONE = 1e-3
-BONE_WIDTH, MUSCLE_WIDTH = 0.02, 0.006  # [m]
+SHORTEST_BONE = 1e-3  # draw no shorter bone, because it connects two joints in the same place [m]
+BONE_WIDTH, MUSCLE_WIDTH = 0.02, 0.006  # draw lines of these widths [m]
 BONE_COLOUR = (0.8, 0.8, 0.75)  # red, green, blue
-BALL_SIZE = 1.7  # diameter of a ball, divided by the width of its line
+BALL_SIZE = 1.7  # draw a ball of this diameter, divided by the width of its line
 
 
 class Line(NamedTuple):
@@ -88,7 +87,7 @@ def _within(line: Line, middle: Array, reach: float) -> Line:
 
 
 def save_picture(lines: Sequence[Line], path: Path, title: str = '', whole: bool = True) -> None:
-    """Draw lines in true proportions, seen from the front and from the side, and save them.
+    """Save a picture of lines in true proportions, seen from the front and from the side.
 
     Args:
         lines: The lines.

@@ -5,8 +5,8 @@ from typing import Annotated
 
 from msgspec import Meta
 
-LARGEST = 1e8  # largest absolute value of any number [SI units]
-LONGEST_LIST = 1000  # largest number of entries of a list: muscles, points of a route, joints
+LARGEST = 1e8  # refuse any number of a larger absolute value [SI units]
+LONGEST_LIST = 1000  # refuse a list of more entries: muscles, points of a route, joints
 
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0.0, le=LARGEST)]

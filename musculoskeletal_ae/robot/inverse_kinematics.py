@@ -22,14 +22,15 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.gauss_newton import minimise_each
 from musculoskeletal_ae.robot.robot import Robot
 
-#: standard deviations of a marker's pose measured by a typical camera, σ_p [m] and σ_R [rad], (6,)
+#: by default, expect a typical camera to measure a marker with σ_p [m] and σ_R [rad], (6,)
 SPREADS = np.repeat([0.002, 0.01], 3)
 #: standard deviations that leave the orientation free
 POSITION_ONLY = np.repeat([0.002, 100.0], 3)
-ROUNDS = 30  # largest number of steps
-#: prior standard deviation of a step, which damps joints that the pose does not determine [rad]
+ROUNDS = 30  # take at most this many steps
+#: damp each step by this prior standard deviation, so that joints that the pose does not determine
+#: hardly move [rad]
 STEP_SPREAD = 0.1
-LEAST_GAIN = 1.0  # decrease of the minimised sum below which the search ends
+LEAST_GAIN = 1.0  # end the search once a step reduces the minimised sum by less than this
 
 
 class Posture(NamedTuple):

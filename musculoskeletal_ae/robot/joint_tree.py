@@ -42,7 +42,7 @@ class JointPoses(NamedTuple):
     axis: Array  # joint axes, (N, J, 3); zero at index 0
 
 
-#: largest number of coefficients of a coupling's polynomial; two chained couplings of degree 4 have
+#: refuse a coupling whose polynomial has more coefficients; two chained couplings of degree 4 have
 #: degree 16
 MOST_TERMS = 17
 

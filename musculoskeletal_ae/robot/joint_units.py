@@ -8,7 +8,7 @@ prismatic joints and r = 1 for revolute ones,
 
     position = r θ,   effort = τ / r,   stiffness outside = K / r²
 
-What reads a position converts it to θ, and what publishes or prints θ converts it back.
+Code that reads a position converts it to θ, and code that publishes or prints θ converts it back.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # a slow import, which the parameters of the nodes do not nee
     import pinocchio as pin
 
 PRISMATIC = ('JointModelPX', 'JointModelPY', 'JointModelPZ', 'JointModelPrismaticUnaligned')
-#: travel of a prismatic joint that counts as one radian [m]: the radius of the assumed pinion
+#: count this travel of a prismatic joint as one radian [m]: the radius of the assumed pinion
 RACK = 0.06
 
 
@@ -121,7 +121,7 @@ class JointUnits:
         return outside.scaled(self.radian)
 
     def elasticity_outside(self, elasticity: JointElasticity) -> JointElasticity:
-        """Return springs and dampers in the units of the joints: the inverse."""
+        """Return springs and dampers in the joints' units: inverse of `elasticity_to_core`."""
         return elasticity.scaled(1.0 / self.radian)
 
     def mean_errors(self, error: Array) -> Array:

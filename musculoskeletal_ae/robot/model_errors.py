@@ -16,14 +16,15 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
 
-ATTACHMENT = 0.007  # standard deviation of each coordinate of each route point [m]
-ELASTIC = 0.2  # standard deviation of an elongation, relative to the elongation
-#: standard deviation of a length because tendons do not run straight between route points [m]
+ATTACHMENT = 0.007  # assume this standard deviation of each coordinate of each route point [m]
+ELASTIC = 0.2  # assume this standard deviation of an elongation, relative to the elongation
+#: assume this standard deviation of a length, because tendons do not run straight between route
+#: points [m]
 SMOOTH = 0.003
-#: Factor of the standard deviation for arms whose tendons make detours around bones. Without this
-#: factor, lengths of four emulated arms with small detours (`kin`) differ from the model as
-#: expected. Those of four arms with larger detours (`foreign`) differ by 1.4 to 2.1 times as much,
-#: 1.7 times on average.
+#: Multiply the standard deviation by this, for arms whose tendons make detours around bones.
+#: Without this factor, lengths of four emulated arms with small detours (`kin`) differ from the
+#: model as expected. Those of four arms with larger detours (`foreign`) differ by 1.4 to 2.1 times
+#: as much, 1.7 times on average.
 SHAPE_FACTOR = 1.7
 #: Largest difference between a length of a healthy arm and of its geometric model [m]. It was at
 #: most 42 mm for the emulated individuals 0 to 9 of arm26 and musashi_left_arm

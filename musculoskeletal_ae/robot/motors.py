@@ -41,7 +41,7 @@ class MotorTopics(NamedTuple):
     commands: str = ''  # positions that the motors should reach; '' to command no motor
 
 
-NO_MOTORS = MotorTopics()  # of a robot that publishes muscle_states
+NO_MOTORS = MotorTopics()  # topics of a robot that publishes muscle_states
 
 
 class Constants(Strict, frozen=True):

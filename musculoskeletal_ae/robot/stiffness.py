@@ -19,7 +19,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
-LEAST_COMPLIANCE = 1e-7  # smallest plausible ∂L_e/∂T of an elastic element and its tendon [m/N]
+LEAST_COMPLIANCE = 1e-7  # assume at least this ∂L_e/∂T of an elastic element and its tendon [m/N]
 
 
 def muscle_stiffness(module: Array, compliance: Array) -> Array:

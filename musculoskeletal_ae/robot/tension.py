@@ -22,8 +22,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.robot.robot import Robot
 
-#: smallest gap between the limits of a muscle [N]; without it, rounding would make the problem
-#: infeasible for quadprog if a muscle is fixed at one tension (hot, ruptured)
+#: leave at least this gap between the limits of a muscle [N]; without it, rounding would make the
+#: problem infeasible for quadprog if a muscle is fixed at one tension (hot, ruptured)
 LEAST_GAP = 1e-8
 #: ε [(N·m/N)²]; with torques of some N·m and tensions of some hundred N, the second term is small
 SOFT_WEIGHT = 1e-7

@@ -45,7 +45,7 @@ class TensionSource:
         return self.newton_per_ampere is not None
 
     def of_muscles(self, muscles: Ints) -> TensionSource:
-        """Return the tension source of an arm with only those muscles whose indices are given."""
+        """Return the tension source of an arm that has only the muscles with these indices."""
         if self.newton_per_ampere is None:
             return self
         return TensionSource(self.kind, self.newton_per_ampere[muscles])

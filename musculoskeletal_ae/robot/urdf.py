@@ -18,15 +18,18 @@ import pinocchio as pin
 from musculoskeletal_ae.exceptions import RobotDescriptionError, printable
 from musculoskeletal_ae.robot.joint_tree import Coupling
 
-#: largest number of links and joints; recursive parsers overflow their stack at thousands of links
+#: refuse a file with more links and joints; recursive parsers overflow their stack at thousands of
+#: links
 MOST_PARTS = 2000
-#: largest depth of nested elements; the parser that MuJoCo and pinocchio use has the same limit
+#: refuse elements that are nested more deeply; the parser that MuJoCo and pinocchio use has the
+#: same limit
 DEEPEST = 500
 #: elements below <robot> that xacro understands only with its prefix
 PREPROCESSED = 'include', 'macro', 'property'
 XACRO = 'http://www.ros.org/wiki/xacro'  # namespace of the elements of xacro
 EXPAND = 'expand it to a new file first:  xacro FILE > NEW.urdf'
-LARGEST = 1e6  # largest absolute value of any number except efforts and velocities [SI units]
+#: refuse any number of a larger absolute value, except efforts and velocities [SI units]
+LARGEST = 1e6
 
 LIMITED = 'revolute', 'prismatic'  # types of joints that need limits
 ONE_AXIS = *LIMITED, 'continuous'  # types of joints with one axis
@@ -122,7 +125,7 @@ def read_mimics(root: ET.Element) -> dict[str, Coupling]:
 
 
 def _check_expanded(file: Path, root: ET.Element) -> None:
-    """Reject a file that still contains macros, which the URDF parser would ignore."""
+    """Check that a file contains no macros, which the URDF parser would ignore."""
     for problem, remedy in _preprocessor_parts(root):
         raise RobotDescriptionError(f'{file}: this is not a finished URDF ({problem}); {remedy}')
 
@@ -148,7 +151,7 @@ def _preprocessor_parts(root: ET.Element) -> Iterator[tuple[str, str]]:
 
 
 def _limit_mimics(parts: list[ET.Element]) -> bool:
-    """Change continuous joints with <mimic> into revolute ones; return whether there are any.
+    """Limit continuous joints with <mimic>, as revolute joints; return whether there are any.
 
     Pinocchio represents a continuous joint by two coordinates, which cannot follow the single
     coordinate of the mimicked joint. A revolute joint must have limits. They are so wide that they
@@ -169,7 +172,7 @@ def _limit_mimics(parts: list[ET.Element]) -> bool:
 
 
 def _check_tree(file: Path, parts: list[ET.Element]) -> None:
-    """Reject links and joints that do not form a tree.
+    """Check that links and joints form a tree.
 
     Pinocchio's parser would only report them on stderr, or leave them out. If several joints have
     the same child, it would use the last one.

@@ -25,8 +25,8 @@ Where the tendon lifts off, the arc has length zero and the tangents lie on the 
 Length and moment arm are therefore continuous there. A point within RIM · r of the surface counts
 as lying on the rim, that is, outside the object. In MuJoCo, rounding decides about such points.
 
-The functions are compiled by numba. The geometric model evaluates many segments in one call. The
-emulator evaluates one segment after another in each step.
+Numba compiles the functions. The geometric model evaluates many segments in one call. The emulator
+evaluates one segment after another in each step.
 """
 
 import cmath
@@ -41,8 +41,8 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics
 
-TINY = 1e-12  # smallest divisor
-#: distance from the surface, divided by the radius, within which a point counts as outside
+TINY = 1e-12  # divide by at least this, and count a smaller distance as zero
+#: count a point as outside if it is less than this beneath the surface, relative to the radius
 RIM = 1e-6
 Vector = tuple[float, float, float] | Array
 

@@ -49,14 +49,15 @@ UnknownROSArgsError = rclpy_implementation.UnknownROSArgsError
 
 VARIABLE = 'MUSCULOSKELETAL_AE_EXECUTOR'
 CHOICES = ('lean', 'single')
-#: first and last version of rclpy that LeanExecutor was tested with
+#: choose LeanExecutor by default from the first to the second of these versions of rclpy, with
+#: which it was tested
 TESTED = (7, 1, 1), (7, 1, 11)
 #: undocumented attributes of SingleThreadedExecutor that LeanExecutor uses
 PRIVATE_NAMES = (
     '_guard', '_is_shutdown',
     '_take_client', '_take_service', '_take_subscription', '_take_timer',
 )  # fmt: skip
-FULL_ROUND_PERIOD = 1.0  # longest time between two full rounds (see `LeanExecutor`) [s]
+FULL_ROUND_PERIOD = 1.0  # run a full round (see `LeanExecutor`) after at most this time [s]
 
 
 class _Group(NamedTuple):
@@ -107,7 +108,7 @@ class LeanExecutor(SingleThreadedExecutor):
         super().wake()
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Task:
-        """Schedule a function or coroutine for the next *full round*, and return its task."""
+        """Create and return a task that runs a function or coroutine in the next *full round*."""
         self._is_changed = True
         return super().create_task(callback, *args, **kwargs)
 

@@ -24,10 +24,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-LONGEST_STALL = 10.0  # longest legal time without progress [s]
-LOOK_PERIOD = 0.5  # time between two checks [s]
+LONGEST_STALL = 10.0  # end the process after this time without progress [s]
+LOOK_PERIOD = 0.5  # check the progress at this interval [s]
 STALLED = 70  # exit status: EX_SOFTWARE of sysexits.h
-#: names of modules in which the main thread may stay for more than LONGEST_STALL
+#: do not end the process while its main thread runs code of these modules
 SLOW_MODULES = ('bdb', 'numba', 'pdb', '_pydevd_bundle')
 
 
@@ -45,7 +45,7 @@ def waited_for_processor() -> float:
 
 
 def end_process() -> None:
-    """Dump the stacks of all threads, and end the process immediately."""
+    """End the process immediately, after dumping the stacks of all threads."""
     problem = f'no progress for {LONGEST_STALL:g} s; the process ends'
     print(f'{problem}. Stacks of all threads:', file=sys.stderr)
     faulthandler.dump_traceback(all_threads=True)
@@ -85,7 +85,7 @@ class ProgressWatch:
         self._thread.start()
 
     def note(self) -> None:
-        """Record that the main thread makes progress."""
+        """Note that the main thread makes progress."""
         self._quiet = 0.0
 
     def stop(self) -> None:

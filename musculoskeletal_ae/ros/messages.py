@@ -114,7 +114,7 @@ def serve(node: Node, kind: Any, name: str, work: Callable[[Any], str]) -> None:
 
 
 def refuse(request: Any, response: Any, reason: str) -> None:
-    """Mark a response as failed, with the reason, if its type has a field for that."""
+    """Refuse a request: state the reason in the response, if its type has a field for that."""
     refused = SetParametersResult(successful=False, reason=reason)
     if hasattr(response, 'results'):  # one result for each parameter; some may exist already
         response.results += [refused] * (len(request.parameters) - len(response.results))

@@ -44,11 +44,11 @@ class NeededTopics:
         return topic in self._topics
 
     def add(self, *topics: str) -> None:
-        """Report these topics while they are missing or silent."""
+        """Add topics, to report them while they are missing or silent."""
         self._topics += topics
 
     def expect_rate(self, topic: str, rate: float) -> None:
-        """Warn of a topic while its rate is lower than SLOW times `rate` [Hz]."""
+        """Expect a rate [Hz] of a topic; warn while its rate is lower than SLOW times `rate`."""
         self._expected_rates[topic] = rate
 
     def remove(self, topic: str) -> None:
@@ -56,7 +56,7 @@ class NeededTopics:
         self._topics = [other for other in self._topics if other != topic]
 
     def check_rates(self) -> None:
-        """Compare the newest rates with the expected ones; log which topics are missing.
+        """Check the newest rates against the expected ones; log which topics are missing.
 
         Call this once for each periodic report. A topic without any message is silent, not slow.
         """

@@ -27,8 +27,8 @@ from musculoskeletal_ae.ros.executor import RCLError, make_executor
 from musculoskeletal_ae.ros.hang_detection import ProgressWatch
 from musculoskeletal_ae.ros.ros_arguments import PARAMETER_ERRORS, parameters_given, reason
 
-STOP_CHECK_PERIOD = 0.1  # time between checks for a stop signal [s]
-NICENESS = 5  # niceness of nodes that are not time-critical
+STOP_CHECK_PERIOD = 0.1  # check for a stop signal at this interval [s]
+NICENESS = 5  # run nodes that are not time-critical with this niceness
 
 
 def run(name: str) -> int:

@@ -53,19 +53,21 @@ AUTHORS = {
     CLOCK: 'the source of time',
 }
 COMMANDS = frozenset(topic for topic, author in AUTHORS.items() if author == _CONTROLLER)
-SEVERAL = 'several publishers'  # rejection reason
+SEVERAL = 'several publishers'  # reason under which rejected messages are counted
 
-LOOK_PERIOD = 0.1  # time between checks of the graph [s]
-LOOKS = 20  # number of recent checks over which decreases of the sequence number are counted
-TURNS = 3  # number of decreases within LOOKS checks that proves two publishers of one name
-LEASE = 30.0  # time for which the graph keeps a killed node, plus a margin [s]
-NAMING = 1.0  # longest time for which the graph knows a publisher but not its node [s]
-#: time for which there may be more publishers than links, and without a message after which a link
-#: counts as having no sensor [s]
+LOOK_PERIOD = 0.1  # check the graph at this interval [s]
+LOOKS = 20  # count decreases of the sequence number over this many recent checks
+TURNS = 3  # count publishers of one name as two nodes after this many decreases within LOOKS checks
+#: count publishers of one name as two nodes if two of them have been in the graph for this time
+#: [s]; the graph keeps a killed node for up to 20 s
+LEASE = 30.0
+NAMING = 1.0  # wait at most this long until the graph knows the node of a publisher [s]
+#: report more publishers than links only after this time, and count a link as having no sensor
+#: after this time without a message [s]
 LINK_PATIENCE = 3.0
 #: name that the graph returns for a node of which it knows only a publisher
 UNNAMED = '_NODE_NAME_UNKNOWN_'
-#: how messages to users call such a node
+#: name of such a node in messages to users
 NAMELESS = 'a node that has not announced its name yet'
 
 
@@ -163,7 +165,7 @@ class Twins:
             self._others.use(now)
 
     def is_alone(self, now: float) -> bool:
-        """Whether no other node has reported under this name in the last NODE_SILENCE seconds."""
+        """Return whether no other node has reported under this name for NODE_SILENCE seconds."""
         return self._others.age(now) > NODE_SILENCE
 
 
@@ -181,7 +183,7 @@ class LinkSensors:
     def __init__(self) -> None:
         self.problem = ''
         self._heard_at: dict[str, float] = {}  # time of the last message [s], by link
-        self._too_many_since = math.inf  # [s]
+        self._too_many_since = math.inf  # time since which there are too many publishers [s]
 
     def take(self, link: str, now: float) -> None:
         """Record that a message about a link arrived at `now` [s]."""

@@ -40,10 +40,10 @@ if TYPE_CHECKING:  # slow imports, which --help does not need
     from musculoskeletal_ae.signals.motor_interface import MotorInterface
 
 JOINTS = 'joint_states'
-DISCOVERY_TIME = 1.0  # time in which other nodes are discovered [s]
-COUNTDOWN = 10.0  # time between two statements of the remaining time [s]
-TICK = 0.02  # period of a timer [s]; a late tick shows that this process was paused
-#: longest time between two ticks that is no pause [s]; it is shorter than that of the nodes,
+DISCOVERY_TIME = 1.0  # wait this long for other nodes to be discovered [s]
+COUNTDOWN = 10.0  # state the remaining time at this interval [s]
+TICK = 0.02  # tick at this interval [s]; a late tick shows that this process was paused
+#: count a longer time between two ticks as a pause [s]; it is shorter than that of the nodes,
 #: because gaps of 0.2 s between messages are judged
 LONGEST_TICK = 0.07
 
@@ -129,7 +129,8 @@ class CheckDriver:
         if listening.count:
             if is_first:
                 text = f'listening for {chosen.seconds:g} s'
-                if chosen.move or chosen.seconds >= COUNTDOWN:  # otherwise too short to follow it
+                # Give an instruction only if there is time to follow it.
+                if chosen.move or chosen.seconds >= COUNTDOWN:
                     has_joint_sensors = node.count_publishers(JOINTS) > 0
                     text += f': {_instruction(self.robot, chosen, has_joint_sensors)}'
                 _say(text)

@@ -24,11 +24,13 @@ from rclpy.task import Future
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.ros_tools.ros_tool import Spinner
 
-STEP = 5_000_000  # longest recorded time between two questions [ns]
-MOST_MESSAGES = 8  # largest number of messages between two questions; the queues of nodes hold 10
-START_TIME = 300.0  # longest wait for the first answer of all nodes, which have to start [s]
-REPEAT_TIME = 2.0  # time after which an unanswered question is repeated while nodes start [s]
-#: longest wait for an answer during playback [s]; a node that hangs ends by itself by this time
+STEP = 5_000_000  # ask the nodes after at most this recorded time [ns]
+MOST_MESSAGES = 8  # ask the nodes after at most this many messages; the queues of nodes hold 10
+#: wait at most this long for the first answer of all nodes, which have to start [s]
+START_TIME = 300.0
+REPEAT_TIME = 2.0  # repeat an unanswered question after this time while nodes start [s]
+#: wait at most this long for an answer during playback [s]; a node that hangs has ended itself by
+#: then
 LONGEST_WAIT = 15.0
 
 

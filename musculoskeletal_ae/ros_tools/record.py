@@ -35,14 +35,15 @@ from musculoskeletal_ae.ros_tools.ros_tool import (
     start_ros,
 )
 
-#: time between writes to disk [s]; a killed recorder loses the messages since the last write
+#: write to disk at this interval [s]; a killed recorder loses the messages since the last write
 FLUSH_PERIOD = 0.5
 #: QoS whose queue holds at least a second of the fastest topic, in case the disk is busy
 LIVE = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-DRAIN_TIME = 0.5  # time after Ctrl-C for recording messages that have already arrived [s]
-DISCOVERY_TIME = 0.5  # time in which publishers are discovered before a recording is announced [s]
-CONNECTION_TIME = 2.0  # longest wait for connections to the discovered publishers [s]
+DRAIN_TIME = 0.5  # after Ctrl-C, record messages that have already arrived for this time [s]
+#: wait this long for publishers to be discovered before a recording is announced [s]
+DISCOVERY_TIME = 0.5
+CONNECTION_TIME = 2.0  # wait at most this long for connections to the discovered publishers [s]
 
 
 class Record(Node):
@@ -99,7 +100,7 @@ class Record(Node):
                 qos.reliability = ReliabilityPolicy.BEST_EFFORT
             elif policy == QoSPolicyKind.DURABILITY:
                 qos.durability = DurabilityPolicy.VOLATILE
-            else:  # the subscription requests no other policy
+            else:  # no other policy of the subscription can be weakened
                 continue
             self.destroy_subscription(before)
             self._subscribe(name, qos)

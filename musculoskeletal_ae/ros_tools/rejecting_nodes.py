@@ -17,7 +17,7 @@ class Rejections:
     """Warns once for each node, topic and reason when a node rejects more and more messages."""
 
     def __init__(self, topics: Iterable[str], bag: str, warn: Callable[[str], object]) -> None:
-        """Watch topics.
+        """Prepare to watch which nodes reject messages of some topics.
 
         Args:
             topics: Full names of the topics that are published.

@@ -16,7 +16,8 @@ from musculoskeletal_ae.ros.messages import SENSOR
 from musculoskeletal_ae.ros_tools.ros_tool import ROS_HELP, Spinner, run_tool, start_ros
 
 BODY, ESTIMATE = 'hardware_emulator/markers', 'estimated/markers'
-DISCOVERY_TIME = 2.0  # time in which running nodes discover each other [s]
+#: wait this long for the preferred topic after another topic has brought markers [s]
+DISCOVERY_TIME = 2.0
 
 
 def _line(strip: Marker) -> Line:

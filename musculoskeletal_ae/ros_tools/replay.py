@@ -65,17 +65,20 @@ from musculoskeletal_ae.signals.motor_interface import STATES
 
 #: depth of the QoS; a reader that is one second late still receives every message
 DEPTH = 1000
-SERVICE_PERIOD = 0.02  # longest time between two rounds in which services are answered [s]
-LONGEST_SLEEP = 0.002  # longest wait that uses time.sleep instead of answering services [s]
-#: time from the discovery of a subscriber until it can receive messages [s]
+SERVICE_PERIOD = 0.02  # answer services after at most this time [s]
+LONGEST_SLEEP = 0.002  # answer services instead of sleeping during any longer wait [s]
+#: wait this long after the discovery of a subscriber, until it can receive messages [s]
 SETTLE_TIME = 0.3
-LAP_GAP = 10_000_000  # time between the last message of a lap and the first of the next [ns]
-WAIT = 2.0  # default of the longest wait for subscribers; playback may start without them [s]
-SEND_WAIT = 10.0  # default of the same wait for --as-trajectory, which needs a subscriber [s]
-CLOCK_PERIOD = 0.005  # recorded time between two messages on /clock [s]
-SLOW = 0.5  # share of the wanted speed below which playback counts as slow
-LOCKSTEP_LAG = 0.005  # in lockstep, recorded time makes up for at most this delay [s]
-#: shortest wall time between two messages on /clock that nodes can handle [s]
+#: wait this recorded time between the last message of a lap and the first of the next [ns]
+LAP_GAP = 10_000_000
+WAIT = 2.0  # by default, wait at most this long for subscribers, and then play without them [s]
+#: by default, wait at most this long for the subscriber that --as-trajectory needs [s]
+SEND_WAIT = 10.0
+CLOCK_PERIOD = 0.005  # publish /clock at this interval of recorded time [s]
+SLOW = 0.5  # count playback as slow below this share of the wanted speed
+LOCKSTEP_LAG = 0.005  # in lockstep, catch up with at most this delay [s]
+#: publish /clock at intervals of at least this wall time, because nodes cannot handle more messages
+#: [s]
 SHORTEST_CLOCK_PERIOD = 0.001
 
 
@@ -157,7 +160,7 @@ class Replay(Node):
             serve(self, Trigger, f'replay/{work.__name__}', work)
 
     def play(self, progress: tqdm, again: bool) -> None:
-        """Publish all messages from start to stop; if `again`, repeat until the process ends."""
+        """Play all messages from start to stop; if `again`, repeat until the process ends."""
         self._lap(progress)
         while again:
             self._wait(self._stop + LAP_GAP, progress)
@@ -431,7 +434,7 @@ def parse(arguments: list[str]) -> Namespace:
 
 
 def _check_combination(parser: Parser, options: Namespace) -> None:
-    """Exit with an error if options contradict each other or would have no effect."""
+    """Check that options fit together and have an effect; otherwise, exit with an error."""
     if options.rate != 1 and not options.clock:
         parser.error(
             '--rate other than 1 needs --clock, and nodes with use_sim_time, because nodes with '

@@ -31,7 +31,7 @@ from musculoskeletal_ae.ros.ros_arguments import (
 ROS_HELP = (
     'Options of ROS follow --ros-args, such as  --ros-args -r __ns:=/left_arm -r TOPIC:=OTHER.'
 )
-LONGEST_WAIT = 0.1  # longest time between checks of a condition and of the stop signals [s]
+LONGEST_WAIT = 0.1  # check a condition and the stop signals after at most this time [s]
 
 
 def message_class(type_name: str) -> Any:

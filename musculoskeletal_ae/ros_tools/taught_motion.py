@@ -20,17 +20,18 @@ from musculoskeletal_ae.ros.diagnostics import PERIOD
 from musculoskeletal_ae.ros.messages import RELIABLE
 from musculoskeletal_ae.ros_tools.ros_tool import Spinner, start_ros
 
-ACKNOWLEDGE_TIME = 2.0  # longest wait until reliable readers have acknowledged the messages [s]
+#: wait at most this long for reliable readers to acknowledge the messages [s]
+ACKNOWLEDGE_TIME = 2.0
 TRAJECTORY = 'joint_trajectory'
 #: value of a rate on /diagnostics if no message was used since the previous report
 NO_RATE = '0.0 Hz'
-FIRST_REPORT_TIME = 2.0 * PERIOD  # longest wait for a first report of the subscribers [s]
-REPORT_TIME = 5.0 * PERIOD  # longest wait for two reports after sending a trajectory [s]
-SENDINGS = 3  # number of attempts to send a trajectory
+FIRST_REPORT_TIME = 2.0 * PERIOD  # wait at most this long for a first report of the subscribers [s]
+REPORT_TIME = 5.0 * PERIOD  # wait at most this long for two reports after sending a trajectory [s]
+SENDINGS = 3  # try at most this often to send a trajectory
 
 
 def send_taught_motion(bag: Bag, options: Namespace, arguments: list[str]) -> int:
-    """Publish a hand-guided motion as one trajectory, and return the exit status 0.
+    """Send a hand-guided motion as one trajectory, and return the exit status 0.
 
     Raises:
         MusculoskeletalError: If the bag has no hand-guided motion, or the trajectory is not
@@ -105,7 +106,7 @@ class _Answers:
 
 
 def _send(node: Node, spinner: Spinner, message: JointTrajectory, topic: str, wait: float) -> None:
-    """Publish a trajectory to the connected nodes, and wait until one has used it.
+    """Send a trajectory to the connected nodes, and wait until one has used it.
 
     Raises:
         MusculoskeletalError: If there is no subscriber, or the trajectory was lost or refused.

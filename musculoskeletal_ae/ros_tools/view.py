@@ -56,12 +56,13 @@ from musculoskeletal_ae.signals.motor_interface import STATES, MotorInterface
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 #: QoS of /diagnostics, on which all nodes of the graph report
 MANY = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
-PERIOD = 1.0 / 30.0  # time between pictures [s]
-TEXT_PERIOD = 0.25  # time between updates of texts and curves [s]
-GRAPH_PERIOD = 1.0  # time between checks of the graph [s]
-PATIENCE = 10.0  # longest wait for the response of a service [s]
-STOP_CHECK_PERIOD = 0.1  # time between checks for a stop signal [s]
-#: time after a reset within which a remaining cause stops the arm again [s]
+PERIOD = 1.0 / 30.0  # draw a picture at this interval [s]
+TEXT_PERIOD = 0.25  # update texts and curves at this interval [s]
+GRAPH_PERIOD = 1.0  # check the graph at this interval [s]
+PATIENCE = 10.0  # wait at most this long for the response of a service [s]
+STOP_CHECK_PERIOD = 0.1  # check for a stop signal after at most this time [s]
+#: show the outcome of a reset after this time [s]; a cause that remains has stopped the arm again
+#: by then
 SETTLE_TIME = 2.5
 #: topics from which the arms on the page are drawn
 ARM_TOPICS = {
@@ -228,7 +229,7 @@ class View(Node):
             time.sleep(max(0.0, begun + PERIOD - time.monotonic()))
 
     def _show(self, now: float) -> None:
-        """Read the newest messages and show them; `now` is monotonic time [s]."""
+        """Show the newest messages; `now` is monotonic time [s]."""
         self._take()
         self.situation.forget_ended()
         posture = {arm: at for arm in ARM_TOPICS if (at := self._newest(arm)) is not None}
@@ -289,7 +290,7 @@ class View(Node):
         self.page.follow(self.payload, self._newest('played', math.inf))
 
     def _show_reset_outcome(self) -> None:
-        """Tell visitors, SETTLE_TIME after a reset, whether the arm has stopped again."""
+        """Show visitors, SETTLE_TIME after a reset, whether the arm has stopped again."""
         if time.monotonic() > self.reset_at + SETTLE_TIME:
             self.reset_at = math.inf
             trouble, is_stopped = self.situation.trouble(), self.situation.is_stopped

@@ -35,14 +35,14 @@ class Trust(IntEnum):
 
     KNOWN = 0
     UNKNOWN = 1  # not determined since the start, or being determined by a length calibration
-    REVOKED = 2  # was known until a finding of the estimator contradicted it
+    REVOKED = 2  # was known until the estimator found a fault that makes it unreliable
 
 
 class Anomaly(IntEnum):
-    """What has become of the estimator's newest finding, as published in `body_state`.
+    """What has become of the estimator's newest finding (the newest fault that it has detected).
 
-    A restarted estimator reports NONE, because it does not know of earlier findings. Only ENDED
-    lets an arm that was stopped for a verification move again.
+    It is published in `body_state`. A restarted estimator does not know earlier findings, and
+    therefore reports NONE. Only ENDED lets an arm that was stopped for a verification move again.
     """
 
     NONE = 0  # no finding since the estimator was started
@@ -71,7 +71,7 @@ class LengthOffsets:
     trust: Ints = field(default_factory=lambda: np.zeros(0, dtype=int))
 
     def __post_init__(self) -> None:
-        """Complete a missing trust."""
+        """Set a missing trust from the standard deviations: offsets below UNKNOWN are known."""
         if len(self.trust) != len(self.offset):
             is_known = self.deviation < UNKNOWN
             object.__setattr__(self, 'trust', np.where(is_known, Trust.KNOWN, Trust.UNKNOWN))
@@ -109,7 +109,7 @@ class LengthOffsets:
 
     @cached_property
     def revoked(self) -> tuple[int, ...]:
-        """Indices of the muscles whose offsets a finding has revoked."""
+        """Indices of the muscles whose offsets the estimator has revoked."""
         return tuple(np.flatnonzero(self.trust == Trust.REVOKED).tolist())
 
 

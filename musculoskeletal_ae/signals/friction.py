@@ -23,11 +23,11 @@ REVERSAL = 0.0004  # b: sliding distance over which friction reverses [m]
 #: noise of a length [m]; a mean deviation ē of this size (`FrictionDirection`) is as likely due to
 #: sliding as due to noise
 NOISE = 0.00013
-LATEST = 0.07  # weight a of the newest deviation in the running mean ē
-SPIKE = 0.0002  # a reading is limited to this distance outside the range of the last two [m]
-LARGEST_GAIN = 1.5  # largest |γ| of `Transmission`
-#: prior of γ, b and F of a motor current: standard deviations of γ, b/T_limit and F/T_limit, and
-#: the mean of F/T_limit; the means of γ and b are 0
+LATEST = 0.07  # give the newest deviation this weight a in the running mean ē
+SPIKE = 0.0002  # limit a reading to this distance outside the range of the last two [m]
+LARGEST_GAIN = 1.5  # limit |γ| of `Transmission` to this
+#: expect γ, b/T_limit and F/T_limit of a motor current to have these standard deviations, and
+#: F/T_limit to have this mean, before anything is learned; the means of γ and b are 0
 DRIVE_SPREAD = 0.2, 0.05, 0.1
 DRIVE_FRICTION_MEAN = 0.08
 

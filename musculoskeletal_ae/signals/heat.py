@@ -25,31 +25,31 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.robot.robot import Robot
 
-HELD = 60.0  # duration for which planned tensions must be permissible [s]
-MOMENT = 5.0  # duration for which every commanded tension must be permissible [s]
-EVERY = 1.0  # time between two updates [s]
-LONGEST = 10.0  # longest time that one update may cover [s]
-#: largest change of a housing's temperature between two updates that the motor can cause [°C]; a
-#: larger change is due to the sensor or to another source of heat
+HELD = 60.0  # plan no tension that heats a winding too much when it is held for this time [s]
+MOMENT = 5.0  # command no tension that heats a winding too much when it is held for this time [s]
+EVERY = 1.0  # update at this interval [s]
+LONGEST = 10.0  # let one update cover at most this time [s]
+#: Attribute a larger change of a housing's temperature between two updates to the sensor or to
+#: another source of heat [°C], because the motor cannot cause it.
 JUMP = 2.0
-NOISE = 0.1  # standard deviation of the mean of c₂ over EVERY [°C]
+NOISE = 0.1  # expect this standard deviation of the mean of c₂ over EVERY [°C]
 RATIO = 0.4  # assumed ratio r: typical of small motors, which vary widely
-#: initial estimate of how much warmer than the air the housing becomes while T_limit is held [°C]
+#: at first, assume that holding T_limit makes the housing this much warmer than the air [°C]
 RISE = 80.0
-WINDING_TIME = 30.0  # initial estimate of the winding's time constant τ₁ [s]
-HOUSING_TIME = 800.0  # initial estimate of the housing's time constant τ₂ [s]
-AIR = 25.0  # initial estimate of the air temperature c_a [°C]
+WINDING_TIME = 30.0  # at first, assume this time constant τ₁ of the winding [s]
+HOUSING_TIME = 800.0  # at first, assume this time constant τ₂ of the housing [s]
+AIR = 25.0  # at first, assume this air temperature c_a [°C]
 #: initial standard deviations of c₁ − c₂ [°C], c₂ [°C], log κ, log τ₁, log τ₂ and c_a [°C]
 SPREAD = np.array([5.0, 0.2, 0.7, 0.5, 0.5, 5.0])
 #: standard deviations of the process noise of the same quantities, per √s
 WALK = np.array([0.1, 0.02, 0.003, 0.002, 0.002, 0.02])
-FAR = 2.5  # largest change of the logarithm of a constant from its initial estimate
-SLOPE = 1e-4  # step of numerical derivatives
-LEARNED = 1200.0  # time of learning before a constant can count as known [s]
-KNOWN = 0.2  # standard deviation of a constant's logarithm below which the constant is known
-REST_STEP = 30.0  # step by which the end of a rest is searched for [s]
-LONGEST_REST = 3600.0  # longest rest that is predicted [s]
-CHANGED = 1.5  # factor by which a known constant must change to be reported
+FAR = 2.5  # let the logarithm of a constant depart from its initial estimate by at most this
+SLOPE = 1e-4  # compute numerical derivatives with this step
+LEARNED = 1200.0  # count a constant as known only after this time of learning [s]
+KNOWN = 0.2  # count a constant as known below this standard deviation of its logarithm
+REST_STEP = 30.0  # search for the end of a rest in steps of this [s]
+LONGEST_REST = 3600.0  # predict no longer rest than this [s]
+CHANGED = 1.5  # report a known constant once it has changed by this factor
 
 
 def flow(state: Array, square: Array, dt: float) -> Array:

@@ -26,24 +26,25 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.robot.joint_units import JointUnits
 from musculoskeletal_ae.robot.robot import Robot
 
-LEAST_MOTION = 0.05  # smallest range of θ of a joint that is judged [rad]
-#: smallest |a_j| by which a sign is judged. On the emulated individuals 0–4 of two shipped arms
+LEAST_MOTION = 0.05  # judge a joint only if the range of its θ is at least this [rad]
+#: Judge a sign only if |a_j| is at least this. On the emulated individuals 0–4 of two shipped arms
 #: and both emulator models, a_j of joints that moved enough is between 0.4 and 1.9.
 LEAST_SCALE = 0.3
-BEYOND = 0.3  # distance by which a correct θ may exceed the joint limits [rad]
+BEYOND = 0.3  # let a correct θ exceed the joint limits by at most this [rad]
 #: Another unit, order or sign of θ (`_hypotheses`) is assumed if it reduces the misfit of l to less
 #: than this fraction.
 BETTER = 0.8
-MOST_SAMPLES = 600  # largest number of messages that are used, evenly distributed
-LEAST_SAMPLES = 20  # smallest number of messages by which sensors are judged
-STUCK_TIME = 5.0  # shortest time for which a stuck sensor repeats its reading [s]
-#: motion of a joint, according to the lengths, above which a repeated reading is stuck [rad]
+MOST_SAMPLES = 600  # use at most this many messages, evenly distributed
+LEAST_SAMPLES = 20  # judge sensors only by at least this many messages
+STUCK_TIME = 5.0  # count a reading as stuck only if it repeats for at least this time [s]
+#: count a repeated reading as stuck if the lengths show that its joint moves by more than this
+#: [rad]
 STUCK_MOTION = 0.2
-#: distance of a joint from its reading, according to the lengths, above which a repeated reading is
-#: stuck [rad]
+#: count a repeated reading as stuck if the lengths show that its joint is further away from it than
+#: this [rad]
 STUCK_OFFSET = 0.5
-#: fraction of the mean square of the misfit of l that this motion or distance of the joint must
-#: explain
+#: believe in a hidden motion or distance of a joint only if it leaves at most this fraction of the
+#: mean square of the misfit of l
 STUCK_EXPLAINED = 0.5
 DEGREES, SIGN, ORDER, STUCK = 'degrees', 'joint sign', 'joint order', 'joint stuck'
 

@@ -9,12 +9,11 @@ the jumps with which it begins and ends,
     |θ_n − θ_n−1| > step + speed · dt
 
 with the step and speed of `joint_stream.py`, or by readings that are the same before and after it
-and further than the step from it. Not only these readings are then left out, but all
-with the same value, so that none is left where the arm happens to be close to it. The remaining
-readings pass through a `JointStream`.
+and further than the step from it. All readings with the value of a false constant are left out,
+even where the arm happens to be close to it. The remaining readings pass through a `JointStream`.
 
-Encoders count whole turns, or wrap around at 0 or π. Readings that are within the joint limits, and
-continuous, after whole turns have been subtracted are used in this form.
+Encoders count whole turns, or wrap around at 0 or π. Whole turns are therefore subtracted from
+readings that are then within the joint limits and continuous.
 
 If a sensor has impossible readings again and again even then, none of its readings during that time
 is usable, as on a running arm (`estimation/joint_check.py`).
@@ -39,22 +38,22 @@ from musculoskeletal_ae.signals.limits import LIMITS
 
 #: a constant is false if at least this share of its appearances begins and ends with a jump
 INTERRUPTING = 0.5
-LEAST_REPEATED = 3  # smallest number of equal readings that count as a constant
+LEAST_REPEATED = 3  # count equal readings as a constant only if there are at least this many
 #: A constant that appears only once is false if the readings before and after it differ by less
 #: than this share of the jumps, if at least FOREIGN_SHARE of the joints jump at once, or if it
 #: lasts although at most the share NOISY of the other readings repeat the one before. Otherwise, a
 #: sensor may have slipped.
 RETURNING, NOISY = 0.5, 0.1
-#: If more than this share of the readings of a joint is far outside its limits, or if it gets there
-#: without a jump more often than this, its unit, sign or zero is wrong, and no single reading is to
-#: blame. `joint_sensors.py` judges these.
+#: Assume that the unit, sign or zero of a joint is wrong, and blame no single reading, if more than
+#: this share of its readings is far outside its limits, or if more than this share of its steps
+#: over the limits is no jump. `joint_sensors.py` then finds the fault.
 WRONG_SCALE = 0.5
 #: Whole turns are subtracted from the readings of a joint if at least this share of those readings
 #: is then within the limits and continuous with the reading before
 CONTINUOUS = 0.95
 #: report a smaller share of messages with false readings as a remark instead of a fault
 TOLERATED = 0.01
-MOST_NAMED = 6  # largest number of kinds of false readings in a text
+MOST_NAMED = 6  # name at most this many kinds of false readings in a text
 REMEDY = (
     'stop a second program that publishes joint_states, and let the driver leave out readings that '
     'failed'

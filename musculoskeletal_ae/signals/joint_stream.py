@@ -7,8 +7,8 @@ A reading is usable if it is a number within the joint limits (plus `LIMITS.join
 satisfies this equation. θ_j,accepted is the last usable reading of joint j, and dt is the time
 since its previous reading, limited to `LIMITS.longest_step`. Single impossible readings, such as 0
 or −π, and bursts of them are therefore not usable. Each joint is judged by itself, so that a bad
-sensor does not affect the readings of the others. Only if at least half of the joints in a message
-are impossible, no reading in it is usable, because the message then describes another posture, for
+sensor does not affect the readings of the others. However, if at least half of the joints in a
+message are impossible, no reading in it is usable: the message then describes another posture, for
 example that of another program.
 
 The level of a sensor changes if the sensor slips on its axis. The new level is accepted after all
@@ -31,10 +31,10 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
 
-#: constant part of the largest change between two readings of a joint sensor [rad], far beyond the
-#: noise, resolution and backlash of sensors
+#: accept a change of at most this plus SPEED · dt between two readings of a joint sensor [rad]; it
+#: is far beyond the noise, resolution and backlash of sensors
 STEP = 0.1
-#: largest speed of a joint [rad/s]; emulated arms reach 5.4 rad/s when a tendon slips
+#: expect no joint to move faster [rad/s]; emulated arms reach 5.4 rad/s when a tendon slips
 SPEED = 10.0
 #: report a series of impossible readings that has lasted for this time [s]; a burst is shorter,
 #: even with the time in which the readings of a moving arm settle again
@@ -133,7 +133,7 @@ class JointChannel:
         return JointReading.JUMPED
 
     def note(self, time: float, value: float, kind: JointReading) -> None:
-        """Record a reading [rad] received at `time` [s], and how it was judged in the end."""
+        """Note a reading [rad] received at `time` [s], and how it was judged in the end."""
         series = self.series
         if kind is JointReading.USABLE:
             self._accepted = value

@@ -24,12 +24,11 @@ class SensorTrust(IntEnum):
 
     #: Its readings are used. If they were in doubt before, those of the doubtful time are given up.
     TRUSTED = 0
-    #: Its readings are not used, from the begin of the doubt on.
+    #: Its readings are not used from the beginning of the doubt on.
     DOUBTED = 1
     #: Its readings are used, including those of the doubtful time, because the user confirmed them.
     CONFIRMED = 2
-    #: Its readings are not used, from the begin of a series of impossible readings on, until the
-    #: series ends.
+    #: Its readings are not used from the beginning to the end of a series of impossible readings.
     IMPOSSIBLE = 3
 
 
@@ -43,8 +42,8 @@ class JointTrust:
 
     Attributes:
         trust: Trust in each joint sensor, D values.
-        since: Begin of the newest time in which each sensor was not used [s], (D,); NaN if there
-            was none.
+        since: Beginning of the newest time in which each sensor was not used [s], (D,); NaN if
+            there was none.
         deviation: By how much each sensor read too much at the newest doubt [rad], (D,), as the
             muscle lengths show; 0 if there was no doubt.
     """

@@ -32,7 +32,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.limits import LENGTH_JUMPED, LIMITS
 
-#: smallest change of a length that may be a part of a jump, as a fraction of the legal change
+#: count a change of more than this fraction of the legal change as a possible part of a jump
 LARGE = 0.5
 
 
@@ -243,7 +243,7 @@ class LengthJumps:
         return True
 
     def _note(self, large: Change) -> None:
-        """Add a large change to the present jump, or begin one if the change is too large."""
+        """Note a large change: add it to the present jump, or begin one if it is too large."""
         if self._jump is not None:
             self._jump += large
             return

@@ -54,7 +54,7 @@ class Limits(NamedTuple):
     # stayed at the new level for `settled`.
     step: float = 0.02  # constant part of the largest change of a length [m]
     speed: float = 1.0  # largest speed of a length [m/s]
-    longest_step: float = 0.05  # longest time that counts for the change of a length [s]
+    longest_step: float = 0.05  # upper limit of dt in this formula [s]
     settled: float = 1.0  # time after which a new level of a length is accepted [s]
     #: time after which implausible messages are a fault instead of a glitch [s]
     glitch: float = 0.1
@@ -63,7 +63,7 @@ class Limits(NamedTuple):
 
 
 LIMITS = Limits()
-POSTURES = 500  # number of random postures over which `length_range` searches
+POSTURES = 500  # search this many random postures for the extremes of `length_range`
 
 #: reason under which messages with a jump of a length are counted
 LENGTH_JUMPED = 'length jumped'
@@ -149,7 +149,7 @@ class Persistence:
         self._problem, self._since, self._newest = '', math.inf, math.inf
 
     def note(self, problem: str, now: float) -> None:
-        """Record the fault of the newest message, '' if it has none."""
+        """Note the fault of the newest message, '' if it has none."""
         self._since = min(self._since, now) if problem else math.inf
         self._problem, self._newest = problem, now
 

@@ -170,7 +170,7 @@ class MuscleStream:
         self._delay = 0.0  # delay of the newest message, accepted or not [s]
 
     def use_transmission(self, transmission: Transmission) -> None:
-        """From now on, compute motor-side and bone-side tensions by this transmission."""
+        """Use a transmission to compute motor-side and bone-side tensions from now on."""
         if self._robot.tension_source.is_current and transmission.drive is None:
             unknown = Transmission.unknown(self._robot.description.tension.limit)
             transmission = replace(unknown, friction=transmission.friction)

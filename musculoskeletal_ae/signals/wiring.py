@@ -44,9 +44,9 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 BETTER = 1.4
 #: A fault is assumed if correcting it divides the cost of all readings by at least this factor.
 COST_BETTER = 1.1
-#: standard deviation of noise that is added to every misfit [m]; an arm at rest then shows nothing
+#: add noise of this standard deviation to every misfit [m], so that an arm at rest proves nothing
 NOISE = 0.0005
-MOST_SAMPLES = 400  # largest number of messages that are used, evenly distributed
+MOST_SAMPLES = 400  # use at most this many messages, evenly distributed
 
 #: computes the lengths [m], (N, M), for θ [rad], (N, D), and T [N], (N, M)
 Lengths = Callable[[Array, Array], Array]
@@ -216,7 +216,7 @@ def judge(
         now, then = misfit(wiring, of), misfit(other, of)
         return now - then if now > BETTER**2 * then else 0.0
 
-    # One fault after the other, so that no more columns are blamed than necessary.
+    # Correct one fault after the other, so that no more columns are blamed than necessary.
     alternatives: tuple[Wiring, ...] = (wiring,)
     for _ in columns:
         best = max(single_faults(wiring, columns, signs), key=gain, default=wiring)

@@ -49,15 +49,15 @@ RIGID = 4e5
 #: B without the dampers, divided by Σ_i |∂l_i/∂θ| [N·s/rad]. With it, motions take as long as on
 #: the emulated arm; values from 8 to 20 do equally well.
 VISCOSITY = 12.0
-JACOBIAN_POSTURES = 100  # number of postures over which |∂l_i/∂θ| is averaged
-LEAST_VISCOSITY = 0.1  # smallest B, such as that of a joint that no muscle crosses [N·m·s/rad]
-#: largest speed of a joint [rad/s] or [m/s]; it limits each step, and so the effect of network
-#: errors
+JACOBIAN_POSTURES = 100  # average |∂l_i/∂θ| over this many postures
+LEAST_VISCOSITY = 0.1  # use at least this B, such as at a joint that no muscle crosses [N·m·s/rad]
+#: move no joint faster than this [rad/s] or [m/s]; this limits each step, and so the effect of
+#: network errors
 JOINT_SPEED = 5.0
-MODULE_SPEED = 0.25  # largest winding speed of muscle modules [m/s], the same as in the emulator
-ROUNDS = 3  # largest number of rounds to find the tendons whose friction reverses in a step
-FARTHEST = 0.05  # largest distance by which a position command runs ahead of the module [m]
-POSTURES_PER_COEFFICIENT = 10  # a cubic is fitted to this number of postures per coefficient
+MODULE_SPEED = 0.25  # let muscle modules wind no faster than this, as in the emulator [m/s]
+ROUNDS = 3  # find the tendons whose friction reverses in a step in at most this many rounds
+FARTHEST = 0.05  # let a position command run ahead of the module by at most this distance [m]
+POSTURES_PER_COEFFICIENT = 10  # fit a cubic to this many postures per coefficient
 
 
 class ArmState(NamedTuple):
@@ -162,7 +162,7 @@ def combine(shares: Array, rows: Array, total: Array) -> None:
 def add_slopes(
     limbs: Limbs, theta: Array, tension: Array, jacobian: Array, curvature: Array
 ) -> None:
-    """Compute derivatives of the lengths with respect to θ from cubics of all limbs (see `Slopes`).
+    """Write G, and add Σ T_i ∂²l_i/∂θ² to `curvature`, from the cubics of all limbs (see `Slopes`).
 
     Args:
         limbs: The cubics.

@@ -28,16 +28,17 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState
 
-LONGEST_STEP = 0.01  # longest step [s]; longer times are divided into several steps
-CHUNK = 384  # number of arms in a call of the compiled code; their arrays fit into a core's cache
-SETTLING_STEP = 0.1  # duration of a step of `settle` [s]
-SETTLING_STEPS = 300  # largest number of steps of `settle`
-#: motion in a step below which the arms have settled [rad]; a change of tension by 1000 N counts
-#: like 1 rad
+LONGEST_STEP = 0.01  # divide a longer time into several steps [s]
+#: simulate this many arms in a call of the compiled code; their arrays fit into a core's cache
+CHUNK = 384
+SETTLING_STEP = 0.1  # let each step of `settle` take this time [s]
+SETTLING_STEPS = 300  # let `settle` take at most this many steps
+#: count arms as settled if a step moves them by less than this [rad]; a change of tension by 1000 N
+#: counts like 1 rad
 SETTLED = 1e-6
 
-STOP_TORQUE = 0.1  # torque of a stop above which `limits` names the joint [N·m]
-TENSION_MARGIN = 1.0  # distance from T_max below which `limits` names the muscle [N]
+STOP_TORQUE = 0.1  # let `limits` name a joint whose stop exerts more than this torque [N·m]
+TENSION_MARGIN = 1.0  # let `limits` name a muscle that is nearer to T_max than this [N]
 
 
 class Simulation:

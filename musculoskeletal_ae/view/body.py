@@ -23,10 +23,10 @@ from musculoskeletal_ae.robot import drawing
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.routes import ARC
 
-LARGEST_MESH = 50_000_000  # largest size of a mesh file [bytes]
+LARGEST_MESH = 50_000_000  # refuse a larger mesh file [bytes]
 FORMATS = ('.stl', '.obj', '.ply', '.glb')
-POSTURES = 50  # number of random postures of each kind in `space`
-DASHES = 5  # number of tubes per straight piece of a muscle; only dashed muscles have gaps
+POSTURES = 50  # draw this many random postures of each kind in `space`
+DASHES = 5  # draw each straight piece of a muscle as this many tubes; only dashed muscles have gaps
 #: red, green, blue at T_bias and at T_limit
 ENDS = LOOSE, TIGHT = np.array([0, 114, 178]), np.array([230, 97, 0])
 

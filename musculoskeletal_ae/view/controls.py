@@ -45,9 +45,10 @@ BUTTONS = {
     'call controller/explore true': EXPLORE,
     'call controller/explore': EXPLORE,
 }
-PUSH_STIFFNESS = 200.0  # force on the hand per distance by which the mouse drags it [N/m]
-MOST_PUSH = 60.0  # largest force of a push with the mouse [N]
-MOST_PAYLOAD = 5.0  # largest payload that a visitor can choose [kg]
+#: exert this force on the hand per distance by which the mouse drags it [N/m]
+PUSH_STIFFNESS = 200.0
+MOST_PUSH = 60.0  # exert at most this force by a push with the mouse [N]
+MOST_PAYLOAD = 5.0  # let visitors choose payloads of up to this mass [kg]
 #: requests after which values that are still being entered are not sent
 COMMANDS = (
     'controller/stop', 'controller/explore', 'end exploring', 'reset', 'hand', 'estimator/zero',
@@ -261,7 +262,7 @@ class Controls:
         return False
 
     def _show(self, theta: Array) -> None:
-        """Set the sliders to a posture θ [rad] (D,)."""
+        """Show a posture θ [rad] (D,) on the sliders."""
         positions = self._robot.units.to_position(theta)
         for joint, position, slider in zip(self._robot.joints, positions, self.sliders):
             near = round(np.clip(position, slider.min, slider.max) / slider.step) * slider.step

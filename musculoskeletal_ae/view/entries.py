@@ -9,11 +9,11 @@ types as fast as a dragged slider changes. The rate of changes therefore shows w
 import threading
 from collections import deque
 
-SETTLE_TIME = 0.7  # time without a change after which a value is complete [s]
+SETTLE_TIME = 0.7  # count a value as complete after this time without a change [s]
 #: A slider is being dragged if it has changed DRAG_CHANGES times within DRAG_TIME [s]. viser
 #: reports up to 20 changes per second; typing a number changes its value at most four times.
 DRAG_CHANGES, DRAG_TIME = 5, 0.5
-HOLD_TIME = 3.0  # time after a change for which the slider does not follow the arm [s]
+HOLD_TIME = 3.0  # keep a slider from following the arm for this time after a change [s]
 Key = tuple[str, str]  # a request and the label of a slider
 
 

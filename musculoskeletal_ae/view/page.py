@@ -23,7 +23,8 @@ from musculoskeletal_ae.view.readings import HTML, History, ReadingsPanel
 from musculoskeletal_ae.view.scene import RIGHT_PANEL, Scene
 from musculoskeletal_ae.view.visits import checked_visits
 
-NARROW = 900  # width below which two panels would hide the arm [pixels]
+#: show one panel in a window narrower than this, because two would hide the arm [pixels]
+NARROW = 900
 HOT = 80.0  # temperature at the right end of a bar [°C]
 
 

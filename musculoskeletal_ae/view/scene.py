@@ -16,11 +16,11 @@ from musculoskeletal_ae.view.body import MARKS, DrawnState
 from musculoskeletal_ae.view.readings import ARMS, LEFT_PANEL
 
 CAMERA_FOV = 0.8  # vertical field of view [rad]
-FILLED = 0.95  # share of the visible width and height that the arm may fill
+FILLED = 0.95  # let the arm fill at most this share of the visible width and height
 #: unit vector from the arm to the initial camera
 VIEW_DIRECTION = np.array([1.25, 1.15, 0.35]) / np.linalg.norm([1.25, 1.15, 0.35])
 RIGHT_PANEL = 330  # width of the right panel [pixels]
-#: width and height for which the initial camera is placed [pixels]
+#: place the initial camera for a window of this width and height [pixels]
 WINDOW = 1280, 800
 
 

@@ -259,7 +259,7 @@ def test_the_reversed_sign_of_every_length_is_one_fault_of_an_arm_at_rest(robot)
 
 
 def test_the_tolerance_of_zeros_is_stated():
-    assert 'zero ok: within 45 mm of the route' in str(heard())
+    assert 'zero ok: l agrees with the modelled route to 45 mm' in str(heard())
 
 
 @pytest.mark.parametrize('name', ANGLES)
