@@ -71,7 +71,8 @@ class Split(NamedTuple):
     full: Run | None = None
 
 
-def _rows(run: Run, rows: Any) -> Run:
+def rows_of(run: Run, rows: Any) -> Run:
+    """Return some rows of a run, without its rests."""
     parts = {'length': run.length[rows], 'effort': run.effort[rows], 'theta': run.theta[rows]}
     return replace(run, rests=run.rests[:0], **parts)
 
@@ -88,7 +89,7 @@ def neck_splits(recording: Recording) -> Iterator[Split]:
     # between. A pose extends from the end of the previous rest to the end of its own rest.
     pose = np.searchsorted(none.rests[:, 1], np.arange(len(none.length)), side='right')
     others = (pose % 2 == 1) & (pose < len(none.rests))
-    yield Split('0 g → other poses, 0 g', own, _rows(none, others), [], _rows(none, ~others))
+    yield Split('0 g → other poses, 0 g', own, rows_of(none, others), [], rows_of(none, ~others))
     for test in (half, whole):
         yield Split(f'0 g → {test.name}', own, test, [], none)
     for first, second, test in ((none, whole, half), (none, half, whole), (half, whole, none)):
@@ -121,7 +122,7 @@ def stand_splits(recording: Recording) -> Iterator[Split]:
     order = np.random.default_rng(0).permutation(len(run.length))
     for count in (20, 100):
         name = f'{count} poses → all others'
-        yield Split(name, _rows(run, order[:count]), _rows(run, order[count:]), [])
+        yield Split(name, rows_of(run, order[:count]), rows_of(run, order[count:]), [])
 
 
 SPLITS: dict[str, Callable[[Recording], Iterator[Split]]] = {

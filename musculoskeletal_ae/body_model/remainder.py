@@ -123,6 +123,12 @@ class GroupRemainder:
         amplitude = _constants(self.logarithms)[0]
         return np.sqrt(np.maximum(amplitude**2 - known, 0.0))
 
+    def text(self) -> str:
+        """Return the four constants as text."""
+        amplitude, by_theta, by_tension, noise = _constants(self.logarithms)
+        sizes = f'a {1e3 * amplitude:.1f} mm, b {by_theta:.2f}, c {by_tension:.1f}'
+        return f'{sizes}, σ {1e3 * noise:.2f} mm'
+
     def _covariance(self, theta: Array, tension: Array) -> Array:
         inputs = np.hstack([theta[:, self.joints], tension[:, self.muscles]]) / self.scale
         return _kernel(_squares(inputs, self.inputs, len(self.joints)), self.logarithms)
