@@ -2,7 +2,7 @@
 """Export a learned body as an MJCF model, and compare the model with the network.
 
 Links, joints, limits and masses are those of the robot directory. Route points are learned: the
-calibrated body without a residual model is fitted to the network (`body_model.fit.fit_to_network`).
+calibrated body without a remainder is fitted to the network (`body_model.fit.fit_to_network`).
 Each tendon has an actuator that represents a motor and its series elastic element. The control u is
 the length of the tendon at which the element is slack:
 
@@ -120,7 +120,7 @@ def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> Report:
 
 def _write(robot: Robot, mae: Mae, out: Path, seed: int) -> Report:
     robot = robot.with_elasticity(mae.elasticity)
-    body = CalibratedBody.of_straight_lines(robot)
+    body = CalibratedBody(robot)
     fit_to_network(body, mae, seed, with_remainder=False)
     shift = np.concatenate([body.shift(m) for m in range(robot.muscle_count)])
     moved = Robot(replace(robot.description, routes=_moved(robot, shift)))
