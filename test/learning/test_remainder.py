@@ -113,6 +113,16 @@ def test_the_network_learns_that_lengths_far_from_all_samples_are_uncertain(arm2
     assert spread[far].mean() > 3.0 * spread[near].mean()
 
 
+def test_errors_that_muscles_have_in_common_are_expected_in_common(arm26, straight_stage):
+    observed = straight_stage.observations(60)
+    common = 0.005 * np.random.default_rng(0).standard_normal((60, 1))
+    body = fitted(arm26, replace(observed, length=observed.length + common))
+    theta = arm26.random_postures(500, np.random.default_rng(1))
+    tension = np.full((500, 6), 100.0)
+    drawn = body.remainder.drawn_error(theta, tension, np.random.default_rng(2))
+    assert np.corrcoef(drawn.T).min() > 0.5
+
+
 def test_a_body_that_the_model_can_express_keeps_no_remainder(arm26, straight_stage):
     observed = straight_stage.observations(60)
     remainder = fitted(arm26, observed).remainder.at(observed.theta, observed.tension)
