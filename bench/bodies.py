@@ -16,8 +16,9 @@ learner keeps, and DRAW the seed with which they are drawn. Names are
 Training rows of neck and arm come from every other pose or file, and test rows from those between.
 A line has the mean error ‖θ_est − θ‖ [rad] after some updates, the share of test errors in the 95 %
 ellipsoid, the error of the lengths of network and body [mm], the size of the remainder [mm] and its
-constants, the processor time of an update [s], and the errors of the regressions. `notes/
-real_bodies.md` contains the figures.
+constants, the processor time of an update [s], and the errors of the regressions. With --body, only
+the body is fitted, and θ is estimated by least squares on it, with the covariance that the fit
+expects. This takes a quarter of the time. notes/real_bodies.md contains the figures.
 """
 
 from __future__ import annotations
@@ -38,11 +39,13 @@ from bench.recordings_learn import INITIAL_STEPS, STEPS, joined, tensions
 from bench.recordings_read import Files, Run, SoftLink, fitted, repositories
 from bench.regression import BASELINES
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.body_model.body_fit import BodyFit
 from musculoskeletal_ae.body_model.covariance import ellipsoids
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.online_learning import teach
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, HELD_OUT_STREAM, record
+from musculoskeletal_ae.gauss_newton import minimise_each
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.learner import Learner
@@ -61,6 +64,10 @@ EXPLORED, HELD_OUT = 300.0, 60.0  # durations of exploration and test [s]
 THINNED = 10  # use every tenth message of the test
 MOST_ROWS = 1500  # largest number of test rows
 COUPLING = 0.006  # standard deviation of the coupling [m]
+MOST_FITTED = 150  # largest number of test rows for least squares
+#: least squares: step of finite differences [rad], typical step as a share of the joint ranges, and
+#: largest number of iterations
+DIFFERENCE, USUAL_STEP, ROUNDS = 1e-4, 0.1, 15
 RECORDINGS = {'neck': 'soft_neck', 'arm': 'soft_arm', 'stand': 'continuum_stand'}
 
 
@@ -223,6 +230,37 @@ def package(case: Case, updates: int, seed: int) -> str:
     )
 
 
+def body_alone(case: Case, fits: int = 2) -> str:
+    """Fit the body without a network, and return the error of least squares on it as text."""
+    body_fit = BodyFit(case.robot, None)
+    for _ in range(fits):
+        fit = body_fit.fit(case.training, case.training.theta)
+    body, robot = body_fit.body, case.robot
+    rows = slice(None, None, max(1, len(case.test) // MOST_FITTED))
+    test = case.test[rows]
+    start = case.initial.estimate(test.end_tension(case.initial.transmission), test.length).theta
+
+    def length(theta: Array) -> Array:
+        return body.lengths(theta, test.tension, test.direction)[0]
+
+    def residuals(theta: Array) -> tuple[Array, Array]:
+        covariance = body.remainder.covariance(theta, test.tension) + np.diag(fit.noise**2)
+        white = np.linalg.inv(np.linalg.cholesky(covariance))
+        steps = DIFFERENCE * np.eye(robot.joint_count)
+        slope = [
+            (length(theta + step) - length(theta - step)) / (2.0 * DIFFERENCE) for step in steps
+        ]
+        return (white @ (length(theta) - test.length)[..., None])[..., 0], white @ np.stack(
+            slope, axis=-1
+        )
+
+    usual = (USUAL_STEP * (robot.upper - robot.lower)) ** -2.0
+    theta = minimise_each(residuals, start, usual, ROUNDS, bounds=(robot.lower, robot.upper))
+    error = np.linalg.norm(theta - test.theta, axis=1).mean()
+    constants = ' '.join(group.text() for group in body.remainder.groups)
+    return f'{error:.4f} rad by least squares on the body ({constants})'
+
+
 def regressions(case: Case) -> str:
     """Return the errors of the baselines as text."""
 
@@ -267,12 +305,13 @@ def main(argv: list[str]) -> None:
     parser.add_argument('--cache', type=Path, required=True, help=help_cache)
     parser.add_argument('--updates', type=whole(1, 100), default=6, help='number of updates')
     parser.add_argument('--seed', type=whole(0, 10**6), default=0, help='seed of the training')
+    parser.add_argument('--body', action='store_true', help='fit the body without a network')
     parser.add_argument('--baselines', action='store_true', help='also fit the regressions')
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     args.cache.mkdir(parents=True, exist_ok=True)
     for text in args.cases:
         case = read_case(text, args.clones, args.cache)
-        line = package(case, args.updates, args.seed)
+        line = body_alone(case) if args.body else package(case, args.updates, args.seed)
         also = f'; {regressions(case)}' if args.baselines else ''
         print(f'{text} ({len(case.training)} samples): {line}{also}', flush=True)

@@ -174,6 +174,14 @@ class Remainder:
             result[:, group.muscles] = group.at(theta, tension)
         return result if self.before is None else result + self.before.at(theta, tension)
 
+    def covariance(self, theta: Array, tension: Array) -> Array:
+        """Return the posterior covariance of g [m²] in each state for a known body, (N, M, M)."""
+        result = np.zeros((len(theta), self.muscle_count, self.muscle_count))
+        for group in self.groups:
+            root = group.spread(theta, tension)[..., None] * group.correlation
+            result[:, group.muscles[:, None], group.muscles] = root @ root.swapaxes(1, 2)
+        return result
+
     def drawn_error(self, theta: Array, tension: Array, rng: np.random.Generator) -> Array:
         """Draw the error of g [m] (N, M) from its posterior, independently for each state."""
         result = np.zeros((len(theta), self.muscle_count))
