@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import covariance, false_stops, lab, pictures
+from bench import bodies, covariance, false_stops, lab, pictures
 from bench.__main__ import benches, main
+from bench.regression import BASELINES
 from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -89,3 +91,17 @@ def test_honesty_of_a_covariance_is_0_95_inside_and_nees_1_if_the_errors_follow_
     )
     too_large = covariance.honesty(4.0 * root @ root.T, error)
     assert too_large.inside > 0.99 and too_large.nees == pytest.approx(0.25, abs=0.01)
+
+
+@pytest.mark.parametrize('name', BASELINES)
+def test_a_regression_learns_a_smooth_function(name):
+    inputs = np.random.default_rng(0).uniform(-1.0, 1.0, (60, 3))
+    inputs[:, 2] = 5.0  # some quantities are constant, for example unknown tensions
+    outputs = np.stack([np.sin(2.0 * inputs[:, 0]), inputs[:, 0] * inputs[:, 1]], axis=1)
+    predicted = BASELINES[name](inputs[:40], outputs[:40])(inputs[40:])
+    assert np.abs(predicted - outputs[40:]).mean() < 0.1 * outputs.std()
+
+
+def test_an_unknown_body_is_refused_with_the_legal_ones(tmp_path):
+    with pytest.raises(MusculoskeletalError, match=r'nose:20.*neck, arm, stand, kin_SEED'):
+        bodies.main(['nose:20', '--cache', str(tmp_path)])

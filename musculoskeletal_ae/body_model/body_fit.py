@@ -38,7 +38,7 @@ class BodyFit:
         """Begin with a body that is fitted to `mae`, or with the geometric model if it is None."""
         if mae is not None:
             robot = robot.with_elasticity(mae.elasticity)
-        self.body = CalibratedBody(robot, seed=seed)
+        self.body = CalibratedBody(robot)
         #: parameters fitted to the network, which replace the geometric model as prior mean
         self._prior_mean: list[Array] | None = None
         if mae is not None:
@@ -59,7 +59,7 @@ class BodyFit:
         if self._prior_mean is None or self._is_prior_confirmed or len(observed) < LEAST_NEWEST:
             return False
         self._is_prior_confirmed = True
-        body = CalibratedBody(self.body.robot, self._prior_mean, smooth=self.body.smooth)
+        body = CalibratedBody(self.body.robot, self._prior_mean)
         body.remainder = self.body.remainder.before or body.remainder
         (length,) = body.lengths(observed.theta, observed.tension, observed.direction)
         return bool(np.median(np.abs(observed.length - length)[observed.known]) > LEAST_CHANGE)
@@ -67,8 +67,7 @@ class BodyFit:
     def start_anew(self) -> None:
         """Start again from the geometric model."""
         self._prior_mean = None
-        robot = self.body.robot.with_elasticity(None)
-        self.body = CalibratedBody(robot, smooth=self.body.smooth)
+        self.body = CalibratedBody(self.body.robot.with_elasticity(None))
 
     def fit(self, observed: Observations, guess: Array) -> Fit:
         """Fit the body to samples.

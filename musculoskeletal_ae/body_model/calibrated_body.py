@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The calibrated body: the geometric model with fitted parameters, plus a residual model.
+"""The calibrated body: the geometric model with fitted parameters.
 
-    l_i(θ, T) = f_i(θ; p + δ) − f_i(0; p + δ) − L_e(f_i, T e^{−μ s}; c e^κ) + o − r a + ψ(θ)ᵀ v
+    l_i(θ, T) = f_i(θ; p + δ) − f_i(0; p + δ) − L_e(f_i, T e^{−μ s}; c e^κ) + o − r a + g_i(θ, T)
 
     f, L_e  length of the route through the attachment points, and elongation of the elastic element
     δ       errors of the attachment points p, a few millimetres
@@ -10,24 +10,22 @@
             friction makes the motor-side tension T differ from the tension at the elastic element
     o       offset of the length sensor
     r, a    creep of the tendon per sample, and the number of samples that came after this one
-    ψᵀ v    residual model: random Fourier features over the joints that the muscle crosses, minus
-            their values at θ = 0. It represents what straight lines between route points miss,
-            such as wrapping round bones
+    g       the remainder (`remainder`): what the parameters cannot express, such as the effect of
+            tendons that wrap round bones
 
-If all parameters are zero, the calibrated body is the geometric model. The module `fit` estimates
-the parameters. The springs of the joints do not change lengths; `springs` describes their
-corrections.
+If all parameters and the remainder are zero, the calibrated body is the geometric model. The module
+`fit` estimates the parameters. The springs of the joints do not change lengths; `springs` describes
+their corrections.
 """
 
 from __future__ import annotations
 
-import math
 from copy import copy
 from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools, Ints, Singles
+from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.body_model import springs
 from musculoskeletal_ae.body_model.remainder import Remainder
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
@@ -37,28 +35,20 @@ from musculoskeletal_ae.signals.friction import LARGEST_GAIN, Transmission
 
 #: largest |γ|, |b|/T_limit and |F|/T_limit of `signals.friction.Transmission`
 LARGEST_DRIVE = np.array([LARGEST_GAIN, 1.0, 1.0])
-FEATURES = 60  # number of random features drawn for each muscle
-WIDTH = 0.35  # width of the kernel that the features approximate, as a share of the joint ranges
-#: Share of the variance of the features that is dropped with the directions that vary least. These
-#: are about half of all directions, and change a length by less than 0.1 mm at the prior's spread.
-LEFT_OUT = 1e-3
-POSTURES = 500  # number of random postures over which the variance of the features is computed
 #: largest |μ|; the tensions at the motor and at the elastic element then differ by a factor of 2
 LARGEST_FRICTION = 0.7
 LARGEST_LOG = 1.5  # largest |κ|
 
 
 class Layout:
-    """Positions of the parameters δ, κ, μ, o, r and v in the vector of one muscle.
+    """Positions of the parameters δ, κ, μ, o and r in the vector of one muscle.
 
     The docstring of the module explains the symbols. δ has three values for each route point. If
     tensions come from motor currents, the vector also contains the constants γ, b and F of
     `Transmission`.
     """
 
-    def __init__(
-        self, points: Ints, weights: Array, features: int, with_drive: bool = False
-    ) -> None:
+    def __init__(self, points: Ints, weights: Array, with_drive: bool = False) -> None:
         end = 3 * len(points)
         self.points = points  # indices of the muscle's route points
         #: factor with which each line between consecutive route points counts in the length
@@ -67,61 +57,9 @@ class Layout:
         #: κ: logarithms of force, rate and wire_stretch relative to their nominal values
         self.elastic = slice(end, end + 3)
         self.friction, self.offset, self.creep = end + 3, end + 4, end + 5  # μ; o, r [m]
-        last = end + 6 + features
-        self.rest = slice(end + 6, last)  # v [m]
         #: γ, b/T_limit and F/T_limit of `Transmission` where motor currents are measured
-        self.drive = slice(last, last + 3 * with_drive)
-        self.size = last + 3 * with_drive
-
-
-class ResidualModel(NamedTuple):
-    """Residual model ψ of one muscle, made of random Fourier features of θ.
-
-    K features are drawn and projected onto the F directions in which they vary most. ψ is computed
-    in single precision, in which cosines take a seventh of the time of double precision.
-    """
-
-    frequency: Singles  # [1/rad], (K, D); 0 for joints that the muscle does not cross
-    phase: Singles  # phases of the cosines [rad], (K,)
-    basis: Singles  # directions in feature space along which the features vary most, (K, F)
-
-    @classmethod
-    def drawn(
-        cls, robot: Robot, crossed: Bools, theta: Array, rng: np.random.Generator
-    ) -> ResidualModel:
-        """Draw the random features of one muscle's residual model.
-
-        Args:
-            robot: The robot, whose joint ranges scale the kernel.
-            crossed: Which joints the muscle crosses, (D,).
-            theta: Postures over which the variance of the features is computed, (N, D).
-            rng: The random generator.
-        """
-        count = FEATURES if crossed.any() else 0
-        frequency = rng.normal(0.0, 1.0, (count, robot.joint_count))
-        frequency = frequency * crossed / (WIDTH * (robot.upper - robot.lower))
-        phase = rng.uniform(0.0, 2.0 * np.pi, count)
-        every = cls(*(part.astype(np.float32) for part in (frequency, phase, np.eye(count))))
-        values = every.at(theta)
-        power, basis = np.linalg.eigh(values.T @ values)
-        kept = basis[:, power.cumsum() > LEFT_OUT * power.sum()]
-        return every._replace(basis=kept.astype(np.float32))
-
-    def at(self, theta: Array) -> Array:
-        """Return ψ(θ), which is 0 at θ = 0, shape (N, F)."""
-        angles = theta @ self.frequency.T + self.phase
-        values = np.cos(angles.astype(self.phase.dtype)) - np.cos(self.phase)
-        return (values @ self._scaled).astype(float)
-
-    def slope(self, theta: Array, joints: Ints) -> Singles:
-        """Return ∂ψ/∂θ for the joints in `joints` [1/rad], shape (joints, N, F)."""
-        angles = theta @ self.frequency.T + self.phase
-        values = -np.sin(angles.astype(self.phase.dtype)) * self.frequency.T[joints, None]
-        return values @ self._scaled
-
-    @property
-    def _scaled(self) -> Singles:
-        return math.sqrt(2.0 / max(1, len(self.phase))) * self.basis
+        self.drive = slice(end + 6, end + 6 + 3 * with_drive)
+        self.size = self.drive.stop
 
 
 class Poses(NamedTuple):
@@ -135,38 +73,26 @@ class Poses(NamedTuple):
 class CalibratedBody:
     """Computes muscle lengths of the calibrated body, and their derivatives by its parameters."""
 
-    def __init__(
-        self,
-        robot: Robot,
-        parameters: list[Array] | None = None,
-        seed: int = 0,
-        smooth: list[ResidualModel] | None = None,
-    ) -> None:
+    def __init__(self, robot: Robot, parameters: list[Array] | None = None) -> None:
         """Create a calibrated body.
 
         Args:
             robot: The geometric model.
             parameters: One vector for each muscle; None for zeros.
-            seed: Seed of the random features, if `smooth` is None.
-            smooth: The residual model of each muscle; None to draw new ones.
         """
         self.robot, routes = robot, robot.routes
         self._has_drive, limit = robot.tension_source.is_current, robot.description.tension.limit
         #: units of the parameters of a drive: γ, b and F, (3, M)
         self.drive_units: Array = np.array([np.ones_like(limit), limit, limit])
-        if smooth is None:
-            rng = np.random.default_rng([seed, 0xF0])
-            theta = robot.random_postures(POSTURES, np.random.default_rng([seed, 0xF1]))
-            smooth = [ResidualModel.drawn(robot, crossed, theta, rng) for crossed in routes.crossed]
-        self.smooth, self.layouts = smooth, list[Layout]()
-        for m, own in enumerate(smooth):
+        self.layouts = list[Layout]()
+        for m in range(robot.muscle_count):
             segments = np.flatnonzero(routes.muscle == m)
             points = np.union1d(routes.first[segments], routes.second[segments])
             # A muscle may have several branches. The line from the last point of a branch to the
             # first point of the next keeps the factor 0.
             weights = np.zeros(len(points) - 1)
             weights[routes.first[segments] - points[0]] = routes.weight[segments]
-            self.layouts.append(Layout(points, weights, own.basis.shape[1], self._has_drive))
+            self.layouts.append(Layout(points, weights, self._has_drive))
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
         #: what the parameters cannot express; `lengths` includes it, `linearised` does not
         self.remainder = Remainder(robot.muscle_count)
@@ -181,23 +107,14 @@ class CalibratedBody:
 
     def limb(self, joints: Ints, muscles: Ints) -> CalibratedBody:
         """Return the part with these joints and muscles only, without its remainder."""
-        of_group = [self.smooth[m] for m in muscles]
-        smooth = [own._replace(frequency=own.frequency[:, joints]) for own in of_group]
         parameters = [self.parameters[m] for m in muscles]
-        return CalibratedBody(self.robot.limb(joints, muscles), parameters, smooth=smooth)
+        return CalibratedBody(self.robot.limb(joints, muscles), parameters)
 
     def with_parameters(self, parameters: list[Array]) -> CalibratedBody:
         """Return a copy of the body with other parameters, one vector for each muscle."""
         body = copy(self)
         body.parameters = parameters
         return body
-
-    @classmethod
-    def of_straight_lines(cls, robot: Robot) -> CalibratedBody:
-        """Return the body without its residual model, as a robot description can represent it."""
-        shapes = (0, robot.joint_count), 0, (0, 0)
-        none = ResidualModel(*(np.zeros(shape, np.float32) for shape in shapes))
-        return cls(robot, smooth=[none] * robot.muscle_count)
 
     @property
     def elasticity(self) -> JointElasticity:
@@ -313,7 +230,6 @@ class CalibratedBody:
             absolute += poses.detour[:, m]
             absolute, at_zero = absolute[:-1], absolute[-1]
             fixed = absolute - at_zero + self.parameters[m][layout.offset] + remainder[:, m]
-            fixed += self.smooth[m].at(theta) @ self.parameters[m][layout.rest]
             elastic = self.elastic(m)
             for lengths, s in zip(result, direction, strict=True):
                 end, _ = self.end(m, tension[:, m], s[:, m])
@@ -321,14 +237,17 @@ class CalibratedBody:
         return result
 
     def linearised(
-        self, poses: Poses, smooth: Array, tension: Array, direction: Array, m: int,
+        self,
+        poses: Poses,
+        tension: Array,
+        direction: Array,
+        m: int,
         age: Array | float = 0.0,
-    ) -> tuple[Array, Array]:  # fmt: skip
+    ) -> tuple[Array, Array]:
         """Return l_i [m] (N,) of one muscle and ∂l_i/∂parameters (N, P).
 
         Args:
             poses: Joint poses at the postures θ, from `poses`.
-            smooth: ψ(θ), from `ResidualModel.at`, (N, F).
             tension: T_i or T_read,i [N], (N,).
             direction: Direction of sliding s_i, (N,).
             m: Index i of the muscle.
@@ -349,15 +268,14 @@ class CalibratedBody:
         end, by_losses = self.end(m, tension, direction)
         end = np.maximum(end, 0.0)
         length = absolute - at_zero - elastic.elongation(absolute, end)
-        length = length + parameters[layout.offset] + smooth @ parameters[layout.rest]
+        length = length + parameters[layout.offset]
         length -= age * parameters[layout.creep]
         slope = 1.0 - elastic.length_slope(end)
-        jacobian = np.empty((len(smooth), layout.size))
+        jacobian = np.empty((len(length), layout.size))
         jacobian[:, layout.attachment] = slope[:, None] * by_point[:-1] - by_point[-1]
         jacobian[:, layout.elastic] = -elastic.by_logarithms(absolute, end)
         compliance = elastic.compliance(absolute, end)
         jacobian[:, layout.friction] = compliance * end * direction
         jacobian[:, layout.drive] = -compliance[:, None] * by_losses[:, 1:]
         jacobian[:, layout.offset], jacobian[:, layout.creep] = 1.0, -np.asarray(age)
-        jacobian[:, layout.rest] = smooth
         return length, jacobian

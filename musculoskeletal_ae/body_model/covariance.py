@@ -134,8 +134,7 @@ def _drawn_errors(
         steps = solve_triangular(root, rng.standard_normal((len(root), BODIES))).T
         ends = np.cumsum([body.layouts[m].size for m in muscles])
         for m, step in zip(muscles.tolist(), np.split(steps, ends, axis=1)):
-            smooth = body.smooth[m].at(theta)
-            observed, slope = body.linearised(poses, smooth, tension[:, m], direction[:, m], m)
+            observed, slope = body.linearised(poses, tension[:, m], direction[:, m], m)
             length[:, m] += observed + (slope * step[bodies]).sum(axis=1)
         joints = list(group.joints)
         offset[:, joints] = steps[:, ends[-1] : ends[-1] + len(joints)]

@@ -97,8 +97,9 @@ def fit_body(
     own = np.isfinite(observed.theta) & (observed.spread == 0.0)
     measured = replace(observed, theta=np.where(own, observed.theta - body.zero, fit.theta))
     before = body.remainder.at(measured.theta, observed.tension)
-    corrected = replace(observed, theta=observed.theta - own * body.zero)
-    body.remainder = learned_remainder(body, corrected, fit.weight, priors)
+    # Angles from a camera are less accurate than the fitted ones, which combine them with lengths.
+    known = np.where(np.isnan(observed.theta), np.nan, measured.theta)
+    body.remainder = learned_remainder(body, replace(observed, theta=known), fit.weight, priors)
     # The constants have to agree with the new remainder, or both would explain the same lengths.
     if np.abs(body.remainder.at(measured.theta, observed.tension) - before).max() > LEAST_NOISE:
         fit = fitted()
@@ -156,8 +157,7 @@ class MuscleFit:
     ) -> None:
         """Prepare the fit of muscle `m` to the samples where `used` (N,) is True."""
         self._body, self._m = body, m
-        self._poses, self._smooth = poses, body.smooth[m].at(observed.theta)
-        self._observed = observed
+        self._poses, self._observed = poses, observed
         self._known = used.astype(float)[:, None]
         self._mean = prior.mean
         self._least_noise = least_noise
@@ -182,7 +182,6 @@ class MuscleFit:
         of_all[m] = parameters
         length, jacobian = self._body.with_parameters(of_all).linearised(
             self._poses,
-            self._smooth,
             observed.tension[:, m],
             observed.direction[:, m],
             m,

@@ -141,10 +141,7 @@ class PostureModel:
             tensions, directions, age = (
                 np.tile(part, len(parts)) for part in (tension, direction, observed.age)
             )
-            still = body.smooth[m].at(own)
-            turned = still + DIFFERENCE * body.smooth[m].slope(own, turns)
-            smooth = np.concatenate([still, *turned])
-            l_m, j_m = body.linearised(placed, smooth, tensions, directions, m, age)
+            l_m, j_m = body.linearised(placed, tensions, directions, m, age)
             l_m, j_m = l_m.reshape(len(parts), count), j_m.reshape(len(parts), count, -1)
             length[:, m] = observed.length[:, m] - l_m[0]
             by_body.append(j_m[0])

@@ -34,7 +34,6 @@ class Prior:
     friction_mean: float = 0.05  # mean of μ
     offset: float = 0.001  # σ of the offset of the length sensor [m]
     creep: float = 1e-5  # σ of the creep of a tendon from one sample to the next [m]
-    smooth: float = 0.002  # σ of the parameters of the residual model [m]
     #: σ of the logarithm of a motor current's scale, and of its offset and drive friction as shares
     #: of T_limit
     drive: tuple[float, float, float] = DRIVE_SPREAD
@@ -48,7 +47,6 @@ class Prior:
         spread[layout.elastic] = self.elastic
         spread[layout.friction] = self.friction
         spread[layout.offset], spread[layout.creep] = self.offset, self.creep
-        spread[layout.rest] = self.smooth
         spread[layout.drive] = self.drive[: layout.drive.stop - layout.drive.start]
         return spread
 
@@ -62,7 +60,7 @@ class Prior:
 
 PRIOR = Prior()
 #: prior of a muscle that was replaced or whose tendon was renewed, around its earlier parameters
-REOPENED = Prior(attachment=0.004, elastic=0.3, offset=0.03, smooth=0.001)
+REOPENED = Prior(attachment=0.004, elastic=0.3, offset=0.03)
 
 
 class MusclePrior(NamedTuple):

@@ -1,27 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
 """The remainder: what the samples show of the lengths, and the calibrated body cannot express.
 
-    l_i(θ, T) = body_i(θ, T; w_i) + g_i(θ, T),   g_i ~ GP(0, k),   l_i measured with noise σ_i
+    l_i(θ, T) = body_i(θ, T; w_i) + g_i(θ, T),   g_i ~ GP(0, k_i),   l_i measured with noise σ_i
 
-    k = a² exp(−‖(θ − θ')/(b R)‖²/2 − ‖(T − T')/(c T_limit)‖²/2)
+    k_i = a² (1 + q/(2ν))^−ν
+    q = ‖(θ − θ')_c/(b R)‖² + ‖(θ − θ')_u/(e b R)‖² + ‖(T − T')/(c T_limit)‖²
 
-R are the joint ranges. g depends on all joints and tensions of a group, whereas the constants of
-the body affect only muscles that cross a joint. It represents, for example, an elastic body whose
-links bend together, or tendons that stretch unlike their model.
+R are the joint ranges, (…)_c has the joints that muscle i crosses, and (…)_u those that it does not
+cross. With a large e, g depends only on the joints that a muscle crosses, for example because
+tendons wrap round bones. With e near 1, all joints change all lengths, for example because the
+links of an elastic body bend together. A small c means that tendons stretch unlike their model.
+With a large ν, g is smooth on one scale. With ν near 1, it varies on many scales: it may be rough,
+for example where tendons become slack, and still far samples tell something.
 
-The samples decide how far the body is trusted. The amplitude a, the scales b and c and the noise
-are those with the largest evidence, which is the probability of the lengths after the parameters w
-of the body have been integrated out over their prior:
+The samples decide how far the body is trusted. The amplitude a, the scales b, e and c, the shape ν
+and the noise σ are those with the largest evidence, which is the probability of the lengths after
+the parameters w of the body have been integrated out over their prior:
 
     l_i − l_i(θ, T; w̄_i) ~ N(0, J_i S_i² J_iᵀ + k + σ² diag(1/ω_i)),   J_i = ∂l_i/∂w_i
 
 S are the spreads of the prior, and ω the robust weights of the fit. If the body explains the
 lengths, a falls to nearly zero. If it does not, g approaches the true lengths with more samples.
+
+The errors of g are correlated between muscles, for example if one slack tendon lets the link move,
+which changes all other lengths. The correlation is that of the errors of each sample's lengths if
+they are predicted from all other samples.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -29,7 +37,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 
-from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -37,14 +45,18 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
     from musculoskeletal_ae.body_model.priors import MusclePrior
 
-#: Unknowns of the evidence are the natural logarithms of a, b, c and σ, relative to these units:
-#: [m], joint ranges, T_limit and [m].
-UNITS = np.array([0.002, 0.5, 1.0, 0.001])
-USUAL = np.array([-1.5, 0.5, 2.0, -2.0])  # means of their prior
-SPREAD = np.array([2.0, 0.4, 1.0, 1.5])  # standard deviations of their prior
-BOUNDS = ((-8.0, 4.0), (-1.5, 3.0), (-1.5, 4.0), (-1.2, 3.0))
+#: Unknowns of the evidence are the natural logarithms of a, b, e, c, ν and σ, relative to these
+#: units: [m], joint ranges, 1, T_limit, 1 and [m].
+UNITS = np.array([0.002, 0.5, 1.0, 1.0, 1.0, 0.001])
+USUAL = np.array([-1.5, 0.5, 1.0, 2.0, 1.0, -2.0])  # means of their prior
+SPREAD = np.array([2.0, 0.4, 1.0, 1.0, 1.0, 1.5])  # standard deviations of their prior
+BOUNDS = ((-8.0, 4.0), (-1.5, 3.0), (0.0, 4.0), (-1.5, 4.0), (0.0, 3.5), (-2.5, 3.0))
 #: initial values of a search: a trusted body, a wrong body, and one with a rough remainder
-STARTS = USUAL, USUAL + [2.5, 0.0, 0.0, 0.0], USUAL + [3.0, -1.0, 0.0, 1.0]
+STARTS = (
+    USUAL,
+    USUAL + [2.5, 0.0, 0.0, 0.0, 0.0, 0.0],
+    USUAL + [3.0, -1.0, -1.0, 0.0, 0.0, 1.0],
+)
 #: Number of samples below which each search begins with STARTS. The evidence of few samples has
 #: several maxima, which change with each sample. Later searches continue from the last result.
 FEW_SAMPLES = 60
@@ -83,9 +95,8 @@ class Lengths(NamedTuple):
         """
         poses, deviation, by_body = body.poses(observed.theta), list[Array](), list[Array]()
         for m, prior in enumerate(priors):
-            smooth = body.smooth[m].at(observed.theta)
             tension, direction = observed.tension[:, m], observed.direction[:, m]
-            length, jacobian = body.linearised(poses, smooth, tension, direction, m, observed.age)
+            length, jacobian = body.linearised(poses, tension, direction, m, observed.age)
             moved = jacobian @ (body.parameters[m] - prior.mean)
             deviation.append(observed.length[:, m] - length + moved)
             by_body.append(jacobian * prior.spread)
@@ -104,28 +115,44 @@ class GroupRemainder:
     joints: Ints
     muscles: Ints
     scale: Array  # units of the inputs: R of the joints, T_limit of the muscles, (D+M,)
-    logarithms: Array  # natural logarithms of a, b, c and σ in units of UNITS, (4,)
+    crossed: Bools  # whether each muscle crosses each joint, (M, D)
+    logarithms: Array  # natural logarithms of a, b, e, c, ν and σ in units of UNITS, (6,)
     inputs: Array  # θ and T of the samples in units of `scale`, (N, D+M)
-    weights: Array  # α, (N, M): g = k(·, inputs) α
-    #: error of each length that is predicted from all other samples [m], (N, M)
-    left_out: Array
-    #: lower Cholesky factor of k + σ² diag(1/ω), with the mean ω of all muscles, (N, N)
-    root: Array
+    weights: Array  # α, (N, M): g_i = k_i(·, inputs) α_i
+    #: lower Cholesky factor of the correlation between the errors of the g_i, (M, M)
+    correlation: Array
+    #: lower Cholesky factor of k + σ² diag(1/ω) for each row of `crossed` that differs, with the
+    #: mean ω of all muscles, (N, N) each
+    roots: tuple[Array, ...]
 
     def at(self, theta: Array, tension: Array) -> Array:
         """Return g [m] of the group's muscles, (N, M), for θ and T of the whole body."""
-        return self._covariance(theta, tension) @ self.weights
+        result = np.empty((len(theta), len(self.muscles)))
+        for own, covariance in self._covariances(theta, tension):
+            result[:, own] = covariance @ self.weights[:, own]
+        return result
 
     def spread(self, theta: Array, tension: Array) -> Array:
-        """Return the posterior standard deviation of each g_i for a known body [m], (N,)."""
-        covariance = self._covariance(theta, tension)
-        known = np.square(solve_triangular(self.root, covariance.T, lower=True)).sum(axis=0)
+        """Return the posterior standard deviation of each g_i for a known body [m], (N, M)."""
+        result = np.empty((len(theta), len(self.muscles)))
         amplitude = _constants(self.logarithms)[0]
-        return np.sqrt(np.maximum(amplitude**2 - known, 0.0))
+        parts = zip(self._covariances(theta, tension), self.roots, strict=True)
+        for (own, covariance), root in parts:
+            known = np.square(solve_triangular(root, covariance.T, lower=True)).sum(axis=0)
+            result[:, own] = np.sqrt(np.maximum(amplitude**2 - known, 0.0))[:, None]
+        return result
 
-    def _covariance(self, theta: Array, tension: Array) -> Array:
+    def text(self) -> str:
+        """Return the constants as text."""
+        amplitude, by_theta, ratio, by_tension, tail, noise = _constants(self.logarithms)
+        scales = f'b {by_theta:.2f}, e {ratio:.1f}, c {by_tension:.1f}, ν {tail:.1f}'
+        return f'a {1e3 * amplitude:.1f} mm, {scales}, σ {1e3 * noise:.2f} mm'
+
+    def _covariances(self, theta: Array, tension: Array) -> Iterator[tuple[Ints, Array]]:
+        """Yield muscles that cross the same joints, and k between given states and the samples."""
         inputs = np.hstack([theta[:, self.joints], tension[:, self.muscles]]) / self.scale
-        return _kernel(_squares(inputs, self.inputs, len(self.joints)), self.logarithms)
+        for joints, own in _alike(self.crossed):
+            yield own, _covariance(inputs, self.inputs, joints, self.logarithms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,14 +174,21 @@ class Remainder:
             result[:, group.muscles] = group.at(theta, tension)
         return result if self.before is None else result + self.before.at(theta, tension)
 
+    def covariance(self, theta: Array, tension: Array) -> Array:
+        """Return the posterior covariance of g [m²] in each state for a known body, (N, M, M)."""
+        result = np.zeros((len(theta), self.muscle_count, self.muscle_count))
+        for group in self.groups:
+            root = group.spread(theta, tension)[..., None] * group.correlation
+            result[:, group.muscles[:, None], group.muscles] = root @ root.swapaxes(1, 2)
+        return result
+
     def drawn_error(self, theta: Array, tension: Array, rng: np.random.Generator) -> Array:
-        """Draw the error of g [m] (N, M) from its posterior, independently for each sample."""
+        """Draw the error of g [m] (N, M) from its posterior, independently for each state."""
         result = np.zeros((len(theta), self.muscle_count))
         for group in self.groups:
-            spread = group.spread(theta, tension)[:, None]
-            result[:, group.muscles] = spread * rng.standard_normal(
-                (len(theta), len(group.muscles))
-            )
+            spread = group.spread(theta, tension)
+            drawn = rng.standard_normal(spread.shape) @ group.correlation.T
+            result[:, group.muscles] = spread * drawn
         return result
 
 
@@ -199,8 +233,8 @@ def group_remainder(
         joints: Joints of the group.
         muscles: Muscles of the group.
         lengths: The samples.
-        start: Logarithms of a, b, c and σ from which the search starts; None to search from the
-            beginning.
+        start: Logarithms of a, b, e, c, ν and σ from which the search starts; None to search from
+            the beginning.
     """
     ranges = (robot.upper - robot.lower)[joints]
     scale = np.concatenate([ranges, robot.tension.limit[muscles]])
@@ -210,7 +244,8 @@ def group_remainder(
     rows = np.arange(count)
     if count > JUDGING:
         rows = np.linspace(0, count - 1, JUDGING).astype(int)
-    evidence = _Evidence(lengths.part(rows), scale)
+    crossed = robot.routes.crossed[np.ix_(muscles, joints)]
+    evidence = _Evidence(lengths.part(rows), scale, crossed)
     is_fresh = start is None or count < FEW_SAMPLES
     starts = [*([] if start is None else [start]), *(STARTS if is_fresh else [])]
     rounds = ROUNDS if is_fresh else FEW_ROUNDS
@@ -222,82 +257,130 @@ def group_remainder(
     ]
     logarithms = min(found, key=lambda result: result.fun).x
     inputs = np.hstack([lengths.theta, lengths.tension]) / scale
-    kernel = _kernel(_squares(inputs, inputs, len(joints)), logarithms)
-    weights, left_out = [], []
-    for m in range(len(muscles)):
-        noise = _variances(lengths.weight[:, m], logarithms)
-        covariance = kernel + lengths.by_body[m] @ lengths.by_body[m].T + np.diag(noise)
-        inverse = cho_solve((cholesky(covariance, lower=True), True), np.eye(count))
-        weights.append(inverse @ lengths.deviation[m])
-        left_out.append(weights[-1] / np.diag(inverse))
-    of_muscles, errors = (np.stack(part, axis=1) for part in (weights, left_out))
-    noise = _variances(lengths.weight.mean(axis=1), logarithms)
-    root = cholesky(kernel + np.diag(noise), lower=True)
-    return GroupRemainder(joints, muscles, scale, logarithms, inputs, of_muscles, errors, root)
+    weights, scores = (np.zeros((count, len(muscles))) for _ in range(2))
+    roots, mean_noise = list[Array](), _variances(lengths.weight.mean(axis=1), logarithms)
+    for of_joints, alike in _alike(crossed):
+        kernel = _covariance(inputs, inputs, of_joints, logarithms)
+        roots.append(cholesky(kernel + np.diag(mean_noise), lower=True))
+        for m in alike:
+            noise = _variances(lengths.weight[:, m], logarithms)
+            covariance = kernel + lengths.by_body[m] @ lengths.by_body[m].T + np.diag(noise)
+            inverse = cho_solve((cholesky(covariance, lower=True), True), np.eye(count))
+            weights[:, m] = inverse @ lengths.deviation[m]
+            # The error of a length predicted from all other samples is α_n/(K⁻¹)_nn, and its
+            # variance 1/(K⁻¹)_nn.
+            used = lengths.weight[:, m] > 0.0
+            scores[used, m] = (weights[:, m] / np.sqrt(np.diag(inverse)))[used]
+    correlation = _correlation(scores)
+    return GroupRemainder(
+        joints, muscles, scale, crossed, logarithms, inputs, weights, correlation, tuple(roots)
+    )
+
+
+def _correlation(scores: Array) -> Array:
+    """Return the lower Cholesky factor of the correlation between the errors of M muscles.
+
+    Few samples cannot distinguish a correlation from chance. Therefore M more samples are added,
+    whose errors are not correlated.
+
+    Args:
+        scores: Errors in standard deviations, (N, M); 0 where they are unknown.
+    """
+    product = scores.T @ scores + scores.shape[1] * np.eye(scores.shape[1])
+    size = np.sqrt(np.diag(product))
+    root: Array = cholesky(product / np.outer(size, size), lower=True)
+    return root
 
 
 class _Evidence:
-    """Negative logarithm of the evidence, and its derivatives by the four logarithms."""
+    """Negative logarithm of the evidence, and its derivatives by the six logarithms."""
 
-    def __init__(self, lengths: Lengths, scale: Array) -> None:
+    def __init__(self, lengths: Lengths, scale: Array, crossed: Bools) -> None:
         self._lengths = lengths
         inputs = np.hstack([lengths.theta, lengths.tension]) / scale
-        self._squares = _squares(inputs, inputs, lengths.theta.shape[1])
+        self._alike = [(_parts(inputs, joints), muscles) for joints, muscles in _alike(crossed)]
         self._by_body = [part @ part.T for part in lengths.by_body]
 
     def __call__(self, logarithms: Array) -> tuple[float, Array]:
-        kernel = _kernel(self._squares, logarithms)
-        value, identity = 0.0, np.eye(len(kernel))
-        common, by_noise = np.zeros_like(kernel), 0.0
-        for m, by_body in enumerate(self._by_body):
-            noise = _variances(self._lengths.weight[:, m], logarithms)
-            try:
-                root = cholesky(by_body + kernel + np.diag(noise), lower=True, check_finite=False)
-            except LinAlgError:
-                return 1e12, np.zeros(4)
-            inverse = cho_solve((root, True), identity, check_finite=False)
-            weights = inverse @ self._lengths.deviation[m]
-            value += 0.5 * float(weights @ self._lengths.deviation[m])
-            value += float(np.log(np.diag(root)).sum())
-            slope = inverse - np.outer(weights, weights)
-            common += slope
-            used = self._lengths.weight[:, m] > 0.0
-            by_noise += float(np.diag(slope)[used] @ noise[used])
-        _, by_theta, by_tension, _ = _constants(logarithms)
-        angles, tensions = self._squares
+        identity = np.eye(len(self._lengths.theta))
+        _, by_theta, ratio, by_tension, tail, _ = _constants(logarithms)
         deviation = (logarithms - USUAL) / SPREAD
-        weighted = common * kernel
-        gradient = np.array(
-            [
-                weighted.sum(),
-                0.5 * (weighted * angles).sum() / by_theta**2,
-                0.5 * (weighted * tensions).sum() / by_tension**2,
-                by_noise,
-            ]
-        )
-        return value + 0.5 * float(deviation @ deviation), gradient + deviation / SPREAD
+        value, gradient = 0.5 * float(deviation @ deviation), deviation / SPREAD
+        for (crossed, others, tensions), muscles in self._alike:
+            distance = crossed / by_theta**2 + others / (ratio * by_theta) ** 2
+            distance += tensions / by_tension**2
+            kernel = _kernel(distance, logarithms)
+            common = np.zeros_like(kernel)
+            for m in muscles:
+                noise = _variances(self._lengths.weight[:, m], logarithms)
+                covariance = self._by_body[m] + kernel + np.diag(noise)
+                try:
+                    root = cholesky(covariance, lower=True, check_finite=False)
+                except LinAlgError:
+                    return 1e12, np.zeros(len(logarithms))
+                inverse = cho_solve((root, True), identity, check_finite=False)
+                weights = inverse @ self._lengths.deviation[m]
+                value += 0.5 * float(weights @ self._lengths.deviation[m])
+                value += float(np.log(np.diag(root)).sum())
+                slope = inverse - np.outer(weights, weights)
+                common += slope
+                used = self._lengths.weight[:, m] > 0.0
+                gradient[5] += float(np.diag(slope)[used] @ noise[used])
+            relative = 0.5 * distance / tail
+            by_scale = 0.5 * common * kernel / (1.0 + relative)
+            of_others = (by_scale * others).sum() / (ratio * by_theta) ** 2
+            gradient[0] += (common * kernel).sum()
+            gradient[1] += (by_scale * crossed).sum() / by_theta**2 + of_others
+            gradient[2] += of_others
+            gradient[3] += (by_scale * tensions).sum() / by_tension**2
+            by_tail = relative / (1.0 + relative) - np.log1p(relative)
+            gradient[4] += 0.5 * tail * (common * kernel * by_tail).sum()
+        return value, gradient
+
+
+def _alike(crossed: Bools) -> Iterator[tuple[Bools, Ints]]:
+    """Yield each set of joints (D,) that some muscles cross, and the indices of these muscles."""
+    joints, place = np.unique(crossed, axis=0, return_inverse=True)
+    for n, own in enumerate(joints):
+        yield own, np.flatnonzero(place.ravel() == n)
 
 
 def _constants(logarithms: Array) -> Array:
-    """Return a [m], b, c and σ [m]."""
+    """Return a [m], b, e, c, ν and σ [m]."""
     constants: Array = UNITS * np.exp(logarithms)
     return constants
 
 
-def _squares(one: Array, other: Array, joints: int) -> tuple[Array, Array]:
-    """Return squared distances between inputs by angles and by tensions, (N, K) each."""
-    parts = (one[:, :joints], other[:, :joints]), (one[:, joints:], other[:, joints:])
-    by_angle, by_tension = (
-        np.maximum(np.square(a).sum(axis=1)[:, None] + np.square(b).sum(axis=1) - 2 * a @ b.T, 0.0)
-        for a, b in parts
-    )
-    return by_angle, by_tension
+def _parts(inputs: Array, crossed: Bools) -> list[Array]:
+    """Return squared distances of inputs by crossed joints, other joints and tensions, (N, N)."""
+    joints, of_tensions = inputs[:, : len(crossed)], inputs[:, len(crossed) :]
+    parts = joints[:, crossed], joints[:, ~crossed], of_tensions
+    return [_squares(part, part) for part in parts]
 
 
-def _kernel(squares: Sequence[Array], logarithms: Array) -> Array:
-    amplitude, by_theta, by_tension, _ = _constants(logarithms)
-    exponent = squares[0] / by_theta**2 + squares[1] / by_tension**2
-    kernel: Array = amplitude**2 * np.exp(-0.5 * exponent)
+def _covariance(one: Array, other: Array, crossed: Bools, logarithms: Array) -> Array:
+    """Return k between inputs (N, D+M) and (K, D+M) of muscles that cross some joints, (N, K)."""
+    _, by_theta, ratio, by_tension, _, _ = _constants(logarithms)
+    scale = np.full(one.shape[1], by_tension)
+    scale[: len(crossed)] = by_theta * np.where(crossed, 1.0, ratio)
+    return _kernel(_squares(one / scale, other / scale), logarithms)
+
+
+def _squares(one: Array, other: Array) -> Array:
+    """Return the squared distances between inputs, (N, K)."""
+    squares = np.square(one).sum(axis=1)[:, None] + np.square(other).sum(axis=1)
+    squares -= 2.0 * one @ other.T
+    return np.maximum(squares, 0.0, out=squares)
+
+
+def _kernel(distance: Array, logarithms: Array) -> Array:
+    """Return k for values of q, in the same shape."""
+    constants = _constants(logarithms)
+    amplitude, tail = constants[0], constants[4]
+    kernel = np.log1p(distance * (0.5 / tail))
+    kernel *= -tail
+    np.exp(kernel, out=kernel)
+    kernel *= amplitude**2
     return kernel
 
 
@@ -305,5 +388,5 @@ def _variances(weight: Array, logarithms: Array) -> Array:
     """Return the variance of measured lengths with robust weights ω (N,) [m²], (N,)."""
     variances = np.full(len(weight), UNKNOWN)
     used = weight > 0.0
-    variances[used] = _constants(logarithms)[3] ** 2 / weight[used] + JITTER
+    variances[used] = _constants(logarithms)[5] ** 2 / weight[used] + JITTER
     return variances

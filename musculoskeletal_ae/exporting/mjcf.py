@@ -2,7 +2,7 @@
 """Export a learned body as an MJCF model, and compare the model with the network.
 
 Links, joints, limits and masses are those of the robot directory. Route points are learned: the
-calibrated body without a residual model is fitted to the network (`body_model.fit.fit_to_network`).
+calibrated body without a remainder is fitted to the network (`body_model.fit.fit_to_network`).
 Each tendon has an actuator that represents a motor and its series elastic element. The control u is
 the length of the tendon at which the element is slack:
 
@@ -136,7 +136,7 @@ def export_into(robot: Robot, mae: Mae, file: Path, out: Path, seed: int = 0) ->
         )
     with new_directory(out, refuse):
         robot = robot.with_elasticity(mae.elasticity)
-        body = CalibratedBody.of_straight_lines(robot)
+        body = CalibratedBody(robot)
         fit_to_network(body, mae, seed, with_remainder=False)
         learned = learned_routes(robot, body, mae, places)
         for route, moved in zip(robot.description.routes, learned.routes, strict=True):
@@ -185,7 +185,7 @@ def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> ExportReport:
 
 def _write(robot: Robot, mae: Mae, out: Path, seed: int) -> ExportReport:
     robot = robot.with_elasticity(mae.elasticity)
-    body = CalibratedBody.of_straight_lines(robot)
+    body = CalibratedBody(robot)
     fit_to_network(body, mae, seed, with_remainder=False)
     learned = learned_routes(robot, body, mae)
     moved = Robot(replace(robot.description, routes=learned.routes))

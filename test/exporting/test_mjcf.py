@@ -123,7 +123,7 @@ def test_a_muscle_keeps_points_if_learned_ones_are_worse_or_make_its_length_jump
     learned, monkeypatch
 ):
     robot, _, mae, _ = learned
-    body, rng = CalibratedBody.of_straight_lines(robot), np.random.default_rng(0)
+    body, rng = CalibratedBody(robot), np.random.default_rng(0)
     fit_to_network(body, mae, with_remainder=False)
     layout = body.layouts[0]
     body.parameters[0][layout.attachment] += 0.05 * rng.normal(size=3 * len(layout.points))

@@ -8,6 +8,7 @@ import pytest
 
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.priors import PRIOR
+from musculoskeletal_ae.body_model.remainder import Remainder
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.samples import Observations, Sample, SampleStore
@@ -26,9 +27,34 @@ def initial(trained):
     return trained['default']
 
 
-def drawn_body(robot, features: int, seed: int, scale: float) -> CalibratedBody:
+class Wrapping(Remainder):
+    """Smooth length errors of each muscle that depend on the joints that it crosses.
+
+    They stand for tendons that wrap round bones.
+    """
+
+    def __init__(self, robot, scale: float, seed: int) -> None:
+        super().__init__(robot.muscle_count)
+        rng, waves = np.random.default_rng([seed, 0xF0]), 60
+        shape = robot.muscle_count, waves, robot.joint_count
+        crossed = robot.routes.crossed[:, None] / (0.35 * (robot.upper - robot.lower))
+        values = {
+            'frequency': rng.standard_normal(shape) * crossed,
+            'phase': rng.uniform(0.0, 2.0 * np.pi, shape[:2]),
+            'size': scale * 0.002 * np.sqrt(2.0 / waves) * rng.standard_normal(shape[:2]),
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def at(self, theta, tension):  # noqa: ARG002 (lengths do not depend on tensions here)
+        angles = np.einsum('mkd,nd->nmk', self.frequency, theta) + self.phase
+        return ((np.cos(angles) - np.cos(self.phase)) * self.size).sum(axis=2)
+
+
+def drawn_body(robot, wrapping: int, seed: int, scale: float) -> CalibratedBody:
     """Return a body drawn from the prior, with wrapping but without creep."""
-    body, rng = CalibratedBody(robot, seed=features), np.random.default_rng(seed)
+    body, rng = CalibratedBody(robot), np.random.default_rng(seed)
+    body.remainder = Wrapping(robot, scale, wrapping)
     for m, layout in enumerate(body.layouts):
         draw = np.insert(rng.standard_normal(layout.size - 1), layout.creep, 0.0)
         body.parameters[m] = PRIOR.mean(layout) + scale * PRIOR.spread(layout) * draw

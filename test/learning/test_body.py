@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from learning.conftest import drawn_body
-from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody, ResidualModel
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.fit import fit_body, fit_to_network
+from musculoskeletal_ae.body_model.remainder import Remainder
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -27,6 +28,7 @@ def test_a_body_without_corrections_is_the_geometric_model(arm26):
 def test_a_limb_alone_has_the_same_lengths_as_in_the_whole_body():
     robot, rng = Robot.load('musashi_upper_body'), np.random.default_rng(0)
     body = drawn_body(robot, 3, seed=1, scale=1.0)
+    body.remainder = Remainder(robot.muscle_count)
     theta, tension = robot.random_postures(5, rng), rng.uniform(0.0, 300.0, (5, robot.muscle_count))
     (length,) = body.lengths(theta, tension, 0.0 * tension)
     for joints, muscles in robot.groups[1:]:
@@ -42,31 +44,19 @@ def test_the_linearisation_is_the_derivative(other_body, arm26, m):
     rng = np.random.default_rng(m)
     theta, tension = arm26.random_postures(5, rng), rng.uniform(20.0, 200.0, 5)
     direction = rng.uniform(-1.0, 1.0, 5)
-    body = CalibratedBody(arm26, [p.copy() for p in other_body.parameters], seed=7)
-    poses, smooth = body.poses(theta), body.smooth[m].at(theta)
-    _, jacobian = body.linearised(poses, smooth, tension, direction, m)
+    body = CalibratedBody(arm26, [p.copy() for p in other_body.parameters])
+    poses = body.poses(theta)
+    _, jacobian = body.linearised(poses, tension, direction, m)
     step = 1e-6
     for k in range(body.layouts[m].size):
         at = body.parameters[m][k]
         values = []
         for sign in (1.0, -1.0):
             body.parameters[m][k] = at + sign * step
-            values.append(body.linearised(poses, smooth, tension, direction, m)[0])
+            values.append(body.linearised(poses, tension, direction, m)[0])
         body.parameters[m][k] = at
         slope = (values[0] - values[1]) / (2.0 * step)
         np.testing.assert_allclose(jacobian[:, k], slope, atol=1e-6)
-
-
-@pytest.mark.parametrize('joint', range(2))
-def test_the_slope_of_the_residual_model_is_its_derivative(other_body, arm26, joint):
-    theta, step = arm26.random_postures(5, np.random.default_rng(joint)), 1e-6 * np.eye(2)[joint]
-    for single in other_body.smooth:
-        smooth = ResidualModel(*(part.astype(float) for part in single))
-        (slope,) = smooth.slope(theta, np.array([joint]))
-        difference = smooth.at(theta + step) - smooth.at(theta - step)
-        np.testing.assert_allclose(slope, difference / 2e-6, atol=1e-7)
-        (shipped,) = single.slope(theta, np.array([joint]))
-        np.testing.assert_allclose(shipped, slope, atol=1e-5)
 
 
 def test_twenty_samples_leave_a_third_of_the_difference_to_the_geometric_model(arm26, stage):

@@ -69,6 +69,12 @@ def kernel_ridge(observed, states):
 
 
 @pytest.fixture
+def straight_stage(other_body):
+    """Return samples of a body whose tendons do not wrap round bones."""
+    return Stage(CalibratedBody(other_body.robot, other_body.parameters))
+
+
+@pytest.fixture
 def elastic_stage(other_body):
     """Return samples of a body, and states of it, to which a coupling was added."""
     stage = Stage(other_body)
@@ -107,8 +113,18 @@ def test_the_network_learns_that_lengths_far_from_all_samples_are_uncertain(arm2
     assert spread[far].mean() > 3.0 * spread[near].mean()
 
 
-def test_a_body_that_the_model_can_express_keeps_no_remainder(arm26, stage):
-    observed = stage.observations(60)
+def test_errors_that_muscles_have_in_common_are_expected_in_common(arm26, straight_stage):
+    observed = straight_stage.observations(60)
+    common = 0.005 * np.random.default_rng(0).standard_normal((60, 1))
+    body = fitted(arm26, replace(observed, length=observed.length + common))
+    theta = arm26.random_postures(500, np.random.default_rng(1))
+    tension = np.full((500, 6), 100.0)
+    drawn = body.remainder.drawn_error(theta, tension, np.random.default_rng(2))
+    assert np.corrcoef(drawn.T).min() > 0.5
+
+
+def test_a_body_that_the_model_can_express_keeps_no_remainder(arm26, straight_stage):
+    observed = straight_stage.observations(60)
     remainder = fitted(arm26, observed).remainder.at(observed.theta, observed.tension)
     assert np.abs(remainder).max() < 0.0002
 
@@ -149,9 +165,8 @@ def test_learning_continues_from_a_network_without_losing_its_remainder(
     assert error(again.body, states) < 0.5 * error(fitted(arm26, few), states)
 
 
-def test_the_update_reports_what_the_body_model_cannot_express(arm26, elastic_stage, initial):
-    stage, _ = elastic_stage
-    plain = stage.observations(40)
+def test_the_update_reports_what_the_body_model_cannot_express(arm26, straight_stage, initial):
+    plain = straight_stage.observations(40)
     sizes = [
         BodyUpdater(arm26, initial).update(Job(observed, NO_MESSAGES, True, 1)).remainder.max()
         for observed in (plain, coupled(plain))

@@ -46,8 +46,8 @@ from musculoskeletal_ae.robot.robot import Robot
 
 POSTURES = 300  # number of random postures over which variances are averaged
 SENSOR_NOISE = 0.0003  # standard deviation of the noise of a length [m]
-#: Width of the correlation ρ, as a share of the joint ranges. It is the width with which the
-#: learner's residual model varies (`body_model/calibrated_body.py`).
+#: Width of the correlation ρ, as a share of the joint ranges. The learner finds
+#: similar widths for tendons that wrap round bones (b in `body_model/remainder.py`).
 SMOOTHNESS = 0.35
 
 

@@ -1,0 +1,318 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of the learned estimate on recorded and emulated bodies, beside those of regressions.
+
+    python -m bench bodies neck:20 arm+effort:100:0 kin_0 foreign_1 --clones DIR --cache DIR
+
+A case is NAME[:COUNT[:DRAW]]. COUNT is the number of training samples, by default as many as the
+learner keeps, and DRAW the seed with which they are drawn. Names are
+
+    neck, arm, stand        recordings of `bench recordings` without payload, whose clones are in
+                            --clones; with `+effort`, efforts of the motors are the tensions
+    kin_SEED, foreign_SEED  rest samples of an emulated arm that explored for 5 minutes, tested on
+                            another minute. With `+coupled`, a smooth function of all joints with a
+                            standard deviation of 6 mm is added to each length. With `+blind`, the
+                            learner has no joint sensors
+
+Training rows of neck and arm come from every other pose or file, and test rows from those between.
+A line has the mean error ‖θ_est − θ‖ [rad] after some updates, the share of test errors in the 95 %
+ellipsoid, the error of the lengths of network and body [mm], the size of the remainder [mm] and its
+constants, the processor time of an update [s], and the errors of the regressions. With --body, only
+the body is fitted, and θ is estimated by least squares on it, with the covariance that the fit
+expects. This takes a quarter of the time. notes/real_bodies.md contains the figures.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from bench.learned_arm import initial
+from bench.recordings import clone_of
+from bench.recordings_learn import INITIAL_STEPS, STEPS, joined, tensions
+from bench.recordings_read import Files, Run, SoftLink, fitted, repositories
+from bench.regression import BASELINES
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.body_model.body_fit import BodyFit
+from musculoskeletal_ae.body_model.covariance import ellipsoids
+from musculoskeletal_ae.emulator.reality import make_arm
+from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.experiments.online_learning import teach
+from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, HELD_OUT_STREAM, record
+from musculoskeletal_ae.gauss_newton import minimise_each
+from musculoskeletal_ae.learning.calibration import Healthy
+from musculoskeletal_ae.learning.job import Job
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.samples import CAPACITY, Observations
+from musculoskeletal_ae.learning.trainer import Trainer
+from musculoskeletal_ae.learning.update import BodyUpdater
+from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.initial_training import initial_mae
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.options import Parser, whole
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.friction import directions
+
+ROBOT = 'musashi_left_arm'  # the emulated arm
+EXPLORED, HELD_OUT = 300.0, 60.0  # durations of exploration and test [s]
+THINNED = 10  # use every tenth message of the test
+MOST_ROWS = 1500  # largest number of test rows
+COUPLING = 0.006  # standard deviation of the coupling [m]
+MOST_FITTED = 150  # largest number of test rows for least squares
+#: least squares: step of finite differences [rad], typical step as a share of the joint ranges, and
+#: largest number of iterations
+DIFFERENCE, USUAL_STEP, ROUNDS = 1e-4, 0.1, 15
+RECORDINGS = {'neck': 'soft_neck', 'arm': 'soft_arm', 'stand': 'continuum_stand'}
+
+
+class Case(NamedTuple):
+    """A robot with samples to learn from and to test with."""
+
+    robot: Robot
+    initial: Mae
+    training: Observations
+    test: Observations
+    healthy: Healthy
+
+
+class Never(Trainer):
+    """A trainer that never updates."""
+
+    ready = False
+
+
+def _observed(theta: Array, tension: Array, length: Array) -> Observations:
+    known = np.ones(length.shape, dtype=bool)
+    return Observations(theta, tension, length, np.zeros_like(length), known)
+
+
+def _nothing(robot: Robot) -> Healthy:
+    return Healthy(np.empty((0, 3 * robot.muscle_count), dtype=np.float32), 0.0, 0)
+
+
+def _divided(name: str, clones: Path) -> tuple[SoftLink, Run, Run]:
+    """Return a recording's link, and the rows without payload for training and for the test.
+
+    They are the same rows if any row may be either.
+    """
+    for repository in repositories():
+        if repository.recording != RECORDINGS[name]:
+            continue
+        clone = clone_of(repository, clones, fetch=False)
+        if clone is None:
+            raise MusculoskeletalError(f'{clones} has no clone of {repository.name}')
+        recording = repository.read(Files(clone))
+        assert isinstance(recording.link, SoftLink)  # as all in RECORDINGS are
+        runs = [run for run in recording.runs if not run.load > 0.0]
+        if name == 'arm':
+            return recording.link, joined(runs[0::2]), joined(runs[1::2])
+        run = runs[0]
+        if name == 'stand':
+            return recording.link, run, run
+        pose = np.searchsorted(run.rests[:, 1], np.arange(len(run.length)), side='right')
+        held_out = (pose % 2 == 1) & (pose < len(run.rests))
+        return recording.link, run.at(~held_out), run.at(held_out)
+    raise AssertionError(name)
+
+
+def recorded(name: str, count: int, draw: int, clones: Path, cache: Path) -> Case:
+    """Return the case of a recording with random training rows; its first network is cached."""
+    file = cache / f'initial_{name}_{count}_{draw}.safetensors'
+    name, _, effort = name.partition('+')
+    link, every, test = _divided(name, clones)
+    order = np.random.default_rng([draw, count]).permutation(len(every.length))
+    training = every.at(order[:count])
+    if test is every:
+        test = every.at(order[count:])
+        link, at_zero = fitted(link, training)
+        training, test = (replace(run, length=run.length - at_zero) for run in (training, test))
+    test = test.at(slice(None, None, max(1, len(test.length) // MOST_ROWS)))
+    with tempfile.TemporaryDirectory() as folder:
+        robot = Robot.load(link.write(Path(folder), 'sensor' if effort else 'none'))
+    tension = tensions(robot, training, bool(effort))
+    learned, asked = (_observed(run.theta, tension(run), run.length) for run in (training, test))
+    if not file.exists():
+        checkpoint.save(initial_mae(robot, steps=INITIAL_STEPS, seed=0).mae, file)
+    return Case(robot, checkpoint.load(file, robot), learned, asked, _nothing(robot))
+
+
+def emulated(name: str, count: int, draw: int, cache: Path) -> Case:
+    """Return the case of an emulated arm; its samples are cached in a folder."""
+    individual, *options = name.split('+')
+    reality, _, seed = individual.partition('_')
+    robot = Robot.load(ROBOT)
+    driver, file = initial(robot, cache), cache / f'samples_{individual}.npz'
+    if not file.exists():
+        arrays: dict[str, Any] = dict(_explored(robot, driver, reality, int(seed)))
+        np.savez(file, **arrays)
+    with np.load(file) as stored:
+        training, test, learned, judging = (
+            Observations(*(stored[f'{part}_{n}'] for n in range(8)))
+            for part in ('training', 'test', 'learned', 'judging')
+        )
+    healthy = _nothing(robot)._replace(learned=learned, judging=judging)
+    if count < len(training):
+        order = np.random.default_rng([draw, count]).permutation(len(training))
+        training, healthy = training[np.sort(order[:count])], _nothing(robot)
+    if 'coupled' in options:
+        training, test, learned, judging = (
+            replace(part, length=part.length + coupling(robot, part.theta))
+            for part in (training, test, learned, judging)
+        )
+        if healthy.learned is not None:
+            healthy = healthy._replace(learned=learned, judging=judging)
+    if 'blind' in options:
+        training = replace(training, theta=np.full_like(training.theta, np.nan))
+        healthy = _nothing(robot)
+    return Case(robot, driver, training, test, healthy)
+
+
+def _explored(robot: Robot, driver: Mae, reality: str, seed: int) -> Iterator[tuple[str, Array]]:
+    """Record an individual, and yield the fields of its samples with their names."""
+    stream = EXPLORATION_STREAM + seed
+    exploring = record(make_arm(robot, seed, reality), driver, stream, EXPLORED)
+    held = record(make_arm(robot, seed, reality), driver, HELD_OUT_STREAM, HELD_OUT)
+    learner = Learner(robot, driver, seed=seed, trainer=Never)
+    teach(learner, zip(*exploring, strict=True))
+    healthy = learner.collector.healthy.healthy()
+    thin = slice(None, None, THINNED)
+    test = replace(
+        _observed(held.theta[thin], held.tension[thin], held.length[thin]),
+        direction=directions(held.length)[thin],
+    )
+    parts = learner.samples.observations(), test, healthy.learned, healthy.judging
+    for name, part in zip(('training', 'test', 'learned', 'judging'), parts, strict=True):
+        assert part is not None  # the joints of these individuals have sensors
+        for n, values in enumerate(vars(part).values()):
+            yield f'{name}_{n}', values
+
+
+def coupling(robot: Robot, theta: Array) -> Array:
+    """Return changes of all lengths [m] (N, M) that depend smoothly on all joints."""
+    rng, waves = np.random.default_rng(123), 40
+    frequency = rng.normal(0.0, 1.0, (waves, robot.joint_count))
+    frequency /= 0.6 * (robot.upper - robot.lower)
+    phase = rng.uniform(0.0, 2.0 * np.pi, waves)
+    size = rng.normal(0.0, 1.0, (waves, robot.muscle_count)) * COUPLING / np.sqrt(0.5 * waves)
+    changes: Array = (np.cos(theta @ frequency.T + phase) - np.cos(phase)) @ size
+    return changes
+
+
+def package(case: Case, updates: int, seed: int) -> str:
+    """Learn a case, and return its errors as text."""
+    updater, times = BodyUpdater(case.robot, case.initial, seed), list[float]()
+    for _ in range(updates):
+        begin = time.process_time()
+        update = updater.update(Job(case.training, case.healthy, True, STEPS))
+        times.append(time.process_time() - begin)
+    mae, test, body = update.mae, case.test, updater.body
+    end = test.end_tension(mae.transmission)
+    error = mae.estimate(end, test.length).theta - test.theta
+    (of_body,) = body.lengths(test.theta, test.tension, test.direction)
+    of_network = mae.lengths(test.theta, end)
+    by_network, by_body = (
+        1e3 * np.sqrt(np.square(length - test.length).mean()) for length in (of_network, of_body)
+    )
+    assert mae.covariance is not None  # the method of preset default computes it
+    inside = (ellipsoids(mae.covariance, error) <= 1.0).mean()
+    constants = ' '.join(group.text() for group in body.remainder.groups)
+    return (
+        f'{np.linalg.norm(error, axis=1).mean():.4f} rad, {inside:.2f} inside, '
+        f'lengths {by_network:.2f} and {by_body:.2f} mm, '
+        f'remainder {1e3 * update.remainder.max():.2f} mm ({constants}), '
+        f'offsets up to {np.abs(body.zero).max():.4f} rad, '
+        f'{np.mean(times[1:] or times):.2f} s per update'
+    )
+
+
+def body_alone(case: Case, fits: int = 2) -> str:
+    """Fit the body without a network, and return the error of least squares on it as text."""
+    body_fit = BodyFit(case.robot, None)
+    for _ in range(fits):
+        fit = body_fit.fit(case.training, case.training.theta)
+    body, robot = body_fit.body, case.robot
+    rows = slice(None, None, max(1, len(case.test) // MOST_FITTED))
+    test = case.test[rows]
+    start = case.initial.estimate(test.end_tension(case.initial.transmission), test.length).theta
+
+    def length(theta: Array) -> Array:
+        return body.lengths(theta, test.tension, test.direction)[0]
+
+    def residuals(theta: Array) -> tuple[Array, Array]:
+        covariance = body.remainder.covariance(theta, test.tension) + np.diag(fit.noise**2)
+        white = np.linalg.inv(np.linalg.cholesky(covariance))
+        steps = DIFFERENCE * np.eye(robot.joint_count)
+        slope = [
+            (length(theta + step) - length(theta - step)) / (2.0 * DIFFERENCE) for step in steps
+        ]
+        return (white @ (length(theta) - test.length)[..., None])[..., 0], white @ np.stack(
+            slope, axis=-1
+        )
+
+    usual = (USUAL_STEP * (robot.upper - robot.lower)) ** -2.0
+    theta = minimise_each(residuals, start, usual, ROUNDS, bounds=(robot.lower, robot.upper))
+    error = np.linalg.norm(theta - test.theta, axis=1).mean()
+    constants = ' '.join(group.text() for group in body.remainder.groups)
+    return f'{error:.4f} rad by least squares on the body ({constants})'
+
+
+def regressions(case: Case) -> str:
+    """Return the errors of the baselines as text."""
+
+    def inputs(observed: Observations) -> Array:
+        return np.hstack([observed.length, observed.tension])
+
+    texts = []
+    for name, fit in BASELINES.items():
+        model = fit(inputs(case.training), case.training.theta)
+        error = np.linalg.norm(model(inputs(case.test)) - case.test.theta, axis=1).mean()
+        texts.append(f'{name} {error:.4f}')
+    return ', '.join(texts)
+
+
+def read_case(text: str, clones: Path | None, cache: Path) -> Case:
+    """Return the case that NAME[:COUNT[:DRAW]] names.
+
+    Raises:
+        MusculoskeletalError: If there is no such case, or its data are not given.
+    """
+    name, *numbers = text.split(':')
+    legal = f'{", ".join(RECORDINGS)}, kin_SEED or foreign_SEED, then :COUNT and :DRAW'
+    try:
+        count, draw = ([int(number) for number in numbers] + [CAPACITY, 0][len(numbers) :])[:2]
+    except ValueError as error:
+        raise MusculoskeletalError(f'case {text!r}: expected {legal}') from error
+    if name.partition('+')[0] in RECORDINGS:
+        if clones is None:
+            raise MusculoskeletalError(f'case {text!r} is a recording; give --clones')
+        return recorded(name, count, draw, clones, cache)
+    if name.startswith(('kin_', 'foreign_')):
+        return emulated(name, count, draw, cache)
+    raise MusculoskeletalError(f'case {text!r}: expected {legal}')
+
+
+def main(argv: list[str]) -> None:
+    """Print one line for each case."""
+    parser = Parser('bodies', (__doc__ or '').partition('\n')[0])
+    parser.add_argument('cases', nargs='+', metavar='CASE', help='NAME[:COUNT[:DRAW]]')
+    parser.add_argument('--clones', type=Path, help='directory with clones of the recordings')
+    help_cache = 'directory for first networks, and for samples of emulated arms'
+    parser.add_argument('--cache', type=Path, required=True, help=help_cache)
+    parser.add_argument('--updates', type=whole(1, 100), default=6, help='number of updates')
+    parser.add_argument('--seed', type=whole(0, 10**6), default=0, help='seed of the training')
+    parser.add_argument('--body', action='store_true', help='fit the body without a network')
+    parser.add_argument('--baselines', action='store_true', help='also fit the regressions')
+    args = parser.parse_args(argv)
+    torch.set_num_threads(1)
+    args.cache.mkdir(parents=True, exist_ok=True)
+    for text in args.cases:
+        case = read_case(text, args.clones, args.cache)
+        line = body_alone(case) if args.body else package(case, args.updates, args.seed)
+        also = f'; {regressions(case)}' if args.baselines else ''
+        print(f'{text} ({len(case.training)} samples): {line}{also}', flush=True)
