@@ -29,7 +29,7 @@ from musculoskeletal_ae.emulator.modules import STEP, Command, Modules, MuscleSt
 from musculoskeletal_ae.emulator.wrapping import Placed
 from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.kinematics import joint_space_inertia
-from musculoskeletal_ae.robot.passive_tendons import add_passive
+from musculoskeletal_ae.robot.passive_torque import add_passive
 from musculoskeletal_ae.robot.robot import Robot
 
 SLIDING_DISTANCE = 0.0005  # sliding distance over which tendon friction builds up [m]

@@ -19,10 +19,11 @@ from typing import TYPE_CHECKING, NamedTuple, SupportsIndex
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 
-if TYPE_CHECKING:  # a slow import, which the parameters of the nodes do not need
+if TYPE_CHECKING:  # slow imports, which the parameters of the nodes do not need
     import pinocchio as pin
+
+    from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 
 PRISMATIC = ('JointModelPX', 'JointModelPY', 'JointModelPZ', 'JointModelPrismaticUnaligned')
 #: count this travel of a prismatic joint as one radian [m]: the radius of the assumed pinion

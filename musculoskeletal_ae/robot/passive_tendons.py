@@ -21,7 +21,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 
@@ -34,58 +33,6 @@ class Passive(NamedTuple):
     coefficient: Array  # c [m/rad^p], (R,)
     first: Ints  # index of the first term of each tendon, then R, (T+1,)
     law: Array  # k [N/m], x_low and x_high [m] of each tendon, (T, 3)
-
-
-@njit(cache=True)
-def monomial(passive: Passive, term: int, theta: Array, a: int, b: int) -> float:
-    """Return a term of a length at θ (D,), differentiated by θ_a and θ_b; −1 stands for neither."""
-    value = passive.coefficient[term]
-    for j in range(len(theta)):
-        power, order = passive.power[term, j], int(j == a) + int(j == b)
-        if order > power:
-            return 0.0
-        for i in range(order):
-            value *= power - i
-        value *= (theta[j] - passive.centre[j]) ** (power - order)
-    return value
-
-
-@njit(cache=True)
-def add_passive(passive: Passive, theta: Array, torque: Array, gradient: Array) -> None:
-    """Add what holds joints at θ (D,) against passive tendons to `torque` [N·m] and `gradient`.
-
-    `gradient` [N·m/rad] (D, D) is the derivative of `torque` (D,) with respect to θ.
-    """
-    joints = len(theta)
-    slope = np.empty(joints)
-    for t in range(len(passive.law)):
-        terms = range(passive.first[t], passive.first[t + 1])
-        stiffness, low, high = passive.law[t]
-        length = 0.0
-        for r in terms:
-            length += monomial(passive, r, theta, -1, -1)
-        if low <= length <= high:
-            continue
-        force = stiffness * (length - (high if length > high else low))
-        slope[:] = 0.0
-        for j in range(joints):
-            for r in terms:
-                if passive.power[r, j]:
-                    slope[j] += monomial(passive, r, theta, j, -1)
-        for j in range(joints):
-            torque[j] += force * slope[j]
-            for i in range(joints):
-                gradient[j, i] += stiffness * slope[j] * slope[i]
-                for r in terms:
-                    if passive.power[r, j] and passive.power[r, i]:
-                        gradient[j, i] += force * monomial(passive, r, theta, j, i)
-
-
-@njit(cache=True)
-def hold_postures(passive: Passive, theta: Array, torque: Array, gradient: Array) -> None:
-    """Call `add_passive` for N postures: θ (N, D), `torque` (N, D) and `gradient` (N, D, D)."""
-    for n in range(len(theta)):
-        add_passive(passive, theta[n], torque[n], gradient[n])
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +83,9 @@ class PassiveTendons:
         theta = np.asarray(theta, dtype=float)
         rows = np.ascontiguousarray(theta.reshape(-1, theta.shape[-1]))
         torque, gradient = np.zeros(rows.shape), np.zeros((*rows.shape, rows.shape[1]))
+        # numba is a slow import, which help texts do not need
+        from musculoskeletal_ae.robot.passive_torque import hold_postures
+
         hold_postures(self.arrays, rows, torque, gradient)
         return torque.reshape(theta.shape), gradient.reshape(*theta.shape, theta.shape[-1])
 

@@ -63,6 +63,11 @@ def test_learning_from_one_recording_improves_the_estimate_of_another(robot, tea
     assert error(learner.mae, other) < 0.6 * error(mae, other)
 
 
+def enough(*_, enough, **__):
+    """Count the resting postures of a recording as enough to learn from."""
+    return enough
+
+
 def spoiled(path, kind, seconds=60.0):
     """Write the begin of a recording with false joint angles; return the bag."""
     bag = Bag.open(BAGS / 'exploration')
@@ -248,6 +253,7 @@ def test_estimated_joint_sensor_offsets_are_shown_and_the_error_without_them(
         learner.scheduler.updates = 1
 
     monkeypatch.setattr(recording_learning, 'read', lambda *_: recording)
+    monkeypatch.setattr(recording_learning, 'count_postures', enough)
     monkeypatch.setattr(recording_learning, 'learn_table', learned)
     arguments = ['--robot', 'arm26', '--from-bag', 'BAG', '--out', str(tmp_path / 'x.safetensors')]
     assert main([*arguments, '--checkpoint', trained_file]) == 0
@@ -273,6 +279,7 @@ def test_ctrl_c_keeps_what_was_learned_and_leaves_the_earlier_network(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(recording_learning, 'read', lambda *_: recording)
+    monkeypatch.setattr(recording_learning, 'count_postures', enough)
     monkeypatch.setattr(recording_learning, 'learn_table', interrupted)
     out, kept = tmp_path / 'out.safetensors', tmp_path / 'out.interrupted.safetensors'
     out.write_text('an earlier network')
@@ -362,6 +369,7 @@ def learned_from_bag(arm26, initial, monkeypatch, tmp_path):
     monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
     monkeypatch.setattr(model_training, 'initial_mae', trained)
     monkeypatch.setattr(recording_learning, 'read', lambda *_: recording)
+    monkeypatch.setattr(recording_learning, 'count_postures', enough)
     monkeypatch.setattr(recording_learning, 'learn_table', learned)
 
     def run(*options):

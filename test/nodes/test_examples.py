@@ -70,4 +70,5 @@ def test_an_example_ends_silently_after_a_stop_signal_at_any_moment(graph, name,
 
 
 def test_every_example_in_python_is_tested_here():
-    assert {file.relative_to(EXAMPLES).as_posix() for file in EXAMPLES.rglob('*.py')} == set(FIRST)
+    nodes = {file.relative_to(EXAMPLES).as_posix() for file in EXAMPLES.rglob('*.py')}
+    assert nodes - {'make_csv.py'} == set(FIRST)  # test/tables tests this one

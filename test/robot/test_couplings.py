@@ -236,7 +236,7 @@ WRAP = {'wrap': 'cylinder', 'link': 'upper', 'xyz': [0, 0, 0], 'axis': [0, 0, 1]
     ('place', 'change', 'expected'),
     [
         (0, {}, 'a point before and after each wrap'),
-        (1, {'wrap': 'cone'}, "one of cylinder, sphere, got 'cone'"),
+        (1, {'wrap': 'cone'}, "one of cylinder, pulley, sphere, got 'cone'"),
         (1, {'radius': 0.0}, '> 0'),
         (1, {'side': [0, 0, 1]}, 'beside the axis'),
     ],

@@ -203,7 +203,7 @@ MUSCLES = {
     ),
     'keys of a wrap at a point': Row(
         (at((*ROUTE, 1, 'radius'), 0.01),),
-        'radius, side and side_link need wrap: sphere or wrap: cylinder',
+        'radius, side and side_link need wrap: sphere, wrap: cylinder or wrap: pulley',
         (without(*ROUTE, 1, 'radius'), in_order(
             within(*ROUTE, index=2, entry=POINT), of_wrap('wrap', 'sphere'))),
     ),

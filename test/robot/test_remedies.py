@@ -7,6 +7,7 @@ afterwards check_robot has neither this finding nor a fault.
 """
 
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +19,7 @@ from robots import (
     copy_robot,
     read_muscles,
     write_muscles,
+    write_platform,
     write_robot,
 )
 
@@ -30,6 +32,7 @@ POSTURES = 40
 #: findings that have no row here
 EXCEPTIONS = {
     'small_joints': 'the remedy changes the expectations of the reader, not the robot',
+    'suspended': 'the remedy changes the expectations of the reader, not the robot',
     'not_held': 'test_check_robot.py tries what `remedies` computes',
     'not_stiff': 'test_check_robot.py tries what `remedies` computes',
 }
@@ -118,6 +121,22 @@ def arm26(*edits):
         copy_robot('arm26', directory)
         for edit in edits:
             edit(directory)
+
+    return write
+
+
+def platform(height=0.05, limit=150.0):
+    """Return a function that writes a platform on four tendons, in place of an earlier one.
+
+    `height` is that of the attachments [m], and `limit` the tension limit [N].
+    """
+
+    def write(directory, _=None):
+        shutil.rmtree(directory, ignore_errors=True)
+        write_platform(directory, height)
+        document = read_muscles(directory)
+        document['tension']['limit'] = limit
+        write_muscles(directory, document)
 
     return write
 
@@ -291,6 +310,14 @@ ROWS = {
     'idle_object, point inside': Row(
         arm26(with_object(radius=0.045)), 'no route point lies inside',
         [changed_object(radius=0.03)],
+    ),
+    'unstable': Row(
+        platform(height=-0.4), 'attach the muscles above the centre of mass of what they carry',
+        [platform()],
+    ),
+    'no_equilibrium': Row(
+        platform(limit=25.0), 'raise tension.limit',
+        [platform()],
     ),
     'no_inertia': Row(
         other(without_mass), 'add an <inertial> to the links that it carries in robot.urdf',

@@ -1,6 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reading an arm's readings from CSV files and arrays, and `train --from-csv`."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -280,3 +285,14 @@ def test_options_that_do_not_fit_together_end_with_one_error(tmp_path, capsys, a
         main(['--robot', 'arm26', '--out', str(tmp_path / 'out'), *arguments])
     assert ended.value.code == 2
     assert expected in capsys.readouterr().err
+
+
+def test_the_example_writes_a_file_that_can_be_learned(tmp_path):
+    example = Path(__file__).resolve().parents[2] / 'examples' / 'make_csv.py'
+    for options in ([], ['--moving']):
+        file = tmp_path / f'arm{len(options)}.csv'
+        done = [sys.executable, example, file, '--postures', '5', *options]
+        subprocess.run(
+            done, check=True, env={**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path)}
+        )
+        assert file.read_text().startswith('t [ms];' if options else 'shoulder (deg);q2;')
