@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Computes, in compiled code, what holds joints against passive tendons (`passive_tendons.py`)."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numba import njit
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.robot.passive_tendons import Passive
+
+if TYPE_CHECKING:
+    from musculoskeletal_ae.robot.passive_tendons import Passive
 
 
 @njit(cache=True)
