@@ -347,7 +347,9 @@ def main(argv: list[str]) -> int:
     if FILES in options.parts:
         tried, broken, outcomes = attack_files.attack(size.files, seeds[0])
         print(', '.join(f'{count} {what}' for what, count in sorted(outcomes.items())))
-        rows.append(Row('each damaged file is used or refused in time', tried, broken))
+        rows.append(
+            Row('each damaged file is loaded or refused, within the time limit', tried, broken)
+        )
     print_rows(rows)
     print(f'{time.monotonic() - begun:.0f} s')
     return int(any(row.broken for row in rows))

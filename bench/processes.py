@@ -8,8 +8,8 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-TICK = os.sysconf('SC_CLK_TCK')  # /proc counts CPU time in ticks: ticks per second
-PAGE = os.sysconf('SC_PAGE_SIZE')  # /proc counts memory in pages: bytes per page
+TICK = os.sysconf('SC_CLK_TCK')  # number of ticks per second; /proc counts CPU time in ticks
+PAGE = os.sysconf('SC_PAGE_SIZE')  # number of bytes per page; /proc counts memory in pages
 PATIENCE = 20.0  # kill a process that has not ended after this time [s]
 
 

@@ -159,7 +159,7 @@ class Parser(argparse.ArgumentParser):
         )
 
     def add_folder(self, text: str, default: Path | None = None) -> None:
-        """Add `--folder`, a folder that keeps what later runs can use; the text says what it is."""
+        """Add `--folder`, a folder of files that later runs use again; `text` is its help text."""
         self.add_argument('--folder', type=Path, metavar='DIR', default=default, help=text)
 
     def add_initial(self) -> None:

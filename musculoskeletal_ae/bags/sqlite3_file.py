@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read sqlite3 files of rosbag2 with the library rosbags.
 
-A recorder that was killed leaves its last messages in the write-ahead log of sqlite (`-wal`), or a
-journal that undoes an incomplete change (`-journal`). The library reads the file alone. In this
-case, sqlite applies the log to a private copy, which is read instead; the recording stays as it is.
+A recorder that was killed leaves a write-ahead log (`-wal`) with its last messages, or a journal
+(`-journal`) that undoes an incomplete change. The library ignores both. If one exists, this module
+lets sqlite apply it to a private copy, and reads the copy. The recording is not modified.
 """
 
 from __future__ import annotations

@@ -54,9 +54,10 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.signals.limits import LIMITS
 
-WINDING_CHANGE = 0.001  # decrease of the command above which the suspect is being wound in [m]
-CLASSIFICATION_TIME = 0.8  # duration of winding in after which the suspect is classified [s]
-PATIENCE = 8.0  # time after which a suspect that was not wound in stays isolated [s]
+#: count the suspect as being wound in once its length command has decreased by more than this [m]
+WINDING_CHANGE = 0.001
+CLASSIFICATION_TIME = 0.8  # classify the suspect after it was wound in for this time [s]
+PATIENCE = 8.0  # let a suspect stay isolated if it was not wound in within this time [s]
 LONGEST = 10.0  # longest duration of a verification, with the time for winding in [s]
 FAR = 0.025  # smallest |l − l'| that noise and network errors do not explain [m]
 RUPTURE_CHANGE = 0.005  # decrease of l − l' when the rest of a ruptured tendon is wound in [m]

@@ -91,7 +91,10 @@ class ExportReport(NamedTuple):
         )
         lines += ['', kept_text(self.kept)]
         warned = '; '.join(self.warnings) or 'none'
-        lines += ['', f'torque of weight and springs, largest difference: {torques}']
+        lines += [
+            '',
+            f'torque of weight and springs, largest difference between robot.urdf and MuJoCo: {torques}',
+        ]
         lines += [f'warnings of MuJoCo: {warned}', f'MJX {self.mjx}', '', LEGEND]
         return '\n'.join(lines)
 

@@ -208,9 +208,11 @@ class Source:
             ends = getattr(self.model, limits)
             ends[q] = end
             setattr(self.model, limits, ends)
-        text = f'limits of joint {joint}: [{low:.4g}, {high:.4g}] instead of [{before}]'
-        reason = 'beyond them, no muscle can hold the joint or bring it back'
-        self.note('chosen', f'{text}, because {reason} (robot.urdf has them)')
+        text = (
+            f'limits of joint {joint}: robot.urdf has [{low:.4g}, {high:.4g}] instead of [{before}]'
+        )
+        reason = 'no muscle can hold the joint, or bring it back, outside the new limits'
+        self.note('chosen', f'{text}, because {reason}')
 
     def slides(self, joint: str) -> bool:
         """Return whether a joint is prismatic."""

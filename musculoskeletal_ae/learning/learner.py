@@ -152,7 +152,7 @@ class Learner:
         return self.poll(time)
 
     def joints(self, time: float, theta: Array) -> None:
-        """Record θ [rad] (D,) received at `time` [s], with NaN for unmeasured joints."""
+        """Record joint angles θ [rad] (D,) received at `time` [s]; NaN marks unmeasured ones."""
         self.collector.joints(time, theta)
 
     def imu(self, time: float, link: str, acceleration: Array) -> None:

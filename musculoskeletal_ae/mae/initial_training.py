@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains the first network of a robot on its geometric model, by the method of a preset."""
+"""Trains the initial network of a robot on its geometric model, as its preset says."""
 
 from dataclasses import replace
 from typing import NamedTuple

@@ -31,8 +31,10 @@ POLYNOMIALS = (
 # the polynomials. It was measured for 413 × 827, as in the network of a hand of 23 joints; for
 # 163 × 327, both take the same time.
 LARGE = 256
-LEAST_EIGENVALUE = 1e-7  # relative to the largest; float32 does not resolve smaller ones
-MATRIX_RATIO = 12.5  # γ divided by Adam's step size for the biases
+#: raise eigenvalues to at least this multiple of the largest; float32 does not resolve smaller ones
+LEAST_EIGENVALUE = 1e-7
+#: use this multiple of Adam's step size, which biases have, as step size of the weight matrices
+MATRIX_RATIO = 12.5
 
 
 def orthogonal(matrix: Tensor) -> Tensor:

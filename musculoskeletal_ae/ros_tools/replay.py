@@ -237,7 +237,7 @@ class Replay(Node):
             if self._sought is not None:
                 break
             if self._lockstep is not None and self._lockstep.is_due(recorded):
-                self._lockstep.ask()  # early, so that the answers have come when the time is due
+                self._lockstep.ask()  # early, so that answers arrive in time
             # A node that has not used the last messages yet must not receive a later time.
             is_asking = self._lockstep is not None and bool(self._lockstep.missing())
             wait = min(due, SERVICE_PERIOD)
@@ -390,8 +390,8 @@ def parse(arguments: list[str]) -> Namespace:
     check = 'check the contents without playing them (exit status 1: faults)'
     add('--check', action='store_true', help=check)
     robot = (
-        'a shipped robot or a directory: with --check, the robot that the bag must fit; otherwise '
-        'the robot whose motors.yaml names topics of motors (doc/howto/ros2_control.md)'
+        'a shipped robot or a directory: with --check, the robot that the bag must fit; without '
+        'it, its motors.yaml names further topics to play (doc/howto/ros2_control.md)'
     )
     add('--robot', metavar='NAME|DIR', help=robot)
     topics = (

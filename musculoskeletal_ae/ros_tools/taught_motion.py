@@ -27,7 +27,7 @@ TRAJECTORY = 'joint_trajectory'
 NO_RATE = '0.0 Hz'
 FIRST_REPORT_TIME = 2.0 * PERIOD  # wait at most this long for a first report of the subscribers [s]
 REPORT_TIME = 5.0 * PERIOD  # wait at most this long for two reports after sending a trajectory [s]
-SENDINGS = 3  # try at most this often to send a trajectory
+SENDINGS = 3  # send a trajectory at most this many times, until a node uses it
 
 
 def send_taught_motion(bag: Bag, options: Namespace, arguments: list[str]) -> int:

@@ -22,13 +22,13 @@ from musculoskeletal_ae.arrays import Array, Bools
 class SensorTrust(IntEnum):
     """Whether a joint sensor is trusted; the numbers are published."""
 
-    #: Its readings are used. If they were in doubt before, those of the doubtful time are given up.
+    #: The readings of the sensor are used, but not those from a time in which it was in doubt.
     TRUSTED = 0
-    #: Its readings are not used from the beginning of the doubt on.
+    #: The sensor is in doubt, and its readings are not used from the beginning of the doubt on.
     DOUBTED = 1
-    #: Its readings are used, including those of the doubtful time, because the user confirmed them.
+    #: The user has confirmed the sensor, so its readings in the doubtful time are used as well.
     CONFIRMED = 2
-    #: Its readings are not used from the beginning to the end of a series of impossible readings.
+    #: The sensor sends a series of impossible readings, and meanwhile none of them is used.
     IMPOSSIBLE = 3
 
 

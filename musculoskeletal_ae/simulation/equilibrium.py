@@ -101,7 +101,8 @@ class Limbs(NamedTuple):
     counts: Ints  # number of joints D and muscles M of each limb, (limbs, 2)
     joints: Ints  # indices in θ of the joints, limb after limb
     muscles: Ints  # indices in T and l of the muscles, limb after limb
-    crossed: Ints  # for each muscle, the range of its limb in `joints`, (M, 2)
+    #: for each muscle, first and last + 1 index into `joints` of the joints of its limb, (M, 2)
+    crossed: Ints
     #: for each limb, coefficients of G (M, D) in the basis 1, θ_j, θ_j θ_k with j ≤ k
     first: Array
     #: for each limb and muscle, coefficients of the lower half of ∂²l_i/∂θ² in the basis 1, θ_j

@@ -161,7 +161,9 @@ class LengthModel:
 class Point(NamedTuple):
     """Values of the unknowns, and the residuals at these values."""
 
-    constants: Array  # (3M + D,)
+    #: length offset, friction and tension offset of each muscle, then friction of each joint,
+    #: (3M + D,)
+    constants: Array
     theta: Array  # postures of K moments [rad], (K, D)
     residual: Array  # in standard deviations, (K, M + 2D)
 
