@@ -76,8 +76,8 @@ explanation:
 
 The times "before" were measured on another machine, on which an estimate in torch took
 {torch_before:.0f} µs; on this machine it takes {slower:.1f} times as long. Therefore do not compare
-times of different days. Compare their ratios to the times of torch in this table, or to those of
-"messages alone" in the next one.
+the two columns directly. Compare the ratio of each time to that of torch in this table, or to that
+of "messages alone" in the next table.
 
 {core}
 

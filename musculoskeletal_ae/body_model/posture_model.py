@@ -29,7 +29,7 @@ from musculoskeletal_ae.robot.stiffness import muscle_hessian
 DIFFERENCE = 1e-6  # step of the finite differences [rad]
 #: motion of a joint up to which Σ T ∂²l/∂θ² of the geometric model is reused [rad]
 REUSED_MOTION = 0.05
-SMALL = 1e-6  # smallest divisor
+SMALL = 1e-6  # divide by at least this, so that nothing is divided by 0
 
 
 class Unknowns(NamedTuple):

@@ -121,7 +121,7 @@ class Supervisor:
 
     @property
     def may_wind_suspect(self) -> bool:
-        """Whether a suspect muscle may be wound in; False if an operator has stopped the arm."""
+        """Whether a suspect may be wound in: while it is verified, unless an operator stopped."""
         return self.state is StopState.VERIFYING and ConditionKind.OPERATOR not in self._causes
 
     @property

@@ -12,8 +12,8 @@ from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.robot.robot import Robot
 
-# Readers with a colour-vision deficiency, and readers of a grey print, can distinguish these
-# colours. The web page draws the estimated arm in the colour of AFTER.
+# Readers with a colour-vision deficiency can distinguish these colours. In a grey print, only TRUE
+# stands out. The web page draws the estimated arm in the colour of AFTER.
 BEFORE, AFTER, AS_PRINTED, TRUE, MARK = '#D55E00', '#009E73', '#CC79A7', '#222222', '#999999'
 #: colours of results before and after learning
 WHEN = {'before': BEFORE, 'after': AFTER}

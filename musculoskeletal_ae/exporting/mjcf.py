@@ -91,10 +91,8 @@ class ExportReport(NamedTuple):
         )
         lines += ['', kept_text(self.kept)]
         warned = '; '.join(self.warnings) or 'none'
-        lines += [
-            '',
-            f'torque of weight and springs, largest difference between robot.urdf and MuJoCo: {torques}',
-        ]
+        about = 'torque of weight and springs, largest difference between robot.urdf and MuJoCo'
+        lines += ['', f'{about}: {torques}']
         lines += [f'warnings of MuJoCo: {warned}', f'MJX {self.mjx}', '', LEGEND]
         return '\n'.join(lines)
 

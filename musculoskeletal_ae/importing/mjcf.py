@@ -185,7 +185,8 @@ class _Reader:
         mujoco.mj_kinematics(model, self.start)
         self.names = {kind: self._names(kind) for kind in COUNTS}
         self.balls: dict[int, list[str]] = {}
-        #: by coupled joint: its master (−1: none) and the coefficients, the highest power first
+        #: for each coupled joint, the joint that it follows (−1: it is fixed) and the coefficients
+        #: of its polynomial, the highest power first
         self.polynomials: dict[int, tuple[int, Array]] = {}
         self.tendons: dict[str, int] = {}
         self.passive: dict[str, int] = {}

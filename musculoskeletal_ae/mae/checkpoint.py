@@ -314,8 +314,8 @@ def _tensors(data: bytes, meta: Metadata) -> dict[str, Array]:
         least, most = np.linalg.eigvalsh(covariance)[[0, -1]]
         if not np.array_equal(covariance, covariance.T) or least < -SMALLEST_EIGENVALUE * most:
             raise CheckpointError(
-                f'tensor touch.drive_covariance is not symmetric, or has eigenvalues from {least:g}'
-                f' to {most:g}; legal: 0 or more'
+                f'tensor touch.drive_covariance has eigenvalues from {least:g} to {most:g}; legal: '
+                'a symmetric matrix with eigenvalues of 0 or more'
             )
     if meta.elastic:
         _check_elasticity(tensors['elasticity.stiffness'], tensors['elasticity.damping'])

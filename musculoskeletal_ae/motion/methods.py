@@ -60,7 +60,7 @@ STEP = 0.05
 class JointStiffness(NamedTuple):
     """Expected joint stiffness of a command, and the range that the posture allows [N·m/rad]."""
 
-    expected: Array  # K_θ, (D, D)
+    expected: Array  # joint stiffness K_θ that the command produces, (D, D)
     lowest: Array  # smallest K_jj of each joint separately, (D,)
     highest: Array  # largest K_jj of each joint separately, (D,)
 

@@ -124,7 +124,7 @@ class GravityCompensation(TorqueControl):
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
         super().__init__(robot, settings)
-        self.held: Array | None = None  # θ_held [rad], (D,)
+        self.held: Array | None = None  # θ_held, at which the spring holds the arm [rad], (D,)
         self._theta: Array | None = None  # the last posture [rad], (D,)
 
     def enter(self, inputs: Inputs) -> None:

@@ -50,7 +50,7 @@ class LatentSimulation:
         self._robot = robot
 
     def use(self, mae: Mae, robot: Robot) -> None:
-        """Set the network, and the robot with the currently isolated muscles."""
+        """Use another network, and a robot that states which muscles are isolated now."""
         self._mae, self._robot = mae, robot.with_elasticity(mae.elasticity)
         self._load = Load(self._robot.kinematics)
 

@@ -62,7 +62,7 @@ class PassiveTendons:
 
     @property
     def typical_stiffness(self) -> Array:
-        """Σ k (∂x_t/∂θ)² at θ̄ [N·m/rad], (D,): stiffness that the tendons give to each joint."""
+        """Stiffness that the tendons give to each joint at θ̄: Σ k (∂x_t/∂θ)² [N·m/rad], (D,)."""
         passive, stiffness = self.arrays, np.zeros(len(self.arrays.centre))
         for t, (a, b) in enumerate(pairwise(passive.first)):
             is_linear = passive.power[a:b].sum(axis=1) == 1

@@ -41,7 +41,7 @@ HOUSING_TIME = 800.0  # at first, assume this time constant τ₂ of the housing
 AIR = 25.0  # at first, assume this air temperature c_a [°C]
 #: initial standard deviations of c₁ − c₂ [°C], c₂ [°C], log κ, log τ₁, log τ₂ and c_a [°C]
 SPREAD = np.array([5.0, 0.2, 0.7, 0.5, 0.5, 5.0])
-#: standard deviations of the process noise of the same quantities, per √s
+#: standard deviations of the process noise of the quantities of SPREAD, per √s
 WALK = np.array([0.1, 0.02, 0.003, 0.002, 0.002, 0.02])
 FAR = 2.5  # let the logarithm of a constant depart from its initial estimate by at most this
 SLOPE = 1e-4  # compute numerical derivatives with this step

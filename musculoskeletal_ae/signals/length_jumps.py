@@ -254,7 +254,7 @@ class LengthJumps:
             self._jump, self._large = sum(later, first), []
 
     def jumping(self, used: Bools) -> tuple[int, ...]:
-        """Return the muscles in `used` (M,) whose new level has not been accepted yet."""
+        """Return the muscles in `used` (M,) with a jump after which no length is accepted yet."""
         if self._jump is None:
             return ()
         return tuple(np.flatnonzero(self._jump.remaining(used)).tolist())

@@ -112,7 +112,7 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
 
 
 def read_table(file: Path) -> Array:
-    """Return the rows (tension [N], absolute length [m], elongation [m]) of a table, (N, 3)."""
+    """Read a table; return its rows (tension [N], absolute length [m], elongation [m]), (N, 3)."""
     rows = []
     for number, line, cells in read_csv(file, COLUMNS, _refusal):
         try:

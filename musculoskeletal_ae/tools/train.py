@@ -109,7 +109,8 @@ def _check_source(parser: Parser, args: argparse.Namespace) -> None:
     """End with an error if an option does not suit the recordings."""
     if args.from_bag and args.from_csv:
         parser.error(
-            '--from-bag and --from-csv cannot be combined; learn from the bags first, then run train again with the CSV files and --checkpoint'
+            '--from-bag and --from-csv cannot be combined; learn from the bags first, then run '
+            'train again with the CSV files and --checkpoint'
         )
     if not (args.from_bag or args.from_csv) and (args.hold_out or args.checkpoint):
         parser.error('use --hold-out and --checkpoint with --from-bag or --from-csv only')

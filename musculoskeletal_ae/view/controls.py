@@ -83,8 +83,8 @@ class Controls:
         self._is_targeted = False  # whether the sliders show a visitor's target
         self._entries = Entries()  # values that visitors are entering at sliders
         self._sliders: dict[Key, Any] = {}  # handles of all sliders
-        self._settled: dict[Key, float] = {}  # last value that was followed or sent
-        self._entered: dict[Key, float] = {}  # last value that was followed or entered
+        self._settled: dict[Key, float] = {}  # last value that the arm had, or that was sent
+        self._entered: dict[Key, float] = {}  # last value that the arm had, or that was entered
         #: posture [rad] (D,) near which the estimate has been, and since when [s]
         self._rest = np.full(robot.joint_count, np.nan), 0.0
         self._is_pushing = False

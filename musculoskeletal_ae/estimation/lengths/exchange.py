@@ -168,7 +168,7 @@ class ExchangeCheck:
         straight = Wiring.straight(self._robot.muscle_count)
 
         def change(wiring: Wiring, columns: Bools) -> float:
-            """Return by how much lengths change over the silence if wired so, RMS over `columns`."""
+            """Return how far lengths change over the silence if wired so, RMS of `columns`."""
             gap = wiring.signed(after) - before
             return float(np.sqrt(np.square(gap[columns]).mean())) if columns.any() else 0.0
 

@@ -58,12 +58,12 @@ LIMITS = {
     'mean θ by ①': 0.6,
     'mean θ by ③': 0.7,
 }
-LEAST_SPREAD = 0.04  # smallest standard deviation by which errors of lengths are divided [m]
-LEAST_ARM = 0.01  # smallest size of the moment arms by which errors of G are divided [m]
-# Constants of real elastic elements may differ from the model's by factors of e^±1.5.
-STIFFEST = 0.2  # smallest factor of a muscle's elongation
-SOFTEST = 4.5  # largest factor of a muscle's elongation
-INELASTIC = 1e-12  # smallest divisor of a slope, for muscles without elongation [m²]
+LEAST_SPREAD = 0.04  # divide errors of lengths by at least this standard deviation [m]
+LEAST_ARM = 0.01  # divide errors of G by moment arms of at least this size [m]
+# The constants of a real elastic element may be e^±1.5 times those of the model. Its elongation is
+# therefore fitted as that of the model times a factor between these two.
+STIFFEST, SOFTEST = 0.2, 4.5
+INELASTIC = 1e-12  # divide a slope by at least this, for muscles without elongation [m²]
 #: largest error of a poorly determined joint, relative to the error of the best affine map
 UNDETERMINED = 1.2
 #: number of states to which the affine map is fitted; its error is measured on as many other states
