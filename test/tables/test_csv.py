@@ -273,7 +273,7 @@ def test_files_of_a_robot_without_tension_sensors_need_no_tensions(tmp_path, arm
 @pytest.mark.parametrize(
     ('arguments', 'expected'),
     [
-        (['--from-csv', 'a', '--from-bag', 'b'], 'separately'),
+        (['--from-csv', 'a', '--from-bag', 'b'], 'cannot be combined'),
         (['--rate', '100'], 'with --from-csv only'),
         (['--from-csv', 'a', '--columns', 'elbow'], 'expected an entry such as'),
         (['--from-csv', 'a', '--from-namespace', 'b'], 'with --from-bag only'),
