@@ -99,8 +99,8 @@ def spoiled(path, kind, seconds=60.0):
 def test_false_joint_angles_hardly_change_what_is_learned(kind, robot, teaching, tmp_path):
     errors = []
     for each in ('none', kind):
-        recording = read(spoiled(tmp_path / each, each), robot)
-        learner = Learner(robot, initial_mae(robot, steps=150).mae, steps=20)
+        recording = read(spoiled(tmp_path / each, each, 180.0), robot)
+        learner = Learner(robot, initial_mae(robot, steps=600).mae, steps=100)
         learn(learner, recording)
         errors.append(error(learner.mae, part(teaching, 0.0, 15.0)))
     assert errors[1] <= 1.1 * errors[0]
