@@ -901,7 +901,7 @@ def wrong_network(lab: Lab, _: Rng) -> Case:
     def is_visible(lab: Lab) -> bool:
         output = lab.estimator.output
         if output is None or not is_used:
-            return False  # a refusal answers the request
+            return False  # the operator was told that the network is refused
         return bool(np.abs(output.state.theta - lab.arm.theta).max() > SHOWN_ANGLE)
 
     lasts = math.inf if is_used else 0.0

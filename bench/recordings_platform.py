@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from scipy.io import loadmat
 
-from bench.recordings_read import Files, Recording, Run
+from bench.recordings_read import Files, Recording, Run, written_robot
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
@@ -43,7 +42,6 @@ class Platform:
 
     def write(self, directory: Path, tension_source: str = 'none') -> Path:
         """Write the robot directory and return its path."""
-        directory.mkdir(parents=True, exist_ok=True)
         lines, parent = ['<robot name="cable_platform"><link name="frame"/>'], 'frame'
         for name, axis, limit in zip(JOINTS, 2 * ('1 0 0', '0 1 0', '0 0 1'), LIMITS, strict=True):
             child = 'platform' if name == 'yaw' else f'after_{name}'
@@ -62,7 +60,6 @@ class Platform:
             '<inertia ixx="0.184" ixy="0" ixz="0" iyy="0.1154" iyz="0" izz="0.1864"/></inertial>'
             '</link></robot>'
         )
-        (directory / 'robot.urdf').write_text('\n'.join(lines), encoding='utf-8')
         muscles = []
         for i, (entry, end) in enumerate(zip(ENTRY, ATTACHED, strict=True), 1):
             forward = np.array([np.sign(entry[0]), 0.0, 0.0])
@@ -79,9 +76,7 @@ class Platform:
             'series_elastic': {'force': 1000.0, 'rate': 1000.0, 'wire_stretch': 1e-6},
             'tension': {'bias': 20.0, 'limit': 200.0, 'max': 300.0},
         }  # fmt: skip
-        text = yaml.safe_dump(document, sort_keys=False)
-        (directory / 'muscles.yaml').write_text(text, encoding='utf-8')
-        return directory
+        return written_robot(directory, '\n'.join(lines), document)
 
 
 def cable_length(entry: Array, end: Array) -> float:

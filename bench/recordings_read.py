@@ -71,6 +71,15 @@ class Run:
         return replace(self, length=length, effort=effort, theta=theta, rests=spans[:0])
 
 
+def written_robot(directory: Path, urdf: str, muscles: dict[str, Any]) -> Path:
+    """Write a robot directory from a URDF and the document of muscles.yaml; return its path."""
+    directory.mkdir(parents=True, exist_ok=True)
+    (directory / 'robot.urdf').write_text(urdf, encoding='utf-8')
+    text = yaml.safe_dump(muscles, sort_keys=False)
+    (directory / 'muscles.yaml').write_text(text, encoding='utf-8')
+    return directory
+
+
 class Body(Protocol):
     """A recorded robot, of which a robot directory can be written."""
 
@@ -95,10 +104,8 @@ class SoftLink:
 
     def write(self, directory: Path, tension_source: str = 'none') -> Path:
         """Write the robot directory and return its path; the muscle modules regulate positions."""
-        directory.mkdir(parents=True, exist_ok=True)
         low, high, half = -self.limit, self.limit, 0.5 * self.height
         urdf = URDF.format(name=self.name, half=half, mass=self.mass, low=low, high=high)
-        (directory / 'robot.urdf').write_text(urdf, encoding='utf-8')
         muscles = []
         for i, (azimuth, radius) in enumerate(zip(self.azimuths, self.radius, strict=True), 1):
             x, y = (float(radius * f(azimuth)) for f in (np.cos, np.sin))
@@ -111,9 +118,7 @@ class SoftLink:
             'series_elastic': {'force': 1000.0, 'rate': 1000.0, 'wire_stretch': 1e-6},
             'tension': {'bias': 5.0, 'limit': 60.0, 'max': 100.0},
         }  # fmt: skip
-        text = yaml.safe_dump(document, sort_keys=False)
-        (directory / 'muscles.yaml').write_text(text, encoding='utf-8')
-        return directory
+        return written_robot(directory, urdf, document)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 
 import re
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -25,6 +26,18 @@ def members(value: Callable[[str], Any] = lambda member: member) -> list[Members
 def listed(match: re.Match[str]) -> list[str]:
     """Return the members of the legal set that the first group of an advice states."""
     return re.split(r', | or ', match[1])
+
+
+def in_file(name: str, old: str, new: str) -> Callable[..., None]:
+    """Return an edit of a robot directory that replaces a text in a file once."""
+
+    def edit(directory: Path, _: object = None) -> None:
+        file = directory / name
+        text = file.read_text()
+        assert old in text
+        file.write_text(text.replace(old, new, 1))
+
+    return edit
 
 
 def check_remedy(

@@ -17,10 +17,11 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 
-STIFFNESS_SPREAD = 0.5  # prior standard deviation of α
-#: prior standard deviation of the angle at which a spring exerts no torque [rad]
+STIFFNESS_SPREAD = 0.5  # assume that α of an arm has this standard deviation
+#: assume that the angle at which a spring exerts no torque differs from that of the robot
+#: description by this standard deviation [rad]
 REST_SPREAD = 0.2
-LARGEST_LOG = 2.0  # largest |α|
+LARGEST_LOG = 2.0  # permit no larger |α|
 
 
 def none_learned(joint_count: int) -> Array:

@@ -18,14 +18,12 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
 POSTURES = 150
-BUDGET = 2.5  # time after which no further posture is examined [s]
-LEAST_POSTURES = 20  # number of postures that are examined however long it takes
-#: share of holdable postures below which an arm can only explore with the support of joint stops
+BUDGET = 2.5  # examine no further posture after this time [s]
+LEAST_POSTURES = 20  # examine this many postures, however long it takes
+#: below this share of holdable postures, the arm can explore only where joint stops support it
 POINTLESS_SHARE = 0.02
-#: number of random postures near which postures with the support of joint stops are then sought
-NEAR_POSTURES = 10
-#: share of holdable postures below which the robot is said to be hard to explore
-HARD_SHARE = 0.5
+NEAR_POSTURES = 10  # seek such postures near this many random ones
+HARD_SHARE = 0.5  # warn below this share of holdable postures
 
 
 class Prospects(NamedTuple):

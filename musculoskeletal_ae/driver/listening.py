@@ -114,7 +114,8 @@ class Listening:
         if posture is not None:
             self._theta = robot.units.to_theta(np.array(posture))
         self._not_finite: Counter[str] = Counter()  # positions that are not finite, by joint
-        #: states (3, M) of each message of the muscles, and the number of joint messages before it
+        #: readings (3, M) of each message of muscle_states, and how many messages of joint_states
+        #: arrived before it
         self._read: list[tuple[Array, int]] = []
         #: times [s] of the joint messages, which are those of the muscles before them, and θ (D,)
         self._angles_read: list[tuple[float, Array]] = []

@@ -29,7 +29,7 @@ from musculoskeletal_ae.signals.body_state import MOST_OFFSET, BodyState, Length
 
 FILE = 'estimator.offsets'
 LARGEST = 1_000_000  # size limit of the file [bytes]
-RETRY_INTERVAL = 2.0  # time between attempts to write [s]
+RETRY_INTERVAL = 2.0  # wait this long after a failed attempt to write [s]
 
 
 class SavedBody(NamedTuple):

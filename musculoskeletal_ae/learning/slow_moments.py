@@ -18,10 +18,10 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.samples import MOMENT_ARM, NOTHING, Sample
 
-PERIOD = 1.0  # time of which the slowest moment becomes a sample [s]
-MOMENT = 0.1  # duration over which readings are averaged [s]
-LEAST_READINGS = 3  # smallest number of readings that are averaged
-LONGEST_GAP = 0.3  # readings after a longer gap belong to another motion [s]
+PERIOD = 1.0  # learn the slowest moment of each interval of this duration [s]
+MOMENT = 0.1  # average the readings of a moment over this duration [s]
+LEAST_READINGS = 3  # use no moment with fewer readings
+LONGEST_GAP = 0.3  # count readings after a longer gap as another motion [s]
 
 
 class SlowMoments:

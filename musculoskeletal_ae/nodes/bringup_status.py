@@ -62,10 +62,8 @@ class BringupStatus(Shell):
             lambda: nodes_in_graph(self),
             lambda: self.awake.at(time.monotonic()),
         )
-        self.last_known = (
-            '',
-            math.nan,
-        )  # last error, as text, and last A in a status line
+        #: last error, as text, and last A in a status line
+        self.last_known = ('', math.nan)
         self.started: float | None = None
         self.ended: float | None = None  # when the end of the recording was first reported [s]
         self.ended_report = math.inf  # arrival of that report, as `Situation.heard_at` counts [s]

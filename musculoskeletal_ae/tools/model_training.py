@@ -48,8 +48,6 @@ def prepare(args: Namespace) -> Robot:
             raise MusculoskeletalError(problem) from error
     train_on(args.device)
     robot = Robot.load(args.robot)
-    for line in prospects(robot).lines():
-        print(line, file=sys.stderr, flush=True)
     if warning := jump_warning(robot):
         print(f'warning: {warning}. Nodes may reject this network', file=sys.stderr)
     return robot
@@ -58,6 +56,8 @@ def prepare(args: Namespace) -> Robot:
 def train(args: Namespace) -> None:
     """Train on the geometric model, write the checkpoint and print the errors."""
     robot = prepare(args)
+    for line in prospects(robot).lines():
+        print(line, file=sys.stderr, flush=True)
     start = time.perf_counter()
     trained = train_on_model(robot, args)
     checkpoint.save(trained.mae, args.out)  # first, so that no later error loses the training

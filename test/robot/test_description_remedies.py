@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import pytest
 import yaml
-from remedies import Members, check_remedy
+from remedies import Members, check_remedy, in_file
 from robots import chain, copy_robot, read_muscles, write_muscles
 
 from musculoskeletal_ae.design.checks import read_declared_actions
@@ -78,16 +78,6 @@ def within(*path, index, entry):
         document.insert(index, entry)
 
     return of_muscles(change)
-
-
-def in_file(name, old, new):
-    def edit(directory, _=None):
-        file = directory / name
-        text = file.read_text()
-        assert old in text
-        file.write_text(text.replace(old, new, 1))
-
-    return edit
 
 
 def in_urdf(old, new):

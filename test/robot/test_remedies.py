@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from remedies import in_file
 from robots import (
     DRUM_ENDS,
     behind_a_drum,
@@ -89,18 +90,6 @@ def removed(muscle):
         document['muscles'] = [each for each in document['muscles'] if each['name'] != muscle]
 
     return edited(edit)
-
-
-def in_file(name, old, new):
-    """Return an edit that replaces a text in a file."""
-
-    def change(directory, _=None):
-        file = directory / name
-        text = file.read_text()
-        assert old in text
-        file.write_text(text.replace(old, new))
-
-    return change
 
 
 def other(*edits, **top):

@@ -120,10 +120,8 @@ class LengthFit:
             moments: The moments to which it was fitted.
         """
         wiring = Wiring.straight(self._robot.muscle_count)
-        judgement, columns = (
-            WiringJudgement(wiring, (wiring,), (), fit.cost),
-            np.flatnonzero(self.used),
-        )
+        judgement = WiringJudgement(wiring, (wiring,), (), fit.cost)
+        columns = np.flatnonzero(self.used)
         rows = _few(moments)
         for _ in range(MOST_FAULTS):
             wiring, coarse = judgement.wiring, list[tuple[float, Wiring]]()
