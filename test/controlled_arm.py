@@ -2,7 +2,6 @@
 """Emulator, estimator and controller on one graph, with helpers for tests."""
 
 import signal
-import time
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
@@ -48,12 +47,9 @@ class ControlledArm:
             (DiagnosticArray, '/diagnostics'),
         ):
             graph.listen(kind, topic, 1000)
-        self.came_at = []  # arrival of each length command [s]
+        self.sendings = []  # sequence number and time of sending [s] of each length command
         graph.node.create_subscription(
-            Float64MultiArray,
-            'muscle_length_command',
-            lambda _: self.came_at.append(time.monotonic()),
-            1000,
+            Float64MultiArray, 'muscle_length_command', self._note_sending, 1000
         )
         self.hardware = self.start('hardware_emulator', seed=1, **hardware)
         self.estimator = self.start('estimator', checkpoint=checkpoint)
@@ -103,13 +99,18 @@ class ControlledArm:
         """Check that no length command exceeded the rate limit.
 
         Muscles whose tension is above the limit may be paid out faster, if `relieved` is true.
-        After a pause of this process, commands begin anew from the present lengths.
+        After a pause of this process, commands begin anew from the present lengths. A command that
+        did not arrive leaves a gap in the sequence numbers; the next one may differ by two steps.
         """
-        steps = np.diff(self.sent()[since:], axis=0)
-        pauses = np.diff(self.came_at[since : since + len(steps) + 1]) > 0.5 * PAUSE
-        steps = steps[: len(pauses)][~pauses]
+        sent = self.sent()[since:]
+        numbers, times = np.array(self.sendings[since : since + len(sent)]).T
+        steps = np.diff(sent[: len(numbers)], axis=0) / np.maximum(np.diff(numbers), 1)[:, None]
+        steps = steps[np.diff(times) <= 0.5 * PAUSE]
         largest = -steps if relieved else np.abs(steps)
         assert largest.max() <= RATE_LIMIT * LONGEST_STEP + 1e-9
+
+    def _note_sending(self, _, info):
+        self.sendings.append((info['publication_sequence_number'], 1e-9 * info['source_timestamp']))
 
     def posture(self):
         return np.array(self.graph.next('joint_states').position)
