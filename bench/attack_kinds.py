@@ -170,7 +170,7 @@ class Scene:
             attack.call(Trigger, 'estimator/restore')
         elif step is Step.CALIBRATE_LENGTHS:
             self._calibrate_lengths()
-        elif step in (Step.EXPLORE, Step.EXPLORE_GENTLY):
+        elif step in (Step.EXPLORE, Step.EXPLORE_GENTLY, Step.CHANGE_TARGET):
             attack.call(SetBool, 'controller/explore', SetBool.Request(data=True))
         elif step in (Step.RESET_CONTROLLER, Step.RESET_ESTIMATOR):
             node = 'controller' if step is Step.RESET_CONTROLLER else 'estimator'

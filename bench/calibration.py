@@ -35,8 +35,8 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.individual import Individual
 from musculoskeletal_ae.experiments.least_squares import nominal, oracle
 from musculoskeletal_ae.experiments.recording import estimation_error, record
 from musculoskeletal_ae.mae.initial_training import initial_mae

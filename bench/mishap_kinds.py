@@ -71,6 +71,7 @@ MOUNTED = OFF_TARGET | {'other_mounting'}
 SOFTWARE = frozenset({
     Step.RESET_CONTROLLER, Step.RESET_ESTIMATOR, Step.CALIBRATE_LENGTHS, Step.EXPLORE,
     Step.EXPLORE_GENTLY, Step.RESTORE_MUSCLES, Step.WAIT_UNTIL_COOL, Step.REPORT_LOG,
+    Step.CHANGE_TARGET,
 })  # fmt: skip
 
 SHOWN_ANGLE = 0.1  # count a wrong joint angle as visible from this error on [rad]

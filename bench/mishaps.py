@@ -301,7 +301,7 @@ class Course:
                 lab.estimator.calibrate_lengths()
                 lab.publish()
                 self._reset_estimator()
-            elif step in (Step.EXPLORE, Step.EXPLORE_GENTLY):
+            elif step in (Step.EXPLORE, Step.EXPLORE_GENTLY, Step.CHANGE_TARGET):
                 refused = lab.controller.explore(True)
             elif step is Step.RESTORE_MUSCLES:
                 isolated = lab.estimator.body.isolated

@@ -16,8 +16,8 @@ You have to fetch the models yourself; this repository does not contain them:
     leg             MyoHub/myo_sim, leg/myolegs.xml, whole, or hip, knee and ankle of one leg
     arm             MyoHub/myo_sim, arm/myoarm.xml
 
-Each seed is an emulated individual that deviates from the file (`emulator/deviation.py`). The
-columns of a row are
+Each seed is an emulated individual that deviates from the file (`emulator/foreign/deviation.py`).
+The columns of a row are
 
 - the share of random postures that the muscles can hold; if there are hardly any, only the reason
   is printed, with the time after which it was known,

@@ -21,7 +21,7 @@ from bench import timings
 from bench.processes import cpu
 from bench.scaling import update_time
 from bench.wire import KINDS, System, Wire, systems
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, record
 from musculoskeletal_ae.mae import checkpoint

@@ -32,7 +32,7 @@ from bench.learned_arm import initial, learned_arm
 from bench.limbs import BODIES, write_body
 from bench.timings import microseconds
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.least_squares import oracle_errors
 from musculoskeletal_ae.experiments.recording import (

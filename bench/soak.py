@@ -25,7 +25,7 @@ import torch
 
 from bench.learned_arm import initial_network
 from bench.processes import memory
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
 from musculoskeletal_ae.experiments.recording import (
     HELD_OUT_STREAM,

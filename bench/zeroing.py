@@ -25,7 +25,7 @@ import torch
 from bench.learned_arm import learned_arm
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.recording import (

@@ -118,6 +118,7 @@ def methods() -> str:
     rows['this package'] = [*rows['this package'][:2], *recorded[PACKAGE]]
     del rows[PACKAGE]
     rows['this package'] = rows.pop('this package')  # the last row
+    rows = {name: row for name, row in rows.items() if any(error is not None for error in row)}
     best = [
         min(f'{row[place]:.3f}' for row in rows.values() if row[place] is not None)
         for place in range(len(headings))

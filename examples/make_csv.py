@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.faults import Readings
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot
 
 PERIOD = 0.01  # time between two readings [s]

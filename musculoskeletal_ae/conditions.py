@@ -609,6 +609,7 @@ class ConditionKind(Enum):
         'warn',
         'the target of a joint exceeded its limits and was moved to the limit',
         'target clamped to the joint limits',
+        (Step.CHANGE_TARGET,),
     )
     EFFORT_IGNORED = Declaration(
         'effort_ignored',
@@ -630,6 +631,7 @@ class ConditionKind(Enum):
         'warn',
         'the target needs more torque than the muscles can exert',
         'the target needs more torque than the muscles can exert',
+        (Step.CHANGE_TARGET,),
     )
     OUT_OF_REACH = Declaration(
         'out_of_reach',
@@ -637,6 +639,7 @@ class ConditionKind(Enum):
         'warn',
         'the muscles cannot hold the target, or the hand cannot reach it',
         'the target cannot be reached or held',
+        (Step.CHANGE_TARGET,),
     )
     AWAY_FROM_TARGET = Declaration(
         'away_from_target',

@@ -112,6 +112,11 @@ class Step(Enum):
         'call controller/explore true to explore gently until the offsets are known',
         3,
     )
+    CHANGE_TARGET = (
+        'change_target',
+        'command a target that the arm can reach and hold, explore, or reduce the load',
+        3,
+    )
     ENABLE_LEARNING = 'enable_learning', 'call learner/enable true to learn again', 4
 
     @classmethod

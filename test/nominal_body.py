@@ -13,8 +13,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion import methods
 from musculoskeletal_ae.motion.exploration_steps import TRIES, holdable_postures

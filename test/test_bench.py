@@ -10,7 +10,7 @@ import pytest
 from bench import bodies, covariance, false_stops, lab, pictures
 from bench.__main__ import benches, main
 from bench.regression import BASELINES
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 

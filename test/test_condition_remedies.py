@@ -29,6 +29,7 @@ from musculoskeletal_ae.ros.needed_topics import SLOW_REPORTS, NeededTopics
 
 TESTS = Path(__file__).parent
 HERE = Path(__file__).name
+JOINTS = 'estimation/test_joint_sensor_check.py'
 PLACES = {
     Kind.NODE_ENDED: ['nodes/test_controller_stops.py: test_a_crashed_estimator_stops',
                       'nodes/test_bringup_status.py: test_nodes_that_have_ended_or_hang'],
@@ -53,8 +54,8 @@ PLACES = {
     Kind.LENGTH_DISAGREES: ['mishap: tendon creeps'],
     Kind.LENGTHS_DISAGREE: ['mishap: driver restarts, lengths counted from 0'],
     Kind.JOINT_SENSORS_DOUBTED: [
-        'estimation/test_joint_check.py: test_a_sensor_that_slips_is_doubted_until_it_agrees',
-        'estimation/test_joint_check.py: test_a_sensor_that_the_user_confirms_is_trusted'],
+        f'{JOINTS}: test_a_sensor_that_slips_is_doubted_until_it_agrees',
+        f'{JOINTS}: test_a_sensor_that_the_user_confirms_is_trusted'],
     Kind.JOINT_READINGS_IMPOSSIBLE: [
         'estimation/test_lost_lengths.py: test_joint_sensors_are_not_used_while_a_second_program'],
     Kind.JOINT_READINGS_MISSING: [
@@ -94,6 +95,9 @@ PLACES = {
     Kind.STALE_ESTIMATE: ['nodes/test_controller_stops.py: test_a_crashed_estimator_stops'],
     Kind.GENTLE_ONLY: ['nodes/test_zeroing.py: test_length_offsets_are_found_and_reach'],
     Kind.NOT_EXPLORING: ['control/test_controller.py: test_an_arm_that_no_longer_explores_says_so'],
+    Kind.TARGET_CLAMPED: ['control/test_target.py: test_another_target_ends_what_is_wrong'],
+    Kind.TORQUE_MISSING: ['control/test_target.py: test_another_target_ends_what_is_wrong'],
+    Kind.OUT_OF_REACH: ['control/test_target.py: test_another_target_ends_what_is_wrong'],
     Kind.AWAY_FROM_TARGET: ['mishap: payload of 3.6 kg while holding',
                             'control/test_holding.py: test_an_arm_away_from_its_target'],
     Kind.TENSION_LIMITED_BY_HEAT: ['mishap: motor is hot'],

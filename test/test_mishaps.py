@@ -10,7 +10,7 @@ from bench import mishaps
 from bench.lab import Lab
 from bench.mishap_kinds import MISHAPS, NAMES, Case, Mishap
 from bench.statements import Statement, named, statements, troubles
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot.load('arm26')

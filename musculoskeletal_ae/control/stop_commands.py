@@ -10,10 +10,10 @@ while its measured tension is above T_bias. Unloaded tendons thus do not become 
 that carry the arm lower it slowly. If the tension of a muscle is not known, the muscle is
 paid out by `Actuation.release` [m], relative to its length at the start of the release.
 
-After an anomaly, a suspect muscle is verified (`estimation/verification`). It is wound in slowly
-once the other muscles are paid out. Winding ends when the measured tension of the suspect, or the
-tension that muscle stiffness control demands, has risen by `LARGEST_RISE`. Whatever the sensors
-read, winding also ends when the length command has decreased by `Actuation.winding_depth`.
+After an anomaly, a suspect muscle is verified (`estimation/suspect_verification`). It is wound in
+slowly once the other muscles are paid out. Winding ends when the measured tension of the suspect,
+or the tension that muscle stiffness control demands, has risen by `LARGEST_RISE`. Whatever the
+sensors read, winding also ends when the length command has decreased by `Actuation.winding_depth`.
 """
 
 from __future__ import annotations

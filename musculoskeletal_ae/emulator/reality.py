@@ -5,8 +5,8 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.individual import Individual
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
@@ -33,7 +33,7 @@ def make_arm(
         friction: False removes the friction of tendons and joints. It has no effect on an
             individual of an MJCF file (`deviates`).
         deviates: Whether the body of a file is an individual that differs from the file
-            (`emulator/deviation.py`). By default it equals the file.
+            (`emulator/foreign/deviation.py`). By default it equals the file.
 
     Raises:
         MusculoskeletalError: If `reality` is neither an emulator model nor a file, or if the model
@@ -53,8 +53,8 @@ def make_arm(
             legal = f'{KIN}, {FOREIGN} or the model.xml that import_robot writes'
             raise MusculoskeletalError(f'reality {reality[:80]!r} is unknown; legal: {legal}')
     # Imported here because `kin` does not need MuJoCo.
-    from musculoskeletal_ae.emulator.effects import Effects
-    from musculoskeletal_ae.emulator.foreign import ForeignArm
+    from musculoskeletal_ae.emulator.foreign.arm import ForeignArm
+    from musculoskeletal_ae.emulator.foreign.effects import Effects
 
     effects = Effects()
     if not friction:

@@ -29,12 +29,12 @@ from musculoskeletal_ae.arrival import INTERRUPTION, LONGEST_STEP, SILENCE
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation import status
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
-from musculoskeletal_ae.estimation.detectors.joint_disagreement import GAP_LEARNED, GAP_YOUNG
+from musculoskeletal_ae.estimation.detectors.length_disagreement import GAP_LEARNED, GAP_YOUNG
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
 from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
-from musculoskeletal_ae.estimation.joint_check import JointCheck
+from musculoskeletal_ae.estimation.joint_sensor_check import JointSensorCheck
 from musculoskeletal_ae.estimation.lengths.checked_calibration import CheckedCalibration
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthTrust
 from musculoskeletal_ae.estimation.marker import posture_of_marker
@@ -43,8 +43,8 @@ from musculoskeletal_ae.estimation.mounting import MountingCheck
 from musculoskeletal_ae.estimation.repair_check import RepairCheck
 from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.estimation.state_estimator import Estimate, StateEstimator
+from musculoskeletal_ae.estimation.suspect_verification import LONGEST
 from musculoskeletal_ae.estimation.suspects import SuspectHandling
-from musculoskeletal_ae.estimation.verification import LONGEST
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
@@ -144,7 +144,7 @@ class Estimator:
         self._commands = ModuleCommands()
         self._rejected = Persistence()  # why messages are rejected
         self.joint_stream = JointStream(robot)
-        self.joint_check = JointCheck(robot)
+        self.joint_check = JointSensorCheck(robot)
         #: usable readings of the joint sensors [rad] and their times [s], (2, D); NaN if unknown
         self._readings = np.full((2, robot.joint_count), np.nan)
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.detectors.frozen_sensor import FrozenSensor
-from musculoskeletal_ae.estimation.detectors.joint_disagreement import JointDisagreement
+from musculoskeletal_ae.estimation.detectors.length_disagreement import LengthDisagreement
 from musculoskeletal_ae.estimation.detectors.length_jump import LengthJump
 from musculoskeletal_ae.estimation.detectors.missing_values import MissingValues
 from musculoskeletal_ae.estimation.detectors.saturated_sensor import SaturatedSensor
@@ -40,7 +40,7 @@ class HealthMonitor:
         """
         chosen = preset_named(preset)
         self.residual, by_physics = chosen.residual_detectors(robot)
-        self.joints = JointDisagreement(robot)
+        self.joints = LengthDisagreement(robot)
         self.heat = Heat(robot)
         self._exchange = ExchangeCheck(robot)
         self._detectors: list[Detector] = [

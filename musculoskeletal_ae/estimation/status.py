@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from musculoskeletal_ae.conditions import Condition, ConditionKind
-from musculoskeletal_ae.estimation.verification import LONGEST
+from musculoskeletal_ae.estimation.suspect_verification import LONGEST
 from musculoskeletal_ae.remedy import REPAIR, Step
 from musculoskeletal_ae.report import Report
 

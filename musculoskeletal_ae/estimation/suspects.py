@@ -43,7 +43,7 @@ from collections.abc import Iterable
 from musculoskeletal_ae.conditions import Reaction
 from musculoskeletal_ae.estimation.finding import Finding
 from musculoskeletal_ae.estimation.settings import ISOLATE, EstimatorSettings
-from musculoskeletal_ae.estimation.verification import (
+from musculoskeletal_ae.estimation.suspect_verification import (
     ModuleLaw,
     Outcome,
     PositionLaw,

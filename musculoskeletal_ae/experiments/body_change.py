@@ -31,8 +31,8 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.individual import Individual
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.online_learning import explore, new_learner_and_loop, teach
 from musculoskeletal_ae.experiments.roles import shoulder

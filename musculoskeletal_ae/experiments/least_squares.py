@@ -22,7 +22,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
-from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.emulator.kin.individual import Individual
 from musculoskeletal_ae.emulator.modules import LENGTH_NOISE, TENSION_NOISE, Arm
 from musculoskeletal_ae.experiments.recording import Recording, mean_error
 from musculoskeletal_ae.gauss_newton import minimise_each

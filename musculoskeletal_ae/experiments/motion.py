@@ -38,9 +38,9 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.emulator.arm import VISCOUS
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
-from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.emulator.kin.arm import VISCOUS
+from musculoskeletal_ae.emulator.kin.individual import Individual
 from musculoskeletal_ae.emulator.modules import MOTOR_GAIN, Arm
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.experiments import contact, plots

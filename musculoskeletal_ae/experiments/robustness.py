@@ -26,9 +26,9 @@ from typing import Any
 
 import numpy as np
 
+from musculoskeletal_ae.emulator.foreign.tendons import load_cell, spooled
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN
-from musculoskeletal_ae.emulator.tendons import load_cell, spooled
 from musculoskeletal_ae.experiments import online_learning, plots
 from musculoskeletal_ae.experiments.least_squares import EVERY, nominal, oracle
 from musculoskeletal_ae.experiments.recording import (
@@ -155,8 +155,8 @@ def _error_with_effects(
         effects: Sizes of the changed effects by name; 0 removes an effect.
         run: Seed of exploration and training, by default the seed of the individual.
     """
-    from musculoskeletal_ae.emulator.effects import Effects
-    from musculoskeletal_ae.emulator.foreign import ForeignArm
+    from musculoskeletal_ae.emulator.foreign.arm import ForeignArm
+    from musculoskeletal_ae.emulator.foreign.effects import Effects
 
     def arm() -> Arm:
         return ForeignArm(study.robot, seed, replace(Effects(), **effects))

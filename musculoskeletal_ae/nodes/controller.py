@@ -30,7 +30,7 @@ from musculoskeletal_ae.control.controller import Controller as Core
 from musculoskeletal_ae.control.method_choice import check_settings
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.control.stop_memory import BEFORE, StopMemory
-from musculoskeletal_ae.estimation.verification import LONGEST
+from musculoskeletal_ae.estimation.suspect_verification import LONGEST
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.message_reading import (
     read_pose,

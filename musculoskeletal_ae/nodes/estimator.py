@@ -30,7 +30,7 @@ from musculoskeletal_ae.estimation.estimator import Output
 from musculoskeletal_ae.estimation.lengths.length_calibration import stated_theta
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
 from musculoskeletal_ae.estimation.settings import EstimatorSettings
-from musculoskeletal_ae.estimation.verification import VerificationVerdict
+from musculoskeletal_ae.estimation.suspect_verification import VerificationVerdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.message_reading import read_pose

@@ -16,7 +16,7 @@ Encoders count whole turns, or wrap around at 0 or π. Whole turns are therefore
 readings that are then within the joint limits and continuous.
 
 If a sensor has impossible readings again and again even then, none of its readings during that time
-is usable, as on a running arm (`estimation/joint_check.py`).
+is usable, as on a running arm (`estimation/joint_sensor_check.py`).
 """
 
 from collections import defaultdict

@@ -13,7 +13,7 @@ example that of another program.
 
 The level of a sensor changes if the sensor slips on its axis. The new level is accepted after all
 readings have followed each other plausibly for `LIMITS.settled`. This file cannot say which level
-is right: the estimator compares both with the muscle lengths (`estimation/joint_check.py`).
+is right: the estimator compares both with the muscle lengths (`estimation/joint_sensor_check.py`).
 
 As with `MuscleStream`, each node that reads the messages drops single readings by its own stream.
 What a lasting fault of a sensor means for others is decided by the estimator alone, which publishes

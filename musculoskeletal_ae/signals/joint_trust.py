@@ -2,9 +2,9 @@
 """Which joint sensors are trusted, as the estimator has decided.
 
 The estimator compares the joint sensors with the muscle lengths, and watches for lasting series of
-impossible readings (`estimation/joint_check.py`). It publishes its decision on the latched topic
-`joint_sensor_trust`. Nothing else judges whether a plausible reading is right. Every change creates
-a new `JointTrust`.
+impossible readings (`estimation/joint_sensor_check.py`). It publishes its decision on the latched
+topic `joint_sensor_trust`. Nothing else judges whether a plausible reading is right. Every change
+creates a new `JointTrust`.
 """
 
 from __future__ import annotations

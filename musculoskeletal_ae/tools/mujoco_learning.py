@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`train --mujoco`: imports a MuJoCo model, and learns an emulated arm of it, without ROS.
 
-The emulated arm is an individual that deviates from the file (`emulator/deviation.py`). It explores
-in closed loop, as fast as the computer can.
+The emulated arm is an individual that deviates from the file (`emulator/foreign/deviation.py`). It
+explores in closed loop, as fast as the computer can.
 """
 
 import time

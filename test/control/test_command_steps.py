@@ -21,7 +21,7 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import METHODS
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.signals.body_state import Anomaly, LengthOffsets
 

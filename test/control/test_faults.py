@@ -12,8 +12,8 @@ from readings import reading
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import FIRST_ESTIMATE, Controller
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.faults import KINDS
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.message_reading import read_muscle_states

@@ -18,8 +18,8 @@ from musculoskeletal_ae.control.command import LENGTH, TENSION, Command
 from musculoskeletal_ae.control.limiter import CommandLimiter
 from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.control.stop_commands import PAYING_OUT, SafeStop
-from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.experiments.recording import ClosedLoop
 from musculoskeletal_ae.motion.methods import first_command, proposed
 from musculoskeletal_ae.robot.description import SPEED_DEFAULT, with_modules

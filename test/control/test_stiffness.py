@@ -6,7 +6,7 @@ import pytest
 from exact_mae import ExactMae
 from nominal_body import stiffness_ratios
 
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.motion.methods import MARGINS, StiffnessModel, stiffness_command
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian

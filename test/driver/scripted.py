@@ -12,8 +12,8 @@ from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.driver.positioning import Positioning
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.driver.winding import Winding
-from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.faults import Faults, Readings
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 

@@ -9,11 +9,11 @@ from robots import write_robot
 
 from emulator.commands import to_mid_range
 from musculoskeletal_ae.emulator import modules
-from musculoskeletal_ae.emulator.arm import EmulatedArm, tension_from_elongation
-from musculoskeletal_ae.emulator.effects import NONE
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
-from musculoskeletal_ae.emulator.foreign import ForeignArm
-from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
+from musculoskeletal_ae.emulator.foreign.arm import ForeignArm
+from musculoskeletal_ae.emulator.foreign.effects import NONE
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm, tension_from_elongation
+from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.message_reading import MOST_WRENCH
 from musculoskeletal_ae.robot.robot import Robot

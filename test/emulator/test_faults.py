@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from emulator.commands import to_mid_range
-from musculoskeletal_ae.emulator.arm import EmulatedArm
 from musculoskeletal_ae.emulator.faults import KINDS, Faults, Readings, read_fault
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.emulator.sensors import Sensors, read_sensors
 from musculoskeletal_ae.exceptions import MusculoskeletalError

@@ -9,11 +9,11 @@ import pytest
 from robots import read_muscles, write_muscles, write_robot
 
 from emulator.commands import to_mid_range
-from musculoskeletal_ae.emulator import foreign
-from musculoskeletal_ae.emulator.effects import NONE, Effects
-from musculoskeletal_ae.emulator.foreign import ForeignArm
+from musculoskeletal_ae.emulator.foreign import arm as foreign
+from musculoskeletal_ae.emulator.foreign.arm import ForeignArm
+from musculoskeletal_ae.emulator.foreign.effects import NONE, Effects
+from musculoskeletal_ae.emulator.foreign.tendons import law
 from musculoskeletal_ae.emulator.reality import make_arm
-from musculoskeletal_ae.emulator.tendons import law
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity

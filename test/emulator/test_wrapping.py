@@ -10,8 +10,8 @@ from differences import slopes
 from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.design import route_jumps
-from musculoskeletal_ae.emulator.foreign import ForeignArm
-from musculoskeletal_ae.emulator.individual import NOMINAL, Individual, Spread
+from musculoskeletal_ae.emulator.foreign.arm import ForeignArm
+from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual, Spread
 from musculoskeletal_ae.robot.robot import Robot
 
 

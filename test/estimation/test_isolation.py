@@ -9,7 +9,7 @@ from readings import reading
 
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.settings import EstimatorSettings
-from musculoskeletal_ae.estimation.verification import (
+from musculoskeletal_ae.estimation.suspect_verification import (
     LONGEST,
     PATIENCE,
     ModuleLaw,

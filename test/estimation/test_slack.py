@@ -8,7 +8,7 @@ import pytest
 from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME, SLACK_LENGTH
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.finding import observe

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.experiments.detection import (
     CARRYING,
     LATEST_RUPTURE,

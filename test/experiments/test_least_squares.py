@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
-from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.individual import Individual
 from musculoskeletal_ae.experiments.least_squares import (
     nominal,
     on_calibrated_body,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from readings import reading
 
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.experiments.recording import (
     SAMPLE_TIME,

@@ -16,7 +16,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.estimation import estimator
 from musculoskeletal_ae.estimation.finding import Finding
 from musculoskeletal_ae.estimation.health import HealthMonitor

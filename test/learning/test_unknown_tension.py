@@ -4,7 +4,7 @@
 import numpy as np
 
 from musculoskeletal_ae.body_model.body_fit import BodyFit
-from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.emulator.kin.individual import Individual
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from robots import read_muscles, write_muscles, write_robot
 
-from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.emulator.kin.individual import Individual
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.motion.exploration import Exploration
 from musculoskeletal_ae.motion.exploration_steps import explored_posture, holdable_postures

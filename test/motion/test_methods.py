@@ -13,8 +13,8 @@ from nominal_body import posture_table
 
 from bench.timings import eager_proposed, eager_proposed_paper
 from musculoskeletal_ae.control.command import msc_compensation
-from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.mae.units import Mask

@@ -18,7 +18,7 @@ from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.command import LENGTH
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion import hand as hand_motion

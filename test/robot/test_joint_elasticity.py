@@ -17,10 +17,10 @@ from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.design.checks import check_robot
 from musculoskeletal_ae.design.robot_report import summary
-from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.emulator.effects import NONE
-from musculoskeletal_ae.emulator.foreign import ForeignArm
-from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
+from musculoskeletal_ae.emulator.foreign.arm import ForeignArm
+from musculoskeletal_ae.emulator.foreign.effects import NONE
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.estimation.contact import ContactEstimator
 from musculoskeletal_ae.exceptions import CheckpointError, InfeasibleError, RobotDescriptionError
 from musculoskeletal_ae.exporting.mjcf import export

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from robots import read_muscles, write_muscles, write_robot
 
-from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
 from musculoskeletal_ae.robot.description import SPEED_DEFAULT

@@ -10,8 +10,8 @@ from robots import write_robot
 
 from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.design.checks import check_robot
-from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
 from musculoskeletal_ae.importing.convert import import_robot

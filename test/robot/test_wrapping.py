@@ -10,8 +10,8 @@ from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.design import route_jumps
-from musculoskeletal_ae.emulator.arm import EmulatedArm
-from musculoskeletal_ae.emulator.individual import NOMINAL, Individual
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.wrapping import WrapObjects, wrapped_segments

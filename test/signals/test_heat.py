@@ -7,7 +7,7 @@ from numba import njit
 from readings import reading
 
 from musculoskeletal_ae.emulator import modules
-from musculoskeletal_ae.emulator.arm import EmulatedArm
+from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.heat import AIR, HELD, LEARNED, MOMENT, RATIO, Heat, flow

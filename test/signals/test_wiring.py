@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.emulator.kin.individual import Individual
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.wiring import Wiring, decide, judge
 

@@ -24,7 +24,7 @@ import mujoco
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.emulator.effects import NONE, Draw, Effects
+from musculoskeletal_ae.emulator.foreign.effects import NONE, Draw, Effects
 from musculoskeletal_ae.robot.robot import Robot
 
 ATTACHMENT = 0.1  # σ of a displacement, relative to the typical moment arm

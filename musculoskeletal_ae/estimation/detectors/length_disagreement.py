@@ -15,8 +15,8 @@ by as much as the offset.
 A joint sensor with an offset δθ changes g as well, but like a change of posture: Δ = −G δθ, where G
 is the muscle Jacobian ∂l/∂θ. Because muscles outnumber joints, arbitrary errors of lengths rarely
 have this form. If some δθ explains most of Δ, and more of it than a wrong length of one muscle,
-nothing is reported here, because the joint sensors are false (`joint_check.py`); otherwise, the
-lengths are reported. If only one length disagrees with θ, only its muscle is reported.
+nothing is reported here, because the joint sensors are false (`joint_sensor_check.py`); otherwise,
+the lengths are reported. If only one length disagrees with θ, only its muscle is reported.
 
 A healthy tendon that is shorter than l_net is stretched and has tension. If a tendon is shorter but
 has no tension, it is ruptured. Its muscle is reported, provided that the lengths of all other
@@ -100,7 +100,7 @@ HEALTHY_EXCESS = 0.5
 UNEXPLAINED = 0.5
 
 
-class JointDisagreement(Detector):
+class LengthDisagreement(Detector):
     """Reports muscle lengths that contradict the joint sensors.
 
     Attributes:

@@ -24,7 +24,7 @@ from numba import njit
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator import modules
-from musculoskeletal_ae.emulator.effects import Draw
+from musculoskeletal_ae.emulator.foreign.effects import Draw
 from musculoskeletal_ae.emulator.modules import AMBIENT, STEP, Command, MuscleState
 from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.robot import Robot

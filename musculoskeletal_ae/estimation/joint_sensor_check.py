@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decides which joint sensors are trusted, mainly by comparing them with the muscle lengths.
+"""Decides which joint sensors are trusted: finds those that slip, drift or stick.
+
+The readings are mainly compared with the muscle lengths:
 
     x_j = (θ_j − θ̂_j) − median of the same in earlier messages
 
@@ -92,7 +94,7 @@ class _Usual(NamedTuple):
     residual_spread: Array  # [m], (M,)
 
 
-class JointCheck:
+class JointSensorCheck:
     """Judges the joint sensors of one arm.
 
     Attributes:

@@ -12,7 +12,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.design.route_jumps import MOST_DRAWS, newly_jumping
-from musculoskeletal_ae.emulator.wrapping import Placed, Tree, WrappedRoutes, wrapped_lengths
+from musculoskeletal_ae.emulator.kin.wrapping import Placed, Tree, WrappedRoutes, wrapped_lengths
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.wrapping import WrapObjects

@@ -23,10 +23,11 @@ import pinocchio as pin
 from numba import njit
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.emulator import modules, wrapping
-from musculoskeletal_ae.emulator.individual import Individual
+from musculoskeletal_ae.emulator import modules
+from musculoskeletal_ae.emulator.kin import wrapping
+from musculoskeletal_ae.emulator.kin.individual import Individual
+from musculoskeletal_ae.emulator.kin.wrapping import Placed
 from musculoskeletal_ae.emulator.modules import STEP, Command, Modules, MuscleState
-from musculoskeletal_ae.emulator.wrapping import Placed
 from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.kinematics import joint_space_inertia
 from musculoskeletal_ae.robot.passive_torque import add_passive

@@ -8,7 +8,7 @@ import pytest
 from exact_mae import ExactMae
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.estimation.detectors.joint_disagreement import JointDisagreement
+from musculoskeletal_ae.estimation.detectors.length_disagreement import LengthDisagreement
 from musculoskeletal_ae.robot.robot import Robot
 
 ARM = Robot.load('musashi_left_arm')
@@ -19,7 +19,7 @@ def findings(theta, length_error, joint_error):
     """Return what the detector reports in 4 s in which an arm stands in a posture."""
     mae = ExactMae(ARM)
     mae.isolated, mae.anomaly = (), SimpleNamespace(calibrated=True)
-    detector, rng = JointDisagreement(ARM), np.random.default_rng(0)
+    detector, rng = LengthDisagreement(ARM), np.random.default_rng(0)
     detector.use(mae)
     length = mae.lengths(theta, TENSION) + length_error + rng.normal(0.0, 0.002, len(TENSION))
     sample = SimpleNamespace(length=length, bone_tension=TENSION, motor_tension=TENSION)

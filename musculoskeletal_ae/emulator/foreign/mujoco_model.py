@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.emulator.effects import Draw
+from musculoskeletal_ae.emulator.foreign.effects import Draw
 from musculoskeletal_ae.emulator.modules import STEP, joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
 from musculoskeletal_ae.importing.adapted_mjcf import HAND

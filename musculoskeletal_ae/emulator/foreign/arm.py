@@ -18,9 +18,9 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.design.route_jumps import MOST_DRAWS, newly_jumping
-from musculoskeletal_ae.emulator import deviation, mujoco_model, tendons
-from musculoskeletal_ae.emulator.effects import NONE, Draw, Effects
 from musculoskeletal_ae.emulator.faults import Readings
+from musculoskeletal_ae.emulator.foreign import deviation, mujoco_model, tendons
+from musculoskeletal_ae.emulator.foreign.effects import NONE, Draw, Effects
 from musculoskeletal_ae.emulator.modules import STEP, Arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.importing.adapted_mjcf import HAND
@@ -272,7 +272,7 @@ class ForeignArm(Arm):
             file: The `model.xml` that `import_robot` wrote beside the robot, instead of a body that
                 is built from the robot directory.
             deviates: Whether the arm is an individual that differs from `file`
-                (`emulator/deviation.py`).
+                (`emulator/foreign/deviation.py`).
 
         Raises:
             MusculoskeletalError: If the robot or the file cannot be built.
