@@ -29,7 +29,6 @@ from musculoskeletal_ae.arrival import INTERRUPTION, LONGEST_STEP, SILENCE
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation import status
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
-from musculoskeletal_ae.estimation.detectors.length_disagreement import GAP_LEARNED, GAP_YOUNG
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
 from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.health import HealthMonitor
@@ -40,7 +39,7 @@ from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthT
 from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
 from musculoskeletal_ae.estimation.mounting import MountingCheck
-from musculoskeletal_ae.estimation.repair_check import RepairCheck
+from musculoskeletal_ae.estimation.repair_check import LARGEST_LEARNED, LARGEST_YOUNG, RepairCheck
 from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.estimation.state_estimator import Estimate, StateEstimator
 from musculoskeletal_ae.estimation.suspect_verification import LONGEST
@@ -454,10 +453,6 @@ class Estimator:
         observation = Observation(sample, estimate, demand, dt, known, self.measured, command)
         finding = self.health.step(observation)
         detected = self._handle(finding, now)
-        if detected:
-            self.joint_check.drop_newest()
-        elif known and self.suspects.finding is None:
-            self.joint_check.step(observation, readings, now)
         contact = None
         if known and self.robot.tension_source.is_known:
             pull = sample.bone_tension * self.body.used
@@ -465,6 +460,11 @@ class Estimator:
             if self.suspects.finding is None:
                 self.healthy_torque.step(contact.torque, self.contact.velocity, sent_apart)
                 self.mounting.step(estimate.state.theta, pull, contact.torque, dt)
+        if detected:
+            self.joint_check.drop_newest()
+        elif known and self.suspects.finding is None:
+            load = 0.0 if contact is None else contact.distance
+            self.joint_check.step(observation, readings, now, load)
         self.output = Output(
             sample, estimate.state, estimate.covariance, estimate.anomaly, detected, contact
         )
@@ -547,8 +547,9 @@ class Estimator:
         sample, mae, body = self.sample, self.state.complete_mae, self.body
         if sample is None or mae is None:
             return None
-        limits = GAP_LEARNED if self.health.residual.is_calibrated else GAP_YOUNG
-        limit = float(np.max(limits.single)) if body.offsets.known else math.inf
+        limit = LARGEST_LEARNED if self.health.residual.is_calibrated else LARGEST_YOUNG
+        if not body.offsets.known:
+            limit = math.inf
         demand = self._commands.demand(self.robot, sample.length, self.stepped_at)
         jumping, theta = self.stream.jumping, self.measured
         return RepairCheck(self.robot, mae, sample, body.isolated, theta, demand, jumping, limit)

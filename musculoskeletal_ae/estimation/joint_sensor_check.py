@@ -16,7 +16,8 @@ cancels out.
 
 A sensor is doubted while the median of |x_j| over the newest messages exceeds a limit: a constant
 or a multiple of the healthy spread of x_j, whichever is larger. Only messages of different postures
-count, because the error of a network in one posture says little about others.
+count, because the error of a network in one posture says little about others. Messages of an arm
+that carries a load do not count.
 
 A change of muscle lengths also changes θ̂. The readings are therefore compared with two hypotheses:
 the sensors of the joints with large x are false, or the length of a single muscle has changed.
@@ -51,6 +52,9 @@ SPACING = 0.5  # shortest time between two messages that count [s]
 #: counted [rad]
 MOVED = 0.03
 EARLIER = 600  # largest number of earlier messages, at least 5 min of motion
+#: Count no message with more evidence for an external load than this (`contact.py`, d). Under a
+#: load that was not learned, the estimate may be wrong, and not the joint sensor.
+LOADED = 3.0
 ENOUGH = 80  # judge a sensor by this many earlier messages at least
 NEWEST = 48  # number of newest messages, which are judged by all messages before them
 #: Windows in which a sensor is judged: number of messages, smallest limit of the median of |x|
@@ -176,14 +180,17 @@ class JointSensorCheck:
 
     # -- messages -------------------------------------------------------------------------------
 
-    def step(self, observation: Observation, theta: Array, now: float) -> None:
+    def step(self, observation: Observation, theta: Array, now: float, load: float = 0.0) -> None:
         """Judge the sensors by a message of an arm without an anomaly, whose offsets are known.
 
         Args:
             observation: The message.
             theta: Usable readings of the joint sensors [rad], (D,), NaN for other joints.
             now: Time of a steady clock [s].
+            load: Evidence for an external load; NaN if unknown.
         """
+        if load > LOADED:
+            return
         self._since += observation.dt
         estimate, sample = observation.estimate.state.theta, observation.sample
         if self._mae is None or self._since < SPACING - 1e-9 or np.isnan(theta).all():
