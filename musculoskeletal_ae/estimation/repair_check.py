@@ -29,7 +29,7 @@ from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 #: Refuse a repaired muscle if |l − l'| exceeds this [m], with a calibrated network or with any
-#: other. Healthy lengths differ by at most 0.013 m and 0.051 m (`detectors/length_disagreement.py`).
+#: other. Healthy lengths differ by at most 0.013 and 0.051 m (`detectors/length_disagreement.py`).
 LARGEST_LEARNED, LARGEST_YOUNG = 0.02, 0.08
 
 
