@@ -456,7 +456,7 @@ class Estimator:
         self._unchecked += dt
         self._unchecked_sent += sent_apart
         detected, contact = False, None
-        if sample.jumped or not 0.0 < self._unchecked < SPACING:
+        if sample.jumped or not 0.0 < self._unchecked_sent < SPACING:
             detected, contact = self._check(sample, estimate, readings, now)
         self.output = Output(
             sample, estimate.state, estimate.covariance, estimate.anomaly, detected, contact

@@ -101,6 +101,17 @@ def test_an_anomaly_is_detected_within_50_ms_at_any_rate(stepped, wound, dt):
     assert (reported.index(True) + 1) * dt < 0.0501
 
 
+def test_late_messages_that_arrive_together_are_all_checked(stepped, wound):
+    stepped.step(wound)
+    stepped.now += 0.05
+    detected = []
+    for late in (0.04, 0.03, 0.02, 0.01, 0.0):  # sent 10 ms apart, received 0.1 ms apart
+        stepped.now += 0.0001
+        message = reading(states(wound))
+        detected.append(stepped.core.take(message, stepped.now, stepped.now, late).detected)
+    assert detected == [False, False, False, True, False]
+
+
 @pytest.mark.parametrize('dt', [0.01, 0.002])
 def test_a_jump_of_lengths_is_found_at_any_rate(stepped, healthy, dt):
     stepped.step(healthy, 20, dt)
