@@ -74,6 +74,11 @@ explanation:
 - *bound*: the time of the network's multiply-adds alone, at the speed of matrix products of that
   size on this machine
 
+The rows `mujoco.rollout` show what MuJoCo takes for the exported model of the same arm, at its own
+step and at that of our simulator. The last rows show the whole core of each node for one message of
+an exploring arm; detectors and learning skip some of these messages. `notes/wire.md` divides them
+into parts.
+
 The times "before" were measured on another machine, on which an estimate in torch took
 {torch_before:.0f} µs; on this machine it takes {slower:.1f} times as long. Therefore do not compare
 the two columns directly. Compare the ratio of each time to that of torch in this table, or to that

@@ -9,19 +9,29 @@ for the multiply-adds of the network alone, as matrix products. The products hav
 single call, and a batch of rows for many arms.
 """
 
+import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import mujoco
 import numpy as np
 import torch
+from mujoco import rollout
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.command import msc_compensation
+from musculoskeletal_ae.control.command import Command, msc_compensation
+from musculoskeletal_ae.control.controller import Controller
+from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.modules import STEP
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
+from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.exporting.mjcf import export
+from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, TorchLengths, from_mae
@@ -34,10 +44,15 @@ from musculoskeletal_ae.paper import control as paper
 from musculoskeletal_ae.paper.constants import CONTROL_WEIGHTS, TORQUE_UNITS
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
+from musculoskeletal_ae.signals.muscle_readings import muscle_reading
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 #: time a batch of this many arms; end a round of calls after about this time [s]
 MANY, LONGEST = 4096, 0.05
+SIMULATED = 0.01  # simulate this time in each call [s]
+ROLLED = 256  # number of arms in `mujoco.rollout`, whose time per arm does not depend on it
+#: rate [Hz] and number of the messages of which each is timed in the cores of the nodes
+RATE, MESSAGES = 500.0, 2000
 
 
 class Row(NamedTuple):
@@ -273,7 +288,7 @@ def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
 
     def step(simulated: Any) -> Callable[[], object]:
         # A GPU computes asynchronously. Reading the angles waits until it has finished.
-        return lambda: simulated.step(0.01).theta[-1].tolist()
+        return lambda: simulated.step(SIMULATED).theta[-1].tolist()
 
     network, work = TorchLengths(mae), 2 * products(mae, Mask.THETA_TENSION, lengths=True)
     one, per_arm = 'simulation step', 'simulation step, time per arm in a batch of'
@@ -288,7 +303,50 @@ def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
         Row(one, step(arms(1)), step(arms(1, network)), 1, work),
         Row(many, step(arms(MANY)), step(arms(MANY, network)), MANY, work),
         *there,
+        *rollout_rows(robot, mae, arms(ROLLED).state.theta),
         Row('loading a new network into the simulator', partial(Simulation(robot, mae).use, mae)),
+    ]
+
+
+def rollout_rows(robot: Robot, mae: Mae, theta: Array) -> list[Row]:
+    """Return rows for the time of a simulation step in `mujoco.rollout` of the exported model.
+
+    The model is that of `export_mjcf`. Each of its muscles has a constant control. MuJoCo simulates
+    the inertia of the links, which our simulator neglects.
+
+    Args:
+        robot: The robot.
+        mae: The network to export.
+        theta: Postures in which the arms begin [rad], (N, D).
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        export(robot, mae, Path(folder) / 'model')
+        model = mujoco.MjModel.from_xml_path(str(Path(folder) / 'model' / 'model.xml'))
+    data, state = mujoco.MjData(model), mujoco.mjtState.mjSTATE_FULLPHYSICS
+    starts = np.empty((len(theta), mujoco.mj_stateSize(model, state)))
+    tension = np.tile(robot.tension.bias, (len(theta), 1))
+    command = first_command(robot, mae, theta, tension)
+    for posture, start in zip(theta, starts):
+        data.qpos[:] = robot.kinematics.tree.angles(posture)
+        mujoco.mj_getState(model, data, start, state)
+
+    def simulating(timestep: float) -> Callable[[], object]:
+        steps = round(SIMULATED / timestep)
+        control = np.repeat(command[:, None], steps, axis=1)
+
+        def simulate() -> object:
+            model.opt.timestep = timestep
+            return rollout.rollout(model, data, starts, control)
+
+        return simulate
+
+    return [
+        Row(
+            f'the same {1e3 * SIMULATED:.0f} ms in mujoco.rollout, steps of {1e3 * step:.0f} ms',
+            simulating(step),
+            several=len(theta),
+        )
+        for step in (model.opt.timestep, SIMULATED)
     ]
 
 
@@ -302,6 +360,46 @@ def emulation_rows(robot: Robot) -> list[Row]:
             several=steps,
         )
         for reality in (KIN, FOREIGN)
+    ]
+
+
+def message_times(robot: Robot, mae: Mae, preset: str) -> list[Timed]:
+    """Return the mean times of the nodes' cores for one message of an exploring emulated arm."""
+    estimator, learner = Estimator(robot, preset), Learner(robot, preset=preset)
+    controller = Controller(robot, Settings(preset=preset))
+    estimator.use(mae)
+    controller.use(mae)
+    controller.explore(True)
+    arm, spent = make_arm(robot, 0), defaultdict[str, list[float]](list)
+
+    def timed(name: str, function: Callable[[], Any]) -> Any:
+        begun = time.process_time()
+        result = function()
+        spent[name].append(time.process_time() - begun)
+        return result
+
+    def command(theta: Array, now: float) -> Command | None:
+        controller.estimated(theta, now)
+        return controller.step(now)
+
+    for n in range(MESSAGES):
+        now = 100.0 + n / RATE
+        arm.step(1.0 / RATE)
+        reading = timed('emulated arm: readings', arm.sense)
+        theta, message = reading.theta, muscle_reading(robot, **reading.muscles)
+        timed('estimator: joint angles', partial(estimator.joints, theta, now))
+        output = timed('estimator: muscle states', partial(estimator.take, message, now, now))
+        timed('controller: muscle states', partial(controller.take, message, now))
+        wanted = timed('controller: command', partial(command, output.state.theta, now))
+        timed('learner: joint angles', partial(learner.joints, now, theta))
+        timed('learner: muscle states', partial(learner.take, message, now))
+        if wanted is not None:
+            arm.command_length(wanted.value)
+            estimator.commanded(now, length=wanted.value)
+    settled = {name: each[MESSAGES // 4 :] for name, each in spent.items()}
+    return [
+        Timed(f'{name}, {RATE:.0f} Hz', 1e6 * sum(each) / len(each), 0.0, 0.0)
+        for name, each in settled.items()
     ]
 
 
@@ -324,7 +422,7 @@ def measure(robot: Robot, preset: str, device: str | None = None) -> list[Timed]
             row.products / (one if row.several == 1 else many),
         )
         for row in every
-    ]
+    ] + message_times(robot, initial_mae(robot, preset, steps=200).mae, preset)
 
 
 def show(robot: Robot, preset: str, device: str | None = None) -> None:

@@ -180,7 +180,7 @@ class System:
                 # A busy machine may pause for longer than the default `max_age`, which would stop
                 # the arm.
                 assignments[name] += ['explore:=true', 'max_age:=1.0']
-            if name in ('learner', 'estimator'):
+            if name in ('learner', 'estimator', 'controller', 'combined'):
                 assignments[name].append(f'state_directory:={network.parent / str(time.time_ns())}')
         quiet: dict[str, Any] = {'stdout': subprocess.DEVNULL}
         for name in names:

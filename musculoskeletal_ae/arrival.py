@@ -42,6 +42,10 @@ INTERRUPTION = 0.2
 #: Largest time between two messages or steps that advances detectors, commands and emulated arms
 #: [s]. After a longer pause, they do not catch up.
 LONGEST_STEP = 0.1
+#: Skip a message that follows the last one used sooner than this, where no more than about 100
+#: messages a second are needed [s]. Detectors and learning are tuned at 100 Hz, and their
+#: computation for each message would otherwise take most of the time of a fast arm's nodes.
+SPACING = 0.006
 #: longest time between two requests of one stream of requests [s]; it exceeds SILENCE, because
 #: `ros2 topic pub` sends one message a second
 STREAM_GAP = 1.5

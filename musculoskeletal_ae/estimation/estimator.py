@@ -25,7 +25,7 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.arrival import INTERRUPTION, LONGEST_STEP, SILENCE
+from musculoskeletal_ae.arrival import INTERRUPTION, LONGEST_STEP, SILENCE, SPACING
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation import status
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
@@ -70,8 +70,8 @@ class Output(NamedTuple):
         covariance: Covariance of the joint angles [rad²], (D, D), or None if it is unknown.
         anomaly: Anomaly score A: the size of the network's residual, in scaled units.
         detected: Whether a finding has been latched because of this message.
-        contact: External load; None while the length offsets are unknown, and on a robot whose
-            tensions are unknown.
+        contact: External load; None while the length offsets are unknown, on a robot whose tensions
+            are unknown, and for a message that follows the last checked one within SPACING.
     """
 
     sample: MuscleSample
@@ -110,6 +110,7 @@ class Estimator:
         measured: Joint angles from joint sensors [rad], (D,), at the last message with an estimate;
             None unless all joint sensors are trusted and reported a usable value within the 0.05 s
             before it.
+        load: The newest external load; None as in `Output`.
         stepped_at: Time on the steady clock at which the last message was accepted while there was
             a network [s].
     """
@@ -140,6 +141,10 @@ class Estimator:
         self.output: Output | None = None
         self.measured: Array | None = None
         self.stepped_at = -math.inf
+        self.load: Contact | None = None
+        #: time since the health of the body was checked: by reception, of which each message counts
+        #: at most LONGEST_STEP, and by publication [s]
+        self._unchecked = self._unchecked_sent = 0.0
         self._commands = ModuleCommands()
         self._rejected = Persistence()  # why messages are rejected
         self.joint_stream = JointStream(robot)
@@ -257,7 +262,7 @@ class Estimator:
         self.calibration = CheckedCalibration(self.robot, self.mae, posture)
         self.distrust_lengths(Evidence.CALIBRATING)
         self.health.residual.forget_reading()
-        self.output = None
+        self.output = self.load = None
         self.contact.reset()
         self.reset()
         self.health.joints.forget()
@@ -445,30 +450,53 @@ class Estimator:
         estimate = self.state.step(sample.bone_tension, sample.length_read - guess.offset)
         if self.suspects.verification is not None:
             self._verify(sample, estimate, dt, now)
-        demand = self._commands.demand(self.robot, sample.length, now)
-        known = self.body.offsets.known
         readings = self._fresh_readings(now)
         self.measured = self._measured_theta(readings)
-        command = self._commands.length(now)
-        observation = Observation(sample, estimate, demand, dt, known, self.measured, command)
-        finding = self.health.step(observation)
-        detected = self._handle(finding, now)
-        contact = None
-        if known and self.robot.tension_source.is_known:
-            pull = sample.bone_tension * self.body.used
-            contact = self.contact.step(estimate.state.theta, pull, sent_apart)
-            if self.suspects.finding is None:
-                self.healthy_torque.step(contact.torque, self.contact.velocity, sent_apart)
-                self.mounting.step(estimate.state.theta, pull, contact.torque, dt)
-        if detected:
-            self.joint_check.drop_newest()
-        elif known and self.suspects.finding is None:
-            load = 0.0 if contact is None else contact.distance
-            self.joint_check.step(observation, readings, now, load)
+        self._unchecked += dt
+        self._unchecked_sent += sent_apart
+        detected, contact = False, None
+        if sample.jumped or not 0.0 < self._unchecked_sent < SPACING:
+            detected, contact = self._check(sample, estimate, readings, now)
         self.output = Output(
             sample, estimate.state, estimate.covariance, estimate.anomaly, detected, contact
         )
         return self.output
+
+    def _check(
+        self, sample: MuscleSample, estimate: Estimate, readings: Array, now: float
+    ) -> tuple[bool, Contact | None]:
+        """Check the health of the body, and estimate the external load.
+
+        Args:
+            sample: The readings.
+            estimate: The network's estimate.
+            readings: Fresh readings of the joint sensors [rad], (D,); NaN where there are none.
+            now: Time on the steady clock [s].
+
+        Returns:
+            Whether a finding has been latched, and the external load as in `Output`.
+        """
+        dt, sent_apart = min(self._unchecked, LONGEST_STEP), self._unchecked_sent
+        self._unchecked = self._unchecked_sent = 0.0
+        known = self.body.offsets.known
+        demand = self._commands.demand(self.robot, sample.length, now)
+        command = self._commands.length(now)
+        observation = Observation(sample, estimate, demand, dt, known, self.measured, command)
+        detected = self._handle(self.health.step(observation), now)
+        self.load = None
+        if known and self.robot.tension_source.is_known:
+            pull = sample.bone_tension * self.body.used
+            self.load = self.contact.step(estimate.state.theta, pull, sent_apart)
+            if self.suspects.finding is None:
+                torque = self.load.torque
+                self.healthy_torque.step(torque, self.contact.velocity, sent_apart)
+                self.mounting.step(estimate.state.theta, pull, torque, dt)
+        if detected:
+            self.joint_check.drop_newest()
+        elif known and self.suspects.finding is None:
+            load = 0.0 if self.load is None else self.load.distance
+            self.joint_check.step(observation, readings, now, load)
+        return detected, self.load
 
     # -- findings, verification and calibration -------------------------------------------------
 

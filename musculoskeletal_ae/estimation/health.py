@@ -23,7 +23,7 @@ from musculoskeletal_ae.signals.heat import Heat
 
 
 class HealthMonitor:
-    """Checks every message with all detectors, and returns the finding of the first that has one.
+    """Checks messages with all detectors, and returns the finding of the first that has one.
 
     Attributes:
         residual: The detector of the residual distance, which also names the most suspect muscle.

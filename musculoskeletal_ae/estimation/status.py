@@ -191,7 +191,7 @@ def _residuals(core: Estimator) -> dict[str, str]:
 def _contact(core: Estimator) -> dict[str, str]:
     if not core.robot.tension_source.is_known:
         return {'contact': UNKNOWN_TENSION, 'tension': UNKNOWN_TENSION}
-    contact = None if core.output is None else core.output.contact
+    contact = core.load
     if contact is None:
         return {}
     count = str(core.contact.count)

@@ -56,6 +56,8 @@ from musculoskeletal_ae.ros.messages import (
 from musculoskeletal_ae.ros.second_publishers import AUTHORS
 from musculoskeletal_ae.signals.limits import LIMITS
 
+OVERDUE = 1.5  # compute a command after this number of periods without an estimate
+
 
 class Controller(Shell):
     """Passes messages, parameters and services to the core controller; publishes its commands."""
@@ -114,8 +116,9 @@ class Controller(Shell):
         serve(self, SetBool, 'controller/explore', self._explore)
         serve(self, Trigger, 'controller/stop', self._stop)
         serve(self, Trigger, 'controller/reset', self._reset)
-        # While no estimates arrive, this timer checks message ages and publishes commands.
-        self.create_timer(1.0 / self.rate, self._watch, clock=STEADY)
+        # Each step resets this timer. It is therefore called only while no estimates arrive, to
+        # check the ages of messages and to publish commands.
+        self.overdue = self.create_timer(OVERDUE / self.rate, self._step, clock=STEADY)
         if self.parameter('explore') and (reason := self.core.explore_at_start()):
             self.get_logger().warning(f'not exploring: {reason}')
 
@@ -279,11 +282,8 @@ class Controller(Shell):
             raise MusculoskeletalError(f'refused: {present.text}; {remedy}; {again}')
         return 'moving to the last target, if there is one; call controller/explore to explore'
 
-    def _watch(self) -> None:
-        if time.monotonic() - self.core.watchdog.steps.stepped_at > 1.5 / self.rate:
-            self._step()
-
     def _step(self) -> None:
+        self.overdue.reset()
         command = self.core.step(time.monotonic(), self.now())
         if command is not None:
             value, offset = command.value, self.body.offsets.offset

@@ -6,6 +6,7 @@ muscle_states, joint_states or vision_joint_states (or neither), imu, body_state
 accepted_checkpoint and rejected_checkpoint are the estimator's answers.
 """
 
+import math
 import time
 from collections.abc import Iterable, Iterator
 from functools import partial
@@ -16,6 +17,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
+from musculoskeletal_ae.arrival import SPACING
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.learning import learner
@@ -33,6 +35,7 @@ from musculoskeletal_ae.ros.second_publishers import SEVERAL, LinkSensors, publi
 IMU = 'imu'  # topic of the accelerometers
 MOST_DIGITS = 15  # reject a version of a network with more digits
 POLL_PERIOD = 0.05  # check the training process at this interval [s]
+LEAST_PERIOD = 0.01  # pair joint angles at most as narrowly as if messages had this period [s]
 JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
 
 
@@ -44,11 +47,12 @@ class Learner(Shell):
     def __init__(self, **options: Any) -> None:
         super().__init__('learner', **options)
         value = self.parameter
+        self.taken_at = -math.inf  # time of the last message that was learned [s]
         self.core = learner.Learner(
             self.robot,
             preset=value('preset'),
             seed=value('seed'),
-            period=1.0 / self.rate,
+            period=max(1.0 / self.rate, LEAST_PERIOD),
             joint_source=value('joint_source'),
             trainer=partial(TrainerProcess, device=value('device')),
             directory=self.state_directory(),
@@ -126,7 +130,11 @@ class Learner(Shell):
         self.core.imu(self.now(), link, acceleration)
 
     def _take_muscle_states(self, message: Float64MultiArray, _: float, delay: float) -> None:
-        self.core.take(message, self.now(), delay)
+        now = self.now()
+        if 0.0 < now - self.taken_at < SPACING:  # more messages would not improve the samples
+            return
+        self.taken_at = now
+        self.core.take(message, now, delay)
 
     def _use_accepted(self, message: UInt8MultiArray) -> Iterator[None]:
         mae = checkpoint.from_bytes(bytes(message.data), self.robot)

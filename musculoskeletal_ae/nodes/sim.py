@@ -29,6 +29,7 @@ from musculoskeletal_ae.ros.second_publishers import MOTOR_COMMAND
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
 from musculoskeletal_ae.simulation.simulation import Simulation
 
+MOST_RATE = 100.0  # beside a robot, simulate at most this often, because nothing is controlled [Hz]
 TEMPERATURE = 25.0  # report this temperature of all modules [°C]
 
 
@@ -59,7 +60,8 @@ class Sim(ArmNode):
             self.follow_body(self._isolate)  # `_command` reads `body.offsets`
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)
         self.ticked = self.get_clock().now()
-        self.create_timer(1.0 / self.rate, self._tick)
+        rate = self.rate if self.as_robot else min(self.rate, MOST_RATE)
+        self.create_timer(1.0 / rate, self._tick)
 
     def _use_checkpoint(self, mae: Mae) -> None:
         if self.arm is None:

@@ -64,10 +64,19 @@ class _Group(NamedTuple):
     """Entities of one kind, such as all subscriptions of the executor's nodes."""
 
     kind: str  # name of the kind in rclpy's wait set
-    entities: list[Any]
-    add: Callable[[Any], None]  # adds the handle of an entity to the wait set
+    handles: list[Any]
+    by_pointer: dict[int, Any]  # the entities by the pointers of their handles
+    add: Callable[[Any], None]  # adds a handle to the wait set
     #: takes the message of an entity, and returns a function that calls the callback with it
     take: Callable[[Any], Any]
+
+
+def _group(
+    kind: str, entities: list[Any], add: Callable[[Any], None], take: Callable[[Any], Any]
+) -> _Group:
+    handles = [entity.handle for entity in entities]
+    by_pointer = {handle.pointer: entity for handle, entity in zip(handles, entities)}
+    return _Group(kind, handles, by_pointer, add, take)
 
 
 class LeanExecutor(SingleThreadedExecutor):
@@ -130,8 +139,8 @@ class LeanExecutor(SingleThreadedExecutor):
         wait_set, groups = self._wait_set, self._groups
         wait_set.clear_entities()
         for group in groups:
-            for entity in group.entities:
-                group.add(entity.handle)
+            for handle in group.handles:
+                group.add(handle)
         for action in self._actions:
             action.add_to_wait_set(wait_set)
         wait_set.add_guard_condition(self._guard.handle)
@@ -141,10 +150,8 @@ class LeanExecutor(SingleThreadedExecutor):
             raise ExternalShutdownException
         has_action = any(action.is_ready(wait_set) for action in self._actions)
         for group in groups:
-            ready = wait_set.get_ready_entities(group.kind)
-            for entity in group.entities if ready else ():
-                if entity.handle.pointer in ready:
-                    self._run(entity, group.take)
+            for pointer in wait_set.get_ready_entities(group.kind):
+                self._run(group.by_pointer[pointer], group.take)
         # Up to rclpy 7.1.8, tasks that await a future must be polled. Finished tasks may still be
         # listed. Later versions call `create_task` or list a task as ready to resume it.
         if hasattr(self, '_tasks'):
@@ -207,10 +214,10 @@ class LeanExecutor(SingleThreadedExecutor):
             count.num_clients, count.num_services, count.num_events, self.context.handle,
         )  # fmt: skip
         self._groups = (
-            _Group('timer', timers, new.add_timer, self._take_timer),
-            _Group('subscription', subscriptions, new.add_subscription, self._take_subscription),
-            _Group('service', services, new.add_service, self._take_service),
-            _Group('client', clients, new.add_client, self._take_client),
+            _group('timer', timers, new.add_timer, self._take_timer),
+            _group('subscription', subscriptions, new.add_subscription, self._take_subscription),
+            _group('service', services, new.add_service, self._take_service),
+            _group('client', clients, new.add_client, self._take_client),
         )
 
     def _release(self) -> None:

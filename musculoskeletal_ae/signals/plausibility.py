@@ -46,6 +46,9 @@ class LevelCheck:
             used: Which muscles to check, (M,).
             lengths_known: Whether to check l, which requires known length offsets.
         """
+        beyond = (states < self._low) | (states > self._high)
+        if not np.count_nonzero(beyond):
+            return None
         low = self._low.copy()
         # A slack tendon, such as that of a ruptured muscle, can be wound in beyond any posture.
         low[Row.LENGTH] -= np.where(
@@ -90,7 +93,8 @@ class TemperatureCheck:
         self._age += elapsed
         change = LIMITS.temperature_step + LIMITS.temperature_rate * self._age
         accepted = possible & (np.abs(read - self._believed) <= change)
-        accepted |= self._begins(np.where(possible, read, math.nan), elapsed)
+        if np.count_nonzero(np.isnan(self._believed)):
+            accepted |= self._begins(np.where(possible, read, math.nan), elapsed)
         self._believed = np.where(accepted, read, self._believed)
         self._age = np.where(accepted, 0.0, self._age)
         return np.where(possible, self._believed, math.nan)

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 
+from contextlib import suppress
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,12 +10,14 @@ import pytest
 from readings import reading
 
 from musculoskeletal_ae.arrival import INTERRUPTION
+from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.detectors.missing_values import SILENT
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.module_commands import COMMAND_AGE
 from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
+from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 
 DT = 0.01
@@ -89,6 +92,34 @@ def test_a_network_with_singular_statistics_is_refused_and_the_one_in_use_stays(
         stepped.core.use(replace(calibrated, version=9, anomaly=singular))
     assert stepped.core.mae is calibrated
     assert np.isfinite(stepped.step(healthy)[0].anomaly)
+
+
+@pytest.mark.parametrize('dt', [0.01, 0.002, 0.001])
+def test_an_anomaly_is_detected_within_50_ms_at_any_rate(stepped, wound, dt):
+    reported = [estimate.detected for estimate in stepped.step(wound, round(0.1 / dt), dt)]
+    assert sum(reported) == 1
+    assert (reported.index(True) + 1) * dt < 0.0501
+
+
+def test_late_messages_that_arrive_together_are_all_checked(stepped, wound):
+    stepped.step(wound)
+    stepped.now += 0.05
+    detected = []
+    for late in (0.04, 0.03, 0.02, 0.01, 0.0):  # sent 10 ms apart, received 0.1 ms apart
+        stepped.now += 0.0001
+        message = reading(states(wound))
+        detected.append(stepped.core.take(message, stepped.now, stepped.now, late).detected)
+    assert detected == [False, False, False, True, False]
+
+
+@pytest.mark.parametrize('dt', [0.01, 0.002])
+def test_a_jump_of_lengths_is_found_at_any_rate(stepped, healthy, dt):
+    stepped.step(healthy, 20, dt)
+    jumped = healthy._replace(length=healthy.length + 0.05)
+    for _ in range(round(2.0 * LIMITS.settled / dt)):
+        with suppress(RejectionError):
+            stepped.step(jumped, 1, dt)
+    assert stepped.core.suspects.finding.kind is ConditionKind.LENGTHS_JUMPED
 
 
 def test_an_anomaly_is_detected_once_and_latched_with_its_first_suspect(

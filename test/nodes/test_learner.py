@@ -217,6 +217,16 @@ def test_the_learner_saves_what_the_estimator_accepts_and_returns_from_what_it_r
     assert learner.report().values['last rejected network'] == 'it is too wrong'
 
 
+def test_of_a_fast_arm_the_learner_uses_more_than_100_messages_a_second_but_not_all(host, graph):
+    learner, duration, period = host(rate=500.0), 0.3, 0.002
+    for _ in range(round(duration / period)):
+        learner.arm.time += period - DT  # `publish` adds DT
+        learner.arm.publish()
+        graph.spin(0.005)
+    graph.wait(lambda: learner.taken > 100 * duration, 'messages that are used')
+    assert learner.taken < 200 * duration
+
+
 def test_an_anomaly_and_learner_enable_stop_learning_for_a_time(host, graph):
     learner = host()
     healthy = BodyState.healthy(6)

@@ -91,6 +91,15 @@ def test_the_simulator_follows_the_command_of_the_hardware(arm, arm26, mae, core
     arm.wait(lambda: arm.report('sim').message == 'following commands', 'the report')
 
 
+def test_beside_a_fast_robot_the_simulator_publishes_at_100_hz(graph, trained_file):
+    states = graph.listen(JointState, 'sim/joint_states')
+    graph.host(Sim, robot='arm26', checkpoint=trained_file, rate=1000.0)
+    graph.next('sim/joint_states', 50)
+    stamps = [message.header.stamp for message in states]
+    times = [stamp.sec + 1e-9 * stamp.nanosec for stamp in stamps]
+    assert (times[-1] - times[0]) / (len(times) - 1) > 0.009
+
+
 def test_a_push_acts_until_it_is_zero(arm, arm26, core):
     rest = posture(arm)
     push = arm.publisher(WrenchStamped, 'sim/external_wrench')
