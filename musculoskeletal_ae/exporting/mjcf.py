@@ -25,7 +25,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.fit import fit_to_network
-from musculoskeletal_ae.emulator.foreign.arm import mujoco_model
+from musculoskeletal_ae.emulator.foreign import mujoco_model
 from musculoskeletal_ae.emulator.foreign.effects import NONE, Draw
 from musculoskeletal_ae.emulator.modules import joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError

@@ -9,8 +9,8 @@ import pytest
 from robots import read_muscles, write_muscles, write_robot
 
 from emulator.commands import to_mid_range
+from musculoskeletal_ae.emulator.foreign import arm as foreign
 from musculoskeletal_ae.emulator.foreign.arm import ForeignArm
-from musculoskeletal_ae.emulator.foreign.arm import arm as foreign
 from musculoskeletal_ae.emulator.foreign.effects import NONE, Effects
 from musculoskeletal_ae.emulator.foreign.tendons import law
 from musculoskeletal_ae.emulator.reality import make_arm

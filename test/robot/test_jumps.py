@@ -13,8 +13,8 @@ from robots import DRUM_ENDS, behind_a_drum
 from musculoskeletal_ae.design import route_jumps as robot_jumps
 from musculoskeletal_ae.design.checks import check_robot
 from musculoskeletal_ae.design.route_jumps import JUMP, jump_choices, jumps
+from musculoskeletal_ae.emulator.foreign import arm as foreign
 from musculoskeletal_ae.emulator.foreign.arm import ForeignArm
-from musculoskeletal_ae.emulator.foreign.arm import arm as foreign
 from musculoskeletal_ae.emulator.kin import individual
 from musculoskeletal_ae.emulator.kin.individual import Individual
 

@@ -19,7 +19,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.design.route_jumps import MOST_DRAWS, newly_jumping
 from musculoskeletal_ae.emulator.faults import Readings
-from musculoskeletal_ae.emulator.foreign.arm import deviation, mujoco_model, tendons
+from musculoskeletal_ae.emulator.foreign import deviation, mujoco_model, tendons
 from musculoskeletal_ae.emulator.foreign.effects import NONE, Draw, Effects
 from musculoskeletal_ae.emulator.modules import STEP, Arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
