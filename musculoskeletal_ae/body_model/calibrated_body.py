@@ -33,11 +33,11 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.signals.friction import LARGEST_GAIN, Transmission
 
-#: largest |γ|, |b|/T_limit and |F|/T_limit of `signals.friction.Transmission`
+#: permit no larger |γ|, |b|/T_limit and |F|/T_limit of `signals.friction.Transmission`
 LARGEST_DRIVE = np.array([LARGEST_GAIN, 1.0, 1.0])
-#: largest |μ|; the tensions at the motor and at the elastic element then differ by a factor of 2
+#: permit no larger |μ|: at this value, friction halves or doubles the tension along the route
 LARGEST_FRICTION = 0.7
-LARGEST_LOG = 1.5  # largest |κ|
+LARGEST_LOG = 1.5  # permit no larger |κ|
 
 
 class Layout:
@@ -88,8 +88,8 @@ class CalibratedBody:
         for m in range(robot.muscle_count):
             segments = np.flatnonzero(routes.muscle == m)
             points = np.union1d(routes.first[segments], routes.second[segments])
-            # A muscle may have several branches. The line from the last point of a branch to the
-            # first point of the next keeps the factor 0.
+            # A muscle may have several branches. Nothing connects the last point of a branch to the
+            # first point of the next, so this line keeps the factor 0.
             weights = np.zeros(len(points) - 1)
             weights[routes.first[segments] - points[0]] = routes.weight[segments]
             self.layouts.append(Layout(points, weights, self._has_drive))

@@ -27,9 +27,9 @@ from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 
 DIFFERENCE = 1e-6  # step of the finite differences [rad]
-#: motion of a joint up to which Σ T ∂²l/∂θ² of the geometric model is reused [rad]
+#: reuse Σ T ∂²l/∂θ² of the geometric model until a joint has moved by more than this [rad]
 REUSED_MOTION = 0.05
-SMALL = 1e-6  # divide by at least this, so that nothing is divided by 0
+SMALL = 1e-6  # raise smaller divisors to this value
 
 
 class Unknowns(NamedTuple):

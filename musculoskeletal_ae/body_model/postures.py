@@ -53,20 +53,20 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 
 GRAVITY_NOISE = 0.02  # σ_u, from the noise and the mounting of the accelerometer [rad]
-FIRST_NOISE = 0.002  # initial σ of a length [m]
-LEAST_NOISE = 0.0008  # smallest σ of a length in the weights, for errors of the body model [m]
+FIRST_NOISE = 0.002  # assume this σ of a length in the first iteration [m]
+LEAST_NOISE = 0.0008  # weigh lengths by no smaller σ than this, for errors of the body model [m]
 #: σ_τ as a share of the muscles' absolute torques at a joint. It is wide, because friction and the
 #: offsets of the tension sensors are common to all samples.
 TORQUE_NOISE = 0.3
-#: smallest usual residual torque, as a share of the muscles' absolute torques at a joint
+#: assume at least this usual residual torque, as a share of the muscles' absolute torques
 LEAST_TORQUE = 0.01
-SCALINGS = 2  # number of iterations that compute the Birge ratio
-ROUNDS = 12  # largest number of Gauss–Newton iterations
-#: Decrease of the cost, per measured length, below which the iterations end. The step is then far
-#: shorter than the posterior spread, and the noise has settled. With ten times this value, the fit
-#: mistakes a slipped joint sensor for a changed muscle more often.
+SCALINGS = 2  # recompute the Birge ratio this many times
+ROUNDS = 12  # end the fit after this many Gauss–Newton iterations
+#: End the fit if an iteration lowers the cost by less than this, per measured length. The step is
+#: then far shorter than the posterior spread. With ten times this value, the fit mistakes a slipped
+#: joint sensor for a changed muscle more often.
 LEAST_DECREASE = 3e-4
-TYPICAL_STEP = 0.3  # typical step of a posture [rad]
+TYPICAL_STEP = 0.3  # expect a posture to move by this much per iteration [rad]
 
 
 class Weights(NamedTuple):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The remainder: what the samples show of the lengths, and the calibrated body cannot express.
+"""The remainder: the part of the measured lengths that the calibrated body cannot express.
 
     l_i(θ, T) = body_i(θ, T; w_i) + g_i(θ, T),   g_i ~ GP(0, k_i),   l_i measured with noise σ_i
 
@@ -10,8 +10,8 @@ R are the joint ranges, (…)_c has the joints that muscle i crosses, and (…)_
 cross. With a large e, g depends only on the joints that a muscle crosses, for example because
 tendons wrap round bones. With e near 1, all joints change all lengths, for example because the
 links of an elastic body bend together. A small c means that tendons stretch unlike their model.
-With a large ν, g is smooth on one scale. With ν near 1, it varies on many scales: it may be rough,
-for example where tendons become slack, and still far samples tell something.
+With a large ν, g is smooth on one scale. With ν near 1, it varies on many scales, for example where
+tendons become slack: it may be rough, and yet distant samples still inform it.
 
 The samples decide how far the body is trusted. The amplitude a, the scales b, e and c, the shape ν
 and the noise σ are those with the largest evidence, which is the probability of the lengths after
@@ -22,9 +22,9 @@ the parameters w of the body have been integrated out over their prior:
 S are the spreads of the prior, and ω the robust weights of the fit. If the body explains the
 lengths, a falls to nearly zero. If it does not, g approaches the true lengths with more samples.
 
-The errors of g are correlated between muscles, for example if one slack tendon lets the link move,
-which changes all other lengths. The correlation is that of the errors of each sample's lengths if
-they are predicted from all other samples.
+The errors of g are correlated between muscles: if one slack tendon lets the link move, all other
+lengths change. The correlation is computed from the errors of each sample's lengths when they are
+predicted from all other samples.
 """
 
 from __future__ import annotations
@@ -51,21 +51,21 @@ UNITS = np.array([0.002, 0.5, 1.0, 1.0, 1.0, 0.001])
 USUAL = np.array([-1.5, 0.5, 1.0, 2.0, 1.0, -2.0])  # means of their prior
 SPREAD = np.array([2.0, 0.4, 1.0, 1.0, 1.0, 1.5])  # standard deviations of their prior
 BOUNDS = ((-8.0, 4.0), (-1.5, 3.0), (0.0, 4.0), (-1.5, 4.0), (0.0, 3.5), (-2.5, 3.0))
-#: initial values of a search: a trusted body, a wrong body, and one with a rough remainder
+#: start a search from these values: a trusted body, a wrong body, and a rough remainder
 STARTS = (
     USUAL,
     USUAL + [2.5, 0.0, 0.0, 0.0, 0.0, 0.0],
     USUAL + [3.0, -1.0, -1.0, 0.0, 0.0, 1.0],
 )
-#: Number of samples below which each search begins with STARTS. The evidence of few samples has
-#: several maxima, which change with each sample. Later searches continue from the last result.
+#: With fewer samples, start every search from STARTS: the evidence then has several maxima, which
+#: change with each sample. With more, continue from the last result.
 FEW_SAMPLES = 60
-ROUNDS = 25  # largest number of iterations of a search that begins with STARTS
-FEW_ROUNDS = 4  # largest number of iterations of a search that continues from an earlier result
-JUDGING = 150  # largest number of samples that the evidence is computed from
-LEAST_SAMPLES = 5  # smallest number of samples from which a remainder is learned
-UNKNOWN = 1.0  # variance of a length that a sample does not describe [m²]
-JITTER = 1e-10  # variance that keeps covariances positive definite [m²]
+ROUNDS = 25  # end a search that starts from STARTS after this many iterations
+FEW_ROUNDS = 4  # end a search that continues from the last result after this many iterations
+JUDGING = 150  # compute the evidence from at most this many samples
+LEAST_SAMPLES = 5  # learn a remainder only from at least this many samples
+UNKNOWN = 1.0  # assume this variance of a length that a sample does not describe [m²]
+JITTER = 1e-10  # add this variance to keep covariances positive definite [m²]
 
 
 class Lengths(NamedTuple):
@@ -239,7 +239,7 @@ def group_remainder(
     ranges = (robot.upper - robot.lower)[joints]
     scale = np.concatenate([ranges, robot.tension.limit[muscles]])
     if not robot.tension_source.is_known:
-        scale[len(joints) :] = np.inf  # the tensions say nothing
+        scale[len(joints) :] = np.inf  # ignore the tensions
     count = len(lengths.theta)
     rows = np.arange(count)
     if count > JUDGING:
