@@ -27,9 +27,8 @@ POLYNOMIALS = (
     (2.8769, -3.1427, 1.2046),
     (2.8366, -3.0525, 1.2012),
 )
-# For matrices whose smaller side is longer than this, an eigendecomposition takes half the time of
-# the polynomials. It was measured for 413 × 827, as in the network of a hand of 23 joints; for
-# 163 × 327, both take the same time.
+# Use an eigendecomposition for matrices whose smaller side is longer than this. At 413 × 827, as in
+# a hand of 23 joints, it takes half the time of the polynomials; at 163 × 327, as long as they do.
 LARGE = 256
 #: raise eigenvalues to at least this multiple of the largest; float32 does not resolve smaller ones
 LEAST_EIGENVALUE = 1e-7
