@@ -79,7 +79,7 @@ class Body(NamedTuple):
     most: Array  # T_max [N]
     span: Array  # distance of l_target below l at which T reaches T_max [m]
     loose: Array  # distance of l_target above l beyond which T no longer changes [m]
-    friction: Array  # tendon friction coefficient μ
+    friction: Array  # tendon friction μ
     speed: Array  # largest speed of the module [m/s]; infinite if it is not stated
     # constants of the series elastic elements, as in `SeriesElastic`
     force: Array
@@ -329,8 +329,9 @@ def advance(
             stiffness, bias, most = body.stiffness[m], body.bias[m], body.most[m]
             friction = body.friction[m]
             for n in range(arms):
-                # While the friction of a tendon reverses, it acts like a stiff spring. Its
-                # stiffness is constant here, but decreases gradually on the real arm.
+                # While the friction of a tendon reverses, it acts like a stiff spring. On the real
+                # arm, its stiffness decreases gradually; here it is constant until the friction has
+                # reversed.
                 rubbed, turns = friction * end[m, n], abs(turning[m, n]) < 1.0
                 rub = rubbed / REVERSAL if turns else 0.0
                 lost[m, n] = 0.0 if turns else rubbed * (turning[m, n] - slid[m, n])
