@@ -35,8 +35,8 @@ from musculoskeletal_ae.robot.urdf import MOST_PARTS, ONE_AXIS, parse_xml, read_
 
 Limits = dict[str, tuple[float, float]]  # lower and upper limit of each joint [rad] or [m]
 
-ROUND = 'SPHERICAL', 'CYLINDRICAL'  # via points that are wraps
-#: attributes that SDF 1.6 does not have, and that change the meaning of poses and axes
+ROUND = 'SPHERICAL', 'CYLINDRICAL'  # count via points of these kinds as wraps
+#: reject SDF 1.6 files with these attributes: SDF 1.6 lacks them, and they change poses and axes
 FRAMES = 'relative_to', 'expressed_in', 'rotation_format'
 
 
@@ -134,7 +134,7 @@ def _read_limits(file: Path) -> dict[str, tuple[float, float]]:
 def _measure(source: Source) -> None:
     """Set `source.lengths` to a function that computes the lengths of all straight routes.
 
-    CARDSflow, too, connects the points of a straight route by straight lines.
+    Only straight routes can be compared: CARDSflow, too, connects their points by straight lines.
     """
     straight = {n: r for n, r in source.routes.items() if not any(isinstance(p, Wrap) for p in r)}
     joints = [n for n, j in zip(source.model.names, source.model.joints) if j.shortname() in KINDS]
@@ -267,7 +267,7 @@ def _read_sdf(
         lost = sorted({*above, *above.values(), *links} - {'world'} - set(order)) or order
         raise refuse(file, f'expected a tree of links with one root; outside it: {", ".join(lost)}')
     source.above = above
-    #: for each link, index of the joint that carries it, and the joint's pose in the model
+    #: for each link, the index of the joint that carries it, and the joint's pose in the model
     stands: dict[str, tuple[int, pin.SE3]] = {}
     for name in order:
         carrier, at = stands.get(above.get(name, ''), (0, pin.SE3.Identity()))

@@ -31,7 +31,7 @@ from musculoskeletal_ae.robot.joint_tree import resolved
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
-LARGEST = 20_000_000  # largest file [bytes]
+LARGEST = 20_000_000  # refuse a larger file [bytes]
 OPENSIM = (
     'OpenSim models are not read; convert this model to MJCF with MyoConverter '
     '(https://github.com/MyoHub/myoconverter) and import the .xml file that it writes'
@@ -48,7 +48,7 @@ class Imported(NamedTuple):
     """An imported robot."""
 
     robot: Robot
-    #: properties that were chosen, dropped, held fixed, renamed or approximated
+    #: what the import chose, dropped, held fixed, renamed or approximated
     notes: tuple[str, ...]
     #: comparison with the source's own engine; None if this engine computes no lengths
     comparison: Comparison | None
@@ -63,7 +63,7 @@ def read_source(file: Path) -> Source:
         RobotDescriptionError: If the file cannot be read as XML, or if a URDF is not valid.
     """
     text = read_text(file, refuse, LARGEST)
-    # Look for OpenSim before parsing, because some of its tags are not valid XML.
+    # Look for OpenSim before parsing, because some of its files are not valid XML.
     if '<OpenSimDocument' in text:
         raise refuse(file, OPENSIM)
     try:
@@ -97,7 +97,8 @@ def import_robot(
     Args:
         file: The file.
         out: A new or empty directory.
-        loaded: Gets the new robot before it is compared with the source, which takes longer.
+        loaded: Function that gets the new robot before the comparison with the source, which takes
+            long.
         chain: Options of `cut`.
 
     Raises:
@@ -146,7 +147,7 @@ def run(args: Namespace) -> int:
 
 
 def show_prospects(robot: Robot) -> None:
-    """Print what can be expected of a robot."""
+    """Print how well a robot will probably learn and move (`design/prospects.py`)."""
     for line in prospects(robot).lines():
         print(line, flush=True)
 

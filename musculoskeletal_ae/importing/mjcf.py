@@ -48,10 +48,10 @@ check_mujoco()
 COUNTS = {
     'body': 'nbody', 'joint': 'njnt', 'tendon': 'ntendon', 'actuator': 'nu', 'equality': 'neq',
 }  # fmt: skip
-RANGE_POSTURES = 200  # postures in which the range of a tendon's length is measured
-LEAST_REACH = 1e-3  # smallest distance of a far end from the origin of its body [m]
-#: largest plausible force of an actuator [N]; MuJoCo computes larger forces for muscles without an
-#: initial moment arm
+RANGE_POSTURES = 200  # measure the range of a tendon's length in this many postures
+LEAST_REACH = 1e-3  # a far end has to be at least this far from the origin of its body [m]
+#: ignore a larger force of an actuator [N]: MuJoCo computes it for muscles without an initial
+#: moment arm
 STRONGEST = 1e6
 
 
@@ -70,7 +70,7 @@ def read_mjcf(file: Path, root: ET.Element) -> Source:
     mujoco.set_mju_user_warning(warnings.append)
     try:
         spec = mujoco.MjSpec.from_file(str(file))
-        spec.compiler.fusestatic = False  # fused bodies could not be links
+        spec.compiler.fusestatic = False  # keep all bodies, because the links are bodies
         model = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         raise refuse(file, f'MuJoCo cannot load it: {" ".join(str(error).split())}') from error
@@ -230,7 +230,7 @@ class _Reader:
             shares = {self.names['joint'][m.wrap_objid[w]]: float(m.wrap_prm[w]) for w in path}
             low, high = m.tendon_lengthspring[t]
             name = f'tendon {self.names["tendon"][t]}'
-            if high - low > 1e-9:  # its spring is slack in between
+            if high - low > 1e-9:  # the spring of the tendon is slack between two lengths
                 continue
             source.springs.append(Spring(shares, float(m.tendon_stiffness[t]), float(low), name))
 

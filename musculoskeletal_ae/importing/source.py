@@ -30,29 +30,30 @@ from musculoskeletal_ae.robot.kinematics import link_placement, reduced
 from musculoskeletal_ae.robot.robot import Robot
 
 KINDS = REVOLUTE + PRISMATIC
-POSTURES = 1000  # number of postures in which lengths are compared
-ARM_POSTURES = 200  # number of postures in which moment arms are compared
-PROBES = 20  # postures in which it is found which joints change the length of a passive tendon
-MOVED = 1e-8  # change of a length from which on a joint counts as moving a tendon [m]
-WRONG_LENGTH = 5e-5  # error of a passive tendon's polynomial from which on it is reported [m]
+POSTURES = 1000  # compare lengths in this many postures
+ARM_POSTURES = 200  # compare moment arms in this many postures
+PROBES = 20  # search the joints that change the length of a passive tendon in this many postures
+MOVED = 1e-8  # count a joint as moving a tendon if it changes the length by at least this [m]
+WRONG_LENGTH = 5e-5  # report a passive tendon whose polynomial is wrong by at least this [m]
 TURN = 1e-5  # step of the numerical derivatives that give moment arms [rad]
-SHORT_ARM = 1e-3  # length of a moment arm below which its sign is not compared [m]
-LISTED = 12  # largest number of names in a message
-# Tensions of a muscle whose largest tension the source states: `limit` is that tension.
-MAX_SHARE = 1.5  # tension.max, relative to the limit
-#: tension.bias, relative to the limit, if the source lets the muscle be slack. Modules and their
-#: sensors need a tension that is not 0.
+SHORT_ARM = 1e-3  # do not compare the sign of a shorter moment arm [m]
+LISTED = 12  # list at most this many names in a message
+# The largest tension that the source states for a muscle becomes its tension.limit.
+MAX_SHARE = 1.5  # set tension.max to this multiple of the limit
+#: set tension.bias to this share of the limit if the muscle may be slack in the source; modules and
+#: their sensors need a tension above 0
 BIAS_SHARE = 0.01
-# Muscles of a source whose tendons do not stretch get elements that are as stiff as the emulated
-# modules can regulate, but not stiffer than needed.
-RIGID_STIFFNESS = 1e5  # largest stiffness of an element at tension.max [N/m]
-RIGID_ELONGATION = 5e-4  # elongation at the limit that is short enough to count as none [m]
+# If tendons do not stretch in the source, give the muscles elastic elements that are as stiff as
+# the emulated modules can regulate, but no stiffer than needed.
+RIGID_STIFFNESS = 1e5  # make no element stiffer than this at tension.max [N/m]
+#: let a rigid element stretch by this at the limit, which counts as nothing [m]
+RIGID_ELONGATION = 5e-4
 EARTH = 9.81  # gravity of the earth [m/s²]
 #: ± limits of joints without limits, by whether the joint is prismatic: [rad] or [m]
 UNLIMITED = {False: np.pi, True: 0.5}
 
-#: function that computes the absolute length of each muscle in N postures [m], (N,), from the
-#: positions of joints, (N,) each; joints without positions are at rest
+#: returns the absolute length of each muscle in N postures [m], (N,), from joint positions, (N,)
+#: each; joints without positions are at rest
 Lengths = Callable[[dict[str, Array]], dict[str, Array]]
 
 
@@ -103,7 +104,7 @@ class Source:
     strength: dict[str, float] = field(default_factory=dict)  # largest tension [N], if known
     #: tension that the actuators of a muscle always exert [N]; 0 if missing
     least: dict[str, float] = field(default_factory=dict)
-    #: whether tendons do not stretch in the source; otherwise, their elasticity is unknown
+    #: whether tendons do not stretch in the source; otherwise, nobody stated their elasticity
     is_rigid: bool = False
     springs: list[Spring] = field(default_factory=list)
     damping: dict[str, float] = field(default_factory=dict)  # by joint [N·m·s/rad]
