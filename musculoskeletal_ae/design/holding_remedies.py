@@ -29,8 +29,9 @@ from musculoskeletal_ae.design.checks import (
 )
 from musculoskeletal_ae.robot.description import shown
 
-LEAST_GAIN = 0.01  # smallest gain of a suggested change, in the share of held or stiff postures
-#: changes that are tried, the costliest first, each with its factors, the smallest step first
+#: suggest a change only if it raises the share of held or stiff postures by at least this
+LEAST_GAIN = 0.01
+#: changes to try, the costliest first, each with its factors, the smallest step first
 CHANGES = {
     'limits': (0.8, 0.6),
     'moment arms': (1.25, 1.5, 2.0),
