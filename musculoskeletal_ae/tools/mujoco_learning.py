@@ -34,7 +34,7 @@ from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.model_training import train_on_model
 
-HELD_OUT = 60.0  # duration of the motion in which the error is measured; it is not learned [s]
+HELD_OUT = 60.0  # measure the error in a motion of this duration, which is not learned [s]
 CHAIN = 'joints', 'muscles', 'without', 'base', 'end'  # options of `import_robot`
 
 

@@ -54,15 +54,15 @@ from musculoskeletal_ae.tables.table import Table, TableError
 from musculoskeletal_ae.tools.model_training import prepare, train_on_model
 from musculoskeletal_ae.tools.network_cache import network_file
 
-LEAST_OFFSET = 0.002  # smallest joint-sensor offset that is shown [rad]
-#: A held-out recording repeats what was learned if more than REPEATED_SHARE of its postures are
-#: closer than REPEATED [rad] to a learned one. Between two explorations of a neck of two joints
-#: with the same seed, this was 70 % of the postures, and 2 % with different seeds.
+LEAST_OFFSET = 0.002  # do not show a smaller joint-sensor offset [rad]
+#: Warn that a held-out recording repeats what was learned if more than REPEATED_SHARE of its
+#: postures are closer than REPEATED [rad] to a learned one. Between two explorations of a neck of
+#: two joints with the same seed, 70 % of the postures were; with different seeds, 2 %.
 REPEATED, REPEATED_SHARE = 0.03, 0.25
-#: largest length zero of a table that needs no --estimate-zeros [m]; of five emulated arms, the
-#: lengths differ by up to 15 mm from those of the geometric model
+#: refuse a table whose length zeros are larger, unless --estimate-zeros is given [m]; on five
+#: emulated arms, lengths differ from the geometric model by up to 15 mm
 LARGEST_ZERO = 0.03
-#: A table is refused if more than this share of the values of a joint or muscle is impossible.
+#: refuse a table if more than this share of the values of a joint or muscle is impossible
 MOST_IMPOSSIBLE = 0.5
 
 
@@ -92,7 +92,7 @@ def train(args: Namespace) -> None:
     CheckpointValidator(robot).check(mae)
     steps = REST_STEPS if at_rest else STEPS
     learner = Learner(robot, mae, args.preset, args.seed, steps=steps, from_motion=from_motion)
-    # A recording that does not tell which muscles were isolated is of the arm of this network.
+    # A recording that does not say which muscles were isolated belongs to the arm of this network.
     learner.use_body(learner.body.with_isolated(mae.isolated))
     before = [table_errors(mae, source.table) for source in sources]
     try:
@@ -100,7 +100,7 @@ def train(args: Namespace) -> None:
             if source.is_held_out:
                 continue
             stop = _learn_and_show(learner, source)
-            if stop and stop != unchanged(learner):  # otherwise, the error below says so
+            if stop and stop != unchanged(learner):  # otherwise, an error at the end says so
                 warnings.append(f'{source.name}: {stop}')
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(_keep(learner, args)) from interrupt
