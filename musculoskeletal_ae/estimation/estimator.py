@@ -8,12 +8,11 @@
                          ▲                                                              │
                          └───────── isolated muscles, anomaly ──────────────────────────┘
 
-The body state consists of the length offsets, the isolated muscles and the anomaly. When one of
-them changes, only the estimator creates a new body state, which its node publishes.
-`length_trust.py` decides which length
-offsets are known; the other parts provide evidence. During a length calibration, only the
-detectors that do not need lengths report findings. `suspects.py` describes the sequence from a
-rupture to resuming.
+The body state consists of the length offsets, the isolated muscles and the anomaly. Only the
+estimator creates a new one, when one of these changes; its node publishes it. `length_trust.py`
+decides which length offsets are known, on the evidence of the other parts. During a length
+calibration, only the detectors that do not need lengths report findings. `suspects.py` describes
+the sequence from a rupture to resuming.
 """
 
 import math
@@ -57,8 +56,8 @@ from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.limits import Persistence
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
-#: Age up to which measured joint angles are used with a message [s]. It is much shorter than
-#: SILENCE, because an older reading belongs to another posture of a moving arm.
+#: Use measured joint angles with a message only if they are younger than this [s]. It is much
+#: shorter than SILENCE, because an older reading belongs to another posture of a moving arm.
 JOINTS_AGE = 0.05
 
 
@@ -415,7 +414,7 @@ class Estimator:
         pause = max(elapsed, sent_apart)
         if pause > INTERRUPTION:
             # What happened in the pause is unknown: the driver may have received no commands, or
-            # the whole computer may have stood still.
+            # the whole computer may have stopped.
             self.health.reset()
         if pause > SILENCE:
             self.contact.reset()

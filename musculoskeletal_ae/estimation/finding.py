@@ -16,7 +16,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-#: longest time from a fault to its finding [s]; messages of this time may already be wrong
+#: discard messages up to this long before a finding [s]: detectors need this time, so they may be
+#: wrong
 DETECTION_DELAY = 2.0
 
 

@@ -44,32 +44,32 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.joint_trust import NOT_USED, JointTrust, SensorTrust
 
-SPACING = 0.5  # shortest time between two messages that count [s]
-#: a message counts if the estimate of a joint has moved by this much since the last one that
+SPACING = 0.5  # count at most one message in this time [s]
+#: count a message only if the estimate of a joint has moved by this much since the last one that
 #: counted [rad]
 MOVED = 0.03
-EARLIER = 600  # largest number of earlier messages, at least 5 min of motion
-ENOUGH = 80  # judge a sensor by this many earlier messages at least
-NEWEST = 48  # number of newest messages, which are judged by all messages before them
-#: Windows in which a sensor is judged: number of messages, smallest limit of the median of |x|
-#: [rad], and limit in healthy spreads of x. The short window finds large errors fast; the long one
+EARLIER = 600  # keep this many earlier messages, which are at least 5 min of motion
+ENOUGH = 80  # judge a sensor by at least this many earlier messages
+NEWEST = 48  # judge this many of the newest messages, by all messages before them
+#: Judge a sensor in these windows: number of messages, smallest limit of the median of |x| [rad],
+#: and limit in healthy spreads of x. The short window finds large errors fast; the long one
 #: averages over more postures.
 WINDOWS = ((6, 0.12, 7.0), (24, 0.07, 3.0), (NEWEST, 0.06, 2.2))
-#: Multiply the limits by 1 + FEW/n if there are n earlier messages
+#: multiply the limits by 1 + FEW/n if there are n earlier messages
 FEW = 20.0
-#: Trust a sensor again once the median of |x| is below AGREEING_LIMIT [rad], or below
-#: AGREEING_SPREADS healthy spreads of x. It has to be so over the newest AGREEING messages and over
-#: the newer half of them.
+#: Trust a sensor again once the median of |x| is below AGREEING_LIMIT [rad] or AGREEING_SPREADS
+#: healthy spreads of x, both over the newest AGREEING messages and over the newer half of them.
 AGREEING, AGREEING_LIMIT, AGREEING_SPREADS = 12, 0.035, 1.0
-#: Smallest healthy spread of r [m], which bounds the precision of any length sensor
+#: assume at least this healthy spread of a length residual [m], because no length sensor is more
+#: precise
 LEAST_SPREAD = 0.0005
-#: Doubt joint sensors if the assumption that they are false leaves a sum of squares of Δ that is
-#: smaller than this share of the one that a change of any single muscle leaves
+#: Doubt joint sensors if false joint sensors would leave a smaller sum of squares of Δ than this
+#: share of what a change of any single muscle would leave
 BETTER = 0.7
 USES = 10  # compute the medians of the earlier messages again after this many messages
-TO_SIGMA = 1.48  # standard deviation of a normal distribution, in medians of absolute deviations
-#: doubt a sensor with fewer earlier messages if its reading differs from the estimate by this much
-#: [rad]
+TO_SIGMA = 1.48  # multiply a median of absolute deviations by this to get the standard deviation
+#: doubt a sensor even with few earlier messages if its reading differs from the estimate by this
+#: much [rad]
 GROSS = 0.8
 
 
@@ -216,7 +216,7 @@ class JointCheck:
         doubted = self.trust.is_doubted
         for count, limit in self._limits(usual):
             new = (_median(np.abs(excess[-count:])) > limit) & ~doubted
-            # At least the newer half of a window that exceeds the limit shows the change.
+            # If a window exceeds the limit, at least its newer half shows the change.
             rows = -(count // 2)
             if new.any() and self._explains(new, excess[rows:], usual):
                 self._set(new, SensorTrust.DOUBTED, excess)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.estimator import Estimator
     from musculoskeletal_ae.mae.mae import Mae
 
-#: a sensor whose readings are impossible in at least this share is itself at fault
+#: call the sensor itself faulty if at least this share of its readings is impossible
 ALL = 0.9
 UNKNOWN_TENSION = 'unknown: tension_source is none'
 

@@ -54,8 +54,8 @@ from musculoskeletal_ae.remedy import REPAIR
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly
 
-ACQUITTALS = 2  # number of suspects verified as healthy after which the next one is not verified
-WITHIN = 60.0  # time during which a suspect verified as healthy counts [s]
+ACQUITTALS = 2  # verify no further suspect after this many were verified as healthy
+WITHIN = 60.0  # count a suspect that was verified as healthy for this long [s]
 
 
 #: reactions to findings that leave no doubt which muscle is faulty

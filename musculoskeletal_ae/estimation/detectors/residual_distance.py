@@ -46,9 +46,10 @@ NORM = 'norm'  # name of the threshold of A in a checkpoint
 #: name a muscle as well if d without it is below the threshold, and at most this multiple of d
 #: without the suspect
 EQUALLY_LIKELY = 1.5
-IN_A_ROW = 5  # number of consecutive messages above the threshold that lead to a finding
-NEAR = 0.25  # distance to a calibrated posture above which the threshold grows [joint ranges]
-WIDEST = 3.0  # largest factor by which the threshold is raised
+IN_A_ROW = 5  # report the suspect after this many consecutive messages above the threshold
+#: raise the threshold at this distance from the nearest calibrated posture [joint ranges]
+NEAR = 0.25
+WIDEST = 3.0  # raise the threshold by no larger factor than this
 
 
 class Reading(NamedTuple):

@@ -35,24 +35,25 @@ from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_readings import Row
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement, decide, single_faults
 
-SPACING = 0.25  # time between two messages that are kept [s]
-USUAL_COUNT = 120  # number of messages whose median A is the usual one
-ENOUGH = 20  # smallest number of messages from which the usual A is known
-RECENT = 20  # number of the newest of these messages by which a finding is judged
-ANOMALOUS = 2.0  # judge by the messages whose A is above this multiple of the usual A
+SPACING = 0.25  # keep one message in this time [s]
+USUAL_COUNT = 120  # take the median A of this many messages as the usual one
+ENOUGH = 20  # know the usual A only from at least this many messages
+RECENT = 20  # judge a finding by this many of the newest messages
+ANOMALOUS = 2.0  # judge only by messages whose A is above this multiple of the usual A
 #: assume an exchange only if A after putting the columns back is below this multiple of the usual A
 USUAL = 1.5
-#: assume an exchange only if putting the columns back divides A by at least this factor. With both
-#: factors, in moments of two learned arms, an exchange explained 3 of 475 shifts of one or two
-#: lengths, and it was recognised in 194 of 229 exchanges.
+#: Assume an exchange only if putting the columns back divides A by at least this factor. In moments
+#: of two learned arms, USUAL and BETTER together blamed an exchange for 3 of 475 shifts of one or
+#: two lengths, and recognised 194 of 229 exchanges.
 BETTER = 3.0
-SILENT = 0.3  # pause of all messages after which the driver may have restarted [s]
+#: assume that the driver may have restarted after a pause of all messages of this length [s]
+SILENT = 0.3
 #: judge a finding by the lengths around a silence for this time after it [s]
 RESTARTED = 5.0
 #: a length that has changed by more than this during a silence may belong to another muscle [m]
 DISCONTINUOUS = 0.02
-#: assume another wiring only if it divides the change of the concerned lengths during the silence
-#: by at least this factor, and if this change was larger than that of the other lengths by it
+#: assume another wiring only if it divides the change of its lengths during the silence by at least
+#: this factor, and if that change exceeds the change of all other lengths by this factor
 CONTINUOUS = 3.0
 #: kinds of findings to which an exchange can lead
 EXPLAINED = frozenset(

@@ -9,9 +9,9 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 
-SPAN = 10.0  # time that the kept messages cover [s]
-SPACING = 0.1  # shortest time between two kept messages [s]
-LEAST = 20  # smallest number of messages on which a network can be validated
+SPAN = 10.0  # keep messages that are no older than this [s]
+SPACING = 0.1  # keep one message in this time [s]
+LEAST = 20  # validate a network on at least this many messages
 
 
 class _Message(NamedTuple):

@@ -44,9 +44,9 @@ from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-PROOF = 10.0  # time in use without an anomaly after which a network is proven [s]
-MOST_USED = 20  # largest number of networks that are kept for a rollback
-RELEARNING_TIME = 600.0  # time after its repair during which a muscle may be relearned [s]
+PROOF = 10.0  # count a network as proven after this time in use without an anomaly [s]
+MOST_USED = 20  # keep at most this many networks for a rollback
+RELEARNING_TIME = 600.0  # expect that a muscle may be relearned for this long after its repair [s]
 
 
 class CheckpointValidator:
