@@ -35,7 +35,7 @@ from musculoskeletal_ae.signals.pairing import Paired, Pairing
 SENSOR, MARKER, NONE = 'sensor', 'marker', 'none'
 NO_MESSAGES = 'no muscle_states are received'
 NO_JOINTS = 'muscle_states are received without usable joint angles'
-SPREAD = 0.02  # standard deviation of θ measured by a camera [rad]
+SPREAD = 0.02  # assume this error of θ measured by a camera (standard deviation) [rad]
 
 
 class SampleCollector:

@@ -14,7 +14,7 @@ from collections import deque
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.joint_trust import JointTrust, SensorTrust
 
-MOST_RECENT = 400  # number of newest samples whose times are known
+MOST_RECENT = 400  # remember the times of this many newest samples
 
 
 class JointHistory:

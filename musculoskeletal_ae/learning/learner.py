@@ -11,7 +11,7 @@ The estimator validates the candidates (`estimation/network_validation/`). Whate
 training continues from the newest samples and weights.
 
 Muscles that the estimator has isolated are not learned: samples do not describe them. A network
-states without which muscles it was learned; nobody isolates a muscle because of that.
+states without which muscles it was learned; this alone isolates no muscle.
 
 The caller supplies the time: the ROS clock, recorded time or simulated time. All rules for
 collecting samples and starting updates use this time. A recording is therefore learned in the same

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.learning.samples import Sample
 
-#: Largest number of messages held back, which bounds the memory if the clock stands still. Even at
+#: Hold back at most this many messages, which bounds the memory if the clock stands still. Even at
 #: 1 kHz, fewer messages than this arrive within DETECTION_DELAY.
 MOST_WAITING = 5000
 

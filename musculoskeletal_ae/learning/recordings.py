@@ -34,10 +34,10 @@ from musculoskeletal_ae.signals.muscle_readings import muscle_reading
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 from musculoskeletal_ae.tables.table import Table
 
-#: Number of updates from a table of resting postures, and training steps in each of them. On a
+#: Learn a table of resting postures in this many updates with this many training steps each. On a
 #: running arm, each rest causes an update of fewer steps.
 UPDATES, REST_STEPS = 8, 400
-#: Recordings with fewer different resting postures are learned from slow moments of the motion.
+#: learn from slow moments of the motion if a recording has fewer different resting postures
 LEAST_RESTS = 20
 
 

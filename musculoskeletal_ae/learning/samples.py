@@ -22,12 +22,13 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.signals.friction import Transmission
 
-CAPACITY = 400  # default of the largest number of samples in a store
-#: Tendon creep is estimated once the number of accepted samples exceeds this share of the capacity,
-#: if the same share of the samples has all joint angles.
+CAPACITY = 400  # keep at most this many samples by default
+#: Estimate tendon creep once the number of accepted samples exceeds this share of the capacity, and
+#: this share of the samples has all joint angles.
 CREEP_SHARE = 0.5
 NOTHING: Array = np.zeros(0)  # stands for a quantity that was not measured
-#: typical moment arm, which converts lengths to angles where not all joint angles were measured [m]
+#: divide lengths by this typical moment arm to compare them with angles, where not all joint angles
+#: were measured [m]
 MOMENT_ARM = 0.04
 JOINT_DISTANCE = 0.05  # count two samples as different if an angle differs by more [rad]
 TENSION_DISTANCE = 10.0  # count two samples as different if a tension differs by more [N]
@@ -260,7 +261,7 @@ class SampleStore:
         """
         theta, tension, length = (np.array(part) for part in [*zip(*samples, strict=True)][:3])
         unread = np.isnan(theta).any(axis=1, keepdims=True)
-        # Where not all joint angles were measured, compare the muscle lengths as well.
+        # Where not all joint angles were measured, compare samples by muscle lengths as well.
         by_length = np.where(unread, length / (MOMENT_ARM * JOINT_DISTANCE), np.nan)
         by_angle, by_tension = theta / JOINT_DISTANCE, tension / TENSION_DISTANCE
         return np.concatenate([by_angle, by_tension, by_length], axis=1)

@@ -13,9 +13,9 @@ from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae.mae import Mae
 
 STEPS = 50  # training steps in one update of preset `default`; 100 would reduce the error by 3 %
-#: shortest time between the starts of two updates, and between two checkpoints [s]
+#: let at least this time pass between the starts of two updates, and between two checkpoints [s]
 LEAST_INTERVAL = 1.0
-#: number of samples required for the first update of an arm without joint sensors
+#: require this many samples for the first update of an arm without joint sensors
 LEAST_BLIND = 20
 
 

@@ -28,10 +28,10 @@ from musculoskeletal_ae.robot.robot import Robot
 
 NEWEST, PREVIOUS, LOCK = 'learner.state', 'previous.state', 'lock'
 NETWORK = 'network.safetensors'
-#: largest size of a state file [bytes]; the states of the shipped arms are 100 times smaller
+#: refuse a larger state file [bytes]; the states of the shipped arms are 100 times smaller
 LARGEST = 1 << 26
-CHECK_INTERVAL = 0.5  # time between checks that the files still exist [s]
-RETRY_INTERVAL = 2.0  # time between attempts to save after a failed one [s]
+CHECK_INTERVAL = 0.5  # check at this interval that the files still exist [s]
+RETRY_INTERVAL = 2.0  # try again to save after this time [s]
 
 
 class StateStore:

@@ -30,7 +30,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: text that separates initial training and online learning in `Mae.training`
 LEARNED = '; learned online: '
-NEWEST = 20  # number of newest samples over which the estimation error is computed
+NEWEST = 20  # compute the estimation error over this many newest samples
 
 
 class Updater(ABC):
