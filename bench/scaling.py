@@ -54,7 +54,7 @@ from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.robot import Robot
 
 SMALLEST, INDIVIDUAL, UNSEEN = '2x6', 0, 5000
-HELD_OUT = 300.0  # duration of the held-out motion [s]
+HELD_OUT = 300.0  # measure the error on a held-out motion of this duration [s]
 #: heading of each column of the table, by the key of its numbers in a Row
 COLUMNS = {
     'nominal': '② nominal [rad a joint]',
