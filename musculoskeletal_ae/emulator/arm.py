@@ -32,13 +32,15 @@ from musculoskeletal_ae.robot.kinematics import joint_space_inertia
 from musculoskeletal_ae.robot.passive_torque import add_passive
 from musculoskeletal_ae.robot.robot import Robot
 
-SLIDING_DISTANCE = 0.0005  # sliding distance over which tendon friction builds up [m]
-# Joints.
-ARMATURE = 0.004  # rotor and bearing inertia of a joint module [kg·m²]; chosen by hand
-STICKING_ANGLE = 0.003  # angle over which joint friction builds up [rad]
-VISCOUS = 0.5  # viscous friction of a joint [N·m·s/rad]
-STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0  # of the joint limits [N·m/rad], [N·m·s/rad]
-STOP_LOAD = 40.0  # load by weight and muscles at T_bias above which stops are stiffer [N·m]
+SLIDING_DISTANCE = 0.0005  # let tendon friction build up over this sliding distance [m]
+#: give each joint module this inertia of rotor and bearings [kg·m²]; chosen by hand
+ARMATURE = 0.004
+STICKING_ANGLE = 0.003  # let joint friction build up over this angle [rad]
+VISCOUS = 0.5  # give each joint this viscous friction [N·m·s/rad]
+#: stiffness and damping of the stops at joint limits [N·m/rad], [N·m·s/rad]
+STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0
+#: stiffen the stops of a joint if weight and muscles at T_bias load it by more than this [N·m]
+STOP_LOAD = 40.0
 
 
 #: Constants of one individual for the compiled step: series elastic elements, tendons and sensors

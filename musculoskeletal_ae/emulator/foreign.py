@@ -27,12 +27,12 @@ from musculoskeletal_ae.importing.adapted_mjcf import HAND
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.robot import Robot
 
-GUIDES_EVERY = 5  # number of steps between two updates of the guides
-HISTORY = 64  # largest delay of a sensor, as a number of steps
-HOUR = 3600.0  # duration of an hour [s]
-BEDDING_TIME = 2.0 * HOUR  # time constant with which a new tendon lengthens [s]
-NUDGE = 1e-7  # change of the joint angles where MuJoCo's wrapping fails [rad]
-SLIP_TIME = 5.0 * HOUR  # mean time between two slips of a tendon on its spool [s]
+GUIDES_EVERY = 5  # update the guides after this many steps
+HISTORY = 64  # permit no larger delay of a sensor, as a number of steps
+HOUR = 3600.0  # [s]
+BEDDING_TIME = 2.0 * HOUR  # let a new tendon lengthen with this time constant [s]
+NUDGE = 1e-7  # change the joint angles by this where MuJoCo's wrapping fails [rad]
+SLIP_TIME = 5.0 * HOUR  # let a tendon slip on its spool once in this time on average [s]
 OTHER_ROUTE = 0.02  # refuse a file if the length of a muscle differs by more in most postures [m]
 
 

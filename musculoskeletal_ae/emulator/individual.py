@@ -17,7 +17,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.wrapping import WrapObjects
 
-THICKEST_BONE = 0.04  # largest radius of a bone's head [m]
+THICKEST_BONE = 0.04  # permit no larger radius of a bone's head [m]
 
 
 @dataclass(frozen=True)

@@ -35,29 +35,30 @@ STEP = 0.001  # [s]
 SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 
 # The following values are chosen by hand, because those of Musashi are not public.
-#: rate at which a module in the safe state approaches T_bias [N/s]
+#: let a module in the safe state approach T_bias at this rate [N/s]
 RELEASE_RATE = 100.0
-MOTOR_GAIN = 0.004  # speed of winding in per newton of missing tension [m/s/N]
-POSITION_LAG = 0.02  # time constant of a position-controlled module [s]
+MOTOR_GAIN = 0.004  # wind in at this speed for each newton of missing tension [m/s/N]
+POSITION_LAG = 0.02  # let a position-controlled module follow with this time constant [s]
 # Heat. Each motor is sized for its muscle: constant T_limit heats the average module to 85 °C at
 # the housing and 105 °C in the winding.
 AMBIENT = 25.0  # [°C]
-LOSS = 20.0  # heat loss of a motor at T_limit [W]
+LOSS = 20.0  # let a motor at T_limit lose this power as heat [W]
 WINDING_CAPACITY, HOUSING_CAPACITY = 20.0, 150.0  # [J/K]
 WINDING_RESISTANCE, HOUSING_RESISTANCE = 1.0, 3.0  # [K/W]
-HEAT_SPREAD = 0.15  # standard deviation of the logarithm of LOSS, the capacities and resistances
+#: draw LOSS, capacities and resistances with this standard deviation of their logarithms
+HEAT_SPREAD = 0.15
 
 # Sensors. The values are chosen by hand. Noise is one standard deviation. Readings are rounded to
 # the resolution, which is a power of two as for an A/D converter.
 ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # [rad]
 LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # [m]
 TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # [N]
-#: largest noise of a tension sensor relative to T_bias: sensors of weak muscles are finer
+#: limit the noise of a tension sensor to this share of T_bias: sensors of weak muscles are finer
 TENSION_NOISE_SHARE = 0.1
 TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3  # [°C]
 CURRENT_NOISE, CURRENT_RESOLUTION = 1.0, 2.0**-3  # of a motor current, as a tension [N]
-#: errors of a motor current as a measure of tension: standard deviation of the logarithm of the
-#: scale, standard deviation of the offset [N], and mean drive friction as a share of T_limit
+#: draw errors of a motor current as a measure of tension: standard deviation of the scale's
+#: logarithm, standard deviation of the offset [N], and mean drive friction as a share of T_limit
 CURRENT_SCALE, CURRENT_ZERO, DRIVE_FRICTION = 0.15, 5.0, 0.1
 ACCELERATION_NOISE = 0.05  # [m/s²]
 MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # of the position [m] and the orientation [rad]
@@ -76,13 +77,13 @@ def joint_gear(kinematics: Kinematics) -> Array:
 class Modules(NamedTuple):
     """Constants of the modules, each of shape (M,)."""
 
-    length_low: Array  # limits of the l to which the motor can wind [m]
-    length_high: Array
+    length_low: Array  # shortest motor-side length that the motor can reach [m]
+    length_high: Array  # longest motor-side length that the motor can reach [m]
     stiffness: Array  # K of muscle stiffness control [N/m]
     follows_position: Array  # 1 for position-controlled modules
     speed: Array  # largest speed [m/s]
     tension_bias: Array  # [N]
-    tension_max: Array
+    tension_max: Array  # [N]
     loss: Array  # k [W/N²]
     winding_capacity: Array  # C₁ [J/K]
     housing_capacity: Array  # C₂
@@ -408,7 +409,7 @@ class Arm(ABC):
         """
         if len(offset) not in (1, self.robot.muscle_count):
             legal = f'1 or {self.robot.muscle_count} numbers [m]'
-            raise MusculoskeletalError(f'{list(offset)}; legal: {legal}')
+            raise MusculoskeletalError(f'length offsets {list(offset)}; legal: {legal}')
         self._command.length_error[:] = self._length_bias + np.asarray(offset)
 
     def set_ruptured(self, muscles: Iterable[str]) -> None:

@@ -29,10 +29,10 @@ ARMATURE, DAMPING = 0.005, 0.4  # of a joint module [kg·m²], [N·m·s/rad]; ch
 # The following four are the σ that `Effects.links` multiplies.
 LENGTH_SPREAD, TURN_SPREAD = 0.005, np.radians(2.0)  # of link lengths [m] and joint axes [rad]
 MASS_SPREAD, CENTRE_SPREAD = 0.15, 0.02  # of the logarithm of masses, and of their centres [m]
-THICKEST = 0.045  # largest radius of the head of a bone, or of a muscle [m]
-POSTURES = 300  # number of random postures in which the radii of heads and muscles are fitted
-# Constraint stiffness (solimp) of couplings. With MuJoCo's default, which disregards the ratio of a
-# coupling, a prismatic joint that follows a revolute one would lag by centimetres.
+THICKEST = 0.045  # permit no larger radius of the head of a bone, or of a muscle [m]
+POSTURES = 300  # fit the radii of heads and muscles in this many random postures
+# Couple joints with this constraint stiffness (solimp). MuJoCo's default disregards the ratio of a
+# coupling: a prismatic joint that follows a revolute one would lag by centimetres.
 STIFF = [0.9999, 0.9999, 0.001, 0.5, 2.0]
 SPRING = 'spring'  # first word of the names of springs that couple joints
 

@@ -30,21 +30,22 @@ from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.robot import Robot
 
 # Modelling constants, chosen by hand. The magnitudes of the effects are in `effects.py`.
-SLIDING = 0.0003  # sliding distance over which friction builds up [m]
-BREAKING = 0.0005  # sliding distance that ends stiction [m]
-STICKING = 0.5  # time constant with which stiction builds up at rest [s]
-#: elongation over which rubber changes from one side of its hysteresis loop to the other [m]
+SLIDING = 0.0003  # let friction build up over this sliding distance [m]
+BREAKING = 0.0005  # end stiction after this sliding distance [m]
+STICKING = 0.5  # let stiction build up at rest with this time constant [s]
+#: let rubber change from one side of its hysteresis loop to the other over this elongation [m]
 LOOP = 0.003
-RIDGE = 5.0  # percentage of a route's lengths that lie beyond the ridge [%]
-BACK = 0.003  # distance before the ridge at which the tendon slips back [m]
-GUIDES = 1.0  # bend of the tendon between its motor and its first route point [rad]
+RIDGE = 5.0  # let this percentage of a route's lengths lie beyond the ridge [%]
+BACK = 0.003  # let the tendon slip back this far before the ridge [m]
+GUIDES = 1.0  # assume this bend of the tendon between its motor and its first route point [rad]
 SPOOL = 0.01  # radius of the spool [m]
 # Time constants [s]: four of creep, which is equally large in each of four decades of time, and two
 # of the delayed stretch of a tendon.
 TIMES = np.array([1.0, 10.0, 100.0, 1000.0, 800.0, 14400.0])
-LATE = np.array([0.75, 0.25])  # shares of the delayed stretch with the last two time constants
-KNOTS = 200  # number of entries of the table of an elastic law
-GIVING = 0.1  # time constant with which a route point yields to its load [s]
+#: give the last two time constants these shares of the delayed stretch
+LATE = np.array([0.75, 0.25])
+KNOTS = 200  # tabulate an elastic law with this many entries
+GIVING = 0.1  # let a route point yield to its load with this time constant [s]
 
 
 class Springs:
