@@ -19,10 +19,10 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
 PROBES = 200  # average the length of each muscle over this many postures
-# Report a muscle as changed if its LEAST_NEWEST newest samples contradict the body, all with
-# residuals of the same sign, and at least LEAST_BEFORE samples came before them.
+#: report a muscle as changed if at least this many of its newest samples contradict the body, all
+#: with residuals of the same sign
 LEAST_NEWEST = 4
-LEAST_BEFORE = 8
+LEAST_BEFORE = 8  # report it only if at least this many samples came before those
 #: a sample contradicts the body only if its residual is at least this large [m]
 LEAST_CHANGE = 0.004
 #: a sample contradicts the body only if its residual has at least this many standard deviations

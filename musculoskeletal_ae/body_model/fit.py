@@ -221,7 +221,7 @@ class MuscleFit:
 
 NETWORK_STATES = 400  # evaluate the network at this many states
 NETWORK_ERROR = 0.001  # assume at least this σ of the network's lengths [m]
-FIXED = 1e-6  # prior spread that keeps a parameter at its prior mean
+FIXED = 1e-6  # keep a parameter at its prior mean by this prior spread
 
 
 def fit_to_network(

@@ -28,17 +28,17 @@ from musculoskeletal_ae.arrays import Array, Bools
 if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.posture_model import PostureModel
 
-ROUGH_OFFSET = np.deg2rad(2.0)  # σ of z of a roughly calibrated sensor [rad]
-ACCURATE_OFFSET = 0.003  # σ of z of an accurately calibrated sensor [rad]
+ROUGH_OFFSET = np.deg2rad(2.0)  # expect this offset of a roughly calibrated sensor (σ) [rad]
+ACCURATE_OFFSET = 0.003  # expect this offset of an accurately calibrated sensor (σ) [rad]
 #: refuse an update that finds a larger |z|: ten times σ of a roughly calibrated sensor [rad]
 LARGEST_OFFSET = 10.0 * ROUGH_OFFSET
 STOP_SPREAD = 0.01  # expect a stop to be this far from its limit (standard deviation) [rad]
-#: candidate offsets z, for which the posterior is computed [rad]
+#: compute the posterior of these offsets z [rad]
 OFFSETS = np.linspace(-4.0 * ROUGH_OFFSET, 4.0 * ROUGH_OFFSET, 281)
 NO_STOPS = 0.1  # assume that a joint's limits are no mechanical stops with this probability
 NOT_REACHED = 0.5  # assume that the arm never reaches a given stop with this probability
-SHARES = 0.03, 0.1, 0.3  # candidate shares π of rests at a stop that is reached
-WIDTHS = 0.001, 0.002, 0.004  # candidate widths σ of the cluster at a stop that is reached [rad]
+SHARES = 0.03, 0.1, 0.3  # consider these shares π of rests at a stop that is reached
+WIDTHS = 0.001, 0.002, 0.004  # consider these widths σ of the cluster of readings there [rad]
 WIDTH_RATIO = 2.0  # beyond a limit, widen the cluster by this factor, because stops are compliant
 #: beyond a limit, expect this density of other readings, relative to that within the range
 DENSITY_RATIO = 0.01

@@ -52,11 +52,11 @@ from musculoskeletal_ae.learning.samples import Observations
 if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 
-GRAVITY_NOISE = 0.02  # σ_u, from the noise and the mounting of the accelerometer [rad]
+GRAVITY_NOISE = 0.02  # expect this error of u, by noise and mounting of the accelerometer (σ) [rad]
 FIRST_NOISE = 0.002  # assume this σ of a length in the first iteration [m]
 LEAST_NOISE = 0.0008  # weigh lengths by no smaller σ than this, for errors of the body model [m]
-#: σ_τ as a share of the muscles' absolute torques at a joint. It is wide, because friction and the
-#: offsets of the tension sensors are common to all samples.
+#: Expect errors of the torque balance (σ_τ) of this share of the muscles' absolute torques at a
+#: joint. The share is high, because all samples have the same friction and sensor offsets.
 TORQUE_NOISE = 0.3
 #: assume at least this usual residual torque, as a share of the muscles' absolute torques
 LEAST_TORQUE = 0.01

@@ -19,7 +19,7 @@ from musculoskeletal_ae.signals.friction import DRIVE_FRICTION_MEAN, DRIVE_SPREA
 #: of the body model. This applies to joint-sensor offsets, springs of the joints, constants of
 #: motor currents, and joints without a sensor (torque and stops).
 INDEPENDENT_SAMPLES = 10.0
-SENSOR_NOISE = 0.002  # σ_y of a joint sensor [rad]
+SENSOR_NOISE = 0.002  # expect this noise of a joint sensor (σ_y) [rad]
 LEAST_ANGLE_NOISE = 1e-6  # assume at least this σ_y [rad]
 
 
@@ -58,7 +58,7 @@ class Prior:
 
 
 PRIOR = Prior()
-#: prior of a muscle that was replaced or whose tendon was renewed, around its earlier parameters
+#: expect a replaced muscle or tendon to differ this much from its earlier parameters
 REOPENED = Prior(attachment=0.004, elastic=0.3, offset=0.03)
 
 

@@ -48,8 +48,11 @@ if TYPE_CHECKING:
 #: Unknowns of the evidence are the natural logarithms of a, b, e, c, ν and σ, relative to these
 #: units: [m], joint ranges, 1, T_limit, 1 and [m].
 UNITS = np.array([0.002, 0.5, 1.0, 1.0, 1.0, 0.001])
-USUAL = np.array([-1.5, 0.5, 1.0, 2.0, 1.0, -2.0])  # means of their prior
-SPREAD = np.array([2.0, 0.4, 1.0, 1.0, 1.0, 1.5])  # standard deviations of their prior
+#: expect these unknowns of the evidence before the samples (prior means)
+USUAL = np.array([-1.5, 0.5, 1.0, 2.0, 1.0, -2.0])
+#: expect the unknowns of the evidence to deviate from USUAL by this (prior standard deviations)
+SPREAD = np.array([2.0, 0.4, 1.0, 1.0, 1.0, 1.5])
+#: search each unknown of the evidence within these limits
 BOUNDS = ((-8.0, 4.0), (-1.5, 3.0), (0.0, 4.0), (-1.5, 4.0), (0.0, 3.5), (-2.5, 3.0))
 #: start a search from these values: a trusted body, a wrong body, and a rough remainder
 STARTS = (
@@ -57,8 +60,8 @@ STARTS = (
     USUAL + [2.5, 0.0, 0.0, 0.0, 0.0, 0.0],
     USUAL + [3.0, -1.0, -1.0, 0.0, 0.0, 1.0],
 )
-#: With fewer samples, start every search from STARTS: the evidence then has several maxima, which
-#: change with each sample. With more, continue from the last result.
+#: Start every search from STARTS if there are fewer samples than this: the evidence then has many
+#: maxima, which change with each sample. With more samples, continue from the last result.
 FEW_SAMPLES = 60
 ROUNDS = 25  # end a search that starts from STARTS after this many iterations
 FEW_ROUNDS = 4  # end a search that continues from the last result after this many iterations

@@ -44,19 +44,17 @@ from musculoskeletal_ae.schema import Strict
 
 #: a sound arm must hold at least this share of the postures, and be stiff enough in as many
 REQUIRED_SHARE = 0.95
-# Require REQUIRED_STIFFNESS, or STIFFNESS_PER_LOAD times the largest load of a joint if that is
-# less: a change of the load by a tenth then moves no joint by more than 0.05 rad.
-REQUIRED_STIFFNESS = 5.0  # [N·m/rad]
-STIFFNESS_PER_LOAD = 2.0  # [1/rad]
+REQUIRED_STIFFNESS = 5.0  # require this joint stiffness, or less if the load is small [N·m/rad]
+#: require no more stiffness than this multiple of the largest load of a joint [1/rad]: a change of
+#: that load by a tenth then moves no joint by more than 0.05 rad
+STIFFNESS_PER_LOAD = 2.0
 LEAST_INERTIA = 1e-12  # regard a smaller inertia of a joint as a rounding error [kg·m²]
 #: count a muscle as slack up to this much above the tension that its module maintains [N], because
 #: the solver rounds
 SLACK_MARGIN = 1e-3
-# Count a moment arm only if it is longer than the smaller of COUNTED_ARM and COUNTED_ARM_SHARE of
-# the longest one at its joint, and longer than LEAST_COUNTED_ARM.
-COUNTED_ARM = 0.003  # moment arm with which a tension of 300 N produces about 1 N·m [m]
-COUNTED_ARM_SHARE = 0.1
-LEAST_COUNTED_ARM = 1e-4  # [m]
+COUNTED_ARM = 0.003  # count a moment arm above this, with which 300 N produce about 1 N·m [m]
+COUNTED_ARM_SHARE = 0.1  # also count a moment arm above this share of the longest one at its joint
+LEAST_COUNTED_ARM = 1e-4  # but count no shorter moment arm than this [m]
 #: warn about joints without longer moment arms [m]: shorter ones deviate by half or more in
 #: emulated individuals
 SHORT_ARM = 0.015

@@ -17,7 +17,7 @@ from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-POSTURES = 150
+POSTURES = 150  # examine at most this many random postures
 BUDGET = 2.5  # examine no further posture after this time [s]
 LEAST_POSTURES = 20  # examine this many postures, however long it takes
 #: warn that training is pointless below this share of holdable postures: the arm then explores at

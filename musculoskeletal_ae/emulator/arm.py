@@ -37,7 +37,7 @@ SLIDING_DISTANCE = 0.0005  # let tendon friction build up over this sliding dist
 ARMATURE = 0.004
 STICKING_ANGLE = 0.003  # let joint friction build up over this angle [rad]
 VISCOUS = 0.5  # give each joint this viscous friction [N·m·s/rad]
-#: stiffness and damping of the stops at joint limits [N·m/rad], [N·m·s/rad]
+#: give the stops at joint limits this stiffness [N·m/rad] and damping [N·m·s/rad]
 STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0
 #: stiffen the stops of a joint if weight and muscles at T_bias load it by more than this [N·m]
 STOP_LOAD = 40.0

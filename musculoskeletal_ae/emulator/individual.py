@@ -41,7 +41,7 @@ class Spread:
     spring_rest: float = 0.05
 
 
-#: No differences: a body equal to the geometric model, without friction.
+#: make a body that equals the geometric model, without friction
 NOMINAL = Spread(**{field.name: 0.0 for field in fields(Spread)})
 
 

@@ -29,9 +29,9 @@ from musculoskeletal_ae.robot.joint_units import SLIDE
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-STEP = 0.001  # [s]
+STEP = 0.001  # simulate in steps of this duration [s]
 
-# Modes of a module.
+# modes of a module
 SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 
 # The following values are chosen by hand, because those of Musashi are not public.
@@ -41,27 +41,27 @@ MOTOR_GAIN = 0.004  # wind in at this speed for each newton of missing tension [
 POSITION_LAG = 0.02  # let a position-controlled module follow with this time constant [s]
 # Heat. Each motor is sized for its muscle: constant T_limit heats the average module to 85 °C at
 # the housing and 105 °C in the winding.
-AMBIENT = 25.0  # [°C]
+AMBIENT = 25.0  # temperature of the surroundings [°C]
 LOSS = 20.0  # let a motor at T_limit lose this power as heat [W]
-WINDING_CAPACITY, HOUSING_CAPACITY = 20.0, 150.0  # [J/K]
-WINDING_RESISTANCE, HOUSING_RESISTANCE = 1.0, 3.0  # [K/W]
+WINDING_CAPACITY, HOUSING_CAPACITY = 20.0, 150.0  # heat capacities of an average module [J/K]
+WINDING_RESISTANCE, HOUSING_RESISTANCE = 1.0, 3.0  # thermal resistances of that module [K/W]
 #: draw LOSS, capacities and resistances with this standard deviation of their logarithms
 HEAT_SPREAD = 0.15
 
-# Sensors. The values are chosen by hand. Noise is one standard deviation. Readings are rounded to
-# the resolution, which is a power of two as for an A/D converter.
-ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # [rad]
-LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # [m]
-TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # [N]
+# Sensors. The values are chosen by hand. Each reading gets noise of this standard deviation, and is
+# rounded to this resolution, a power of two as of an A/D converter.
+ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # of joint angles [rad]
+LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # of muscle lengths [m]
+TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # of tensions [N]
 #: limit the noise of a tension sensor to this share of T_bias: sensors of weak muscles are finer
 TENSION_NOISE_SHARE = 0.1
-TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3  # [°C]
+TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3  # of housing temperatures [°C]
 CURRENT_NOISE, CURRENT_RESOLUTION = 1.0, 2.0**-3  # of a motor current, as a tension [N]
 #: draw errors of a motor current as a measure of tension: standard deviation of the scale's
 #: logarithm, standard deviation of the offset [N], and mean drive friction as a share of T_limit
 CURRENT_SCALE, CURRENT_ZERO, DRIVE_FRICTION = 0.15, 5.0, 0.1
-ACCELERATION_NOISE = 0.05  # [m/s²]
-MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # of the position [m] and the orientation [rad]
+ACCELERATION_NOISE = 0.05  # of each axis of an accelerometer [m/s²]
+MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # of a marker's position [m] and orientation [rad]
 
 
 def joint_gear(kinematics: Kinematics) -> Array:

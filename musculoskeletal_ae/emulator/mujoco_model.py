@@ -25,16 +25,18 @@ from musculoskeletal_ae.robot.joint_tree import JointPoses
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-ARMATURE, DAMPING = 0.005, 0.4  # of a joint module [kg·m²], [N·m·s/rad]; chosen by hand
-# The following four are the σ that `Effects.links` multiplies.
-LENGTH_SPREAD, TURN_SPREAD = 0.005, np.radians(2.0)  # of link lengths [m] and joint axes [rad]
-MASS_SPREAD, CENTRE_SPREAD = 0.15, 0.02  # of the logarithm of masses, and of their centres [m]
+#: give each joint module this inertia and damping [kg·m²], [N·m·s/rad]; chosen by hand
+ARMATURE, DAMPING = 0.005, 0.4
+#: change link lengths [m] and joint axes [rad] by these σ times `Effects.links`
+LENGTH_SPREAD, TURN_SPREAD = 0.005, np.radians(2.0)
+#: change logarithms of masses, and their centres [m], by these σ times `Effects.links`
+MASS_SPREAD, CENTRE_SPREAD = 0.15, 0.02
 THICKEST = 0.045  # permit no larger radius of the head of a bone, or of a muscle [m]
 POSTURES = 300  # fit the radii of heads and muscles in this many random postures
 # Couple joints with this constraint stiffness (solimp). MuJoCo's default disregards the ratio of a
 # coupling: a prismatic joint that follows a revolute one would lag by centimetres.
 STIFF = [0.9999, 0.9999, 0.001, 0.5, 2.0]
-SPRING = 'spring'  # first word of the names of springs that couple joints
+SPRING = 'spring'  # begin the names of springs that couple joints with this word
 
 Place = tuple[int, Array]  # joint, and position in its frame [m]
 Obstacle = tuple[int, Array, Array]  # joint, and centre [m] and axis in its frame

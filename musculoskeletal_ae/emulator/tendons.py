@@ -38,9 +38,9 @@ LOOP = 0.003
 RIDGE = 5.0  # let this percentage of a route's lengths lie beyond the ridge [%]
 BACK = 0.003  # let the tendon slip back this far before the ridge [m]
 GUIDES = 1.0  # assume this bend of the tendon between its motor and its first route point [rad]
-SPOOL = 0.01  # radius of the spool [m]
-# Time constants [s]: four of creep, which is equally large in each of four decades of time, and two
-# of the delayed stretch of a tendon.
+SPOOL = 0.01  # assume this radius of a spool [m]
+#: let slow elongations build up with these time constants [s]: four of creep, equally large in each
+#: of four decades of time, and two of the delayed stretch of a tendon
 TIMES = np.array([1.0, 10.0, 100.0, 1000.0, 800.0, 14400.0])
 #: give the last two time constants these shares of the delayed stretch
 LATE = np.array([0.75, 0.25])

@@ -33,7 +33,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-#: bandwidth of the filter [1/s]; damping ratio 0.5 (critical damping would be a third slower)
+#: filter with this bandwidth [1/s] and a damping ratio of 0.5 (critical damping is a third slower)
 BANDWIDTH = 25.0
 LARGEST_USUAL = 20.0  # F₀: assume no larger force at the hand in normal use [N]
 REGULARISATION = np.eye(3) / LARGEST_USUAL**2

@@ -58,7 +58,7 @@ ACQUITTALS = 2  # verify no further suspect after this many were verified as hea
 WITHIN = 60.0  # count a suspect that was verified as healthy for this long [s]
 
 
-#: reactions to findings that leave no doubt which muscle is faulty
+#: isolate without a verification after these reactions: there is no doubt which muscle is faulty
 AT_ONCE = Reaction.ISOLATE_AT_ONCE, Reaction.ISOLATE_ONLY
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from musculoskeletal_ae.design.checks import TOLERATED_SHARE, Setting, measure
 from musculoskeletal_ae.robot.robot import Robot
 
-POSTURES = 600
+POSTURES = 600  # check the muscles in this many random postures
 PARTS = 20  # divide the range of a joint into this many equal parts
 #: keep a part of the range if its share of held postures is at least this, relative to the best one
 KEPT_SHARE = 0.5

@@ -49,7 +49,7 @@ RIGID_STIFFNESS = 1e5  # make no element stiffer than this at tension.max [N/m]
 #: let a rigid element stretch by this at the limit, which counts as nothing [m]
 RIGID_ELONGATION = 5e-4
 EARTH = 9.81  # gravity of the earth [m/s²]
-#: ± limits of joints without limits, by whether the joint is prismatic: [rad] or [m]
+#: give a joint without limits ± these, by whether it is prismatic: [rad] or [m]
 UNLIMITED = {False: np.pi, True: 0.5}
 
 #: returns the absolute length of each muscle in N postures [m], (N,), from joint positions, (N,)

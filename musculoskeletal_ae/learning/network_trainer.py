@@ -14,8 +14,8 @@ from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.training import TINY, one_thread
 from musculoskeletal_ae.mae.units import LENGTH_SCALE
 
-STEP_SIZE = 2e-3  # initial step size
-BATCH = 128  # number of samples of a mini-batch
+STEP_SIZE = 2e-3  # begin online training with this step size
+BATCH = 128  # train on this many samples at once
 AVERAGED_SHARE = 0.1  # average the weights over this share of all steps so far
 LEAST_AVERAGED = 20.0  # average the weights over at least this many steps
 MOST_AVERAGED = 2000.0  # average the weights over at most this many steps

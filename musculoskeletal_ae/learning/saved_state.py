@@ -15,7 +15,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-CHECKSUM = 4  # size of the checksum at the start [bytes]
+CHECKSUM = 4  # begin a state file with a checksum of this size [bytes]
 
 Values = tuple[float, ...]
 

@@ -40,7 +40,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.robot.robot import Robot
 
-REAL_SHARE = 0.1  # share of the training samples that rest samples replace
+REAL_SHARE = 0.1  # replace this share of the training samples by rest samples
 #: replace at most this share of the training samples by motion samples; with MANY_MESSAGES of them,
 #: half of this share
 MOVING_SHARE = 0.3

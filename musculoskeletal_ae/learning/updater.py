@@ -28,7 +28,7 @@ from musculoskeletal_ae.mae.network import Network, to_mae
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.robot.robot import Robot
 
-#: text that separates initial training and online learning in `Mae.training`
+#: separate initial training and online learning by this text in `Mae.training`
 LEARNED = '; learned online: '
 NEWEST = 20  # compute the estimation error over this many newest samples
 

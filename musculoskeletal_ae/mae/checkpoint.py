@@ -60,7 +60,7 @@ Count = Annotated[int, Meta(ge=0, le=2**53)]
 Names = Annotated[tuple[str, ...], Meta(min_length=1, max_length=1000)]
 Units = Annotated[int, Meta(ge=1, le=4096)]
 Threshold = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
-#: entries of the metadata that are attributes of `Mae` with the same name
+#: copy these entries of the metadata to and from the attributes of `Mae` with the same name
 SHARED = (
     'joints', 'muscles', 'groups', 'isolated', 'activation', 'preset', 'version', 'training',
 )  # fmt: skip

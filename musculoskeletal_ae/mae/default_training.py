@@ -40,12 +40,12 @@ from musculoskeletal_ae.mae.units import LENGTH_SCALE, State, scale_vector
 from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.robot import Robot
 
-LAYERS = Layers((200, 100), 'silu')  # hidden layers of the encoder, and activation
+LAYERS = Layers((200, 100), 'silu')  # give the reference arm these hidden layers
 STEPS = 3000  # train the reference arm on this many mini-batches
-BATCH = 128  # samples of a mini-batch
+BATCH = 128  # train on this many samples at once
 SAMPLES = 200_000  # draw at most this many different samples
-STEP_SIZE = 0.004  # step size of the biases; `optimiser` derives the step size of the matrices
-REFERENCE = 5 + 10  # D + M of the arm to which LAYERS and STEPS apply
+STEP_SIZE = 0.004  # train biases with this step size; `optimiser` derives that of the matrices
+REFERENCE = 5 + 10  # scale LAYERS and STEPS for a body with another D + M than this
 # Count at most this many muscles per joint in `size`, because further muscles add equations, but no
 # unknowns.
 COUNTED_MUSCLES = 2.5

@@ -165,7 +165,7 @@ ACTIVATIONS = {
     'tanh': Activation(_tanh, _tanh_slope, 1.0),
     'silu': Activation(_silu, _silu_slope, 0.5),
 }
-LINEAR = Activation(_linear, _linear_slope, 1.0)  # at the latent layer, between two joined stacks
+LINEAR = Activation(_linear, _linear_slope, 1.0)  # join two stacks by this at the latent layer
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,13 +41,13 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import REVERSAL
 from musculoskeletal_ae.simulation.load import Load, LoadTree, hold
 
-#: l_target of muscles without a command [m]; MSC then holds T_bias, and modules that follow
-#: positions hold their length
+#: use this l_target for muscles without a command [m]; MSC then holds T_bias, and modules that
+#: follow positions hold their length
 PAID_OUT = np.inf
-#: K_stiff of position-controlled modules [N/m]; 400 N move such a module by a millimetre
+#: give position-controlled modules this K_stiff [N/m]; 400 N move such a module by a millimetre
 RIGID = 4e5
-#: B without the dampers, divided by Σ_i |∂l_i/∂θ| [N·s/rad]. With it, motions take as long as on
-#: the emulated arm; values from 8 to 20 do equally well.
+#: Multiply Σ_i |∂l_i/∂θ| by this to get B without the dampers [N·s/rad]. Motions then take as long
+#: as on the emulated arm; values from 8 to 20 do equally well.
 VISCOSITY = 12.0
 JACOBIAN_POSTURES = 100  # average |∂l_i/∂θ| over this many postures
 LEAST_VISCOSITY = 0.1  # use at least this B, such as at a joint that no muscle crosses [N·m·s/rad]
@@ -55,7 +55,7 @@ LEAST_VISCOSITY = 0.1  # use at least this B, such as at a joint that no muscle 
 #: network errors
 JOINT_SPEED = 5.0
 MODULE_SPEED = 0.25  # let muscle modules wind no faster than this, as in the emulator [m/s]
-ROUNDS = 3  # find the tendons whose friction reverses in a step in at most this many rounds
+ROUNDS = 3  # search in at most this many rounds for the tendons whose friction reverses in a step
 FARTHEST = 0.05  # let a position command run ahead of the module by at most this distance [m]
 POSTURES_PER_COEFFICIENT = 10  # fit a cubic to this many postures per coefficient
 

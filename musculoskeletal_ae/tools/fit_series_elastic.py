@@ -19,10 +19,10 @@ from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.series_elastic import DEFAULT, SeriesElastic
 
 COLUMNS = ['tension', 'absolute_length', 'elongation']
-#: tensions of the example table [N]
+#: write rows with these tensions into the example table [N]
 EXAMPLE_TENSIONS = (5.0, 15.0, 30.0, 60.0, 110.0, 200.0, 330.0, 500.0)
-EXAMPLE_LENGTHS = (0.15, 0.30, 0.45, 0.60)  # muscle lengths of the example table [m]
-#: noise of the example table (standard deviation) [m]: the resolution of a caliper
+EXAMPLE_LENGTHS = (0.15, 0.30, 0.45, 0.60)  # write rows for muscles of these lengths [m]
+#: add noise of this standard deviation to the example table [m]: the resolution of a caliper
 EXAMPLE_NOISE = 1e-4
 LEAST_FORCE, MOST_FORCE = 1e-3, 1e3  # keep `force` in this range, relative to the highest tension
 ROUNDS = 200  # end the fit after this many Gauss–Newton steps

@@ -35,7 +35,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.model_training import train_on_model
 
 HELD_OUT = 60.0  # measure the error in a motion of this duration, which is not learned [s]
-CHAIN = 'joints', 'muscles', 'without', 'base', 'end'  # options of `import_robot`
+CHAIN = 'joints', 'muscles', 'without', 'base', 'end'  # pass these options on to `import_robot`
 
 
 def train(args: Namespace) -> None:

@@ -22,7 +22,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.directories import find_robot
 
 PACKAGE = Path(__file__).resolve().parents[1]
-#: files and directories of the package that determine an initial network
+#: hash these files and directories of the package, because they determine an initial network
 CODE = (
     'robot',
     'mae',

@@ -20,7 +20,7 @@ from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
-BEGINNING = 2_000_000_000  # read this much first [ns]: it reveals most recordings of other robots
+BEGINNING = 2_000_000_000  # read this time of a recording first [ns]; it reveals most wrong robots
 
 
 def misfit(bag: Bag, name: str, namespace: str | None = None) -> str:

@@ -15,8 +15,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
 
 FROZEN_TIME = 1.0  # suspect a sensor whose reading has stayed the same for this long [s]
-#: conclude that a sensor has noise near T_bias if its reading changes in this share of the messages
-#: there, and if there are at least ENOUGH such messages
+#: conclude that a sensor has noise near T_bias if its reading changes in the share NOISY of the
+#: messages there, of which there must be at least ENOUGH
 NOISY, ENOUGH = 0.9, 1000
 MOVED = 0.006  # report a constant reading if the muscle should have moved by more than this [m]
 

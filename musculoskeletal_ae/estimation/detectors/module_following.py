@@ -42,7 +42,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
 
 FAULTY = 1.0  # report a module after this time of evidence [s]
-SMOOTHING = 0.1  # time constant by which differences and speeds are smoothed [s]
+SMOOTHING = 0.1  # smooth differences and speeds with this time constant [s]
 #: expect no more of a winch that turns at this share of its largest speed, if that is known
 FULL_SPEED = 0.5
 #: expect a healthy module to correct a difference of T_limit at least this fast [m/s]

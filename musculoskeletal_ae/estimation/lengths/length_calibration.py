@@ -43,10 +43,10 @@ LARGEST_RESIDUAL = 0.02
 #: reject a fit with a larger cost per residual: correct offsets cost 0.2 to 0.5, offsets of a wrong
 #: posture 1.1, and pure noise 0.95
 LARGEST_COST = 0.75
-#: remedy if the order or the sign of the readings is wrong
+#: advise these steps if the order or the sign of the readings is wrong
 CORRECT_DRIVER = Step.CORRECT_WIRING, Step.CALIBRATE_LENGTHS
-#: remedy if a calibration in gentle motion fails, for which a network that has not learned the arm
-#: may be too inexact
+#: advise this if a calibration in gentle motion fails: it needs an accurate network, which one that
+#: has not learned the arm may not be
 OTHER_WAY = (
     'provide joint sensors; or set zero_posture, hold the arm there, and call estimator/zero'
 )

@@ -41,7 +41,7 @@ COARSE_ANGLE = 0.1
 LIKELY = 3  # fit this many of the likeliest wirings to all moments
 MOST_FAULTS = 3  # search for at most this many exchanges and reversed signs
 
-FARTHEST = 0.3  # find no larger offset [m]
+FARTHEST = 0.3  # prefer drawn postures that imply no larger offset than this [m]
 ROUNDS = 20  # end the fit after this many Gauss–Newton steps
 FIRST_ROUNDS = 6  # end a fit in the search for initial values after this many Gauss–Newton steps
 LEAST_DECREASE = 3e-5  # end a fit if a step lowers the cost by less than this, per residual

@@ -37,11 +37,11 @@ ISOLATED_WEIGHT = 1e-6
 AT_STOP = 0.03
 
 # Prior of the constants; the mean is 0 except for FRICTION.
-OFFSET = 0.1  # prior standard deviation of a length offset [m]
-FRICTION = 0.05  # prior mean and standard deviation of the friction coefficient μ of a tendon
-#: prior standard deviation of a tension sensor's offset [N]; it covers the error of the gain
+OFFSET = 0.1  # expect a length offset of this size (σ) [m]
+FRICTION = 0.05  # expect this friction coefficient μ of a tendon, with σ of the same size
+#: expect a tension sensor's offset of this size (σ) [N]; it covers the error of the gain
 TENSION_OFFSET = 1.5
-#: prior standard deviation of a joint's Coulomb torque, relative to the weight's largest torque
+#: expect a Coulomb torque of each joint of this size (σ), relative to the weight's largest torque
 JOINT_FRICTION = 0.03
 
 #: after a reversal, let the friction of a joint change its sign over this motion [rad]

@@ -53,7 +53,7 @@ class Transition(NamedTuple):
 _ANY, _UNKNOWN = frozenset(Trust), frozenset({Trust.UNKNOWN})
 _KNOWN, _REVOKED = frozenset({Trust.KNOWN}), frozenset({Trust.REVOKED})
 
-#: what follows from each evidence; nothing leads back to the assumption of the start
+#: change the trust as each evidence demands; nothing leads back to the assumption of the start
 TRANSITIONS = {
     Evidence.NOT_CALIBRATED: Transition(_ANY, Trust.UNKNOWN),
     Evidence.RESTARTED: Transition(_ANY, Trust.UNKNOWN),
@@ -63,7 +63,7 @@ TRANSITIONS = {
     Evidence.MOVED: Transition(_KNOWN, Trust.KNOWN),
     Evidence.CONFIRMED: Transition(_KNOWN, Trust.KNOWN),
 }
-#: what follows from a finding whose kind revokes length offsets
+#: revoke known offsets after a finding whose kind revokes length offsets
 REVOCATION = Transition(_KNOWN, Trust.REVOKED)
 
 

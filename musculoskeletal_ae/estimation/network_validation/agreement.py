@@ -49,8 +49,8 @@ LENGTH_MOVED = 0.07  # permit this difference of a length from a network of eith
 SHAPE_MOVED = 0.3  # permit this relative difference in shape from a learned network
 SHAPE_MOVED_INITIAL = 0.42  # permit this relative difference in shape from an initial network
 
-BY_SENSORS = 'joint sensors'  # source of a reference
-BY_NETWORK = 'the network in use'  # source of a reference
+BY_SENSORS = 'joint sensors'  # name joint sensors so, as the source of a reference
+BY_NETWORK = 'the network in use'  # name the network in use so, as the source of a reference
 
 
 class Agreement(NamedTuple):
