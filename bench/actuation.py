@@ -93,7 +93,7 @@ class Watched:
 def learn(
     arm: Arm, initial: Mae, seed: int, seconds: float, watched: Watched
 ) -> tuple[Learner, int]:
-    """Explore and learn for a time [s]; return the learner and the number of stops."""
+    """Learn from an exploration of a time [s]; return the learner and the number of stops."""
     loop = ClosedLoop(arm, initial, None, EXPLORATION_STREAM + seed)
     learner = Learner(arm.robot, initial, 'default', seed)
     for count, row in enumerate(online_learning.explore(loop, learner, seconds)):

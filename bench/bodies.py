@@ -277,7 +277,7 @@ def regressions(case: Case) -> str:
 
 
 def read_case(text: str, clones: Path | None, cache: Path) -> Case:
-    """Return the case that NAME[:COUNT[:DRAW]] names.
+    """Read NAME[:COUNT[:DRAW]], and return the case that it names.
 
     Raises:
         MusculoskeletalError: If there is no such case, or its data are not given.

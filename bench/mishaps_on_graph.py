@@ -142,7 +142,7 @@ GRAPH_MISHAPS: tuple[GraphMishap, ...] = (
 
 
 def play(scene: Scene, mishap: GraphMishap, seed: int) -> dict[str, Any] | None:
-    """Let a mishap happen and recover from it; return its result, or None if the arm is not well.
+    """Play a mishap, and recover; return its result, or None if the arm is not well.
 
     The names are those of the results of `bench mishaps`.
     """
@@ -212,7 +212,7 @@ def true_error(attack: Attack) -> float:
 def run(
     folder: Path, initial: Path, seed: int, kinds: list[str], keep: Callable[[dict[str, Any]], None]
 ) -> None:
-    """Start the system, and play the named mishaps; call `keep` with each result."""
+    """Run the system, and play the named mishaps; call `keep` with each result."""
     folder.mkdir(parents=True, exist_ok=True)
     with Attack(folder, initial, seed) as attack:
         scene = Scene(attack)

@@ -26,7 +26,7 @@ TENSIONS = 40.0, 120.0  # draw the tensions at the postures from this range [N]
 def record(
     robot: Robot, reality: str, seed: int, seconds: float, motion: float, rest: float, order: int
 ) -> Pairs:
-    """Return a recording of an arm that moves to random postures.
+    """Record an arm that moves to random postures; return the recording.
 
     Args:
         robot: The geometric model.

@@ -68,7 +68,7 @@ LOAD = -50.0  # vertical force on the hand of the simulated arm [N], as in the p
 
 
 def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[str, int]]:
-    """Return the pictures of the film, and by file name the indices of those to save separately."""
+    """Record the film; return its pictures, and the indices of those to save, by file name."""
     frames: list[Image.Image] = []
     browser = Browser(folder / 'profile', f'http://127.0.0.1:{options.port}', SIZE)
 

@@ -57,7 +57,7 @@ class Run:
     rests: Ints  # first row of each rest, and the row after its last row, (R, 2)
 
     def at(self, rows: Any) -> Run:
-        """Return a run with some of the rows, and without rests."""
+        """Return a run with the selected rows and without rests."""
         parts = {part: getattr(self, part)[rows] for part in ('length', 'effort', 'theta')}
         return replace(self, rests=self.rests[:0], **parts)
 

@@ -246,7 +246,7 @@ class Wire(NamedTuple):
 
 
 def measure(system: System, rate: float, seconds: float) -> Wire:
-    """Return latency, losses and CPU times of a started system, measured over some seconds.
+    """Measure latency, losses and CPU times of a started system over some seconds.
 
     Raises:
         MusculoskeletalError: If the nodes exchange no messages.

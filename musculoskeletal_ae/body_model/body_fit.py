@@ -68,7 +68,7 @@ class BodyFit:
         return bool(np.median(np.abs(observed.length - length)[observed.known]) > LEAST_CHANGE)
 
     def start_anew(self) -> None:
-        """Return to the geometric model as prior, because the network learned another arm."""
+        """Start anew from the geometric model, because the network learned another arm."""
         self._prior_mean = None
         self.body = CalibratedBody(self.body.robot.with_elasticity(None))
 

@@ -39,7 +39,7 @@ def estimate_covariance(
     seed: int,
     judging: Observations | None,
 ) -> Array:
-    """Return the expected covariance of a network's errors θ_est − θ [rad²], (D, D).
+    """Estimate the covariance of a network's errors θ_est − θ [rad²], (D, D).
 
     The covariance is computed from errors that are drawn at random postures with tensions of the
     samples. An error has two parts. The first part is the error of the joint-sensor offset.

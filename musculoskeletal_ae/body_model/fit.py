@@ -171,7 +171,7 @@ class MuscleFit:
         return self.usual[1]
 
     def run(self) -> Array:
-        """Return the fitted parameters, starting from the body's present ones."""
+        """Run the fit from the body's present parameters; return the fitted ones."""
         start = self.point(self._body.parameters[self._m])
         enough = LEAST_DECREASE * float(self._known.sum())
         return minimise(self, start, ROUNDS, enough).point.parameters

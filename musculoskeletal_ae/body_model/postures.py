@@ -131,7 +131,7 @@ class GroupFit:
         )
 
     def run(self, start: Unknowns) -> tuple[Unknowns, Array]:
-        """Fit from initial values; return the unknowns and the posterior root of (w, z, e).
+        """Run the fit from initial values; return the unknowns and the posterior root of (w, z, e).
 
         The root R is upper triangular, and (RᵀR)⁻¹ is the covariance of w, z and e.
         """

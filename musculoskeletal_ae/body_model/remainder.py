@@ -377,7 +377,7 @@ def _squares(one: Array, other: Array) -> Array:
 
 
 def _kernel(distance: Array, logarithms: Array) -> Array:
-    """Return k for values of q, in the same shape."""
+    """Return the kernel k = a² (1 + q/(2ν))^−ν for values of q, in the same shape."""
     constants = _constants(logarithms)
     amplitude, tail = constants[0], constants[4]
     kernel = np.log1p(distance * (0.5 / tail))

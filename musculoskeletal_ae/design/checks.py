@@ -187,7 +187,7 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
 
 
 def judge(setting: Setting) -> RobotCheck:
-    """Check whether the muscles of a robot hold and stiffen it in given postures.
+    """Judge whether the muscles of a robot hold and stiffen it in given postures.
 
     Args:
         setting: The robot and the postures.
@@ -207,7 +207,7 @@ def judge(setting: Setting) -> RobotCheck:
 
 
 def measure(setting: Setting) -> RobotCheck:
-    """Compute tensions, stiffness and moment arms in given postures, without any finding."""
+    """Measure tensions, stiffness and moment arms in given postures, without any finding."""
     robot, _, jacobian, _, torque, *_ = setting
     bias, limit = robot.tension.bias, robot.tension.limit
     tension, missing = np.full(jacobian.shape[:2], np.nan), np.zeros(torque.shape)
@@ -256,7 +256,7 @@ def _at_tensions(
 
 
 def _judge_suspended(setting: Setting, found: Equilibria) -> RobotCheck:
-    """Check a suspended robot in its equilibria, which need only be stable (`equilibria`)."""
+    """Judge a suspended robot in its equilibria, which need only be stable (`equilibria`)."""
     robot = setting.robot
     symmetric = 0.5 * (found.gradient + found.gradient.swapaxes(-1, -2))
     result = _at_tensions(setting, found.tension, found.missing, 0.0, symmetric)
@@ -339,7 +339,7 @@ def rounded_text(value: float, least: int = 1, largest: float | None = None) -> 
 
 
 def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int], int]:
-    """Return the signs of moment arms (±1) that `moment_arms.csv` declares.
+    """Read the signs of moment arms (±1) that `moment_arms.csv` declares.
 
     The keys are pairs of indices (muscle, joint). The result is empty if there is no such file.
 

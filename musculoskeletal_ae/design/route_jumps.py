@@ -140,7 +140,7 @@ def jump_choices(robot: Robot) -> list[str]:
 
 
 def _limit_without_jumps(robot: Robot, there: Array, crossed: Ints) -> str:
-    """Suggest new limits of one joint that exclude all postures in which a length jumps.
+    """Limit one joint so that no length jumps; return its new limits as a suggestion.
 
     Of all joints, the one is chosen that keeps the largest share of its range.
 

@@ -34,7 +34,7 @@ THIN = 0.003  # draw muscles this wide in the picture [m]
 
 
 def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array, float, float]:
-    """Search for a change of the via points that makes a robot sound.
+    """Suggest a change of the via points that makes a robot sound.
 
     A muscle that changes the sign of its main action more often than before counts as a failed
     requirement as well.

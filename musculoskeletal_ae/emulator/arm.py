@@ -94,7 +94,7 @@ def tension_from_elongation(elongation: float, force: float, rate: float, stretc
 
 @njit(cache=True)
 def make_handle(parts: Parts) -> Handle:
-    """Pack `parts` into one argument for `muscle_step`. The arrays are shared, not copied."""
+    """Make a handle, by which `muscle_step` gets `parts`. The arrays are shared, not copied."""
     return Handle(parts)
 
 
@@ -248,7 +248,7 @@ class EmulatedArm(modules.Arm):
         self._joint.q[:] = self.robot.kinematics.tree.angles(theta)
 
     def set_payload(self, mass: float) -> None:
-        """Attach a mass [kg] to the hand, as a ball of 5 cm radius at the end effector."""
+        """Set the mass [kg] in the hand, a ball of 5 cm radius at the end effector."""
         load = pin.Inertia.FromSphere(mass, 0.05) if mass > 0.0 else pin.Inertia.Zero()
         placed = load.se3Action(pin.SE3(np.eye(3), self._body.effector))
         self._model.inertias[self._body.effector_joint] = self._bare_inertia + placed

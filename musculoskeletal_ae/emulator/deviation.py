@@ -85,7 +85,7 @@ class Attachments:
         self.move(np.ones(len(self._sites), dtype=bool))
 
     def move(self, muscles: Bools) -> None:
-        """Draw new positions for the sites of the muscles in the mask `muscles`, (M,).
+        """Move the sites of the muscles in the mask `muscles`, (M,), to newly drawn positions.
 
         A site that would lie inside an object that a tendon wraps around keeps its original
         position.
@@ -123,7 +123,7 @@ def _is_inside(model: Any, site: int) -> bool:
 
 
 def change_masses(model: Any, draw: Draw) -> None:
-    """Scale mass and inertia of each body by a random factor."""
+    """Change mass and inertia of each body by a random factor."""
     factor = np.exp(MASS * draw.rng('masses').normal(size=model.nbody))
     model.body_mass[:] *= factor
     model.body_inertia[:] *= factor[:, None]

@@ -110,7 +110,7 @@ class Fault(NamedTuple):
 
 
 def read_fault(line: str, robot: Robot) -> Fault:
-    """Return the fault that a line describes.
+    """Read the fault that a line describes.
 
     Raises:
         MusculoskeletalError: If the line is not legal; the message lists the legal forms.
@@ -188,7 +188,7 @@ class Faults:
         self.set([])
 
     def set(self, lines: Iterable[str]) -> None:
-        """Activate the faults that the lines describe, and end all other faults.
+        """Set the active faults to those that the lines describe.
 
         Raises:
             MusculoskeletalError: If a line is not legal; the faults are then unchanged.
@@ -235,7 +235,7 @@ class Faults:
         return [fault for fault in self._faults if fault.kind in names]
 
     def pass_time(self, duration: float) -> None:
-        """Advance the time of drifts and bursts by `duration` [s]."""
+        """Pass the time `duration` [s] for drifts and bursts."""
         self._time += duration
 
     def _is_in_burst(self, fault: Fault) -> bool:
@@ -247,7 +247,7 @@ class Faults:
         return is_present
 
     def apply(self, readings: Readings) -> Readings:
-        """Return the readings with all sensor faults applied."""
+        """Apply all sensor faults to readings, and return the result."""
         values = {name: getattr(readings, name).copy() for name in (*SENSED, 'theta')}
         values['tension'] = np.minimum(values['tension'], self.ceiling)
         kinds = 'exchange', 'bias', 'drift', 'burst', 'spike', 'dead_sensor', 'nan_sensor', 'freeze'

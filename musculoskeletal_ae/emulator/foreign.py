@@ -194,7 +194,7 @@ class LateSensors:
         self._play = theta + self._zero
 
     def start(self, now: Array) -> None:
-        """Fill the whole history with the present values of all sensed quantities, (D + 3 M,)."""
+        """Start with the present values of all sensed quantities as history, (D + 3 M,)."""
         self._history[:] = now
 
     def append(self, now: Array) -> None:
@@ -203,7 +203,7 @@ class LateSensors:
         self._history[self._steps % HISTORY] = now
 
     def read(self, jitter: float) -> tuple[Array, Array, Array, Array]:
-        """Return the sensed quantities as they were before the delays of their messages.
+        """Read the sensed quantities as they were before the delays of their messages.
 
         Args:
             jitter: Time that is added to the delays [s]; may be negative.
@@ -332,7 +332,7 @@ class ForeignArm(Arm):
         self.reset()
 
     def _set_joint_friction(self) -> None:
-        """Add friction to each joint, in proportion to its load by weight and muscles at T_bias."""
+        """Set the friction of each joint by its largest load from weight and muscles at T_bias."""
         robot, draw, body = self.robot, self._draw, self.individual
         theta = robot.random_postures(200, draw.rng('load'))
         torque = robot.kinematics.holding_torque(theta)
@@ -373,7 +373,7 @@ class ForeignArm(Arm):
         self._sensors.stand(theta)
 
     def reset(self, theta: Array | None = None) -> None:
-        """Put the arm at rest at θ [rad], (D,), as `Arm.reset` does.
+        """Reset the arm to rest at θ [rad], (D,), as `Arm.reset` does.
 
         The age of the tendons, and thus their lengthening, does not change.
         """
@@ -407,7 +407,7 @@ class ForeignArm(Arm):
         return friction
 
     def set_payload(self, mass: float) -> None:
-        """Attach a mass [kg] to the hand, as a ball of 5 cm radius at the end effector."""
+        """Set the mass [kg] in the hand, a ball of 5 cm radius at the end effector."""
         self._model.body_mass[self._hand] = mass
         self._model.body_inertia[self._hand] = 0.4 * mass * 0.05**2
         mujoco.mj_setConst(self._model, mujoco.MjData(self._model))

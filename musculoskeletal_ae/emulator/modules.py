@@ -136,7 +136,7 @@ def wind(
     modules: Modules, muscle: MuscleState, kind: int, command: Command, m: int,
     reading: float, tension: float,
 ) -> float:  # fmt: skip
-    """Turn the motor of one module for one step of 1 ms, as its control law demands.
+    """Wind one module for one step of 1 ms, as its control law demands.
 
     Args:
         modules: Constants of all modules.
@@ -258,7 +258,7 @@ class Arm(ABC):
         self._muscle = MuscleState(*(np.zeros(robot.muscle_count) for _ in MuscleState._fields))
 
     def _make_modules(self, span: Array, stretch: Array) -> Modules:
-        """Return the modules' constants.
+        """Make the modules' constants.
 
         Args:
             span: Route lengths relative to those at θ = 0 [m], in N postures, (N, M).
@@ -277,7 +277,7 @@ class Arm(ABC):
         return Modules(low, high, robot.stiffness, follows, speed, *limits, *thermal)
 
     def reset(self, theta: Array | None = None) -> None:
-        """Put the arm at rest and at ambient temperature, and repair ruptured tendons.
+        """Reset the arm to rest and to ambient temperature, and repair ruptured tendons.
 
         The external wrench ends. All muscles carry T_bias, and the modules wait for the first
         command. Payload, length offsets and `faults` do not change; a tendon that one of the faults
@@ -299,7 +299,7 @@ class Arm(ABC):
         self._age = 0.0
 
     def _attach(self, which: Bools) -> None:
-        """Wind the selected muscles so that they carry T_bias in the present posture."""
+        """Attach the selected muscles so that they carry T_bias in the present posture."""
         bias = self.robot.tension.bias
         length = self.individual.muscle_lengths(self.theta[None], bias)[0] - self.faults.slack
         self._muscle.length[which] = length[which]
@@ -378,7 +378,7 @@ class Arm(ABC):
 
     @abstractmethod
     def set_payload(self, mass: float) -> None:
-        """Attach a mass [kg] to the hand, as a ball of 5 cm radius at the end effector."""
+        """Set the mass [kg] in the hand, a ball of 5 cm radius at the end effector."""
 
     @property
     @abstractmethod
@@ -395,7 +395,7 @@ class Arm(ABC):
         self._friction_factor = factor
 
     def set_wrench(self, wrench: Array) -> None:
-        """Apply a force [N] and torque [N·m] to the end effector, in the root link's axes, (6,)."""
+        """Set the force [N] and torque [N·m] on the end effector, in the root link's axes, (6,)."""
         self._wrench[:] = wrench
 
     def set_length_offset(self, offset: Array | Sequence[float]) -> None:
@@ -413,7 +413,7 @@ class Arm(ABC):
         self._command.length_error[:] = self._length_bias + np.asarray(offset)
 
     def set_ruptured(self, muscles: Iterable[str]) -> None:
-        """Rupture the named muscles and repair all others; a repaired muscle returns to T_bias.
+        """Set which muscles are ruptured; repair all others, which return to T_bias.
 
         Raises:
             MusculoskeletalError: If a name is unknown; nothing changes then.
@@ -425,7 +425,7 @@ class Arm(ABC):
         self._attach(repaired)
 
     def set_faults(self, lines: Iterable[str]) -> None:
-        """Activate the faults that the lines describe, and end all other faults.
+        """Set the active faults to those that the lines describe.
 
         Muscles whose tendon becomes shorter or whole, because a fault 'slack' or 'rupture' ends,
         return to T_bias.
@@ -457,7 +457,7 @@ class Arm(ABC):
 
     @abstractmethod
     def _turn_gravity(self, mount: Array) -> None:
-        """Simulate with the weight of an arm whose base is turned by `mount` (`Faults.mount`)."""
+        """Turn the gravity of the simulation as for a base turned by `mount` (`Faults.mount`)."""
 
     @abstractmethod
     def _raw_readings(self) -> tuple[Array, Array, Array, Array]:
@@ -488,7 +488,7 @@ class Arm(ABC):
         return readings._replace(tension=self.robot.tension_source.known(readings.tension))
 
     def _read_currents(self, tension: Array) -> Array:
-        """Return the tensions that noisy motor currents indicate [N], (M,).
+        """Read the tensions that noisy motor currents indicate [N], (M,).
 
         These tensions include the friction of the drive, which a motor carries in addition to the
         tension of its tendon.

@@ -26,7 +26,7 @@ class Sensors(NamedTuple):
 
 
 def read_sensors(lines: Iterable[str], robot: Robot) -> Sensors:
-    """Return the sensors that the lines describe.
+    """Read which sensors the lines describe.
 
     Raises:
         MusculoskeletalError: If a line is not legal; the message lists the legal forms.

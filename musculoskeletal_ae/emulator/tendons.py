@@ -149,7 +149,7 @@ Guides = namedtuple('Guides', 'tendon point kind start count site body turn plac
 def make_tendons(
     robot: Robot, springs: Springs, at_zero: Array, span: Array, bend: Array, draw: Draw
 ) -> Tendons:
-    """Draw the constants of the tendons.
+    """Make the tendons' constants from random draws.
 
     Args:
         robot: The robot.
@@ -213,7 +213,7 @@ def load_cell(tendons: Tendons, m: int, tension: float, temperature: float) -> f
 
 @njit(cache=True)
 def read(tendons: Tendons, muscle: MuscleState, memory: Memory, command: Command, m: int) -> None:
-    """Write the readings of the sensors of module m into `memory`."""
+    """Read the sensors of module m into `memory`."""
     memory.reading[m] = spooled(tendons, m, muscle.length[m])
     memory.reading[m] += command.length_error[m] + command.zero[m]
     memory.cell[m] = load_cell(tendons, m, muscle.tension[m], muscle.housing[m])
@@ -228,7 +228,7 @@ GuideParts = namedtuple('GuideParts', 'guides tension bend')
 
 @njit(cache=True)
 def make_handle(parts: TendonParts | GuideParts) -> Handle:
-    """Pack `parts` into one argument for `tendons_step` or `guides_step`; arrays are shared."""
+    """Make a handle, by which `tendons_step` or `guides_step` gets `parts`; arrays are shared."""
     return Handle(parts)
 
 

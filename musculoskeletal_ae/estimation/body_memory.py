@@ -74,7 +74,7 @@ class BodyMemory:
                     self.found = self._read(self._file)
 
     def _read(self, file: Path) -> SavedBody:
-        """Return the content of the file; offsets of 0 and no isolated muscle if it is damaged."""
+        """Read the file; return offsets of 0 and no isolated muscle if it is damaged."""
         nothing = SavedBody(np.zeros(len(self._muscles)), (), 0)
         with suppress(MusculoskeletalError, ValueError, TypeError, KeyError, AttributeError):
             content = json.loads(
@@ -91,7 +91,7 @@ class BodyMemory:
         return nothing
 
     def note(self, body: BodyState) -> None:
-        """Save the present body state if it has changed.
+        """Note the present body state, and save it if it has changed.
 
         Provisional offsets of a calibration are not saved. If writing fails, `problem` states the
         reason, and a later call tries again.

@@ -133,7 +133,7 @@ class ContactEstimator:
             self._weight = 1.0 / healthy.spread**2
 
     def reset(self) -> None:
-        """Restart the filter, for example after a jump of the clock."""
+        """Reset the filter, for example after a jump of the clock."""
         self._filter.reset()
         self.velocity: Array = np.zeros(self._robot.joint_count)
         self._beyond = 0  # consecutive messages with d > CONTACT

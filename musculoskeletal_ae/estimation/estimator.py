@@ -244,7 +244,7 @@ class Estimator:
         self._note(evidence, found=LengthOffsets(offset, unknown.deviation))
 
     def calibrate_lengths(self, posture: tuple[float, ...] = ()) -> None:
-        """Start a length calibration, while the arm stands in a posture or moves gently.
+        """Calibrate the lengths from now on, while the arm stands in a posture or moves gently.
 
         Args:
             posture: Positions of the joints at which the arm stands [rad or m], (D,); () if it
@@ -286,7 +286,7 @@ class Estimator:
         return self.joint_check.trust
 
     def confirm_joint_sensors(self) -> tuple[int, ...]:
-        """Take the joint sensors as they are, as the user wants; return the joints concerned.
+        """Confirm the joint sensors, as the user wants; return the joints concerned.
 
         Sensors in doubt are trusted again, and the readings of the doubtful time count as well.
         Sensors without readings count as removed until they report again.
@@ -315,7 +315,7 @@ class Estimator:
         self.isolate(muscle for muscle in self.body.isolated if muscle not in restored)
 
     def reset(self, isolating: Iterable[int] = ()) -> None:
-        """Clear the anomaly, and consider the body healthy in its present state.
+        """Reset the anomaly, and consider the body healthy in its present state.
 
         Args:
             isolating: Muscles (indices) that the caller isolates next; they need not be healthy.
@@ -344,7 +344,7 @@ class Estimator:
     # -- messages -------------------------------------------------------------------------------
 
     def take(self, message: Any, time: float, now: float, delay: float = 0.0) -> Output | None:
-        """Estimate the state from a message of muscle_states, and check for faults.
+        """Take a message of muscle_states: estimate the state, and check for faults.
 
         Args:
             message: The message, or a `MuscleReading`.
@@ -384,7 +384,7 @@ class Estimator:
         return posture_of_marker(self.robot, pose, start)
 
     def report(self, now: float) -> Report:
-        """Return the status for /diagnostics."""
+        """Report the status for /diagnostics."""
         return status.report(self, now)
 
     def conditions(self, now: float) -> tuple[Condition, ...]:
@@ -477,12 +477,12 @@ class Estimator:
         muscles: Iterable[int] | None = None,
         found: LengthOffsets | None = None,
     ) -> None:
-        """Decide by new evidence on length offsets, and use the result (`LengthTrust.take`)."""
+        """Note new evidence on length offsets, and use the decision on it (`LengthTrust.take`)."""
         if self.trust.take(evidence, muscles, found):
             self._update_body(offsets=self.trust.offsets)
 
     def _update_body(self, **changes: Any) -> None:
-        """Change attributes of the body state, and the anomaly as `suspects` says.
+        """Update attributes of the body state, and the anomaly as `suspects` says.
 
         A body state that differs from the one before has the next generation.
         """

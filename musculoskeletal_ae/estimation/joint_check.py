@@ -130,19 +130,19 @@ class JointCheck:
         self._compared.extend(zip(deviation, residual - mae.lengths(estimate, tension)))
 
     def drop_newest(self) -> None:
-        """Discard the newest messages, because an anomaly has been found."""
+        """Drop the newest messages, because an anomaly has been found."""
         for _ in range(min(NEWEST, len(self._messages))):
             self._messages.pop()
             self._compared.pop()
 
     def forget(self) -> None:
-        """Discard all messages, because the length offsets have changed; the trust stays."""
+        """Forget all messages, because the length offsets have changed; the trust stays."""
         self._usual = None
         self._messages.clear()
         self._compared.clear()
 
     def confirm(self) -> tuple[int, ...]:
-        """Trust all doubted sensors, because the user has confirmed them; return their joints.
+        """Confirm all doubted sensors, as the user wants; return their joints.
 
         Their earlier readings are no anchor any more, because they contradict the confirmed ones.
         """
@@ -227,7 +227,7 @@ class JointCheck:
             self._give_up(agrees)
 
     def _compute_usual(self) -> _Usual:
-        """Return medians and spreads of the earlier messages."""
+        """Compute the medians of the earlier messages, and their spreads about them."""
         earlier = list(self._compared)[:-NEWEST]
         deviation, residual = (
             np.array([each[part] for each in earlier]).reshape(len(earlier), len(values))
@@ -289,7 +289,7 @@ class JointCheck:
         used = ~np.isin(np.arange(length.shape[1]), mae.isolated)
 
         def misfit(is_free: Bools, muscles: Bools) -> float:
-            """Return the misfit of the lengths of some muscles if some joints have any angle."""
+            """Return how badly some lengths fit if the joints `is_free` may have any angle."""
             theta = np.where(is_free, estimate, read)
             change = (length - mae.lengths(theta, tension)) / spread
             jacobian = mae.muscle_jacobian(theta, tension) / spread[:, None]
@@ -304,7 +304,7 @@ class JointCheck:
         return by_joints < BETTER * by_muscle
 
     def _give_up(self, joints: Bools) -> None:
-        """Discard the newest readings of joints, except those by which they are trusted again."""
+        """Give up the newest readings of joints, except those by which they are trusted again."""
         for place in range(max(-NEWEST, -len(self._messages)), -AGREEING):
             self._messages[place].theta[joints] = self._compared[place][0][joints] = np.nan
 

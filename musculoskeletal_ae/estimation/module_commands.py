@@ -21,7 +21,7 @@ class ModuleCommands:
         self._time = -math.inf  # time of the newest command [s]
 
     def note(self, now: float, length: Array | None = None, tension: Array | None = None) -> None:
-        """Store target lengths [m] (M,) or target tensions [N] (M,) that were sent at `now` [s]."""
+        """Note target lengths [m] (M,) or target tensions [N] (M,) that were sent at `now` [s]."""
         self._length, self._tension, self._time = length, tension, now
 
     def length(self, now: float) -> Array | None:

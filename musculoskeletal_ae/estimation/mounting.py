@@ -122,7 +122,7 @@ class MountingCheck:
         self._is_learned = mae.anomaly is not None and mae.anomaly.calibrated
 
     def reset(self) -> None:
-        """Discard all evidence, for example after a reset by the user."""
+        """Reset the check: discard all evidence, for example after a reset by the user."""
         self.tilt: Tilt | None = None
         self.evidence = 0.0
         self._counted_at = np.full(self._robot.joint_count, np.inf)  # θ that counted last

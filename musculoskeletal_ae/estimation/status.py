@@ -23,7 +23,7 @@ UNKNOWN_TENSION = 'unknown: tension_source is none'
 
 
 def report(core: Estimator, now: float) -> Report:
-    """Return the status of an estimator; `now` is the time of a steady clock [s].
+    """Report the status of an estimator; `now` is the time of a steady clock [s].
 
     The value `verification` is an identifier for programs, and `last outcome` is one of
     `verification.Outcome`.

@@ -111,7 +111,7 @@ class SuspectHandling:
         return f'{self._robot.muscles[muscle]}: {verdict}'
 
     def take(self, finding: Finding, isolated: Iterable[int], now: float) -> tuple[int, ...]:
-        """Latch a finding and isolate its muscle, if the settings and the kind of finding say so.
+        """Take a finding: latch it and isolate its muscle, if the settings and its kind say so.
 
         Args:
             finding: The finding of a detector.
@@ -181,7 +181,7 @@ class SuspectHandling:
         return self.clear(isolated)
 
     def clear(self, isolated: Iterable[int]) -> tuple[int, ...]:
-        """End the anomaly; return the indices of the muscles that are isolated from now on.
+        """Clear the anomaly; return the indices of the muscles that are isolated from now on.
 
         A suspect that is being verified is restored, because a reset declares it healthy.
         """

@@ -41,7 +41,7 @@ FRAMES = 'relative_to', 'expressed_in', 'rotation_format'
 
 
 def read_cardsflow(file: Path, root: ET.Element) -> Source:
-    """Return the robot of a cardsflow.xml and of the model.urdf or model.sdf beside it."""
+    """Read the robot of a cardsflow.xml and of the model.urdf or model.sdf beside it."""
     limits_file = file.parent / 'joint_limits.yaml'
     limits = _read_limits(limits_file)
     for model, read in (('model.urdf', _read_urdf), ('model.sdf', _read_sdf)):
@@ -113,7 +113,7 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
 
 
 def _read_limits(file: Path) -> dict[str, tuple[float, float]]:
-    """Return the limits of joints in a joint_limits.yaml, or {} if there is no such file."""
+    """Read the limits of joints in a joint_limits.yaml; {} if there is no such file."""
     if not os.path.lexists(file):
         return {}
     document, limits = read_yaml(file, refuse), dict[str, tuple[float, float]]()
@@ -132,7 +132,7 @@ def _read_limits(file: Path) -> dict[str, tuple[float, float]]:
 
 
 def _measure(source: Source) -> None:
-    """Set `source.lengths` to a function that computes the lengths of all straight routes.
+    """Let `source.lengths` measure the lengths of all straight routes.
 
     Only straight routes can be compared: CARDSflow, too, connects their points by straight lines.
     """
@@ -152,7 +152,7 @@ def _measure(source: Source) -> None:
 
 
 def read_urdf_skeleton(file: Path, root: ET.Element) -> Source:
-    """Return the robot of a URDF, with a placeholder muscle over each joint."""
+    """Read the robot of a URDF, with a placeholder muscle over each joint."""
     source, _ = _read_urdf(file, root)
     carried = {source.place(link)[0]: link for link in reversed(source.links)}
     names = distinct(safe_name(f'muscle_of_{joint}', '') for joint in source.model.names[1:])
@@ -177,7 +177,7 @@ def _endless(*ends: str | None) -> bool:
 def _read_urdf(
     file: Path, root: ET.Element, limits_and_file: tuple[Limits, str] = ({}, '')
 ) -> tuple[Source, dict[str, Array]]:
-    """Return the links and joints of a URDF, read by pinocchio, and each link's centre of mass.
+    """Read the links and joints of a URDF by pinocchio, and each link's centre of mass.
 
     `limits_and_file` are limits that replace those of the URDF, and the name of their file.
     """
@@ -220,7 +220,7 @@ def _read_urdf(
 def _read_sdf(
     file: Path, root: ET.Element, limits_and_file: tuple[Limits, str] = ({}, '')
 ) -> tuple[Source, dict[str, Array]]:
-    """Return the links and joints of an SDF with one model, and each link's centre of mass.
+    """Read the links and joints of an SDF with one model, and each link's centre of mass.
 
     `limits_and_file` are limits that replace those of the SDF, and the name of their file.
     """

@@ -55,7 +55,7 @@ class Imported(NamedTuple):
 
 
 def read_source(file: Path) -> Source:
-    """Return the robot of a file of any supported format, which the root element identifies.
+    """Read the robot of a file of any supported format, which the root element identifies.
 
     Raises:
         SourceError: If the file is not valid; the message names the file, the problem and the legal
@@ -125,7 +125,7 @@ def import_robot(
 
 
 def run(args: Namespace) -> int:
-    """Import a file, print the report, and return the exit status."""
+    """Run an import, print the report, and return the exit status."""
     chain = {name: getattr(args, name) for name in ('joints', 'muscles', 'without', 'base', 'end')}
     robot, notes, comparison = import_robot(args.file, args.out, show_prospects, **chain)
     for note, count in Counter(notes).items():

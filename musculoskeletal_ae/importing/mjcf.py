@@ -56,7 +56,7 @@ STRONGEST = 1e6
 
 
 def read_mjcf(file: Path, root: ET.Element) -> Source:
-    """Return the robot of an MJCF file, whose root element is `root`.
+    """Read the robot of an MJCF file, whose root element is `root`.
 
     Raises:
         SourceError: If MuJoCo cannot load the file.

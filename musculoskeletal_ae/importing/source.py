@@ -123,7 +123,7 @@ class Source:
     above: dict[str, str] = field(default_factory=dict)  # parent of each link, if known
 
     def note(self, kind: str, text: str) -> None:
-        """Add a line to the report: `kind`, such as 'chosen' or 'dropped', and then `text`."""
+        """Note a line for the report: `kind`, such as 'chosen' or 'dropped', and then `text`."""
         self.notes.append(f'{kind}: {printable(text)}')
 
     def lost(self) -> list[str]:
@@ -202,7 +202,7 @@ class Source:
         return float(self.model.lowerPositionLimit[q]), float(self.model.upperPositionLimit[q])
 
     def reduce_range(self, joint: str, low: float, high: float) -> None:
-        """Set the limits of a joint [rad or m] to the part that its muscles can hold."""
+        """Reduce the limits of a joint [rad or m] to the part that its muscles can hold."""
         before = ', '.join(f'{end:.4g}' for end in self.span(joint))
         q = self.model.joints[self.model.getJointId(joint)].idx_q
         for limits, end in (('lowerPositionLimit', low), ('upperPositionLimit', high)):
@@ -220,7 +220,7 @@ class Source:
         return self.model.joints[self.model.getJointId(joint)].shortname() in PRISMATIC
 
     def settle(self) -> None:
-        """Set the rest position of each coupled joint from the rest position of its master."""
+        """Settle each coupled joint in the rest position that follows from that of its master."""
         for slave, c in self.couplings.items():
             self.rest[slave] = float(c.value(self.rest.get(c.master, 0.0)))
 
@@ -541,7 +541,7 @@ def _modules(source: Source, muscle: str) -> dict[str, Any]:
 
 
 def _note_chosen_constants(source: Source) -> None:
-    """Add a note for each constant of the muscle modules that the source does not state."""
+    """Note each constant of the muscle modules that the import chose."""
     if any(source.strength.values()):
         least = ', or the tension that its actuators always exert' if source.least else ''
         source.note(

@@ -119,7 +119,7 @@ class Reservoir:
             self._rests.add(rest)
 
     def use_isolated(self, isolated: Iterable[int]) -> None:
-        """Forget all messages if a muscle was isolated in some of them, but is not isolated now.
+        """Use other isolated muscles; forget all messages if a muscle isolated in some is used now.
 
         These messages lack the values of that muscle. `isolated` are the muscles isolated now.
         """
@@ -131,14 +131,14 @@ class Reservoir:
         self._kept = [row for row in self._kept if row[-1] <= self.time - seconds]
 
     def remove_angles(self, joint: int, seconds: float) -> None:
-        """Mark θ of a joint as not measured in the messages of the last `seconds`."""
+        """Remove θ of a joint from the messages of the last `seconds`."""
         place = 3 * self._muscles + joint
         for row in self._kept:
             if row[-1] > self.time - seconds:
                 row[place] = np.nan
 
     def clear(self) -> None:
-        """Forget all messages and rests, for example after the body has changed."""
+        """Clear all messages and rests, for example after the body has changed."""
         self._missing = frozenset()
         self._kept.clear()
         self._offered, self._since, self.time = 0, 0.0, 0.0
@@ -200,7 +200,7 @@ def is_calibrated(mae: Mae) -> bool:
 
 
 def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | None:
-    """Return statistics of a network's residuals, or None if there are fewer than two messages."""
+    """Calibrate on healthy messages: return statistics of residuals, None below two messages."""
     if len(healthy.messages) < 2:
         return None
     tension, length, direction = np.split(healthy.messages.astype(float), 3, axis=1)

@@ -141,7 +141,7 @@ class SampleCollector:
         self._pairing.joints(time, measured)
 
     def take(self, time: float, message: Any, delay: float = 0.0) -> Paired[MuscleSample] | None:
-        """Check a message of muscle_states, and pair it with θ.
+        """Take a message of muscle_states: check it, and pair it with θ.
 
         Args:
             time: Time of reception [s].
@@ -245,7 +245,7 @@ class SampleCollector:
         self.joint_trust = trust
 
     def reset(self) -> None:
-        """Discard incomplete samples, for example after a backward jump of the clock."""
+        """Reset the collector: discard incomplete samples, for example after a clock jump."""
         self._stream.reset()
         self._joint_stream.reset()
         self._pairing.reset()

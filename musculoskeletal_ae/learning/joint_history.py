@@ -39,7 +39,7 @@ class JointHistory:
         self._recent.append((now, self._samples.accepted))
 
     def use(self, trust: JointTrust) -> tuple[int, ...]:
-        """Remove or put back angles, as another trust requires; return the newly unused joints."""
+        """Use another trust: remove or put back angles; return the newly unused joints."""
         before, self._trust = self._trust, trust
         new = tuple(j for j in trust.unused if before.is_used[j])
         for j in new:

@@ -53,7 +53,7 @@ class Publication:
         self._published_at = -math.inf
 
     def take(self, now: float) -> bytes | None:
-        """Return the checkpoint if it is due for publication at `now` [s], else None."""
+        """Take the checkpoint if it is due for publication at `now` [s]; return None otherwise."""
         if not self._is_pending or is_recent(self._published_at, now):
             return None
         self._is_pending, self._published_at = False, now
@@ -103,7 +103,7 @@ class CheckpointKeeper:
         return replace(mae, version=1 + max(mae.version, self._highest_version))
 
     def use(self, mae: Mae) -> None:
-        """Number a network and publish it as a candidate; save it if there is no estimator."""
+        """Use a new network: number it, publish it as a candidate; save it if no estimator runs."""
         self._publish(self.numbered(mae))
         if self._in_use is None:
             self._save_newest(self.publication.checkpoint)
@@ -130,14 +130,14 @@ class CheckpointKeeper:
         self.store()
 
     def clear(self) -> None:
-        """Forget all networks of the learner."""
+        """Clear all networks of the learner."""
         self.mae = self._saved = self.checkpoint = None
         self.publication.offer(None)
 
     # -- decisions of the estimator -------------------------------------------------------------
 
     def note_accepted(self, mae: Mae) -> None:
-        """Record that the estimator uses this network, and save the newest one if it is the same.
+        """Note that the estimator uses this network, and save the newest one if it is the same.
 
         The newest network differs from it while a decision is pending, after a rejection, and if a
         user has chosen a network for the estimator.
@@ -156,7 +156,7 @@ class CheckpointKeeper:
             self._return_if_rejected()
 
     def note_rejected(self, version: int, reason: str) -> None:
-        """Record that the estimator has rejected the network of this version, and why.
+        """Note that the estimator has rejected the network of this version, and why.
 
         A network may be rejected after it was accepted, if an anomaly follows soon.
         """
@@ -193,7 +193,7 @@ class CheckpointKeeper:
         return None if self._state is None else self._state.load(self._samples)
 
     def store(self, changed: bool = True) -> None:
-        """Save samples and network if they have `changed`.
+        """Store samples and network on disk if they have `changed`.
 
         If they have not, check that the files still exist. In both cases, a failed save is retried.
         """

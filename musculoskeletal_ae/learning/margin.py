@@ -51,7 +51,7 @@ class AnomalyMargin:
         return self.is_anomaly or self._time < self._closed_until
 
     def pass_time(self, dt: float) -> None:
-        """Advance the time by `dt` [s], to the time of the next message."""
+        """Pass the time `dt` [s], until the next message."""
         self._time += dt
 
     def hold(self, dt: float, reading: Sample, rest: Sample | None) -> list[Waiting]:
@@ -80,5 +80,5 @@ class AnomalyMargin:
         return lost
 
     def reset(self) -> None:
-        """Discard the messages held back, for example after a backward jump of the clock."""
+        """Reset the margin: discard messages held back, for example after a clock jumped back."""
         self._waiting.clear()

@@ -61,12 +61,12 @@ class NetworkTrainer:
         return float(np.mean(losses[len(losses) // 2 :]))
 
     def move(self, length: Array) -> None:
-        """Shift the network's muscle lengths by `length` [m] (M,), without training."""
+        """Move the network's muscle lengths by `length` [m] (M,), without training."""
         for network in (self.network, self._raw):
             network.mean[-len(length) :] += torch.as_tensor(LENGTH_SCALE * length)
 
     def restart(self) -> None:
-        """Return to a large step size and a short weight average, because the body has changed."""
+        """Restart with a large step size and a short weight average, as the body has changed."""
         self.steps = min(self.steps, int(LEAST_AVERAGED / AVERAGED_SHARE))
 
     def _average(self) -> None:

@@ -44,7 +44,7 @@ LEAST_RESTS = 20
 def learn_table(
     learner: Learner, table: Table, progress: Callable[[float], None] | None = None
 ) -> str:
-    """Pass a table to a learner; create the learner with `steps=REST_STEPS` if it is at rest.
+    """Learn from a table; create the learner with `steps=REST_STEPS` if the table is at rest.
 
     `progress` is called with the seconds or updates since its last call (`work`).
 
@@ -78,7 +78,7 @@ def count_postures(
     from_motion: bool = False,
     enough: float = math.inf,
 ) -> int:
-    """Return how many different postures a learner would learn from a recording.
+    """Count the different postures that a learner would learn from a recording.
 
     Args:
         robot: The recorded robot.
@@ -122,7 +122,7 @@ def without_pauses(steps: ArrayLike) -> Array:
 def learn_rests(
     learner: Learner, rests: Pairs, progress: Callable[[float], None] | None = None
 ) -> None:
-    """Store resting postures as samples, and make UPDATES updates.
+    """Learn resting postures: store them as samples, and make UPDATES updates.
 
     Implausible rows are not stored, but counted in `learner.collector.rejected`. The direction in
     which the tendons slid before each rest is unknown.
@@ -154,7 +154,7 @@ def learn_rests(
 def learn(
     learner: Learner, recording: Pairs, progress: Callable[[float], None] | None = None
 ) -> str:
-    """Pass a recording to a learner, message by message, as on a running arm.
+    """Learn from a recording, message by message, as on a running arm.
 
     This function plays the part of the estimator node: it validates the networks, and an estimator
     decides when learning has to stop. `progress` is called with the recorded seconds since its last

@@ -46,7 +46,7 @@ class ReadingWindow:
         self._first = 0
 
     def clear(self) -> None:
-        """Forget all readings."""
+        """Clear all readings."""
         self.readings.clear()
 
     @property
@@ -55,7 +55,7 @@ class ReadingWindow:
         return self.readings[0][0]
 
     def append(self, time: float, reading: Sample) -> None:
-        """Add a reading received at `time` [s]."""
+        """Append a reading received at `time` [s]."""
         held = min(len(self.readings), MOST_READINGS - 1)  # a full window loses its oldest reading
         self._first += len(self.readings) - held
         row = np.concatenate((reading.length, reading.theta))
@@ -123,7 +123,7 @@ class RestDetector:
         self.reset()
 
     def reset(self) -> None:
-        """Clear the window, for example after a jump of the clock."""
+        """Reset the detector: clear the window, for example after a jump of the clock."""
         self._window.clear()
         self._time = 0.0  # time of the last reading, as the sum of all `dt` [s]
         self._read_at = 0.0  # time of the last usable message [s]

@@ -137,7 +137,7 @@ class SampleStore:
         return bool((np.nanmax(np.abs(points[:-1] - points[-1]), axis=1) > 1.0).all())
 
     def add(self, sample: Sample, known: Bools | None = None, number: int | None = None) -> None:
-        """Store a sample as the newest one.
+        """Add a sample as the newest one.
 
         Args:
             sample: The sample.
@@ -157,7 +157,7 @@ class SampleStore:
         return [*self.samples, *(each.sample for each in self.held)]
 
     def forget(self, muscle: int, newest: int = 0) -> None:
-        """Record that only the last `newest` samples still describe a muscle."""
+        """Forget what all but the last `newest` samples say about a muscle."""
         for known in self.known[: len(self.known) - newest]:
             known[muscle] = False
         for held in self.held:
@@ -178,7 +178,7 @@ class SampleStore:
         self.held_offset = offset
 
     def put_back_held(self) -> None:
-        """Reinsert the held samples at their original positions."""
+        """Put back the held samples at their original positions."""
         for each in self.held:
             place = bisect(self.numbers, each.number)
             self.samples.insert(place, each.sample)
@@ -187,12 +187,12 @@ class SampleStore:
         self.held = []
 
     def drop_held(self) -> int:
-        """Forget the held samples; return their number."""
+        """Drop the held samples; return their number."""
         count, self.held = len(self.held), []
         return count
 
     def remove_angles(self, joint: int, numbers: Set[int]) -> dict[int, float]:
-        """Mark θ of a joint as not measured in the samples with these numbers.
+        """Remove θ of a joint from the samples with these numbers.
 
         Returns:
             The removed angles [rad] by number of the sample.
@@ -232,7 +232,7 @@ class SampleStore:
         return len(places)
 
     def clear(self) -> None:
-        """Forget all samples."""
+        """Clear all samples."""
         self.samples: list[Sample] = []  # the oldest first
         self.known: list[Bools] = []  # whether each sample describes each muscle, (M,)
         self.numbers: list[int] = []  # position of each among all samples ever accepted, from 1

@@ -48,7 +48,7 @@ class Trainer:
         self._update: Update | None = None
 
     def begin(self, mae: Mae) -> None:
-        """Let training start from the network `mae`, and discard any earlier job."""
+        """Begin to train the network `mae`, and discard any earlier job."""
         self._updater = self.preset.make_updater(self.robot, mae, self.seed)
         self._update = None
 
@@ -114,7 +114,7 @@ class TrainerProcess(Trainer):
         self._restart_at = self._deadline = math.inf
 
     def begin(self, mae: Mae) -> None:
-        """Replace the process by a new one that continues from a network."""
+        """Begin with a network in a new process, which replaces the present one."""
         self.close()
         self._mae = mae
         self._start()

@@ -129,7 +129,7 @@ class BodyUpdater(Updater):
         )
 
     def _put(self, data: TrainingData, real: Observations, places: slice) -> None:
-        """Replace the training samples at `places` by random real samples.
+        """Put random real samples into the training data at `places`.
 
         The tensions of real samples are converted to bone-side tensions, and their target lengths
         are corrected for the creep since the samples were taken.

@@ -46,7 +46,7 @@ class Updater(ABC):
         return None
 
     def update(self, job: Job) -> Update:
-        """Run one update and return its result.
+        """Update body and network once; return the result.
 
         The duration is bounded, because the numbers of samples and training steps are bounded.
         """

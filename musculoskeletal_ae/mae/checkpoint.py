@@ -431,7 +431,7 @@ def _check_fit(mae: Mae, robot: Robot) -> None:
 
 
 def save(mae: Mae, path: str | Path) -> None:
-    """Write a checkpoint file atomically.
+    """Save a network as a checkpoint file, atomically.
 
     Raises:
         OSError: If the file cannot be written.
@@ -440,7 +440,7 @@ def save(mae: Mae, path: str | Path) -> None:
 
 
 def load(path: str | Path, robot: Robot | None = None) -> Mae:
-    """Read and check a checkpoint file (see `from_bytes`).
+    """Load and check a checkpoint file (see `from_bytes`).
 
     Raises:
         CheckpointError: If the file cannot be read, is invalid or does not fit the robot.

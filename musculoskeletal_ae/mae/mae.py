@@ -385,7 +385,7 @@ class Mae:
         return self._enter[mask](np.concatenate((one, two), axis=-1))
 
     def decode(self, z: Array) -> State:
-        """Return (θ, T, l) in SI units from z of shape (..., D+M)."""
+        """Decode (θ, T, l) in SI units from z of shape (..., D+M)."""
         joints, muscles = len(self.joints), len(self.muscles)
         values = self._leave(z)
         return State(values[..., :joints], values[..., joints:-muscles], values[..., -muscles:])
@@ -412,7 +412,7 @@ class Mae:
         return state._replace(theta=theta)
 
     def fit_posture(self, tension: Array, length: Array, root: Array, start: Array) -> Array:
-        """Return the most likely posture for measured lengths, θ [rad], (..., D).
+        """Fit the most likely posture to measured lengths; return θ [rad], (..., D).
 
         Args:
             tension: Bone-side tension T_end [N], (..., M).

@@ -60,7 +60,7 @@ def shuffled(samples: Array, batch: int, rng: np.random.Generator) -> Iterator[A
 
 
 def check_device(device: str) -> None:
-    """Raise a MusculoskeletalError if torch cannot use a device."""
+    """Check that torch can use a device; raise a MusculoskeletalError otherwise."""
     try:
         # An available device may still fail to compute, so compute something.
         torch.ones(1, device=device).sum().item()

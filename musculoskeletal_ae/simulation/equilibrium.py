@@ -125,7 +125,7 @@ def clip(value: float, low: float, high: float) -> float:
 def follow(
     command: float, followed: float, length: float, span: float, loose: float, most: float
 ) -> float:
-    """Return the length [m] that a muscle module has reached on the way to a command.
+    """Follow a command: return the length [m] that a muscle module has reached on the way.
 
     Args:
         command: l_target [m].
@@ -143,7 +143,7 @@ def follow(
 
 @njit(cache=True)
 def combine(shares: Array, rows: Array, total: Array) -> None:
-    """Fill `total` (W, N) with rowsᵀ @ shares, from rows (K, W) and shares (K, N)."""
+    """Combine rows (K, W) with shares (K, N): fill `total` (W, N) with rowsᵀ @ shares."""
     terms, width = rows.shape
     total[:] = 0.0
     # The innermost loop should be long, because a core computes several numbers at once.
@@ -216,7 +216,7 @@ def add_slopes(
 def turn(
     body: Body, theta: Array, push: Array, matrix: Array, most: float, fixed: Array, arrived: Array
 ) -> None:
-    """Fill `arrived` with θ (D, N) after the Newton step Δθ that solves matrix · Δθ = push.
+    """Turn the joints by the Newton step of matrix · Δθ = push; fill `arrived` with θ (D, N).
 
     Δθ is scaled down so that no joint moves by more than `most` [rad]. A joint that `push` presses
     against its stop stays there, and forced joints move towards their angles in `fixed`. Only the
@@ -273,7 +273,7 @@ def advance(
     robot: Handle, state: ArmState, after: ArmState, h: float, passed: Array, pulled: Array,
     command: Array, wrench: Array, fixed: Array,
 ) -> None:  # fmt: skip
-    """Compute the state of N arms after a step of h [s], and write it into `after`.
+    """Advance N arms by a step of h [s], and write their states into `after`.
 
     The last axis of all arrays is that of the arms.
 
@@ -403,7 +403,7 @@ class QuasiStatics:
         self._viscosity = viscosity + robot.kinematics.elasticity.damping
 
     def use(self, mae: Mae, robot: Robot) -> None:
-        """Set the network, and the robot with the currently isolated muscles.
+        """Use a network, and the robot with the currently isolated muscles.
 
         Raises:
             FloatingPointError: If the network's lengths are not finite at some posture.

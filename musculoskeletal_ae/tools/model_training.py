@@ -33,7 +33,7 @@ SYMBOLS = {'theta': 'θ', 'tension': 'T', 'length': 'l'}
 
 
 def prepare(args: Namespace) -> Robot:
-    """Check the output files, choose the device, and return the robot, before any training.
+    """Prepare the training: check the output files, choose the device, and return the robot.
 
     Raises:
         MusculoskeletalError: If a file cannot be written or the robot is unusable.

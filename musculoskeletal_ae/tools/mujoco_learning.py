@@ -39,7 +39,7 @@ CHAIN = 'joints', 'muscles', 'without', 'base', 'end'  # pass these options on t
 
 
 def train(args: Namespace) -> None:
-    """Import, train, explore and learn; write the network, the robot and the learned model.
+    """Train on a MuJoCo file: import, explore and learn; write network, robot and learned model.
 
     Raises:
         MusculoskeletalError: If the file cannot be imported, or if the muscles of the model can

@@ -80,7 +80,7 @@ class Source(NamedTuple):
 
 
 def train(args: Namespace) -> None:
-    """Learn from recordings in order; print the errors on them and on held-out recordings."""
+    """Train on recordings in order; print the errors on them and on held-out recordings."""
     robot = prepare(args)
     # All recordings are read first, because training takes minutes and one may be unusable.
     sources = _csv_sources(robot, args) if args.from_csv else _bag_sources(robot, args)
@@ -230,7 +230,7 @@ def _zeros(robot: Robot, sources: list[Source], estimate: bool) -> Array:
 
 
 def _check_range(robot: Robot, source: Source) -> None:
-    """Raise a TableError if most values of a joint or muscle are impossible."""
+    """Check whether most values of a joint or muscle are possible; otherwise raise a TableError."""
     rows = source.table.rows
     margin = LIMITS.joint_outside * (robot.upper - robot.lower)
     (low_length, low_tension, *_), (high_length, high_tension, *_) = possible_readings(robot)
@@ -332,7 +332,7 @@ def _learns_from_motion(robot: Robot, sources: list[Source], preset: str) -> boo
 
 
 def _count(robot: Robot, sources: list[Source], enough: int, *, from_motion: bool) -> int:
-    """Return how many postures would be learned, counted up to `enough`."""
+    """Count how many postures would be learned, up to `enough`."""
     count = 0
     learned = [source for source in sources if not source.is_held_out]
     what = 'slow moments' if from_motion else 'resting postures'
@@ -382,7 +382,7 @@ def offset_text(robot: Robot, zero: Array) -> str:
 
 
 def _keep(learner: Learner, args: Namespace) -> str:
-    """Save the network of an interrupted run beside `--out`; return a sentence that says so.
+    """Keep the network of an interrupted run beside `--out`; return a sentence that says so.
 
     The file of `--out` does not change: it may have the network of an earlier, complete run.
     """
@@ -476,7 +476,7 @@ def anomaly_in(
 
 
 def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
-    """Return the paired messages of a bag, and print progress, and warnings about unused messages.
+    """Read the paired messages of a bag; print progress, and warnings about unused messages.
 
     Args:
         path: The bag.

@@ -43,7 +43,7 @@ class FrozenSensor(Detector):
         self._stop_observing()
 
     def reset(self) -> None:
-        """Restart the measurement of how long readings have been constant."""
+        """Reset the detector: measure anew how long readings have been constant."""
         self._last = None
         self._unchanged_time[:] = 0.0
         self._stop_observing()

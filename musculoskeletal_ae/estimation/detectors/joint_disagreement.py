@@ -129,13 +129,13 @@ class JointDisagreement(Detector):
         self._compute_usual()
 
     def reset(self) -> None:
-        """Discard the last messages, but not the differences that are usual on the healthy arm."""
+        """Reset the detector: discard the last messages, but keep the usual differences."""
         self._recent: deque[Array] = deque(maxlen=COUNT)
         self._since, self._unmeasured, self._beyond = 0.0, 0.0, 0.0
         self.gap = None
 
     def forget(self) -> None:
-        """Discard the last messages and the usual differences, because length offsets changed."""
+        """Forget the last messages and the usual differences, because length offsets changed."""
         self.reset()
         self._healthy.clear()
         self._compute_usual()

@@ -67,11 +67,11 @@ class ModuleFollowing(Detector):
         self.reset()
 
     def use(self, mae: Mae) -> None:
-        """Monitor the muscles that are not isolated in this network."""
+        """Use another network: monitor the muscles that are not isolated in it."""
         self._robot = self._complete_robot.without(mae.isolated)
 
     def reset(self) -> None:
-        """Discard all evidence."""
+        """Reset the detector: discard all evidence."""
         count = self._complete_robot.muscle_count
         self._evidence: Array = np.zeros(count)  # time of evidence [s]
         self._length: Array | None = None  # l in the previous message [m]

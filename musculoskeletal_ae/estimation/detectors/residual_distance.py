@@ -106,11 +106,11 @@ class ResidualDistance(Detector):
             self.threshold = statistics.thresholds.get(self.threshold_name, np.inf)
 
     def reset(self) -> None:
-        """Discard the count of consecutive messages above the threshold."""
+        """Reset the detector: discard the count of messages above the threshold."""
         self._beyond = 0
 
     def forget_reading(self) -> None:
-        """Discard the last reading, for example when the length offsets change."""
+        """Forget the last reading, for example when the length offsets change."""
         self.reading = None
 
     def step(self, observation: Observation) -> Finding | None:

@@ -57,7 +57,7 @@ class SaturatedSensor(Detector):
         self.reset()
 
     def reset(self) -> None:
-        """Forget all visits."""
+        """Reset the detector: forget all visits."""
         count = self._robot.muscle_count
         self._before: Array = np.full(count, np.nan)  # reading of the previous message [N]
         self._unchanged: Array = np.zeros(count)  # time without a change of the reading [s]

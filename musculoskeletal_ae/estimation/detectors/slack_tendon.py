@@ -70,12 +70,12 @@ class SlackTendon(Detector):
         self.is_winding_in: Bools = np.zeros(muscle_count, dtype=bool)
 
     def use(self, mae: Mae) -> None:
-        """Monitor the muscles that are not isolated in this network."""
+        """Use another network: monitor the muscles that are not isolated in it."""
         self._mae = mae
         self._robot = self._complete_robot.without(mae.isolated)
 
     def reset(self) -> None:
-        """Restart the measurement of how long tendons have been slack."""
+        """Reset the detector: measure anew how long tendons have been slack."""
         self._slack_time[:] = self._idle_time[:] = 0.0
 
     def step(self, observation: Observation) -> Finding | None:
@@ -155,13 +155,13 @@ class StretchedTendon(SlackTendon):
         self._taut_predictions = dict[int, tuple[MuscleSample, Bools, Prediction]]()
 
     def use(self, mae: Mae) -> None:
-        """Monitor the muscles that are not isolated in this network."""
+        """Use another network: monitor the muscles that are not isolated in it."""
         super().use(mae)
         self._errors = LengthErrors(self._complete_robot, mae)
         self._taut_predictions.clear()
 
     def reset(self) -> None:
-        """Restart the measurement of how long tendons have been stretched without tension."""
+        """Reset the detector: measure anew how long tendons have been stretched without tension."""
         super().reset()
         self._recent.clear()
         self._taut_count[:] = 0

@@ -89,7 +89,7 @@ class ExchangeCheck:
         self._mae = mae
 
     def read(self, states: Array, now: float) -> None:
-        """Note the raw l of a message, accepted or not, and whether a silence has ended with it.
+        """Read the raw l of a message, accepted or not, and note whether a silence has ended.
 
         Args:
             states: The raw readings, (Q, M).
@@ -103,7 +103,7 @@ class ExchangeCheck:
         self._newest = now, length
 
     def note(self, observation: Observation) -> None:
-        """Keep a message in regular intervals, while the length offsets are known."""
+        """Note a message at regular intervals, while the length offsets are known."""
         self._since += observation.dt
         if self._since < SPACING - 1e-9:
             return
@@ -161,7 +161,7 @@ class ExchangeCheck:
         return finding_of(changed) if len(changed) > 1 else None
 
     def _judge_silence(self) -> WiringJudgement | None:
-        """Return which wiring makes lengths continue over the last silence; None if unknown."""
+        """Judge which wiring makes lengths continue over the last silence; None if unknown."""
         if self._silence is None or self._mae is None:
             return None
         _, before, after = self._silence
@@ -187,7 +187,7 @@ class ExchangeCheck:
         return WiringJudgement(best, tuple(wiring for _, wiring in explaining), (), least)
 
     def _judge(self, observation: Observation) -> WiringJudgement | None:
-        """Return which wiring restores the usual A; None if that cannot be judged."""
+        """Judge which wiring restores the usual A; return None if that cannot be judged."""
         mae, sample = self._mae, observation.sample
         if mae is None or mae.anomaly is None or not mae.anomaly.calibrated:
             return None

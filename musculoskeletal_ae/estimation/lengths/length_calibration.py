@@ -179,7 +179,7 @@ class LengthCalibration:
         self._judge(fit, moments, is_enough)
 
     def _judge(self, fit: Fit, moments: Moments, is_enough: bool) -> None:
-        """Make a fit the newest estimate of the offsets, and decide whether it is reliable.
+        """Judge whether a fit is reliable, and make it the newest estimate of the offsets.
 
         `is_enough` says whether there was enough motion for reliable offsets when the fit began.
         """

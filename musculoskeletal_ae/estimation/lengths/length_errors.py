@@ -100,7 +100,7 @@ class LengthErrors:
     def predict(
         self, length: Array, tension: Array, spread: Array | float, used: Bools, start: Array
     ) -> Prediction:
-        """Fit a posture to the lengths of some muscles, and predict the lengths of all.
+        """Predict the lengths of all muscles in a posture that is fitted to the lengths of some.
 
         Args:
             length: Measured lengths [m], (M,).

@@ -142,7 +142,7 @@ class LengthFit:
         return judgement
 
     def _start(self, fit: Fit, moments: Moments, before: Wiring, after: Wiring, rows: Ints) -> Fit:
-        """Return an initial fit of one wiring, from a fit of another one.
+        """Start the fit of one wiring: return initial values, from a fit of another wiring.
 
         The postures are kept, and so are all constants except the length offsets of the muscles
         whose columns change.
@@ -171,7 +171,7 @@ class LengthFit:
         return fit.cost / self._count(fit.theta)
 
     def _count(self, theta: Array) -> int:
-        """Return the number of length and torque residuals in the postures `theta`, (K, D)."""
+        """Count the length and torque residuals in the postures `theta`, (K, D)."""
         return len(theta) * (self._robot.muscle_count + self._robot.joint_count)
 
     # -- search for a start ---------------------------------------------------------------------

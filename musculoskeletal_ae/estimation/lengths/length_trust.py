@@ -91,7 +91,7 @@ class LengthTrust:
         muscles: Iterable[int] | None = None,
         found: LengthOffsets | None = None,
     ) -> bool:
-        """Decide by new evidence; return whether this has changed an offset or a trust.
+        """Take new evidence; return whether it has changed an offset or a trust.
 
         Args:
             evidence: The evidence, or the kind of a finding that revokes length offsets.

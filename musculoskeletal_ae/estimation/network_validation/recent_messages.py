@@ -51,7 +51,7 @@ class RecentMessages:
         theta: Array | None,
         is_healthy: bool,
     ) -> None:
-        """Store a message if the arm is healthy and the last stored message is at least 0.1 s old.
+        """Note a message if the arm is healthy and the last stored message is at least 0.1 s old.
 
         Args:
             tension: Tensions as read [N], (M,).
@@ -80,10 +80,10 @@ class RecentMessages:
         return mae.transmission.end(tension, sliding), length
 
     def drop_after(self, time: float) -> None:
-        """Discard the messages that are newer than a time [s]."""
+        """Drop the messages that are newer than a time [s]."""
         while self._messages and self._messages[-1].time > time:
             self._messages.pop()
 
     def clear(self) -> None:
-        """Discard all messages."""
+        """Clear all messages."""
         self._messages.clear()

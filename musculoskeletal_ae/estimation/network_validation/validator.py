@@ -105,12 +105,12 @@ class CheckpointValidator:
         self._messages.note(tension, length, sliding, now, theta, is_healthy=not self._is_anomaly)
 
     def start(self) -> None:
-        """Discard all networks and messages, so that the next network counts as the first one."""
+        """Start without networks and messages, so that the next network counts as the first one."""
         self._used.clear()
         self.forget()
 
     def forget(self) -> None:
-        """Discard the messages, for example when the length offsets change."""
+        """Forget the messages, for example when the length offsets change."""
         self._messages.clear()
 
     def check(self, mae: Mae, is_chosen: bool = False) -> None:
@@ -154,7 +154,7 @@ class CheckpointValidator:
         self._repaired_at |= dict.fromkeys(muscles, now)
 
     def take(self, mae: Mae, now: float) -> None:
-        """Record that this network is in use from the time `now` [s] on."""
+        """Take this network as the one in use from the time `now` [s] on."""
         self._used.append((now, mae))
         while len(self._used) > 1 and now - self._used[1][0] >= PROOF:
             del self._used[0]
