@@ -358,7 +358,7 @@ def judge(statement: Statement, mishap: Mishap, case: Case) -> str:
     """
     concerned, subjects = frozenset(case.subjects), statement.subjects
     names_it = not concerned or bool(subjects & concerned)
-    # A statement that names other muscles or joints only is about something else.
+    # Count a statement as being about something else if it only names other muscles or joints.
     is_about = names_it or not subjects
     is_said = bool(mishap.says) and re.search(mishap.says, statement.text, re.I) is not None
     is_true = statement.identifier in mishap.true or is_said
@@ -394,7 +394,7 @@ def play(lab: Lab, mishap: Mishap, seed: int, reality: str, before: float) -> di
     is_accurate = after <= max(WELL * before, before + WELL_RAD)
     case, effect, true_at = course.case, course.effect_at, course.true_at
     is_needed = not mishap.is_harmless and (effect is not None or true_at is not None)
-    # A statement may come before the effect that this bench considers visible.
+    # Count a statement as immediate if it comes before the effect that this bench can see.
     delay = None if true_at is None else round(max(0.0, true_at - (effect or true_at)), 2)
     ended = '' if is_quiet else '; '.join(each.text for each in course.present) or 'not exploring'
     is_advised = course.is_found_by_advice or case.lasts < math.inf or mishap.is_harmless

@@ -104,7 +104,7 @@ def cable_platform(files: Files) -> Recording:
         for entry, end in zip(ENTRY, ATTACHED, strict=True)
     ]
     runs = []
-    # sc_8_medium_b is a copy of sc_8_medium_a.
+    # Leave out sc_8_medium_b, which is a copy of sc_8_medium_a.
     for name in ('sc_27_final', 'sc_27_medium_a', 'sc_8_final', 'sc_8_medium_a'):
         try:
             data: Any = BytesIO(files.data(f'{name}_parsed.mat'))

@@ -114,7 +114,7 @@ def update_time(robot: Robot, mae: Mae, exploring: Recording) -> float:
     times = []
     with one_thread():  # as in the training process of the learner
         for _ in range(6):
-            # Every update of the node has a new sample.
+            # Replace a sample, because every update of the node has a new one.
             kept = np.append(kept[1:], rng.integers(count))
             part = exploring.part(kept)
             none = np.zeros_like(part.tension)

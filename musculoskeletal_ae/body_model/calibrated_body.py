@@ -96,13 +96,12 @@ class CalibratedBody:
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
         #: what the parameters cannot express; `lengths` includes it, `linearised` does not
         self.remainder = Remainder(robot.muscle_count)
-        # The next fit starts from these values:
-        #: joint-sensor offsets [rad], (D,)
+        #: joint-sensor offsets from which the next fit starts [rad], (D,)
         self.zero = np.zeros(robot.joint_count)
-        #: corrections of the joints' springs, as in the module `springs`, (2, D)
+        #: corrections α and β of the joints' springs, from which the next fit starts, (2, D)
         self.springs = springs.none_learned(robot.joint_count)
-        #: fitted θ (D,) and a row of `posture_model.Bent` for each sample; the key is the bytes of
-        #: the sample's lengths
+        #: start of the next fit for each sample, by the bytes of its lengths: fitted θ (D,) and a
+        #: row of `posture_model.Bent`
         self.last_postures: dict[bytes, tuple[Array, ...]] = {}
 
     def limb(self, joints: Ints, muscles: Ints) -> CalibratedBody:

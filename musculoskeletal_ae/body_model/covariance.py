@@ -169,7 +169,7 @@ def ellipsoids(covariance: Array, error: Array) -> Array:
         error: Errors [rad], (N, D).
     """
     squares = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error.T).T)
-    # Quantile of χ² with D degrees of freedom; importing scipy.stats for it would take 0.7 s.
+    # Compute the quantile of χ² with D degrees of freedom here: importing scipy.stats takes 0.7 s.
     bounded: Array = squares / (2.0 * gammaincinv(0.5 * error.shape[1], CONTAINED_SHARE))
     return bounded
 

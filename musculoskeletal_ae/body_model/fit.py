@@ -46,7 +46,7 @@ LEAST_BEFORE_CHANGE = 8
 class Fit(NamedTuple):
     """Result of a fit."""
 
-    #: l − l(θ, T; w) [m], (N, M), at the measured angles, or at fitted ones where there are none
+    #: measured minus computed lengths [m], (N, M), at measured angles, or else at fitted ones
     residual: Array
     noise: Array  # σ of each muscle's length [m], (M,)
     weight: Array  # ω in (0, 1], (N, M); 0 where a sample does not describe a muscle
@@ -138,9 +138,9 @@ def _reopened(
 class MusclePoint(NamedTuple):
     """Parameters of one muscle, with residuals and derivatives."""
 
-    parameters: Array  # w, (P,)
-    residual: Array  # l − l(θ, T; w) [m], (N, 1)
-    jacobian: Array  # ∂l/∂w, (N, P)
+    parameters: Array  # w, fitted constants of the muscle, (P,)
+    residual: Array  # measured minus computed lengths [m], (N, 1)
+    jacobian: Array  # derivatives of the computed lengths by the parameters, (N, P)
 
 
 class MuscleFit:

@@ -35,9 +35,9 @@ SMALL = 1e-6  # raise smaller divisors to this value
 class Unknowns(NamedTuple):
     """Values of all unknowns of one group of D joints and M muscles."""
 
-    theta: Array  # θ of all joints of the body [rad], (N, all joints)
-    zero: Array  # z [rad], (D,)
-    parameters: list[Array]  # w of each muscle
+    theta: Array  # angles θ of all joints of the body [rad], (N, all joints)
+    zero: Array  # joint-sensor offsets z [rad], (D,)
+    parameters: list[Array]  # parameters w of each muscle
     springs: Array  # α and β of all joints of the body, as in the module `springs`, (2, all joints)
 
 
@@ -134,7 +134,7 @@ class PostureModel:
         torque_by_body = np.zeros((count, places, self.parameter_count))
         for m in range(length.shape[1]):
             tension, direction = observed.tension[:, m], observed.direction[:, m]
-            turns = np.flatnonzero(self._crossed[m])  # only these joints change the length
+            turns = np.flatnonzero(self._crossed[m])  # skip joints that do not change the length
             parts = np.append(0, 1 + turns)
             rows = (count * parts[:, None] + np.arange(count)).ravel()
             placed = type(poses)(*(part[np.append(rows, -1)] for part in poses))

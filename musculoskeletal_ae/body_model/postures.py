@@ -346,7 +346,7 @@ def fit_jointly(
     for n, sample in enumerate(samples):
         if sample in body.last_postures:
             theta[n], bent.theta[n], bent.stiffness[n] = body.last_postures[sample]
-    # The remainder is that of the last fit. It is taken at the measured angles where there are any.
+    # Take the remainder of the last fit at the measured angles, where there are any.
     posture = np.where(np.isnan(observed.theta), theta, observed.theta - own * zero)
     remainder = body.remainder.at(posture, observed.tension)
     of_body = replace(observed, length=observed.length - remainder)

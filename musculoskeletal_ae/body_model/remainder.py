@@ -77,7 +77,7 @@ class Lengths(NamedTuple):
     theta: Array  # θ [rad], (N, D)
     tension: Array  # T or T_read [N], (N, M)
     deviation: list[Array]  # l − l(θ, T; w̄) of each muscle [m], (N,)
-    by_body: list[Array]  # J S: change of each length with w in units of the spreads [m], (N, P)
+    by_body: list[Array]  # J S: derivatives of lengths by w, times the prior spreads [m], (N, P)
     weight: Array  # robust weights ω, (N, M)
 
     @classmethod
@@ -270,7 +270,7 @@ def group_remainder(
             covariance = kernel + lengths.by_body[m] @ lengths.by_body[m].T + np.diag(noise)
             inverse = cho_solve((cholesky(covariance, lower=True), True), np.eye(count))
             weights[:, m] = inverse @ lengths.deviation[m]
-            # The error of a length predicted from all other samples is α_n/(K⁻¹)_nn, and its
+            # If a length is predicted from all other samples, its error is α_n/(K⁻¹)_nn, with the
             # variance 1/(K⁻¹)_nn.
             used = lengths.weight[:, m] > 0.0
             scores[used, m] = (weights[:, m] / np.sqrt(np.diag(inverse)))[used]

@@ -125,7 +125,7 @@ def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Set
         terms = checks.arm_terms(robot, joint)
         text = f'{terms.name}s at {robot.joints[joint]} {factor:g} times as large'
         return setting._replace(jacobian=setting.jacobian * scale, hessian=hessian), text
-    if what == 'limits':  # the postures are scaled with the limits
+    if what == 'limits':  # scale the postures with the limits
         theta, middle = setting.theta.copy(), 0.5 * (robot.lower + robot.upper)[joint]
         # Round as the user would write the limits into the file.
         unit, digits = robot.units[joint], 4 if robot.units.slides[joint] else 2

@@ -38,7 +38,7 @@ class Prospects(NamedTuple):
     #: the muscles alone hold hardly any
     supported: int
     idle: Bools  # whether no muscle moves each joint, (D,)
-    #: the joints that lack torque in most postures that are not held, by their number of postures
+    #: joints that most often lack torque in a posture that is not held, and in how many postures
     lacking: tuple[tuple[str, int], ...]
 
     @property

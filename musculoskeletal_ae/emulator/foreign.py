@@ -148,7 +148,7 @@ def _imported_model(robot: Robot, file: Path, draw: Draw, deviates: bool) -> Any
     theta = robot.random_postures(100, np.random.default_rng(0))
     relative = given.absolute_lengths(theta) - given.length_at_zero
     off = np.abs(relative - robot.muscle_lengths(theta, np.zeros(robot.muscle_count)))
-    typical = np.median(off, axis=0)  # a length that jumps may differ in some postures
+    typical = np.median(off, axis=0)  # ignores the few postures in which a length jumps
     for m in np.flatnonzero(typical > OTHER_ROUTE):
         name, millimetres = robot.muscles[m], 1e3 * typical[m]
         problem = f'muscle {name!r} is typically {millimetres:.0f} mm longer or shorter there'

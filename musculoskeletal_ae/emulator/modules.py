@@ -250,7 +250,7 @@ class Arm(ABC):
         self._drive_friction: Array = share * robot.description.tension.limit
         self._mount = self.faults.mount  # turn of the base that the simulation uses
         self._wrench = np.zeros(6)
-        self._friction_factor = 1.0  # friction that varies, as a multiple of the individual's own
+        self._friction_factor = 1.0  # present friction, as a multiple of the individual's own
         self._command = Command(
             np.zeros(robot.muscle_count), length_bias.copy(), self.faults.stuck,
             self.faults.slack, self.faults.zero, self.faults.hot, self.faults.ceiling,
@@ -471,7 +471,7 @@ class Arm(ABC):
         """Read all sensors once, with noise, bias, resolution and faults."""
         theta, length, tension, housing = self._raw_readings()
         ruptured, rng = self._muscle.ruptured > 0.0, self._rng
-        # A ruptured tendon does not load the sensor, and a tension sensor does not read below zero.
+        # Let the sensor of a ruptured tendon read 0, and no tension sensor less than 0.
         finest = TENSION_NOISE_SHARE * self.robot.description.tension.bias
         fineness = np.minimum(1.0, finest / TENSION_NOISE)
         noise, resolution = fineness * TENSION_NOISE, fineness * TENSION_RESOLUTION

@@ -75,7 +75,7 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
     model, names, links = kin.model, list(kin.model.names), draw.sizes.links
     spec.option.gravity = model.gravity.linear
     spec.compiler.balanceinertia, spec.compiler.degree = True, False
-    spec.compiler.boundmass = 1e-6  # for links without mass
+    spec.compiler.boundmass = 1e-6  # lets MuJoCo accept links without mass
     off = links * draw.rng('links').normal(size=(model.njoints, 4, 3))
     bodies, gear = [spec.worldbody], joint_gear(kin)
     springs, units = robot.units.elasticity_outside(_drawn_springs(robot, draw)), robot.units
@@ -282,7 +282,7 @@ def _obstacle(
         turn, origin = poses.rotation[:, carrier], poses.translation[:, carrier]
         away = [poses.rotation[:, c] @ at + poses.translation[:, c] - origin for c, at in ends]
         local = [np.einsum('nji,nj->ni', turn, each) - middle for each in away]
-        along = cylinder * ((local[1] - local[0]) @ axis)  # on a cylinder the path is a helix
+        along = cylinder * ((local[1] - local[0]) @ axis)  # on a cylinder: a helix
         local = [each - cylinder * np.outer(each @ axis, axis) for each in local]
         apart = [np.linalg.norm(each, axis=1) for each in local]
         radius = np.linspace(0.0, min(0.8 * min(map(np.min, apart)), THICKEST), 30)[:, None]
@@ -292,7 +292,7 @@ def _obstacle(
         for each in apart:
             touching = touching - np.arccos(radius / np.maximum(each, 1e-12))
             way = way + np.sqrt(each**2 - radius**2)
-        # Two straight tangents, and the arc between them.
+        # The bent tendon consists of two straight tangents and the arc between them.
         bent = np.hypot(way + radius * touching, along)
         straight = np.hypot(np.linalg.norm(local[1] - local[0], axis=1), along)
         longer = np.max(np.where(touching > 0.0, bent - straight, 0.0), axis=1)
@@ -375,5 +375,5 @@ def other_robot(robot: Robot, file: Path, problem: str) -> MusculoskeletalError:
 def set_options(model: Any) -> None:
     """Set the time step and the other options of the simulation in a compiled model."""
     model.opt.timestep, model.opt.integrator = STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # A diverged simulation stays diverged until `Arm.reset`.
+    # Let a diverged simulation stay diverged until `Arm.reset`; MuJoCo would reset it by itself.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET

@@ -79,7 +79,7 @@ class Springs:
         law[rng.uniform(size=count) >= draw.sizes.laws] = 0
         stiffness = 1.0 + draw.sizes.stiffness * rng.uniform(-1.0, 1.0, count)
         element = laws[law, :, np.arange(count)].T / stiffness
-        stretch = sheet.wire_stretch * at_zero  # of the whole tendon, immediate and delayed [m/N]
+        stretch = sheet.wire_stretch * at_zero  # immediate and delayed stretch of each tendon [m/N]
         #: delayed stretch of the tendons [m/N], (M,)
         self.late: Array = stretch * draw.about('recovery', count)
         #: immediate elongation of elements and tendons [m], (K, M)

@@ -88,7 +88,7 @@ class _Usual(NamedTuple):
     deviation: Array  # θ − θ̂ [rad], (D,); 0 if unknown
     deviation_spread: Array  # [rad], (D,); NaN if unknown
     known_count: Ints  # number of these messages, (D,)
-    residual: Array  # r [m], (M,)
+    residual: Array  # l − l_net(θ̂, T_end) [m], (M,)
     residual_spread: Array  # [m], (M,)
 
 
@@ -106,7 +106,7 @@ class JointCheck:
         self.trust = JointTrust.full(robot.joint_count)
         #: messages in order of time; the last NEWEST of them are judged by the earlier ones
         self._messages: deque[_Message] = deque(maxlen=EARLIER + NEWEST)
-        #: θ − θ̂ [rad] (D,) and r [m] (M,) of each message with the network in use
+        #: θ − θ̂ [rad] (D,) and l − l_net(θ̂, T_end) [m] (M,) of each message with the network in use
         self._compared: deque[tuple[Array, Array]] = deque(maxlen=EARLIER + NEWEST)
         self._since = 0.0  # time since the last message that counted [s]
         #: estimate at the last message that counted [rad], (D,)
@@ -187,7 +187,7 @@ class JointCheck:
         if self._mae is None or self._since < SPACING - 1e-9 or np.isnan(theta).all():
             return
         has_moved = (np.abs(estimate - self._counted_at) > MOVED).any()
-        # A sensor that is far off is also found while the arm stands still.
+        # Look for readings that are far off even while the arm stands still.
         usual = 0.0 if self._usual is None else self._usual.deviation
         is_far = np.abs(theta - estimate - usual) > GROSS
         if not (has_moved or (is_far & ~self.trust.is_doubted).any()):
@@ -200,7 +200,7 @@ class JointCheck:
         if len(self._messages) >= WINDOWS[0][0]:
             self._judge()
         if len(self._messages) > NEWEST:
-            # Readings of a sensor that is not used are no anchor.
+            # Do not compare later readings with those of a sensor that is not used.
             unused = ~self.trust.is_used
             self._messages[-1 - NEWEST].theta[unused] = np.nan
             self._compared[-1 - NEWEST][0][unused] = np.nan
@@ -283,7 +283,7 @@ class JointCheck:
         tension = np.array([message.tension for message in messages])
         length = np.nan_to_num([message.length for message in messages])
         estimate = mae.estimate(tension, length).theta
-        # Usual errors of readings and lengths are no sign of a fault.
+        # Remove the usual errors of readings and lengths, which are no sign of a fault.
         read = estimate + np.nan_to_num(excess)
         length = length - np.nan_to_num(usual.residual)
         used = ~np.isin(np.arange(length.shape[1]), mae.isolated)

@@ -125,8 +125,8 @@ class MountingCheck:
         """Reset the check: discard all evidence, for example after a reset by the user."""
         self.tilt: Tilt | None = None
         self.evidence = 0.0
-        self._counted_at = np.full(self._robot.joint_count, np.inf)  # θ that counted last
-        self._since = SPACING  # time since then [s]
+        self._counted_at = np.full(self._robot.joint_count, np.inf)  # last θ that counted
+        self._since = SPACING  # time since the last posture that counted [s]
         #: terms of S for each posture, newest first, (noise levels, payloads, directions)
         self._costs: deque[Array] = deque(maxlen=MEMORY)
 
@@ -168,7 +168,7 @@ class MountingCheck:
         return cost
 
     def _judge(self) -> None:
-        # Smallest S by number of the newest postures and by direction
+        # Sum the newest n postures for each n, and take the best noise level and payload.
         best = np.cumsum(self._costs, axis=0)[ENOUGH - 1 :].min(axis=(1, 2))
         is_upright = self._angles <= UPRIGHT
         upright, other = best[:, is_upright].min(axis=1), best[:, ~is_upright].min(axis=1)

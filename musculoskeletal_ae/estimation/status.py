@@ -87,7 +87,7 @@ def _isolated(core: Estimator) -> Iterator[Condition]:
             continue
         name, fault = core.robot.muscles[muscle], core.suspects.faults.get(muscle)
         detail = name if fault is None else f'{name} ({fault})'
-        # A muscle that a user has isolated need not be faulty.
+        # Advise no repair of a muscle that a user has isolated, because it need not be faulty.
         steps = None if fault is not None else (Step.RESTORE_MUSCLES,)
         yield ConditionKind.MUSCLE_ISOLATED.condition(detail, [name], steps=steps)
 

@@ -177,7 +177,7 @@ class SuspectHandling:
             self._acquitted.append(now)
         else:
             self.faults[self.verification.muscle] = verdict
-            self.verification = None  # `clear` then leaves the suspect isolated
+            self.verification = None  # so that `clear` leaves the suspect isolated
         return self.clear(isolated)
 
     def clear(self, isolated: Iterable[int]) -> tuple[int, ...]:

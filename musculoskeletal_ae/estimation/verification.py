@@ -92,7 +92,7 @@ class Outcome(Enum):
     TENSION_SENSOR_FROZEN = 'tension_sensor_frozen'
     NOT_WOUND_IN = 'not_wound_in'
     TENSION_UNKNOWN = 'tension_unknown'
-    # isolated at once, without a verification
+    # outcomes of muscles that are isolated at once, without a verification
     VALUES_MISSING = 'values_missing'
     SENSOR_SATURATED = 'sensor_saturated'
 
@@ -126,20 +126,20 @@ class _Reading(NamedTuple):
     """Readings of the suspect, its command, and the length expected from the other muscles."""
 
     tension: float  # T [N]
-    length: float  # l [m]
-    command: float  # l_target [m]
-    likely: float  # l' [m]
+    length: float  # measured length l [m]
+    command: float  # length command l_target [m]
+    likely: float  # length l' that the other muscles indicate [m]
 
 
 class _Row(NamedTuple):
     """Readings of the suspect at one moment while it was wound in."""
 
     tension: float  # T [N]
-    length: float  # l [m]
-    demand: float  # T_ref [N]
-    excess: float  # l − l' [m]
-    command: float  # l_target [m]
-    stretch: float  # x [m]
+    length: float  # measured length l [m]
+    demand: float  # tension T_ref that a healthy muscle would have [N]
+    excess: float  # measured length minus the one that the other muscles indicate [m]
+    command: float  # length command l_target [m]
+    stretch: float  # stretch x of the series elastic element [m]
 
 
 class ModuleLaw:
@@ -265,7 +265,7 @@ class Verification:
         if self._time < PATIENCE:
             return None
         if tension > demand + JAM_EXCESS * self._scale:
-            # the tension is high although the suspect was not wound in
+            # The tension is too high although the suspect was not wound in.
             return VerificationVerdict(Outcome.JAMMED)
         return VerificationVerdict(Outcome.NOT_WOUND_IN)
 

@@ -159,7 +159,7 @@ class AdaptedModel:
             if name := item.get('geom'):
                 geom, element = model.geom(name), geoms[name]
                 sizes = 1 if geom.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE else 2
-                element.attrib.pop('mesh', None)  # an object that was fitted to a mesh
+                element.attrib.pop('mesh', None)  # the fitted size follows
                 element.set('size', _text(geom.size[:sizes]))
                 element.set('pos', _text(geom.pos))
                 element.set('quat', _text(geom.quat))

@@ -292,7 +292,7 @@ def _read_sdf(
                 carrier = source.add_joint(label, carrier, here_in, slides, axis, limits)
                 at = here
             elif kind != 'fixed':
-                source.note('held fixed', f'joint {label}: it is {kind}')
+                source.note('held fixed', f'joint {label}: its type {kind} is not supported')
         stands[name] = carrier, at
         own = links[name].find('inertial')
         parts = None if own is None else own.find('inertia')

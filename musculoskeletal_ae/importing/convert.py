@@ -69,7 +69,7 @@ def read_source(file: Path) -> Source:
     try:
         root = parse_xml(file, text)
     except RobotDescriptionError as error:
-        # MuJoCo accepts some invalid XML, such as two attributes without a space between them.
+        # Let MuJoCo read invalid XML, too: it accepts, for example, attributes without a space.
         loose = isinstance(error.__cause__, ET.ParseError)
         if not (loose and re.match(r'(\s|<\?.*?\?>|<!--.*?-->)*<mujoco[\s/>]', text, re.DOTALL)):
             raise

@@ -218,7 +218,8 @@ class _Reader:
             stiffness, damping = m.jnt_stiffness[j], float(m.dof_damping[m.jnt_dofadr[j]])
             if m.jnt_type[j] not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
                 for effect in ('springs',) * bool(stiffness) + ('damping',) * bool(damping):
-                    source.note('dropped', f'{effect}: joint {name} is neither a hinge nor a slide')
+                    reason = 'which is neither a hinge nor a slide'
+                    source.note('dropped', f'{effect} of joint {name}, {reason}')
                 continue
             if stiffness:
                 rest = float(m.qpos_spring[m.jnt_qposadr[j]])
@@ -246,7 +247,7 @@ class _Reader:
             source.passive.append(PassiveTendon(name, *parts))
             self.passive[name] = t
         for kind, effect in (('joint', 'jnt_stiffness'), ('tendon', 'tendon_stiffness')):
-            # Recent versions of MuJoCo have springs whose force is a polynomial.
+            # Report springs whose force is a polynomial, which recent versions of MuJoCo have.
             higher = np.asarray(getattr(m, f'{effect}poly', np.zeros((0, 1))))
             for i in np.flatnonzero(higher.any(axis=1)).tolist():
                 problem = f'nonlinear stiffness: {kind} {self.names[kind][i]}'
@@ -447,7 +448,7 @@ class _Reader:
         if axis is not None and side is not None and side_link is None:
             out = side - m.geom_pos[geom]
             if np.linalg.norm(np.cross(axis, out)) < 1e-9 and np.linalg.norm(out) >= radius:
-                # MuJoCo moves a side site on the axis of a cylinder in the same way.
+                # Move a side site away from the axis of a cylinder, as MuJoCo does.
                 side = side + radius * turn.T @ data.geom_xmat[geom][::3]
         link = self.names['body'][body]
         return Wrap(link, m.geom_pos[geom].copy(), radius, axis, side, side_link)

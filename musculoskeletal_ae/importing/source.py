@@ -383,7 +383,7 @@ def cut(
         raise SourceError(f'--joints: {kind} joint {missing[0]!r}; joints: {", ".join(free)}')
     if end:
         above = {model.names[i] for i in model.supports[source.place(end)[0]]}
-        # Masters of coupled joints in the chain move the chain as well.
+        # Keep masters of coupled joints in the chain, because they move the chain as well.
         wanted &= above | {c.master for slave, c in couplings.items() if slave in above}
     source.settle()
     source.couplings = {s: c for s, c in couplings.items() if s in movable and c.master in wanted}

@@ -118,7 +118,7 @@ class CheckpointKeeper:
 
     def _publish(self, mae: Mae) -> None:
         if mae.touch is not None and not mae.touch.time:
-            # Updates do not measure the residual torque; earlier networks have it.
+            # Copy the residual torque from the last network, because updates do not measure it.
             mae = _with_torque_of(self.mae, mae)
         self.mae = mae
         self._highest_version = max(self._highest_version, mae.version)
@@ -162,7 +162,7 @@ class CheckpointKeeper:
         """
         self.rejected, self.last_rejected = self.rejected + 1, reason
         self._rejected_version = version
-        # The version may be that of an earlier learner; no network may be mistaken for that one.
+        # The version may be that of an earlier learner; give no network the same one.
         self._highest_version = max(self._highest_version, version)
         self._return_if_rejected()
 

@@ -125,8 +125,8 @@ class Learner:
         if saved is not None:
             self._start(saved)
             return
-        # There is no usable saved network, but there may be saved samples. Repeat as many updates
-        # as the samples caused when they were collected.
+        # Without a usable saved network, repeat as many updates as the saved samples caused when
+        # they were collected.
         self.scheduler.restart(updates_to_repeat=len(self.samples))
         if mae is not None:
             self.begin(mae)

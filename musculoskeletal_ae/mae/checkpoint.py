@@ -332,8 +332,8 @@ def _check_covariance(name: str, covariance: Array) -> None:
         least, most = np.linalg.eigvalsh(covariance)[[0, -1]]  # one value if the matrix is (1, 1)
     except np.linalg.LinAlgError as error:
         raise CheckpointError(f'tensor {name}: its eigenvalues cannot be computed') from error
-    # A covariance is positive definite. The covariance of the residuals must not be close to
-    # singular either, because the detector inverts it.
+    # Require a covariance that is positive definite and, because the detector inverts that of the
+    # residuals, not nearly singular.
     if not least > SMALLEST_EIGENVALUE * most:
         raise CheckpointError(
             f'tensor {name} has eigenvalues from {least:g} to {most:g}; the smallest must '

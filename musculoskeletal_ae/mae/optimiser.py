@@ -68,8 +68,8 @@ class Optimiser:
         self._matrices = [p for p in parameters if muon and p.ndim == 2]
         self._momenta = [torch.zeros_like(p) for p in self._matrices]
         self._step_size = step_size
-        # The state of Adam is kept here for the function `adam`, because constructing
-        # torch.optim.Adam would load torch's compiler, which takes a second or more.
+        # Keep the state of Adam here, for the function `adam`: constructing torch.optim.Adam would
+        # load torch's compiler, which takes a second or more.
         self._others = [p for p in parameters if not muon or p.ndim != 2]
         self._moments = [[torch.zeros_like(p) for p in self._others] for _ in range(2)]
         self._counts = [p.new_zeros(()) for p in self._others]

@@ -59,7 +59,7 @@ class AnomalyStatistics:
 
     mean: Array  # mean μ of e, (2M,)
     covariance: Array  # covariance Σ of e, symmetric and positive definite, (2M, 2M)
-    calibrated: bool  # whether they describe the real arm in its present state well enough
+    calibrated: bool  # whether enough data of the real arm, in its present state, are included
     samples: int  # number of residuals e from which mean and covariance were computed
     #: thresholds of the detectors, by name; all are finite
     thresholds: Mapping[str, float] = field(default_factory=dict)

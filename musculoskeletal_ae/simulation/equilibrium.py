@@ -136,8 +136,7 @@ def follow(
         most: Largest distance that the module winds in a step [m].
     """
     reached = followed + clip(command - followed, -most, most)
-    # Limit the position of the module. Beyond these limits the tension no longer changes, and the
-    # module would only lose time on the way back.
+    # Stop the module where the tension no longer changes; it would only lose time on the way back.
     return clip(reached, length - span, length + max(loose, most))
 
 
@@ -146,7 +145,7 @@ def combine(shares: Array, rows: Array, total: Array) -> None:
     """Combine rows (K, W) with shares (K, N): fill `total` (W, N) with rowsᵀ @ shares."""
     terms, width = rows.shape
     total[:] = 0.0
-    # The innermost loop should be long, because a core computes several numbers at once.
+    # Make the innermost loop long, because a core computes several numbers at once.
     if total.shape[1] == 1:
         row = total.reshape(width)
         for k in range(terms):
@@ -245,7 +244,7 @@ def turn(
         for n in range(arms):
             if held[d, n]:
                 turned[d, n] = 0.0
-    # Gaussian elimination. The viscosity on the diagonal makes pivoting unnecessary.
+    # Eliminate (Gauss); the viscosity on the diagonal makes pivoting unnecessary.
     for d in range(joints):
         for e in range(d + 1, joints):
             for n in range(arms):
@@ -343,8 +342,8 @@ def advance(
                 soft[m, n] = stiffness / (give[m, n] + stiffness * by_motor)
                 slack = compliance[m, n] * lost[m, n] - by_motor * (aim - tension[m, n])
                 wanted[m, n] = aim + soft[m, n] * slack
-                # Where T is clipped to T_bias or T_max, it does not depend on the length, so the
-                # stiffness of the muscle is left out of the Newton matrix (semismooth Newton).
+                # Leave the stiffness of a muscle out of the Newton matrix where T is clipped to
+                # T_bias or T_max, and does not depend on the length (semismooth Newton).
                 settled = clip(wanted[m, n], bias, most)
                 rise = settled - tension[m, n]
                 moved = (compliance[m, n] * lost[m, n] - by_motor * rise) / give[m, n]
@@ -412,7 +411,7 @@ class QuasiStatics:
         robot = robot.with_elasticity(mae.elasticity)
         self._robot, elastic, self._mae = robot, robot.series_elastic, mae
         self.tree = Load(robot.kinematics).tree
-        # A noisy fit may return a slightly negative friction, which would drive the arm.
+        # Raise a slightly negative friction, as a noisy fit may return it: it would drive the arm.
         friction = np.maximum(mae.friction, 0.0)
         bias, most = robot.tension.bias, robot.tension.max
         farthest = np.full_like(most, FARTHEST)

@@ -82,7 +82,7 @@ class Source(NamedTuple):
 def train(args: Namespace) -> None:
     """Train on recordings in order; print the errors on them and on held-out recordings."""
     robot = prepare(args)
-    # All recordings are read first, because training takes minutes and one may be unusable.
+    # Read all recordings first, because training takes minutes and one may be unusable.
     sources = _csv_sources(robot, args) if args.from_csv else _bag_sources(robot, args)
     warnings = list(_warnings(robot, sources, bool(args.from_csv)))
     _warn(warnings)  # also before the training, because the user may want to stop here

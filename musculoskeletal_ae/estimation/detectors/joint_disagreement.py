@@ -237,7 +237,7 @@ class JointDisagreement(Detector):
             'length differs from that at the measured posture by '
             f'{largest.text(change, self._used, muscle)}'
         )
-        by_muscle = np.delete(change, muscle)  # unexplained if this length is wrong
+        by_muscle = np.delete(change, muscle)  # what stays unexplained if this length is wrong
         limit = min(UNEXPLAINED * np.linalg.norm(change), np.linalg.norm(by_muscle))
         if np.linalg.norm(unexplained) <= limit:
             return None  # false joint sensors explain it, which `joint_check` judges

@@ -52,7 +52,7 @@ class SaturatedSensor(Detector):
         self._limit = robot.description.tension.limit
         self._bias = robot.description.tension.bias
         self._highest: Array = np.zeros(count)  # highest reading of two successive ones [N]
-        #: share of the messages below it in which the reading differed from the previous one
+        #: share of the lower readings that differed from the previous one
         self._varying: Array = np.zeros(count)
         self.reset()
 
@@ -66,7 +66,7 @@ class SaturatedSensor(Detector):
         self._value: Array = np.full(count, np.nan)  # value of the last visit [N]
         self._visits: Ints = np.zeros(count, dtype=np.int64)
         self._has_visits = False  # whether any muscle has visited a value
-        self._has_left = np.ones(count, dtype=bool)  # whether it was lower since the last visit
+        self._has_left = np.ones(count, dtype=bool)  # whether readings fell since the last visit
 
     def step(self, observation: Observation) -> Finding | None:
         """Report a muscle whose reading was clipped often enough, or while its module winds in."""

@@ -219,7 +219,7 @@ class ExchangeCheck:
             value = float(np.median(scores(wiring)))
             return value if value < USUAL * usual else math.inf
 
-        # An exchange makes both lengths jump, if they differ by enough.
+        # Consider only the lengths that jumped, if any: an exchange makes both lengths jump.
         columns = sample.jumped or np.flatnonzero(used).tolist()
         faults = single_faults(straight, columns, signs=self._may_have_restarted)
         others = [(other, cost(other)) for other in faults]

@@ -102,7 +102,7 @@ class LengthFit:
         few = moments.rows(_few(moments))
         guesses = yield from self._guesses(moments, few)
         likeliest = yield from self._best(guesses, few, FIRST_ROUNDS)
-        # A few moments may mislead. All moments decide between the new start and the earlier fit.
+        # Let all moments decide between the new start and the earlier fit: a few may mislead.
         candidates = [likeliest.constants]
         if before is not None:
             candidates.append(before.constants)
@@ -201,7 +201,7 @@ class LengthFit:
         """
         mae = self._mae
         tension = np.tile(moments.tension[0], (FITTED_POSTURES, 1))
-        # The balance of torques excludes most postures before any offset is known.
+        # Keep the postures whose torques balance best; this needs no offsets.
         drawn, unbalanced = list[Array](), list[Array]()
         for _ in range(DRAWN_POSTURES // FITTED_POSTURES):
             drawn.append(self._robot.random_postures(FITTED_POSTURES, self._rng))

@@ -71,7 +71,7 @@ class LengthModel:
         postures = robot.random_postures(64, rng)
         weight = np.abs(robot.kinematics.weight_torque(postures)).max()
         moment_arms = np.abs(robot.routes.muscle_jacobian(postures))
-        # Joints with a vertical axis have friction although they carry no weight.
+        # Relate friction also to the muscles: a joint with a vertical axis carries no weight.
         by_bias = (robot.description.tension.bias @ moment_arms).max()
         weight = max(weight, LEAST_WEIGHT * by_bias)
         counts = muscle_count, muscle_count, muscle_count, joint_count

@@ -45,9 +45,9 @@ SCALE = 'scale of l by ①'  # name of the error of the common factor
 #: permit these relative errors; healthy networks have smaller ones (`python -m bench gate`)
 LIMITS = {
     'θ by ①': 0.6,
-    'T by ①': 1.35,  # exchanging two muscles gives √2
+    'T by ①': 1.35,  # permit less than √2, the error after an exchange of two muscles
     'l by ①': 1.7,
-    'θ by ②': 1.3,  # a joint that the muscles do not determine gives 1
+    'θ by ②': 1.3,  # permit more than 1, the error of a joint that the muscles do not determine
     'T by ②': 1.35,
     'l by ②': 0.6,
     'θ by ③': 0.7,

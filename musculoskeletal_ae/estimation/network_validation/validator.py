@@ -137,7 +137,7 @@ class CheckpointValidator:
         """
         faults, steps = list[str](), self._steps(mae.without(self.isolated), is_chosen)
         while True:
-            # An overflow is a large error of the candidate, not a reason for a warning.
+            # Suppress warnings of overflows, which count as large errors of the candidate.
             with np.errstate(all='ignore'):
                 try:
                     fault = next(steps)
