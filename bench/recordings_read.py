@@ -46,7 +46,7 @@ REST = 0.2  # average a rest sample over this time at the end of a pose [s]
 
 @dataclass(frozen=True)
 class Run:
-    """One run with one payload."""
+    """The readings of one recorded run, in which the payload is constant."""
 
     name: str
     load: float  # payload [kg]

@@ -96,7 +96,7 @@ class BodyFit:
 
 
 def contradicted_muscles(observed: Observations, fit: Fit) -> tuple[tuple[int, int], ...]:
-    """Return the muscles that seem to have changed, because their newest samples do not fit.
+    """Return the muscles that seem to have changed, because their newest samples misfit the body.
 
     The newest samples of such a muscle all have large length residuals of the same sign, while
     enough earlier samples exist.

@@ -41,7 +41,7 @@ LARGEST_LOG = 1.5  # permit no larger |κ|
 
 
 class Layout:
-    """Positions of the parameters δ, κ, μ, o and r in the vector of one muscle.
+    """Layout of one muscle's parameter vector: where δ, κ, μ, o and r are in it.
 
     The docstring of the module explains the symbols. δ has three values for each route point. If
     tensions come from motor currents, the vector also contains the constants γ, b and F of
@@ -105,7 +105,7 @@ class CalibratedBody:
         self.last_postures: dict[bytes, tuple[Array, ...]] = {}
 
     def limb(self, joints: Ints, muscles: Ints) -> CalibratedBody:
-        """Return the part with these joints and muscles only, without its remainder."""
+        """Return the part of the body with these joints and muscles only, without its remainder."""
         parameters = [self.parameters[m] for m in muscles]
         return CalibratedBody(self.robot.limb(joints, muscles), parameters)
 
@@ -121,7 +121,7 @@ class CalibratedBody:
         return springs.learned(self.robot.kinematics.elasticity, self.springs)
 
     def shift(self, m: int) -> Array:
-        """Return δ, the displacements of one muscle's route points [m], (P, 3)."""
+        """Return how far one muscle's route points are displaced (δ) [m], (P, 3)."""
         return self.parameters[m][self.layouts[m].attachment].reshape(-1, 3)
 
     def elastic(self, m: int) -> SeriesElastic:
@@ -163,9 +163,10 @@ class CalibratedBody:
         return Transmission(self.frictions(), self.drive)
 
     def end(self, m: int, tension: Array, direction: Array) -> tuple[Array, Array]:
-        """Return T_end [N] (N,) of one muscle, and ∂T_end/∂(μ, γ, b/T_limit, F/T_limit), (N, 4).
+        """Return one muscle's bone-side tension T_end [N] (N,), and its derivatives by μ and drive.
 
-        If the robot has tension sensors, only the derivative ∂T_end/∂μ exists, (N, 1).
+        The derivatives are ∂T_end/∂(μ, γ, b/T_limit, F/T_limit), (N, 4), or, if the robot has
+        tension sensors, ∂T_end/∂μ alone, (N, 1).
 
         Args:
             m: The muscle.
@@ -243,7 +244,7 @@ class CalibratedBody:
         m: int,
         age: Array | float = 0.0,
     ) -> tuple[Array, Array]:
-        """Return l_i [m] (N,) of one muscle and ∂l_i/∂parameters (N, P).
+        """Return the length [m] (N,) of one muscle, and its derivatives by its parameters (N, P).
 
         Args:
             poses: Joint poses at the postures θ, from `poses`.

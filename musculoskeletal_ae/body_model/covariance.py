@@ -75,7 +75,7 @@ def estimate_covariance(
 
 
 def drive_covariance(body: CalibratedBody, fit: Fit) -> Array | None:
-    """Return the posterior covariances of the constants γ, b and F of motor currents.
+    """Return the posterior covariances of each motor current's scale, offset and friction.
 
     `Transmission` explains the constants. All samples together count as at most
     INDEPENDENT_SAMPLES samples, because errors of the body model are common to all of them.
@@ -175,5 +175,5 @@ def ellipsoids(covariance: Array, error: Array) -> Array:
 
 
 def observed_theta(mae: Mae, observed: Observations) -> Array:
-    """Return θ [rad] (N, D) as a network estimates it from observations."""
+    """Return the joint angles θ [rad] (N, D) that a network estimates from observations."""
     return mae.estimate(observed.end_tension(mae.transmission), observed.length).theta

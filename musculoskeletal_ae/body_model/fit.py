@@ -44,7 +44,7 @@ LEAST_BEFORE_CHANGE = 8
 
 
 class Fit(NamedTuple):
-    """Result of a fit."""
+    """The noise, weights, postures and uncertainty that a fit has found."""
 
     #: measured minus computed lengths [m], (N, M), at measured angles, or else at fitted ones
     residual: Array
@@ -144,7 +144,7 @@ class MusclePoint(NamedTuple):
 
 
 class MuscleFit:
-    """Fit of one muscle at known postures, as a `gauss_newton.Problem`."""
+    """Fits one muscle at known postures; a `gauss_newton.Problem`."""
 
     def __init__(
         self,
@@ -191,7 +191,7 @@ class MuscleFit:
         return MusclePoint(parameters, (observed.length[:, m] - length)[:, None], jacobian)
 
     def weigh(self, point: MusclePoint) -> None:
-        """Compute the noise of the lengths and the robust weights from the residuals at a point."""
+        """Weigh the samples: compute noise and robust weights from the residuals at a point."""
         self._noise, weight = noise_and_weight(
             point.residual, self._known, self._noise, self._determined, self._least_noise
         )

@@ -204,7 +204,7 @@ class PostureModel:
     def _muscle_stiffness(self, own: Array) -> Array:
         """Return the joint stiffness Σ T ∂²l/∂θ² [N·m/rad] that muscle tensions cause, (N, D, D).
 
-        It is that of the geometric model at θ (N, D), or from the cache at a posture near θ.
+        The geometric model gives it at θ (N, D), or the cache for a posture near θ.
         """
         joints = self.joints
         at = self._bent.theta[:, joints]

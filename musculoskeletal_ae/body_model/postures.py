@@ -86,7 +86,7 @@ class Point(NamedTuple):
 
 
 class GroupFit:
-    """Fit of one group, as a `gauss_newton.Problem`.
+    """Fits one group of joints and muscles; a `gauss_newton.Problem`.
 
     Attributes:
         noise: σ of each muscle's length [m], (M,).
@@ -191,7 +191,7 @@ class GroupFit:
         return Point(unknowns, self.model.residuals(unknowns))
 
     def weigh(self, point: Point) -> None:
-        """Compute length noise and robust weights at a point, and find joints at their stops."""
+        """Weigh the residuals at a point: compute length noise and robust weights; find stops."""
         residuals, own = point.residuals, point.unknowns.theta[:, self.model.joints]
         self.noise, self.weight = noise_and_weight(
             residuals.length, self._known, self.noise, self._determined, self._least_noise

@@ -106,7 +106,7 @@ class Lengths(NamedTuple):
         return cls(observed.theta, observed.tension, deviation, by_body, weight)
 
     def part(self, rows: Ints) -> Lengths:
-        """Return some of the samples."""
+        """Return the part with the samples in `rows` only."""
         deviation, by_body = ([own[rows] for own in part] for part in self[2:4])
         return Lengths(self.theta[rows], self.tension[rows], deviation, by_body, self.weight[rows])
 
@@ -136,7 +136,7 @@ class GroupRemainder:
         return result
 
     def spread(self, theta: Array, tension: Array) -> Array:
-        """Return the posterior standard deviation of each g_i for a known body [m], (N, M)."""
+        """Return the posterior uncertainty (σ) of each g_i for a known body [m], (N, M)."""
         result = np.empty((len(theta), len(self.muscles)))
         amplitude = _constants(self.logarithms)[0]
         parts = zip(self._covariances(theta, tension), self.roots, strict=True)
@@ -146,7 +146,7 @@ class GroupRemainder:
         return result
 
     def text(self) -> str:
-        """Return the constants as text."""
+        """Return the constants of the remainder as a text for people."""
         amplitude, by_theta, ratio, by_tension, tail, noise = _constants(self.logarithms)
         scales = f'b {by_theta:.2f}, e {ratio:.1f}, c {by_tension:.1f}, ν {tail:.1f}'
         return f'a {1e3 * amplitude:.1f} mm, {scales}, σ {1e3 * noise:.2f} mm'
@@ -171,14 +171,14 @@ class Remainder:
     before: Remainder | None = None
 
     def at(self, theta: Array, tension: Array) -> Array:
-        """Return g(θ, T) [m] (N, M) at θ [rad] (N, D) and T [N] (N, M)."""
+        """Return the remainder g [m] (N, M) at θ [rad] (N, D) and T [N] (N, M)."""
         result = np.zeros((len(theta), self.muscle_count))
         for group in self.groups:
             result[:, group.muscles] = group.at(theta, tension)
         return result if self.before is None else result + self.before.at(theta, tension)
 
     def covariance(self, theta: Array, tension: Array) -> Array:
-        """Return the posterior covariance of g [m²] in each state for a known body, (N, M, M)."""
+        """Return the posterior covariance of the remainder [m²] for a known body, (N, M, M)."""
         result = np.zeros((len(theta), self.muscle_count, self.muscle_count))
         for group in self.groups:
             root = group.spread(theta, tension)[..., None] * group.correlation
@@ -186,7 +186,7 @@ class Remainder:
         return result
 
     def drawn_error(self, theta: Array, tension: Array, rng: np.random.Generator) -> Array:
-        """Draw the error of g [m] (N, M) from its posterior, independently for each state."""
+        """Draw errors of g [m] (N, M) from its posterior, independently for each state."""
         result = np.zeros((len(theta), self.muscle_count))
         for group in self.groups:
             spread = group.spread(theta, tension)
@@ -296,7 +296,7 @@ def _correlation(scores: Array) -> Array:
 
 
 class _Evidence:
-    """Negative logarithm of the evidence, and its derivatives by the six logarithms."""
+    """Computes the negative logarithm of the evidence and its derivatives by six logarithms."""
 
     def __init__(self, lengths: Lengths, scale: Array, crossed: Bools) -> None:
         self._lengths = lengths
@@ -349,7 +349,7 @@ def _alike(crossed: Bools) -> Iterator[tuple[Bools, Ints]]:
 
 
 def _constants(logarithms: Array) -> Array:
-    """Return a [m], b, e, c, ν and σ [m]."""
+    """Return the six constants in their units: a [m], b, e, c, ν and σ [m]."""
     constants: Array = UNITS * np.exp(logarithms)
     return constants
 
@@ -362,7 +362,7 @@ def _parts(inputs: Array, crossed: Bools) -> list[Array]:
 
 
 def _covariance(one: Array, other: Array, crossed: Bools, logarithms: Array) -> Array:
-    """Return k between inputs (N, D+M) and (K, D+M) of muscles that cross some joints, (N, K)."""
+    """Return the prior covariance k of some muscles' lengths between two sets of inputs, (N, K)."""
     _, by_theta, ratio, by_tension, _, _ = _constants(logarithms)
     scale = np.full(one.shape[1], by_tension)
     scale[: len(crossed)] = by_theta * np.where(crossed, 1.0, ratio)

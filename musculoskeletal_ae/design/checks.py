@@ -122,7 +122,7 @@ class Setting(NamedTuple):
 
 
 def _slopes(robot: Robot, theta: Array) -> tuple[Array, Array]:
-    """Return `jacobian` and `hessian` of a `Setting`."""
+    """Return the first and second derivatives of the lengths, `jacobian` and `hessian`."""
     jacobian = robot.routes.muscle_jacobian
     return jacobian(theta), muscle_hessian(jacobian, theta)
 

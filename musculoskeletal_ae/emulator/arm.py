@@ -255,7 +255,7 @@ class EmulatedArm(modules.Arm):
 
     @property
     def tendon_friction(self) -> Array:
-        """Friction μ of each tendon along its route, shape (M,)."""
+        """How strongly each tendon rubs along its route (friction μ), shape (M,)."""
         return self.individual.tendon_friction.copy()
 
     @property

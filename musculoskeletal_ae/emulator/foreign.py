@@ -37,7 +37,7 @@ OTHER_ROUTE = 0.02  # refuse a file if the length of a muscle differs by more in
 
 
 class ForeignBody:
-    """True lengths, moment arms, elastic laws and sensor errors of one arm.
+    """The true lengths, moment arms, elastic laws and sensor errors of one emulated arm.
 
     These properties are those of the arm at rest, before its tendons have aged.
     """

@@ -42,7 +42,7 @@ class SavedBody(NamedTuple):
 
 
 class BodyMemory:
-    """Reads and writes the file.
+    """Reads and writes the file of length offsets and isolated muscles.
 
     Attributes:
         found: The body state that the previous estimator saved; None if there was none.
@@ -50,7 +50,7 @@ class BodyMemory:
     """
 
     def __init__(self, directory: Path | None, muscles: Sequence[str]) -> None:
-        """Read the file.
+        """Read the file of the previous estimator.
 
         Args:
             directory: Directory of the file. With None, nothing is read or saved.

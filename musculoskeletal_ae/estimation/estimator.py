@@ -62,7 +62,7 @@ JOINTS_AGE = 0.05
 
 
 class Output(NamedTuple):
-    """The results of one message.
+    """What the estimator has computed from one message.
 
     Attributes:
         sample: The readings.
@@ -493,7 +493,7 @@ class Estimator:
             self.stream.use_body(self.body)
 
     def _measured_theta(self, readings: Array) -> Array | None:
-        """Return fresh readings (D,), or None if a joint sensor has none or is not used."""
+        """Return the readings (D,) if all are fresh and their sensors are used; otherwise None."""
         is_known = not self.joint_trust.unused and np.isfinite(readings).all()
         return readings if is_known else None
 

@@ -26,7 +26,7 @@ LEAST_SPREAD = 1e-3  # assume at least this σ [N·m]
 class HealthyTorque:
     """Measures the external torque σ that is wrongly estimated for a healthy moving arm.
 
-    The average covers the last minutes of motion, with whichever networks the torque was estimated.
+    The average covers the last minutes of motion, even if the network changed meanwhile.
     """
 
     def __init__(self, joint_count: int) -> None:

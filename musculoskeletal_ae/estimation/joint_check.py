@@ -74,7 +74,7 @@ GROSS = 0.8
 
 
 class _Message(NamedTuple):
-    """Readings of one message that counts."""
+    """The readings of one message that counts for the judgement."""
 
     time: float  # [s]
     theta: Array  # readings of the joint sensors [rad], (D,); NaN where unknown or in doubt
@@ -144,7 +144,7 @@ class JointCheck:
     def confirm(self) -> tuple[int, ...]:
         """Confirm all doubted sensors, as the user wants; return their joints.
 
-        Their earlier readings are no anchor any more, because they contradict the confirmed ones.
+        Later readings are not compared with those from before the doubt, which contradict them.
         """
         joints, doubted = self.trust.doubted, self.trust.is_doubted
         if not joints:

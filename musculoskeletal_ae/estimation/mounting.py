@@ -74,7 +74,7 @@ class Tilt(NamedTuple):
 
     @property
     def text(self) -> str:
-        """A sentence for users."""
+        """The direction of gravity that the tensions show, as a sentence for users."""
         x, y, z = self.direction
         return (
             f'the tensions show that gravity acts along ({x:.1f}, {y:.1f}, {z:.1f}) of the root '
@@ -191,7 +191,7 @@ class MountingCheck:
         return theta < robot.lower + AT_STOP, theta > robot.upper - AT_STOP
 
     def _regressors(self, theta: Array) -> tuple[Array, Array]:
-        """Return Y of the arm and of a mass of 1 kg in the hand, (D, 3) each."""
+        """Return matrices from gravity to torques, of the arm and of 1 kg in the hand, (D, 3)."""
         kinematics, model = self._robot.kinematics, self._model
         angles, columns = kinematics.tree.angles(theta), []
         for unit in np.eye(3):

@@ -167,7 +167,7 @@ class SuspectHandling:
     def conclude(
         self, verdict: VerificationVerdict, isolated: Iterable[int], now: float
     ) -> tuple[int, ...]:
-        """End verification and anomaly; return the indices of the muscles isolated from now on.
+        """Conclude verification and anomaly; return which muscles (indices) stay isolated.
 
         A healthy suspect is restored, a faulty one stays isolated.
         """

@@ -24,7 +24,7 @@ Place = tuple[str, tuple[int, ...]]
 
 
 class Errors(NamedTuple):
-    """Differences between routes and a network, for each muscle (M,)."""
+    """How far routes differ from a network, for each muscle (M,)."""
 
     lengths: Array  # standard deviation of the length [m]
     arms: Array  # moment arms: norm over the joints, root mean square over the postures [m]

@@ -76,7 +76,7 @@ class ExportReport(NamedTuple):
     kept: dict[str, str]  # why a muscle keeps the points of the robot directory, by muscle
 
     def text(self, robot: Robot, offsets: Array) -> str:
-        """Return the report as a text; `offsets` are the offsets of the controls [m], (M,)."""
+        """Return the report as text; `offsets` [m] (M,) lead from measured lengths to controls."""
         counts = f'{robot.joint_count} joints, {robot.muscle_count} muscles, {POSTURES} postures'
         units = f'{"":<28}{"[mm]":>10}{"[mm]":>12}{"[mm]":>8}{"[mm]":>9}{"[m]":>11}'
         head = f'{"muscle":<28}{"length":>10}{"moment arm":>12}{"of":>8}{"spring":>9}{"offset":>11}'

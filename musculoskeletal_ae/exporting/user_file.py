@@ -81,7 +81,7 @@ class UserFile:
         return sites
 
     def places(self, links: dict[str, str]) -> dict[Place, str]:
-        """Return the names of the movable sites by their places.
+        """Return the names of the movable sites by where they are.
 
         Args:
             links: Name of the link of each body, by the name of the body.
@@ -160,7 +160,7 @@ class UserFile:
         return result
 
     def _placed_elsewhere(self, file: Path, names: dict[Path, str]) -> tuple[str, bool]:
-        """Return a text for another folder, and whether it states the folder of meshes."""
+        """Return a file's text for another folder, and whether it states the folder of meshes."""
         text, is_stated = self.texts[file], False
         edits = list[tuple[int, int, str]]()
         plain = _without_comments(text)

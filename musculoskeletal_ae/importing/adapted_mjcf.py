@@ -45,7 +45,7 @@ ACTUATION = 'actuatorfrclimited', 'actuatorfrcrange', 'actuatorgroupdisable', 'a
 
 
 class AdaptedModel:
-    """The text of `model.xml`.
+    """The text of `model.xml`, adapted from the user's model.
 
     Attributes:
         root: The root element.

@@ -45,7 +45,7 @@ READERS = {
 
 
 class Imported(NamedTuple):
-    """An imported robot."""
+    """An imported robot, with notes on the import and a comparison with its source."""
 
     robot: Robot
     #: what the import chose, dropped, held fixed, renamed or approximated

@@ -266,7 +266,7 @@ def tip(source: Source) -> str:
 
 
 def numbers(text: str | None, count: int, where: str) -> Array:
-    """Return the numbers in an XML text.
+    """Return the `count` numbers in an XML text.
 
     Raises:
         ValueError: If the text is not `count` finite numbers; the message names `where`.

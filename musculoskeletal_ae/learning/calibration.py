@@ -145,7 +145,7 @@ class Reservoir:
         self._rests.clear()
 
     def healthy(self) -> Healthy:
-        """Return the messages in the selection, with the healthy time and the number of rests."""
+        """Return the healthy messages that were kept, with healthy time and number of rests."""
         m, count = self._muscles, len(self._rests)
         if not self._kept:
             return Healthy(np.empty((0, 3 * m), np.float32), self.time, count)

@@ -108,14 +108,14 @@ class ModuleFollowing(Detector):
         return Finding(muscle, ConditionKind.MODULE_NOT_FOLLOWING, text, others)
 
     def _differences(self, observation: Observation) -> Array | None:
-        """Return T − T_ref [N], (M,); None without a command."""
+        """Return tension minus demanded tension T − T_ref [N], (M,); None without a command."""
         if observation.demand is None:
             return None
         difference: Array = observation.sample.motor_tension - self._reference(observation.demand)
         return difference
 
     def _reference(self, demand: Array) -> Array:
-        """Return T_ref [N], (M,): what a command demands, but at most T_max."""
+        """Return the demanded tension T_ref [N], (M,): that of a command, but at most T_max."""
         return np.minimum(demand, self._complete_robot.tension.max)
 
     def _growth(self, observation: Observation, away: Array, correcting: Array) -> Array:
@@ -150,7 +150,7 @@ class PositionFollowing(ModuleFollowing):
     """Reports a position-controlled module that has not followed its target length."""
 
     def _differences(self, observation: Observation) -> Array | None:
-        """Return l − l_target [m], (M,); None without a command."""
+        """Return length minus commanded length l − l_target [m], (M,); None without a command."""
         if observation.command is None:
             return None
         return observation.sample.length - observation.command

@@ -191,7 +191,7 @@ class ResidualDistance(Detector):
     def _evidence(
         self, observation: Observation, distance: float, has_slack: bool, waits: bool
     ) -> str:
-        """Count messages above the threshold; return evidence after five in a row, otherwise ''.
+        """Count messages above the threshold; return a text after five in a row, otherwise ''.
 
         Args:
             observation: The message.
@@ -219,8 +219,8 @@ class ResidualDistance(Detector):
     def _suspects(self, bone_tension: Array, length: Array, candidates: Bools) -> list[int]:
         """Return the indices of the suspect muscles among the candidates, the most suspect first.
 
-        This is the muscle whose removal makes the residual of the other muscles most likely on a
-        healthy arm. The others are muscles whose removal does so nearly as well.
+        Without the first muscle, the residual of the other muscles is most likely on a healthy arm.
+        Muscles follow without which it is nearly as likely.
 
         Args:
             bone_tension: Bone-side tensions [N], (M,).

@@ -169,7 +169,7 @@ class ExchangeCheck:
         straight = Wiring.straight(self._robot.muscle_count)
 
         def change(wiring: Wiring, columns: Bools) -> float:
-            """Return how far lengths change over the silence if wired so, RMS of `columns`."""
+            """Return how far lengths change over the silence with this wiring (RMS)."""
             gap = wiring.signed(after) - before
             return float(np.sqrt(np.square(gap[columns]).mean())) if columns.any() else 0.0
 
@@ -200,7 +200,7 @@ class ExchangeCheck:
         tension, length = (np.array(part) for part in zip(*messages))
 
         def scores(wiring: Wiring) -> Array:
-            """Return A of all messages if their columns are wired in this way."""
+            """Return the anomaly scores of all messages with their columns wired in this way."""
             ordered, shifted = wiring.unsigned(tension), wiring.signed(length) - offset
             state = mae.estimate(ordered, shifted)
             return anomaly(residuals(state, ordered, shifted, mae.isolated))

@@ -118,7 +118,7 @@ class LengthTrust:
 
     @property
     def doubts(self) -> dict[str, tuple[int, ...]]:
-        """Why offsets are not known: texts for users, with the indices of the muscles."""
+        """Reasons, for users, why length offsets are not known, with the muscles concerned."""
         doubts = dict[str, tuple[int, ...]]()
         for muscle in self.offsets.not_known:
             text = _text(self.evidence[muscle])

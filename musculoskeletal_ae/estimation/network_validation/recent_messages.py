@@ -23,7 +23,7 @@ class _Message(NamedTuple):
 
 
 class RecentMessages:
-    """The healthy messages of the last 10 s, thinned out. All times are of one steady clock [s]."""
+    """The healthy messages of the last 10 s, at most one in 0.1 s, by a steady clock [s]."""
 
     def __init__(self, joint_count: int) -> None:
         self._unmeasured = np.full(joint_count, np.nan)

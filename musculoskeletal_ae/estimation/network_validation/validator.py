@@ -198,9 +198,9 @@ class CheckpointValidator:
         return check.comparisons(mae)
 
     def weakness(self, mae: Mae) -> str:
-        """Say in what a network is clearly worse on recent messages than a learned one in use.
+        """State what a network does clearly worse, on recent messages, than a learned one in use.
 
-        Joint sensors tell, or else the lengths that each network computes at its own estimate.
+        Joint sensors decide, or else the lengths that each network computes at its own estimate.
 
         Returns:
             The quantity, its error and that of the network in use; '' if it is not clearly worse,
