@@ -97,16 +97,19 @@ def _nothing(robot: Robot) -> Healthy:
 
 
 def _divided(name: str, clones: Path) -> tuple[SoftLink, Run, Run]:
-    """Return a recording's link, and the rows without payload for training and for the test.
+    """Return a recording's link, and its rows without payload for training and for the test.
 
-    They are the same rows if any row may be either.
+    With `stand`, training and test use the same rows.
     """
     for repository in repositories():
         if repository.recording != RECORDINGS[name]:
             continue
         clone = clone_of(repository, clones, fetch=False)
         if clone is None:
-            raise MusculoskeletalError(f'{clones} has no clone of {repository.name}')
+            raise MusculoskeletalError(
+                f'{clones} has no clone of {repository.name}; run python -m bench recordings with '
+                '--fetch'
+            )
         recording = repository.read(Files(clone))
         assert isinstance(recording.link, SoftLink)  # as all in RECORDINGS are
         runs = [run for run in recording.runs if not run.load > 0.0]

@@ -88,12 +88,12 @@ class Case:
     """One mishap that has begun in a laboratory.
 
     Attributes:
-        detail: Its random size, muscle or joint.
+        detail: The random size, muscle or joint of the mishap.
         mend: What a person does who has understood the mishap.
         subjects: The muscles and joints that are concerned; () if the whole arm is.
         is_visible: Whether the mishap can be seen in what the nodes receive; asked until it is.
         lasts: Time after which it ends by itself [s].
-        settled_by: Steps after which nothing is left to be mended.
+        settled_by: Steps of which each mends the mishap, without `mend`.
         found_at: Muscles and joints at which a person finds the fault, besides `subjects`.
     """
 

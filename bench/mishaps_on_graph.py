@@ -37,10 +37,10 @@ class GraphMishap(NamedTuple):
     """A kind of mishap on the graph.
 
     Attributes:
-        name: Its name in tables.
-        begin: Lets it happen; returns the function by which it ends by itself, or None if the
-            operator of `Scene` has to end it.
-        says: Regular expression of status lines that state it truly.
+        name: Name of the mishap in tables.
+        begin: Lets the mishap happen; returns the function that ends it, or None if the operator
+            of `Scene` has to end it.
+        says: Regular expression of status lines that state the mishap truly.
         denies: Regular expression of false status lines, or ''.
         moment: What the arm does before, 'holding' or 'exploring'.
     """

@@ -60,7 +60,7 @@ def _inputs(training: Run, with_effort: bool) -> Callable[[Run], Array]:
 
 
 def _centred(training: Run) -> tuple[Array, Array]:
-    """Return θ of the training rows without its mean, and the mean; 0 if it was not measured."""
+    """Return θ of the training rows minus its mean, and the mean; unmeasured θ counts as 0."""
     theta = np.nan_to_num(training.theta)
     mean = theta.mean(axis=0)
     return theta - mean, mean

@@ -26,7 +26,7 @@ from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 
-DIFFERENCE = 1e-6  # step of the finite differences [rad]
+DIFFERENCE = 1e-6  # differentiate numerically with this step [rad]
 #: reuse Σ T ∂²l/∂θ² of the geometric model until a joint has moved by more than this [rad]
 REUSED_MOTION = 0.05
 SMALL = 1e-6  # raise smaller divisors to this value

@@ -194,7 +194,7 @@ def _objects(
     described = np.random.default_rng([seed, 0x3AB]).uniform(0.9, 1.1, count)
     for s, ends in enumerate(zip(routes.first, routes.second, strict=True)):
         if objects.swivels[s]:
-            continue  # its tendon enters it at the centre of the object
+            continue  # keep the radius of a pulley, because its tendon enters it at the centre
         if objects.radius[s] > 0.0:
             turn, origin = (part[:, objects.joint[s]] for part in poses[:2])
             away = true[:, ends] - (origin + turn @ objects.centre[s])[:, None]

@@ -482,9 +482,9 @@ class Estimator:
             self._update_body(offsets=self.trust.offsets)
 
     def _update_body(self, **changes: Any) -> None:
-        """Update attributes of the body state, and the anomaly as `suspects` says.
+        """Change attributes of the body state, and take its anomaly from `suspects`.
 
-        A body state that differs from the one before has the next generation.
+        If the body state then differs from the previous one, its generation increases by one.
         """
         suspects, before = self.suspects, self.body
         body = replace(before, anomaly=suspects.anomaly, suspect=suspects.suspect, **changes)
@@ -517,7 +517,7 @@ class Estimator:
     def _check_suspect(self, isolating: Iterable[int]) -> None:
         """Check that the suspects may be used again, unless they are among the muscles `isolating`.
 
-        If the length of one has jumped since the finding, its length offset is then confirmed.
+        Then confirm the length offset of each suspect whose length has jumped since the finding.
 
         Raises:
             MusculoskeletalError: If the suspect may not be used yet.

@@ -16,8 +16,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-#: discard messages up to this long before a finding [s]: detectors need this time, so they may be
-#: wrong
+#: discard the messages of this time before a finding [s]: the fault may have begun so much earlier
 DETECTION_DELAY = 2.0
 
 

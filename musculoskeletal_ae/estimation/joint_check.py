@@ -115,7 +115,7 @@ class JointCheck:
         self._uses = 0  # number of messages judged by `_usual`
 
     def use(self, mae: Mae) -> None:
-        """Use another network; its isolated muscles are ignored."""
+        """Use another network from now on, and ignore the muscles that it isolates."""
         self._mae, self._usual = mae, None
         self._compared.clear()
         if not self._messages:

@@ -119,9 +119,9 @@ class Reservoir:
             self._rests.add(rest)
 
     def use_isolated(self, isolated: Iterable[int]) -> None:
-        """Use other isolated muscles; forget all messages if a muscle isolated in some is used now.
+        """Forget all messages if some lack the values of a muscle that is used from now on.
 
-        These messages lack the values of that muscle. `isolated` are the muscles isolated now.
+        `isolated` are the muscles that are isolated from now on.
         """
         if self._missing - frozenset(isolated):
             self.clear()

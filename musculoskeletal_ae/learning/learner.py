@@ -325,7 +325,7 @@ class Learner:
 
     def note_accepted(self, mae: Mae) -> None:
         """Note that the estimator uses this network; see `CheckpointKeeper`."""
-        # Its detector may have been calibrated before a muscle was changed.
+        # The detector of this network may have been calibrated before a muscle was changed.
         self.keeper.note_accepted(mae if self.scheduler.statistics_hold else uncalibrated(mae))
 
     def note_rejected(self, version: int, reason: str) -> None:

@@ -115,7 +115,7 @@ def work(table: Table) -> float:
 
 
 def without_pauses(steps: ArrayLike) -> Array:
-    """Return the times between messages [s], in which a pause of the recording counts little."""
+    """Return the times between messages [s], with longer pauses cut to LONGEST_PAUSE."""
     return np.minimum(steps, LONGEST_PAUSE / 1e9)
 
 
@@ -250,12 +250,12 @@ def table_errors(mae: Mae, table: Table) -> Array:
 
 
 def error(mae: Mae, recording: Pairs) -> float:
-    """Return the mean of ‖θ_est − θ‖₂ [rad] over all messages with θ, for joints with sensors."""
+    """Return the mean norm of a network's errors at the joints with sensors [rad]."""
     return mean_error(errors(mae, recording))
 
 
 def mean_error(off: Array) -> float:
-    """Return the mean of ‖θ_est − θ‖₂ [rad] of errors (N, D), for joints with sensors."""
+    """Return the mean norm of the errors (N, D) of the joints with sensors [rad]."""
     is_known = np.isfinite(off).any(axis=1)
     return float(np.linalg.norm(np.nan_to_num(off), axis=1)[is_known].mean())
 

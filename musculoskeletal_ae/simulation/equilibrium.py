@@ -464,7 +464,7 @@ class Slopes:
     """
 
     def __init__(self, robot: Robot) -> None:
-        """Draw the postures of the fits over all joint ranges; tensions are in mid-range."""
+        """Draw postures over all joint ranges, to which `fit` fits; tensions are in mid-range."""
         most = max(len(group.joints) for group in robot.groups)
         count = POSTURES_PER_COEFFICIENT * comb(most + 3, 3)
         self._postures = robot.random_postures(count, np.random.default_rng(0))

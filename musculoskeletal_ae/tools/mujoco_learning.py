@@ -83,7 +83,9 @@ def _imported(args: Namespace, folder: Path) -> Robot:
         found = prospects(robot)
         print(*found.lines(), sep='\n', flush=True)
         if found.is_pointless:
-            raise MusculoskeletalError(f'{args.mujoco}: its muscles cannot hold it, see above')
+            raise MusculoskeletalError(
+                f'{args.mujoco}: the muscles cannot hold the arm, so nothing was trained'
+            )
 
     chain = {name: getattr(args, name) for name in CHAIN}
     imported = convert.import_robot(args.mujoco, folder, check, **chain)

@@ -193,9 +193,9 @@ class PostureCheck:
 
     @cached_property
     def _undetermined(self) -> Array:
-        """Permitted relative error of a joint that the muscles determine only poorly, (D,).
+        """Permitted relative error of each joint, (D,), for joints that muscles determine poorly.
 
-        It follows from the error of the best affine map from tensions and lengths to joint angles.
+        It is a multiple of the error of the best affine map from tensions and lengths to angles.
         """
         theta, tension, length = self._states(2 * AFFINE)
         ones = np.ones((2 * AFFINE, 1))
