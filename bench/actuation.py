@@ -38,8 +38,9 @@ from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 
-EXPLORED, HELD_OUT = 300.0, 60.0  # durations of the exploration and of the held-out motion [s]
-TARGETS, HELD = 5, 4.0  # number of targets, and default time for each of them [s]
+#: explore and learn for EXPLORED, and then measure in a held-out motion of HELD_OUT [s]
+EXPLORED, HELD_OUT = 300.0, 60.0
+TARGETS, HELD = 5, 4.0  # move to this many targets, and by default stay at each for this time [s]
 RUPTURES = 3  # rupture this many muscles, one after another
 MOVING = 4.0  # explore for this time before a rupture [s]
 LATEST = 10.0  # wait at most this long for an isolation after a rupture [s]
@@ -92,7 +93,7 @@ class Watched:
 def learn(
     arm: Arm, initial: Mae, seed: int, seconds: float, watched: Watched
 ) -> tuple[Learner, int]:
-    """Explore and learn for a time [s]; return the learner and the number of stops."""
+    """Learn from an exploration of a time [s]; return the learner and the number of stops."""
     loop = ClosedLoop(arm, initial, None, EXPLORATION_STREAM + seed)
     learner = Learner(arm.robot, initial, 'default', seed)
     for count, row in enumerate(online_learning.explore(loop, learner, seconds)):

@@ -81,9 +81,9 @@ class Row(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """How fast the commands of one controller process changed."""
+    """The largest changes of the commands of one controller process, and those too fast."""
 
-    commands: int
+    commands: int  # number of commands
     largest_in: float  # largest winding in within one tick [m]
     largest_out: float  # largest paying out within one tick [m]
     too_fast: list[str]

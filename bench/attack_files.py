@@ -299,7 +299,7 @@ def attempts(start: int, count: int, seed: int, folder: Path) -> Iterator[Attemp
 
 
 def attack(count: int, seed: int) -> tuple[int, list[str], Counter[str]]:
-    """Read `count` hostile files in child processes.
+    """Attack the package with `count` hostile files, which child processes read.
 
     Returns:
         The number of files, the findings, and the number of each outcome.

@@ -305,7 +305,7 @@ class Attack:
                         self.start(name)
 
     def wait(self, condition: Callable[[], Any], promise: str, what: str) -> bool:
-        """Process messages until a condition holds; return False if it does not hold in time.
+        """Wait for a condition, and process messages; return False if it does not hold in time.
 
         A timeout is recorded as a violation of `promise`; `what` states what the bench waited for.
         """
@@ -339,14 +339,14 @@ class Attack:
         return self.clients[service]
 
     def send(self, kind: Any, service: str, request: Any = None) -> None:
-        """Call a service without waiting for the response."""
+        """Send a request to a service without waiting for the response."""
         client = self._client(kind, service)
         if client.service_is_ready():
             client.remove_pending_request(client.call_async(request or kind.Request()))
             self.tried['requests'] += 1
 
     def send_parameter(self, node: str, name: str, value: Any) -> None:
-        """Set a parameter without waiting for the response."""
+        """Send a parameter to a node without waiting for the response."""
         self.send(SetParameters, f'{node}/set_parameters', set_request(name, value))
 
     def set_faults(self, lines: list[str]) -> None:
@@ -468,7 +468,7 @@ class Attack:
         return checkpoint.to_bytes(replace(mae, decoder=layers))
 
     def request(self, service: str, kind: str) -> None:
-        """Call a service with illegal content, without waiting for the response."""
+        """Request something illegal of a service, without waiting for the response."""
         rng, name = self.rng, SERVICES[kind]
         request = name.Request()
         node = service.removeprefix(f'{self.namespace}/').split('/')[0]

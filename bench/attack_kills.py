@@ -95,7 +95,7 @@ class Child:
     def _read(self) -> None:
         assert self._process.stdout is not None
         for line in self._process.stdout:
-            # The kill interrupted a line that does not end in a newline, so it does not count.
+            # Do not count a line without a newline, which the kill has interrupted.
             if line.endswith('\n'):
                 self.lines.append(line.split())
                 if line.startswith('found'):

@@ -58,7 +58,7 @@ class Scene:
     # -- the course of an attack ----------------------------------------------------------------
 
     def play(self, kind: str, shape: int, moment: str) -> None:
-        """Bring the arm into a state, attack it, and recover it as /diagnostics advises.
+        """Play one attack: bring the arm into a state, attack it, and recover it as advised.
 
         Args:
             kind: Kind of the attack, a key of KINDS.
@@ -94,7 +94,7 @@ class Scene:
             )
 
     def bring(self, moment: str) -> bool:
-        """Make a healthy arm hold a posture or explore; return whether it does."""
+        """Bring a healthy arm to hold a posture or explore; return whether it does."""
         attack = self.attack
         if not attack.moving():
             return False
@@ -140,7 +140,7 @@ class Scene:
         return mode in ('idle', 'holding', 'moving', 'torque', 'exploring')
 
     def follow_advice(self) -> None:
-        """Restart silent nodes, and take all steps that the reports on /diagnostics advise."""
+        """Follow the advice of all reports on /diagnostics, and restart silent nodes."""
         attack = self.attack
         for node in attack.situation.silent_nodes():
             attack.processes[node].kill()
@@ -154,7 +154,7 @@ class Scene:
             self._take(step)
 
     def _take(self, step: Step) -> None:
-        """Do what one step of the advice on /diagnostics says, as an operator would."""
+        """Take one step of the advice on /diagnostics, as an operator would."""
         attack = self.attack
         if step in (Step.STOP_SECOND_PUBLISHER, Step.STOP_OTHER_ROBOT):
             attack.end_strangers()
@@ -178,7 +178,7 @@ class Scene:
             attack.spin(0.5)
 
     def _calibrate_lengths(self) -> None:
-        """Request a length calibration, and wait until it has ended.
+        """Calibrate the lengths: request the calibration, and wait until it has ended.
 
         The calibration takes half a minute of gentle motion. A second request would restart it.
         """
@@ -208,7 +208,7 @@ class Scene:
             attack.spin(period)
 
     def latch(self, topic: str, *messages: Any) -> None:
-        """Publish false messages on a latched topic; the status line must report the problem."""
+        """Latch false messages on a topic; the status line must report the problem."""
         with self.wrong():
             self.publish(topic, *messages, qos=LATCHED)
             self.attack.spin(LASTING)

@@ -60,13 +60,13 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
 
 ROBOT = 'musashi_left_arm'  # the emulated arm
-EXPLORED, HELD_OUT = 300.0, 60.0  # durations of exploration and test [s]
+EXPLORED, HELD_OUT = 300.0, 60.0  # explore for EXPLORED, and test on a motion of HELD_OUT [s]
 THINNED = 10  # use every tenth message of the test
-MOST_ROWS = 1500  # largest number of test rows
-COUPLING = 0.006  # standard deviation of the coupling [m]
-MOST_FITTED = 150  # largest number of test rows for least squares
-#: least squares: step of finite differences [rad], typical step as a share of the joint ranges, and
-#: largest number of iterations
+MOST_ROWS = 1500  # test on at most this many rows
+COUPLING = 0.006  # add a coupling of this standard deviation to each length [m]
+MOST_FITTED = 150  # fit at most this many test rows by least squares
+#: constants of least squares: step of finite differences [rad], typical step as a share of the
+#: joint ranges, and number of iterations after which it ends
 DIFFERENCE, USUAL_STEP, ROUNDS = 1e-4, 0.1, 15
 RECORDINGS = {'neck': 'soft_neck', 'arm': 'soft_arm', 'stand': 'continuum_stand'}
 
@@ -97,16 +97,19 @@ def _nothing(robot: Robot) -> Healthy:
 
 
 def _divided(name: str, clones: Path) -> tuple[SoftLink, Run, Run]:
-    """Return a recording's link, and the rows without payload for training and for the test.
+    """Return a recording's link, and its rows without payload for training and for the test.
 
-    They are the same rows if any row may be either.
+    With `stand`, training and test use the same rows.
     """
     for repository in repositories():
         if repository.recording != RECORDINGS[name]:
             continue
         clone = clone_of(repository, clones, fetch=False)
         if clone is None:
-            raise MusculoskeletalError(f'{clones} has no clone of {repository.name}')
+            raise MusculoskeletalError(
+                f'{clones} has no clone of {repository.name}; run python -m bench recordings with '
+                '--fetch'
+            )
         recording = repository.read(Files(clone))
         assert isinstance(recording.link, SoftLink)  # as all in RECORDINGS are
         runs = [run for run in recording.runs if not run.load > 0.0]
@@ -277,7 +280,7 @@ def regressions(case: Case) -> str:
 
 
 def read_case(text: str, clones: Path | None, cache: Path) -> Case:
-    """Return the case that NAME[:COUNT[:DRAW]] names.
+    """Read NAME[:COUNT[:DRAW]], and return the case that it names.
 
     Raises:
         MusculoskeletalError: If there is no such case, or its data are not given.

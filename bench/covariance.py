@@ -51,7 +51,7 @@ from musculoskeletal_ae.options import Parser, names, number
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
-HELD_OUT = 40.0  # duration of the held-out motion [s]
+HELD_OUT = 40.0  # test on a held-out motion of this duration [s]
 STEPS = 400, 1200  # train for these numbers of steps in the updates
 #: function that returns the joint angles which the learner receives, by its source of θ
 VIEWS: dict[str, JointView] = {

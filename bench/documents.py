@@ -163,7 +163,7 @@ def script(page: Path, repository: str) -> str:
 
 
 def follow(page: str, clone: Path, home: Path, repository: Path) -> bool:
-    """Run the commands of a page in a clone; return whether every command succeeded."""
+    """Follow a page: run its commands in a clone; return whether every one succeeded."""
     print(f'\n== {page}', flush=True)
     paths = os.environ['PATH'].split(os.pathsep)
     paths = [path for path in paths if not path.startswith(sys.prefix)]

@@ -58,7 +58,7 @@ def lengths_of_cardsflow(file: Path, source: Source) -> Callable[[dict[str, Arra
         at = link.find('inertial/origin')
         text = '0 0 0' if at is None else at.get('xyz', '0 0 0')
         centres[link.get('name', '')] = [*map(float, text.split())]
-        # Masses do not affect muscle lengths, but MuJoCo refuses links without mass.
+        # State the same mass for each link: it affects no muscle length, but MuJoCo needs one.
         for part in link.findall('inertial'):
             link.remove(part)
         weight = ET.SubElement(link, 'inertial')

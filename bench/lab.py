@@ -81,16 +81,16 @@ class Process:
         self.longest_delay = 0.0  # longest delay of a message [s]
 
     def send(self, message: Message) -> None:
-        """Put a message into the queue of the process, which reads it when it runs next."""
+        """Send a message to the process, which reads it when it runs next."""
         if message.sent_at >= self._subscribed_at:
             self._waiting.append(message)
 
     def suspend(self, until: float) -> None:
-        """Do not run before the time `until` [s], as a process that was stopped by a signal."""
+        """Suspend the process until a time [s], as a signal does."""
         self._runs_at = until
 
     def restart(self, at: float) -> None:
-        """End the process; its successor runs and receives messages from the time `at` [s] on."""
+        """Restart the process; its successor runs and gets messages from the time `at` [s] on."""
         self._runs_at = self._subscribed_at = at
         self._arrival = Arrival()
         self._waiting.clear()
@@ -150,7 +150,7 @@ class Wire:
         self.command_faults: list[CommandFault] = []
 
     def clear(self) -> None:
-        """End all faults."""
+        """Clear all faults."""
         self.reading_faults.clear()
         self.command_faults.clear()
 
@@ -280,7 +280,7 @@ class Lab:
             self.publish()
 
     def publish(self) -> None:
-        """Send what has changed in the estimator to the other nodes."""
+        """Publish what has changed in the estimator to the other nodes."""
         core = self.estimator
         if (trust := core.joint_trust) is not self._published_trust:
             self._published_trust = trust
@@ -385,7 +385,7 @@ class Lab:
         self._process_of(node).suspend(self.now + seconds)
 
     def restart(self, node: str) -> None:
-        """Kill a node and start it again, which takes RESTARTING seconds.
+        """Restart a node: kill it and start it again, which takes RESTARTING seconds.
 
         The controller then finds the stop that its predecessor has left behind. The learner keeps
         its samples and its network, which are on disk.

@@ -33,10 +33,11 @@ SELF = frozenset({
     'anomaly_detected', 'not_exploring', 'calibrating', 'learning_waits', 'gentle_only',
     'length_offsets_unknown', 'trajectory_slowed', 'nothing_to_learn',
 })  # fmt: skip
-#: statements that a muscle is faulty, which do not name the faulty part
+#: statements that a muscle is faulty, without saying which part of it
 FAULTY = frozenset({'residual_distance', 'muscle_isolated'})
 RUPTURE = FAULTY | {'slack_tendon'}
-#: names a jammed or weak motor, a wrong tension or length reading, and lost commands as causes
+#: statements that a module does not follow: they name a jammed or weak motor, a wrong reading, and
+#: lost commands as possible causes
 NOT_FOLLOWING = frozenset({'module_not_following'})
 JAM = FAULTY | NOT_FOLLOWING | {'slack_tendon'}
 ONE_LENGTH = FAULTY | {'length_jump', 'length_disagrees'}
@@ -52,7 +53,7 @@ TENSION_SENSOR = FAULTY | NOT_FOLLOWING | {
 JOINT = frozenset({
     'joint_sensors_doubted', 'joint_readings_impossible', 'joint_readings_missing',
 })  # fmt: skip
-#: statements that messages are rejected, and why: true symptoms of readings that jump
+#: statements that messages are rejected, and why; they are true while readings jump
 REJECTED = frozenset({
     'implausible_muscle_states', 'readings_rejected', 'stale_muscle_states', 'stale_estimate',
 })  # fmt: skip
@@ -66,7 +67,7 @@ HEAT = frozenset({
 OFF_TARGET = frozenset({
     'away_from_target', 'torque_missing', 'out_of_reach', 'tension_above_limit', 'overload',
 })  # fmt: skip
-#: symptoms of a base that is mounted otherwise
+#: true symptoms of a base that is mounted in another direction
 MOUNTED = OFF_TARGET | {'other_mounting'}
 SOFTWARE = frozenset({
     Step.RESET_CONTROLLER, Step.RESET_ESTIMATOR, Step.CALIBRATE_LENGTHS, Step.EXPLORE,
@@ -88,12 +89,12 @@ class Case:
     """One mishap that has begun in a laboratory.
 
     Attributes:
-        detail: Its random size, muscle or joint.
+        detail: The random size, muscle or joint of the mishap.
         mend: What a person does who has understood the mishap.
         subjects: The muscles and joints that are concerned; () if the whole arm is.
         is_visible: Whether the mishap can be seen in what the nodes receive; asked until it is.
         lasts: Time after which it ends by itself [s].
-        settled_by: Steps after which nothing is left to be mended.
+        settled_by: Steps of which each mends the mishap, without `mend`.
         found_at: Muscles and joints at which a person finds the fault, besides `subjects`.
     """
 

@@ -211,7 +211,7 @@ class Course:
         return self.mended_at is not None and self.lab.now - self.quiet_since >= QUIET
 
     def mend(self, by_advice: bool = False) -> None:
-        """Let a person mend the fault."""
+        """Mend the fault, as a person would."""
         if self.mended_at is None:
             self.case.mend(self.lab)
             self.mended_at, self.is_found_by_advice = self.lab.now, by_advice
@@ -226,7 +226,7 @@ class Course:
     # -- operator -------------------------------------------------------------------------------
 
     def play(self, rng: np.random.Generator) -> None:
-        """Let the mishap happen, and follow the advice until the arm is well or it is too late."""
+        """Play the mishap, and follow the advice until the arm is well or it is too late."""
         self.run(rng.uniform(2.0, 8.0))
         if self.mishap.holds:
             self._hold(rng)
@@ -352,13 +352,13 @@ class Course:
 
 
 def judge(statement: Statement, mishap: Mishap, case: Case) -> str:
-    """Return whether a statement is 'true', 'allowed' (true but secondary) or 'false'.
+    """Judge whether a statement is 'true', 'allowed' (true but secondary) or 'false'.
 
     A true statement names a muscle or joint that is concerned, if the mishap concerns some.
     """
     concerned, subjects = frozenset(case.subjects), statement.subjects
     names_it = not concerned or bool(subjects & concerned)
-    # A statement that names other muscles or joints only is about something else.
+    # Count a statement as being about something else if it only names other muscles or joints.
     is_about = names_it or not subjects
     is_said = bool(mishap.says) and re.search(mishap.says, statement.text, re.I) is not None
     is_true = statement.identifier in mishap.true or is_said
@@ -383,7 +383,7 @@ def learned_lab(robot: Robot, first: Mae, seed: int, reality: str, seconds: floa
 
 
 def play(lab: Lab, mishap: Mishap, seed: int, reality: str, before: float) -> dict[str, Any]:
-    """Let one mishap happen in a laboratory; return its result by name."""
+    """Play one mishap in a laboratory; return its result by name."""
     number = [each.name for each in MISHAPS].index(mishap.name)
     rng = np.random.default_rng([seed, reality == FOREIGN, number, 0x315])
     begun, from_now = time.process_time(), lab.now
@@ -394,7 +394,7 @@ def play(lab: Lab, mishap: Mishap, seed: int, reality: str, before: float) -> di
     is_accurate = after <= max(WELL * before, before + WELL_RAD)
     case, effect, true_at = course.case, course.effect_at, course.true_at
     is_needed = not mishap.is_harmless and (effect is not None or true_at is not None)
-    # A statement may come before the effect that this bench considers visible.
+    # Count a statement as immediate if it comes before the effect that this bench can see.
     delay = None if true_at is None else round(max(0.0, true_at - (effect or true_at)), 2)
     ended = '' if is_quiet else '; '.join(each.text for each in course.present) or 'not exploring'
     is_advised = course.is_found_by_advice or case.lasts < math.inf or mishap.is_harmless
@@ -475,7 +475,7 @@ def results(folder: Path) -> list[dict[str, Any]]:
 def run_seed(
     robot: Robot, folder: Path, seed: int, reality: str, kinds: Sequence[str], again: bool
 ) -> None:
-    """Play the mishaps of one individual that have no result yet."""
+    """Run the mishaps of one individual that have no result yet."""
     file = folder / f'{reality}_{seed}.jsonl'
     done = {
         each['mishap']
@@ -512,7 +512,7 @@ def other_network(robot: Robot, first: Mae, reality: str, folder: Path) -> Mae:
 
 
 def run_healthy(robot: Robot, folder: Path, seed: int, reality: str, hours: float) -> int:
-    """Let a healthy arm explore; print and count its different warnings and errors."""
+    """Run a healthy arm that explores; print and count its different warnings and errors."""
     lab = learned_lab(robot, initial(robot, folder), seed, reality, AFTER)
     course = Course(lab, MISHAPS[0])
     course.run(3600.0 * hours - AFTER)
@@ -530,7 +530,7 @@ def is_wanted(name: str, kinds: Sequence[str] | None) -> bool:
 def run_graph(
     folder: Path, seeds: Iterable[int], wanted: Sequence[str] | None, again: bool
 ) -> None:
-    """Play the mishaps on the ROS graph that have no result yet, once for each seed."""
+    """Run the mishaps on the ROS graph that have no result yet, once for each seed."""
     from bench.mishaps_on_graph import GRAPH_MISHAPS, run
 
     network = folder / 'graph.safetensors'

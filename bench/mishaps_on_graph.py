@@ -28,7 +28,7 @@ from bench.processes import end_processes
 
 WATCHED = 15.0  # watch the status line for this time while the mishap lasts [s]
 ERROR_TIME = 10.0  # measure the true error over this time [s]
-#: statements that blame the computer; false unless other programs use it up
+#: statements that blame the computer; count them as false unless other programs use it up
 OVERLOADED = 'overloaded|stop other programs'
 BUSY = 8  # keep the computer busy with this many programs
 
@@ -37,10 +37,10 @@ class GraphMishap(NamedTuple):
     """A kind of mishap on the graph.
 
     Attributes:
-        name: Its name in tables.
-        begin: Lets it happen; returns the function by which it ends by itself, or None if the
-            operator of `Scene` has to end it.
-        says: Regular expression of status lines that state it truly.
+        name: Name of the mishap in tables.
+        begin: Lets the mishap happen; returns the function that ends it, or None if the operator
+            of `Scene` has to end it.
+        says: Regular expression of status lines that state the mishap truly.
         denies: Regular expression of false status lines, or ''.
         moment: What the arm does before, 'holding' or 'exploring'.
     """
@@ -142,7 +142,7 @@ GRAPH_MISHAPS: tuple[GraphMishap, ...] = (
 
 
 def play(scene: Scene, mishap: GraphMishap, seed: int) -> dict[str, Any] | None:
-    """Let a mishap happen and recover from it; return its result, or None if the arm is not well.
+    """Play a mishap, and recover; return its result, or None if the arm is not well.
 
     The names are those of the results of `bench mishaps`.
     """
@@ -212,7 +212,7 @@ def true_error(attack: Attack) -> float:
 def run(
     folder: Path, initial: Path, seed: int, kinds: list[str], keep: Callable[[dict[str, Any]], None]
 ) -> None:
-    """Start the system, and play the named mishaps; call `keep` with each result."""
+    """Run the system, and play the named mishaps; call `keep` with each result."""
     folder.mkdir(parents=True, exist_ok=True)
     with Attack(folder, initial, seed) as attack:
         scene = Scene(attack)

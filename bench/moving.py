@@ -19,14 +19,14 @@ from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-PERIOD = 0.01  # time between two readings [s]
-TENSIONS = 40.0, 120.0  # range of the tensions at the postures [N]
+PERIOD = 0.01  # take a reading at this interval [s]
+TENSIONS = 40.0, 120.0  # draw the tensions at the postures from this range [N]
 
 
 def record(
     robot: Robot, reality: str, seed: int, seconds: float, motion: float, rest: float, order: int
 ) -> Pairs:
-    """Return a recording of an arm that moves to random postures.
+    """Record an arm that moves to random postures; return the recording.
 
     Args:
         robot: The geometric model.

@@ -169,7 +169,8 @@ def exertable_path(study: Study, seed: int) -> list[Array]:
             duration = DURATION
         if len(path) == MOTIONS + 2:
             return path[1:]
-    raise MusculoskeletalError(f'{max(len(path) - 2, 0)} of {MOTIONS} motions')
+    found = max(len(path) - 2, 0)
+    raise MusculoskeletalError(f'only {found} of {MOTIONS} motions are possible')
 
 
 def tracking_error(study: Study, seed: int) -> float:
@@ -194,7 +195,7 @@ def holding_error(study: Study, seed: int) -> float:
         loop.go(theta, HOLDING)
         errors.append(float(np.linalg.norm(arm.theta - theta)))
     if not errors:
-        raise MusculoskeletalError('no holdable posture')
+        raise MusculoskeletalError('the muscles can hold no posture')
     return float(np.mean(errors))
 
 

@@ -51,8 +51,9 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / 'test' / 'view'))
 from browser import Browser  # noqa: E402 - the tests' own browser
 
-SIZE = 1280, 720  # size of the page [pixels]
-SCALE, COLOURS = 0.75, 128  # size of the pictures relative to the page; number of colours
+SIZE = 1280, 720  # open the page at this size [pixels]
+#: scale pictures of the page by this factor, and reduce them to this many colours
+SCALE, COLOURS = 0.75, 128
 SCALED = round(SCALE * SIZE[0]), round(SCALE * SIZE[1])
 LEARNING = 60.0  # record the running system for this time before the rupture [s]
 MOVING_ON = 25.0  # record the system for this time after the isolation [s]
@@ -67,7 +68,7 @@ LOAD = -50.0  # vertical force on the hand of the simulated arm [N], as in the p
 
 
 def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[str, int]]:
-    """Return the pictures of the film, and by file name the indices of those to save separately."""
+    """Record the film; return its pictures, and the indices of those to save, by file name."""
     frames: list[Image.Image] = []
     browser = Browser(folder / 'profile', f'http://127.0.0.1:{options.port}', SIZE)
 

@@ -282,7 +282,7 @@ WITH_NODE = tuple(name for name in PLATFORMS if name.startswith(('wheels-', 'sou
 
 
 def check_system(name: str, folder: Path, tests: tuple[str, ...]) -> str:
-    """Create a platform in an empty folder; return one line about bring-up and tests."""
+    """Check a platform in an empty folder; return one line about bring-up and tests."""
     site = Site(folder)
     site.run('cloning', f'git clone -q {shlex.quote(str(ROOT))} clone')
     PLATFORMS[name](site)

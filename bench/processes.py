@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CPU time and memory of processes on Linux, and ending processes."""
+"""Measures CPU time and memory of processes on Linux, and ends processes."""
 
 import os
 import signal

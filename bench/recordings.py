@@ -194,7 +194,7 @@ def models(
 
 
 def learn(repository: Repository, files: Files) -> tuple[list[Result], dict[str, Any]]:
-    """Return the errors of all models on one repository, and the `observations` on its runs."""
+    """Learn from one repository; return all models' errors, and `observations` on its runs."""
     recording = repository.read(files)
     name, results = recording.link.name, list[Result]()
     learned = dict[tuple[str, bool], Model]()

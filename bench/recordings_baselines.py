@@ -20,10 +20,12 @@ from bench.recordings_learn import Model, error, polynomial
 from bench.recordings_read import Run
 from musculoskeletal_ae.arrays import Array
 
-FOLDS = 5  # parts of the cross-validation
+FOLDS = 5  # divide the training rows into this many parts for cross-validation
 DEGREES, RIDGES = (1, 2, 3), (0.0, 1e-6, 1e-4, 1e-2, 1e-1)
 WIDTHS, PENALTIES = (0.5, 1.0, 2.0, 4.0, 8.0), (1e-6, 1e-4, 1e-2, 1e-1)
-STARTS = 3.0, 1.0  # first length scales of the Gaussian process, in standard deviations of inputs
+#: start the search for the Gaussian process from these length scales, in standard deviations of
+#: inputs
+STARTS = 3.0, 1.0
 
 
 def baselines(training: Run, with_effort: bool) -> Iterator[tuple[str, Model]]:
@@ -58,7 +60,7 @@ def _inputs(training: Run, with_effort: bool) -> Callable[[Run], Array]:
 
 
 def _centred(training: Run) -> tuple[Array, Array]:
-    """Return θ of the training rows without its mean, and the mean; 0 if it was not measured."""
+    """Return θ of the training rows minus its mean, and the mean; unmeasured θ counts as 0."""
     theta = np.nan_to_num(training.theta)
     mean = theta.mean(axis=0)
     return theta - mean, mean

@@ -26,8 +26,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.load import Load
 
 INITIAL_STEPS, STEPS, UPDATES = 1000, 400, 8
-#: Tension above T_bias [N] that a model with efforts assigns to a strong effort, which is the 95 %
-#: quantile of the efforts in the training data. This tension is proportional to the effort.
+#: Assign this tension above T_bias [N] to a strong effort, which is the 95 % quantile of the
+#: efforts in the training data. Tensions are proportional to efforts.
 STRONG = 40.0
 
 Model = Callable[[Run], Array]  # returns θ [rad], (N, D)

@@ -30,8 +30,8 @@ ENTRY = np.vstack([ENTRY, ENTRY[::-1] * [-1.0, 1.0, 1.0]])
 ATTACHED = np.array([[0.075, b, 0.28] for b in (-0.075, 0.075)])
 ATTACHED = np.vstack([ATTACHED, ATTACHED[::-1] * [-1.0, 1.0, 1.0]])
 PULLEY = 0.03  # radius of the pulleys [m]
-STILL = 0.002  # a length that changes by less in SPAN is at rest [m]
-SPAN = 5  # rows of a rest, which are 0.5 s
+STILL = 0.002  # count a length as at rest if it changes by less than this in SPAN [m]
+SPAN = 5  # average this many rows (0.5 s) in a rest sample
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def cable_platform(files: Files) -> Recording:
         for entry, end in zip(ENTRY, ATTACHED, strict=True)
     ]
     runs = []
-    # sc_8_medium_b is a copy of sc_8_medium_a.
+    # Leave out sc_8_medium_b, which is a copy of sc_8_medium_a.
     for name in ('sc_27_final', 'sc_27_medium_a', 'sc_8_final', 'sc_8_medium_a'):
         try:
             data: Any = BytesIO(files.data(f'{name}_parsed.mat'))

@@ -46,7 +46,7 @@ REST = 0.2  # average a rest sample over this time at the end of a pose [s]
 
 @dataclass(frozen=True)
 class Run:
-    """One run with one payload."""
+    """The readings of one recorded run, in which the payload is constant."""
 
     name: str
     load: float  # payload [kg]
@@ -57,7 +57,7 @@ class Run:
     rests: Ints  # first row of each rest, and the row after its last row, (R, 2)
 
     def at(self, rows: Any) -> Run:
-        """Return a run with some of the rows, and without rests."""
+        """Return a run with the selected rows and without rests."""
         parts = {part: getattr(self, part)[rows] for part in ('length', 'effort', 'theta')}
         return replace(self, rests=self.rests[:0], **parts)
 

@@ -18,13 +18,14 @@ from scipy.optimize import minimize
 
 from musculoskeletal_ae.arrays import Array
 
-PARTS = 5  # number of parts of the cross-validation
-DEGREES = 1, 2, 3  # of a polynomial
-PENALTIES = 1e-8, 1e-6, 1e-4, 1e-3, 1e-2  # of the squares of its coefficients, over N
-MOST_TERMS = 600  # largest number of terms of a polynomial
-WIDTHS = 0.5, 1.0, 2.0, 4.0, 8.0, 16.0  # of the kernel, in units of √K
-RIDGES = 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0  # of the kernel ridge regression
-JITTER = 1e-8  # variance that keeps covariances positive definite
+PARTS = 5  # divide the samples into this many parts for cross-validation
+DEGREES = 1, 2, 3  # try polynomials of these degrees
+#: try these penalties of the squared coefficients, relative to N
+PENALTIES = 1e-8, 1e-6, 1e-4, 1e-3, 1e-2
+MOST_TERMS = 600  # fit no polynomial with more terms
+WIDTHS = 0.5, 1.0, 2.0, 4.0, 8.0, 16.0  # try kernels of these widths, in units of √K
+RIDGES = 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0  # try these penalties of the kernel ridge regression
+JITTER = 1e-8  # add this variance to keep covariances positive definite
 
 Predict = Callable[[Array], Array]
 

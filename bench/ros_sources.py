@@ -93,7 +93,7 @@ class Builder:
         }
 
     def prepare(self) -> None:
-        """Create the virtual environment with the ROS wheels and the build tools."""
+        """Prepare a virtual environment with the ROS wheels and the build tools."""
         self.folder.mkdir(parents=True, exist_ok=True)
         self.run('a virtual environment', sys.executable, '-m', 'venv', self.venv)
         files = (argument for file in REQUIREMENTS for argument in ('-r', file))

@@ -54,7 +54,7 @@ from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.robot import Robot
 
 SMALLEST, INDIVIDUAL, UNSEEN = '2x6', 0, 5000
-HELD_OUT = 300.0  # duration of the held-out motion [s]
+HELD_OUT = 300.0  # measure the error on a held-out motion of this duration [s]
 #: heading of each column of the table, by the key of its numbers in a Row
 COLUMNS = {
     'nominal': '② nominal [rad a joint]',
@@ -72,7 +72,7 @@ Row = dict[str, float]
 
 
 def measure(body: str, folder: Path, minutes: float) -> Row:
-    """Return the results of a body. Errors [rad] are divided by √D, for D joints."""
+    """Measure a body, and return the results. Errors [rad] are divided by √D, for D joints."""
     folder.mkdir(parents=True, exist_ok=True)
     robot = Robot.load(find_robot('arm26') if body == SMALLEST else write_body(body, folder / body))
     # Training is timed, so a file that an interrupted run left must not replace it.
@@ -114,7 +114,7 @@ def update_time(robot: Robot, mae: Mae, exploring: Recording) -> float:
     times = []
     with one_thread():  # as in the training process of the learner
         for _ in range(6):
-            # Every update of the node has a new sample.
+            # Replace a sample, because every update of the node has a new one.
             kept = np.append(kept[1:], rng.integers(count))
             part = exploring.part(kept)
             none = np.zeros_like(part.tension)
@@ -161,7 +161,7 @@ def draw(rows: dict[str, Row], file: Path) -> None:
 
 
 def run(bodies: list[str], minutes: float, out: Path) -> None:
-    """Measure the bodies that have no results in `out` yet; print the table and draw the plot."""
+    """Run the bodies that have no results in `out` yet; print the table and draw the plot."""
     out.mkdir(parents=True, exist_ok=True)
     file = out / 'rows.json'
     rows: dict[str, Row] = json.loads(file.read_text()) if file.exists() else {}

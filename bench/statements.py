@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the nodes state about the arm, as one list of values for benches.
+"""Collects what the nodes state about the arm, as one list of values for benches.
 
-They are the conditions of the cores, with the muscles and joints that each concerns.
+The statements are the conditions of the cores, with the muscles and joints that each concerns.
 """
 
 from __future__ import annotations

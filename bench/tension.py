@@ -50,7 +50,7 @@ ALLOWED, LONGEST = 1.1, 0.5
 EXPLORED = 60.0  # explore for this time [s]
 #: move to this many targets with each method, and stay at each for this time [s]
 TARGETS, HELD = 4, 4.0
-HELD_OUT = 60.0  # duration of the held-out motion [s]
+HELD_OUT = 60.0  # measure the error on a held-out motion of this duration [s]
 HEAD = (
     f'{"seed":>5} {"what":<12} {"max/limit":>9} {"longest":>8} {"above":>7} {"above":>7} '
     f'{"stops":>5} {"samples":>7} {"error":>7}\n'

@@ -409,7 +409,7 @@ def _eager_gradient(network: Network, latent: torch.Tensor) -> object:
 
 
 def measure(robot: Robot, preset: str, device: str | None = None) -> list[Timed]:
-    """Return the times of all rows, on one thread."""
+    """Measure the times of all rows, on one thread."""
     torch.set_num_threads(1)
     one, many = gemm_rate(1), gemm_rate(256)
     every = mae_rows(robot, preset) + simulation_rows(robot, preset, device)

@@ -206,7 +206,7 @@ class System:
 
             # The annotation of rclpy leaves out that a callback may also take the message's info.
             callback: Callable[..., None] = take
-            # Only the time stamps are needed. Leaving messages serialized saves CPU time.
+            # Leave messages serialized to save CPU time, because only the time stamps are needed.
             self._node.create_subscription(
                 Float64MultiArray, topic, callback, qos_profile_sensor_data, raw=True
             )
@@ -246,7 +246,7 @@ class Wire(NamedTuple):
 
 
 def measure(system: System, rate: float, seconds: float) -> Wire:
-    """Return latency, losses and CPU times of a started system, measured over some seconds.
+    """Measure latency, losses and CPU times of a started system over some seconds.
 
     Raises:
         MusculoskeletalError: If the nodes exchange no messages.

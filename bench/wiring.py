@@ -122,7 +122,7 @@ class Loop:
         return float(np.nanmean(errors)), float(np.nanmean(anomalies))
 
     def follow_advice(self) -> set[int] | None:
-        """Call the services that the estimator advises, until it names a wrong wiring or ends.
+        """Follow the advice of the estimator, until it names a wrong wiring or reports nothing.
 
         Returns:
             The columns that were named; the empty set if a calibration has failed for another
@@ -176,7 +176,7 @@ def cases(robot: Robot, seed: int) -> Iterator[Case]:
 
 
 def run(robot: Robot, mae: Mae, arm: Arm, seed: int, case: Case) -> dict[str, Any]:
-    """Return the outcome of one case, and errors and anomaly scores before and after it."""
+    """Run one case; return its outcome, and errors and anomaly scores before and after it."""
     loop = Loop(robot, mae, arm, seed, case.has_sensors)
     rng = np.random.default_rng([seed, *case.wiring.faulty])
     loop.explore(rng.uniform(BEFORE, 2.0 * BEFORE))

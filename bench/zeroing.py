@@ -43,7 +43,7 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 LEAST, MOST = 0.05, 0.13  # draw length offsets of a magnitude in this range [m]
 MINUTES = 10.0  # explore for this time [min]
-HELD_OUT = 300.0  # duration of the held-out motion [s]
+HELD_OUT = 300.0  # measure errors on a held-out motion of this duration [s]
 AFTER = 30.0  # move for this time after a calibration [s]
 LONGEST = 120.0  # end a calibration after this time [s]
 SETTLING = 20.0  # let the arm hang for this time until it is still [s]

@@ -2,9 +2,9 @@
 """Fits the calibrated body of one arm again in every update.
 
 Every update fits the body to all samples and starts from the last fit. The prior is the geometric
-model. If a network has already learned a real arm, the prior is a body that was fitted to this
-network (`fit_to_network`). The geometric model replaces it if the first samples show that the
-network learned another arm.
+model, or, if a network has already learned a real arm, a body fitted to this network
+(`fit_to_network`). If the first samples show that the network learned another arm, the geometric
+model becomes the prior again.
 """
 
 import numpy as np
@@ -18,13 +18,15 @@ from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-PROBES = 200  # number of postures over which the mean length of each muscle is computed
-# A muscle has changed if at least its LEAST_NEWEST newest samples contradict the body, all with
-# residuals of the same sign, and at least LEAST_BEFORE samples came before them.
+PROBES = 200  # average the length of each muscle over this many postures
+#: report a muscle as changed if at least this many of its newest samples contradict the body, all
+#: with residuals of the same sign
 LEAST_NEWEST = 4
-LEAST_BEFORE = 8
-LEAST_CHANGE = 0.004  # smallest residual of a sample that contradicts the body [m]
-OUTLIER = 6.0  # smallest residual of a sample that contradicts the body, in standard deviations
+LEAST_BEFORE = 8  # report it only if at least this many samples came before those
+#: a sample contradicts the body only if its residual is at least this large [m]
+LEAST_CHANGE = 0.004
+#: a sample contradicts the body only if its residual has at least this many standard deviations
+OUTLIER = 6.0
 
 
 class BodyFit:
@@ -39,7 +41,8 @@ class BodyFit:
         if mae is not None:
             robot = robot.with_elasticity(mae.elasticity)
         self.body = CalibratedBody(robot)
-        #: parameters fitted to the network, which replace the geometric model as prior mean
+        #: parameters fitted to the network; if not None, they replace the geometric model as prior
+        #: mean
         self._prior_mean: list[Array] | None = None
         if mae is not None:
             fit_to_network(self.body, mae, seed)
@@ -65,7 +68,7 @@ class BodyFit:
         return bool(np.median(np.abs(observed.length - length)[observed.known]) > LEAST_CHANGE)
 
     def start_anew(self) -> None:
-        """Start again from the geometric model."""
+        """Start anew from the geometric model, because the network learned another arm."""
         self._prior_mean = None
         self.body = CalibratedBody(self.body.robot.with_elasticity(None))
 
@@ -93,7 +96,7 @@ class BodyFit:
 
 
 def contradicted_muscles(observed: Observations, fit: Fit) -> tuple[tuple[int, int], ...]:
-    """Return the muscles that seem to have changed, because their newest samples do not fit.
+    """Return the muscles that seem to have changed, because their newest samples misfit the body.
 
     The newest samples of such a muscle all have large length residuals of the same sign, while
     enough earlier samples exist.

@@ -33,15 +33,15 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.signals.friction import LARGEST_GAIN, Transmission
 
-#: largest |γ|, |b|/T_limit and |F|/T_limit of `signals.friction.Transmission`
+#: permit no larger |γ|, |b|/T_limit and |F|/T_limit of `signals.friction.Transmission`
 LARGEST_DRIVE = np.array([LARGEST_GAIN, 1.0, 1.0])
-#: largest |μ|; the tensions at the motor and at the elastic element then differ by a factor of 2
+#: permit no larger |μ|: at this value, friction halves or doubles the tension along the route
 LARGEST_FRICTION = 0.7
-LARGEST_LOG = 1.5  # largest |κ|
+LARGEST_LOG = 1.5  # permit no larger |κ|
 
 
 class Layout:
-    """Positions of the parameters δ, κ, μ, o and r in the vector of one muscle.
+    """Layout of one muscle's parameter vector: where δ, κ, μ, o and r are in it.
 
     The docstring of the module explains the symbols. δ has three values for each route point. If
     tensions come from motor currents, the vector also contains the constants γ, b and F of
@@ -88,25 +88,24 @@ class CalibratedBody:
         for m in range(robot.muscle_count):
             segments = np.flatnonzero(routes.muscle == m)
             points = np.union1d(routes.first[segments], routes.second[segments])
-            # A muscle may have several branches. The line from the last point of a branch to the
-            # first point of the next keeps the factor 0.
+            # A muscle may have several branches. Nothing connects the last point of a branch to the
+            # first point of the next, so this line keeps the factor 0.
             weights = np.zeros(len(points) - 1)
             weights[routes.first[segments] - points[0]] = routes.weight[segments]
             self.layouts.append(Layout(points, weights, self._has_drive))
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
         #: what the parameters cannot express; `lengths` includes it, `linearised` does not
         self.remainder = Remainder(robot.muscle_count)
-        # The next fit starts from these values:
-        #: joint-sensor offsets [rad], (D,)
+        #: joint-sensor offsets from which the next fit starts [rad], (D,)
         self.zero = np.zeros(robot.joint_count)
-        #: corrections of the joints' springs, as in the module `springs`, (2, D)
+        #: corrections α and β of the joints' springs, from which the next fit starts, (2, D)
         self.springs = springs.none_learned(robot.joint_count)
-        #: fitted θ (D,) and a row of `posture_model.Bent` for each sample; the key is the bytes of
-        #: the sample's lengths
+        #: start of the next fit for each sample, by the bytes of its lengths: fitted θ (D,) and a
+        #: row of `posture_model.Bent`
         self.last_postures: dict[bytes, tuple[Array, ...]] = {}
 
     def limb(self, joints: Ints, muscles: Ints) -> CalibratedBody:
-        """Return the part with these joints and muscles only, without its remainder."""
+        """Return the part of the body with these joints and muscles only, without its remainder."""
         parameters = [self.parameters[m] for m in muscles]
         return CalibratedBody(self.robot.limb(joints, muscles), parameters)
 
@@ -122,7 +121,7 @@ class CalibratedBody:
         return springs.learned(self.robot.kinematics.elasticity, self.springs)
 
     def shift(self, m: int) -> Array:
-        """Return δ, the displacements of one muscle's route points [m], (P, 3)."""
+        """Return how far one muscle's route points are displaced (δ) [m], (P, 3)."""
         return self.parameters[m][self.layouts[m].attachment].reshape(-1, 3)
 
     def elastic(self, m: int) -> SeriesElastic:
@@ -164,9 +163,10 @@ class CalibratedBody:
         return Transmission(self.frictions(), self.drive)
 
     def end(self, m: int, tension: Array, direction: Array) -> tuple[Array, Array]:
-        """Return T_end [N] (N,) of one muscle, and ∂T_end/∂(μ, γ, b/T_limit, F/T_limit), (N, 4).
+        """Return one muscle's bone-side tension T_end [N] (N,), and its derivatives by μ and drive.
 
-        If the robot has tension sensors, only the derivative ∂T_end/∂μ exists, (N, 1).
+        The derivatives are ∂T_end/∂(μ, γ, b/T_limit, F/T_limit), (N, 4), or, if the robot has
+        tension sensors, ∂T_end/∂μ alone, (N, 1).
 
         Args:
             m: The muscle.
@@ -244,7 +244,7 @@ class CalibratedBody:
         m: int,
         age: Array | float = 0.0,
     ) -> tuple[Array, Array]:
-        """Return l_i [m] (N,) of one muscle and ∂l_i/∂parameters (N, P).
+        """Return the length [m] (N,) of one muscle, and its derivatives by its parameters (N, P).
 
         Args:
             poses: Joint poses at the postures θ, from `poses`.

@@ -16,20 +16,19 @@ from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import TINY
 
-#: number of validation messages that are enough to scale the covariance
+#: scale the covariance by validation messages only if there are at least this many
 MANY_MESSAGES = 200
-#: Number of bodies drawn from the posterior. There are many more of them than joints, because a
-#: covariance of few draws underestimates the errors of other draws.
+#: Draw this many bodies from the posterior: many more than joints, because a covariance from few
+#: draws underestimates the errors of other draws.
 BODIES = 100
-POSTURES_PER_BODY = 10  # number of postures at which errors of each body are drawn
-#: Factor of the covariance if there are fewer than MANY_MESSAGES validation messages. It stands for
-#: errors that are common to all samples and that no prior describes, for example because tendons
-#: wrap round bones. No single factor suits all arms: with this one, the ellipsoids contain 95 % of
-#: the true angles on emulator model `foreign`, and on `kin` if no joint reaches its limits. If
-#: joints reach their limits, the ellipsoids are too large on `kin` (doc/limitations.md, `python -m
-#: bench covariance`).
+POSTURES_PER_BODY = 10  # draw errors of each body at this many postures
+#: Multiply the covariance by this factor if there are fewer than MANY_MESSAGES validation messages.
+#: It stands for errors that all samples share and no prior describes, for example where tendons
+#: wrap round bones. With this factor, the ellipsoids contain 95 % of the true angles on emulator
+#: model `foreign`, and on `kin` if no joint reaches its limits; if joints do, they are too large on
+#: `kin` (doc/limitations.md, `python -m bench covariance`).
 UNVALIDATED_FACTOR = 1.7
-CONTAINED_SHARE = 0.95  # share of the errors that the ellipsoid of a covariance has to contain
+CONTAINED_SHARE = 0.95  # the ellipsoid of a covariance has to contain this share of the errors
 
 
 def estimate_covariance(
@@ -40,16 +39,16 @@ def estimate_covariance(
     seed: int,
     judging: Observations | None,
 ) -> Array:
-    """Return the expected covariance of a network's errors θ_est − θ [rad²], (D, D).
+    """Estimate the covariance of a network's errors θ_est − θ [rad²], (D, D).
 
     The covariance is computed from errors that are drawn at random postures with tensions of the
     samples. An error has two parts. The first part is the error of the joint-sensor offset.
-    Validation messages do not show this part, because they contain the same offset. The second part
-    is everything else. If there are at least MANY_MESSAGES validation messages, it is multiplied by
-    a ratio: the network's actual errors on these messages, relative to errors that are drawn at the
-    same postures. The postures have to be the same, because validation messages are mostly near the
-    samples, where errors are smaller than at random postures. With fewer validation messages, the
-    covariance is multiplied by UNVALIDATED_FACTOR instead.
+    Validation messages do not show it, because they contain the same offset. The second part is
+    everything else. With at least MANY_MESSAGES validation messages, it is multiplied by the ratio
+    of the network's actual errors on these messages to errors drawn at the same postures. The
+    postures must be the same: validation messages lie mostly near samples, where errors are smaller
+    than at random postures. With fewer validation messages, the covariance is multiplied by
+    UNVALIDATED_FACTOR instead.
 
     Args:
         mae: The network.
@@ -76,7 +75,7 @@ def estimate_covariance(
 
 
 def drive_covariance(body: CalibratedBody, fit: Fit) -> Array | None:
-    """Return the posterior covariances of the constants γ, b and F of motor currents.
+    """Return the posterior covariances of each motor current's scale, offset and friction.
 
     `Transmission` explains the constants. All samples together count as at most
     INDEPENDENT_SAMPLES samples, because errors of the body model are common to all of them.
@@ -170,11 +169,11 @@ def ellipsoids(covariance: Array, error: Array) -> Array:
         error: Errors [rad], (N, D).
     """
     squares = np.einsum('ni,ni->n', error, np.linalg.solve(covariance, error.T).T)
-    # Quantile of χ² with D degrees of freedom; importing scipy.stats for it would take 0.7 s.
+    # Compute the quantile of χ² with D degrees of freedom here: importing scipy.stats takes 0.7 s.
     bounded: Array = squares / (2.0 * gammaincinv(0.5 * error.shape[1], CONTAINED_SHARE))
     return bounded
 
 
 def observed_theta(mae: Mae, observed: Observations) -> Array:
-    """Return θ [rad] (N, D) as a network estimates it from observations."""
+    """Return the joint angles θ [rad] (N, D) that a network estimates from observations."""
     return mae.estimate(observed.end_tension(mae.transmission), observed.length).theta

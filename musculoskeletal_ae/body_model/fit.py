@@ -35,17 +35,18 @@ from musculoskeletal_ae.gauss_newton import (
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.mae import Mae
 
-ROUNDS = 30  # largest number of Gauss–Newton iterations for one muscle
-LEAST_DECREASE = 1e-11  # decrease of the cost, per measured length, that ends the iterations
-LEAST_NOISE = 0.0003  # smallest σ of a length at rest [m]
-#: number of samples from before the change of a muscle that are required to derive a new prior
+ROUNDS = 30  # end the fit of one muscle after this many Gauss–Newton iterations
+#: end the fit of one muscle if an iteration lowers the cost by less than this, per measured length
+LEAST_DECREASE = 1e-11
+LEAST_NOISE = 0.0003  # assume at least this σ of a length at rest [m]
+#: derive a new prior for a changed muscle only from at least this many samples before the change
 LEAST_BEFORE_CHANGE = 8
 
 
 class Fit(NamedTuple):
-    """Result of a fit."""
+    """The noise, weights, postures and uncertainty that a fit has found."""
 
-    #: l − l(θ, T; w) [m], (N, M), at the measured angles, or at fitted ones where there are none
+    #: measured minus computed lengths [m], (N, M), at measured angles, or else at fitted ones
     residual: Array
     noise: Array  # σ of each muscle's length [m], (M,)
     weight: Array  # ω in (0, 1], (N, M); 0 where a sample does not describe a muscle
@@ -100,7 +101,8 @@ def fit_body(
     # Angles from a camera are less accurate than the fitted ones, which combine them with lengths.
     known = np.where(np.isnan(observed.theta), np.nan, measured.theta)
     body.remainder = learned_remainder(body, replace(observed, theta=known), fit.weight, priors)
-    # The constants have to agree with the new remainder, or both would explain the same lengths.
+    # Fit the constants again if the remainder changed; otherwise both would explain the same
+    # lengths.
     if np.abs(body.remainder.at(measured.theta, observed.tension) - before).max() > LEAST_NOISE:
         fit = fitted()
     return fit
@@ -110,8 +112,7 @@ def _prior(body: CalibratedBody, observed: Observations, m: int) -> MusclePrior:
     """Return the prior of a muscle around the geometric model."""
     layout = body.layouts[m]
     spread = PRIOR.spread(layout)
-    # The prior of the offset describes the tendon before it crept. Creep since then widens the
-    # prior.
+    # The prior of the offset describes the tendon before it crept, so widen it by the creep since.
     spread[layout.offset] = np.hypot(PRIOR.offset, PRIOR.creep * observed.age.max(initial=0.0))
     return MusclePrior(PRIOR.mean(layout), spread)
 
@@ -137,13 +138,13 @@ def _reopened(
 class MusclePoint(NamedTuple):
     """Parameters of one muscle, with residuals and derivatives."""
 
-    parameters: Array  # w, (P,)
-    residual: Array  # l − l(θ, T; w) [m], (N, 1)
-    jacobian: Array  # ∂l/∂w, (N, P)
+    parameters: Array  # w, fitted constants of the muscle, (P,)
+    residual: Array  # measured minus computed lengths [m], (N, 1)
+    jacobian: Array  # derivatives of the computed lengths by the parameters, (N, P)
 
 
 class MuscleFit:
-    """Fit of one muscle at known postures, as a `gauss_newton.Problem`."""
+    """Fits one muscle at known postures; a `gauss_newton.Problem`."""
 
     def __init__(
         self,
@@ -170,7 +171,7 @@ class MuscleFit:
         return self.usual[1]
 
     def run(self) -> Array:
-        """Return the fitted parameters, starting from the body's present ones."""
+        """Run the fit from the body's present parameters; return the fitted ones."""
         start = self.point(self._body.parameters[self._m])
         enough = LEAST_DECREASE * float(self._known.sum())
         return minimise(self, start, ROUNDS, enough).point.parameters
@@ -190,7 +191,7 @@ class MuscleFit:
         return MusclePoint(parameters, (observed.length[:, m] - length)[:, None], jacobian)
 
     def weigh(self, point: MusclePoint) -> None:
-        """Compute the noise of the lengths and the robust weights from the residuals at a point."""
+        """Weigh the samples: compute noise and robust weights from the residuals at a point."""
         self._noise, weight = noise_and_weight(
             point.residual, self._known, self._noise, self._determined, self._least_noise
         )
@@ -218,9 +219,9 @@ class MuscleFit:
         return self.point(point.parameters + step.common)
 
 
-NETWORK_STATES = 400  # number of states at which the network is evaluated
-NETWORK_ERROR = 0.001  # smallest σ of the network's lengths [m]
-FIXED = 1e-6  # prior spread of a parameter that a fit must not change
+NETWORK_STATES = 400  # evaluate the network at this many states
+NETWORK_ERROR = 0.001  # assume at least this σ of the network's lengths [m]
+FIXED = 1e-6  # keep a parameter at its prior mean by this prior spread
 
 
 def fit_to_network(
@@ -228,10 +229,10 @@ def fit_to_network(
 ) -> None:
     """Fit a body in place to the muscle lengths of a network that has learned a real arm.
 
-    The samples from which the network was learned may be missing (after `train --from-bag`, on
-    another machine, or if the state was lost). With this fit as prior, learning still continues
-    from the learned body and does not start again from the geometric model. An exported model of
-    the learned body is fitted in the same way, but without a remainder, which it cannot contain.
+    The samples that the network learned from may be missing (after `train --from-bag`, on another
+    machine, or if the state was lost). With this fit as prior, learning continues from the learned
+    body instead of the geometric model. An exported model of the learned body is fitted in the same
+    way, but without a remainder, which it cannot contain.
     """
     robot, rng = body.robot, np.random.default_rng([seed, 0x1B])
     theta = robot.random_postures(NETWORK_STATES, rng)

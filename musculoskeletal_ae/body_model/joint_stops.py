@@ -28,26 +28,29 @@ from musculoskeletal_ae.arrays import Array, Bools
 if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.posture_model import PostureModel
 
-ROUGH_OFFSET = np.deg2rad(2.0)  # σ of z of a roughly calibrated sensor [rad]
-ACCURATE_OFFSET = 0.003  # σ of z of an accurately calibrated sensor [rad]
+ROUGH_OFFSET = np.deg2rad(2.0)  # expect this offset of a roughly calibrated sensor (σ) [rad]
+ACCURATE_OFFSET = 0.003  # expect this offset of an accurately calibrated sensor (σ) [rad]
 #: refuse an update that finds a larger |z|: ten times σ of a roughly calibrated sensor [rad]
 LARGEST_OFFSET = 10.0 * ROUGH_OFFSET
-STOP_SPREAD = 0.01  # standard deviation of the distance between a stop and its limit [rad]
-OFFSETS = np.linspace(-4.0 * ROUGH_OFFSET, 4.0 * ROUGH_OFFSET, 281)  # grid of z [rad]
-NO_STOPS = 0.1  # probability that a joint's limits are not mechanical stops
-NOT_REACHED = 0.5  # probability that a stop is never reached
-SHARES = 0.03, 0.1, 0.3  # grid of π, if the stop is reached
-WIDTHS = 0.001, 0.002, 0.004  # grid of σ, if the stop is reached [rad]
-WIDTH_RATIO = 2.0  # σ beyond a limit, relative to σ within the range
-DENSITY_RATIO = 0.01  # density of readings beyond a limit, relative to that within the range
+STOP_SPREAD = 0.01  # expect a stop to be this far from its limit (standard deviation) [rad]
+#: compute the posterior of these offsets z [rad]
+OFFSETS = np.linspace(-4.0 * ROUGH_OFFSET, 4.0 * ROUGH_OFFSET, 281)
+NO_STOPS = 0.1  # assume that a joint's limits are no mechanical stops with this probability
+NOT_REACHED = 0.5  # assume that the arm never reaches a given stop with this probability
+SHARES = 0.03, 0.1, 0.3  # consider these shares π of rests at a stop that is reached
+WIDTHS = 0.001, 0.002, 0.004  # consider these widths σ of the cluster of readings there [rad]
+WIDTH_RATIO = 2.0  # beyond a limit, widen the cluster by this factor, because stops are compliant
+#: beyond a limit, expect this density of other readings, relative to that within the range
+DENSITY_RATIO = 0.01
 # A joint is at its stop if it is near a limit and the muscles push it there.
-NEAR_STOP = 0.05  # largest distance of a joint without a sensor from the limit [rad]
-LEAST_PUSH = 3.0  # smallest torque towards the limit, relative to the usual residual torque
-SMALL = 1e-6  # weight of every angle, relative to the weight of a stop
-NEAR_LIMIT = 0.3  # distance from a limit within which readings may belong to its cluster [rad]
+NEAR_STOP = 0.05  # count a joint without a sensor as near a limit within this distance [rad]
+#: count a joint as pushed if its torque is at least this multiple of the usual residual torque
+LEAST_PUSH = 3.0
+SMALL = 1e-6  # weight of every angle relative to that of a stop; keeps the normal equations regular
+NEAR_LIMIT = 0.3  # ignore readings that are farther than this from a limit [rad]
 # Two rests are distinct if another joint or the reading itself differs.
-OTHER_DIFFERENCE = 0.1  # smallest difference of another joint [rad]
-OWN_DIFFERENCE = 0.01  # smallest difference of the reading [rad]
+OTHER_DIFFERENCE = 0.1  # count rests as distinct if another joint differs by more than this [rad]
+OWN_DIFFERENCE = 0.01  # count rests as distinct if the reading differs by more than this [rad]
 
 
 def sensor_zeros(read: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
@@ -87,7 +90,7 @@ def _at_stop(within: Array, span: float) -> Array:
         within: Distances of the readings from the limit, positive within the range [rad], (N,).
         span: The joint's range [rad].
     """
-    single = np.float32  # logarithms in single precision take a fraction of the time
+    single = np.float32  # computes the logarithms several times faster than double precision
     distance = (within[within < NEAR_LIMIT, None] - OFFSETS).astype(single)
     even = np.where(distance > 0.0, single(1.0), single(DENSITY_RATIO))
     wide = np.where(distance > 0.0, single(1.0), single(WIDTH_RATIO))

@@ -26,18 +26,18 @@ from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 
-DIFFERENCE = 1e-6  # step of the finite differences [rad]
-#: motion of a joint up to which Σ T ∂²l/∂θ² of the geometric model is reused [rad]
+DIFFERENCE = 1e-6  # differentiate numerically with this step [rad]
+#: reuse Σ T ∂²l/∂θ² of the geometric model until a joint has moved by more than this [rad]
 REUSED_MOTION = 0.05
-SMALL = 1e-6  # divide by at least this, so that nothing is divided by 0
+SMALL = 1e-6  # raise smaller divisors to this value
 
 
 class Unknowns(NamedTuple):
     """Values of all unknowns of one group of D joints and M muscles."""
 
-    theta: Array  # θ of all joints of the body [rad], (N, all joints)
-    zero: Array  # z [rad], (D,)
-    parameters: list[Array]  # w of each muscle
+    theta: Array  # angles θ of all joints of the body [rad], (N, all joints)
+    zero: Array  # joint-sensor offsets z [rad], (D,)
+    parameters: list[Array]  # parameters w of each muscle
     springs: Array  # α and β of all joints of the body, as in the module `springs`, (2, all joints)
 
 
@@ -134,7 +134,7 @@ class PostureModel:
         torque_by_body = np.zeros((count, places, self.parameter_count))
         for m in range(length.shape[1]):
             tension, direction = observed.tension[:, m], observed.direction[:, m]
-            turns = np.flatnonzero(self._crossed[m])  # only these joints change the length
+            turns = np.flatnonzero(self._crossed[m])  # skip joints that do not change the length
             parts = np.append(0, 1 + turns)
             rows = (count * parts[:, None] + np.arange(count)).ravel()
             placed = type(poses)(*(part[np.append(rows, -1)] for part in poses))
@@ -204,7 +204,7 @@ class PostureModel:
     def _muscle_stiffness(self, own: Array) -> Array:
         """Return the joint stiffness Σ T ∂²l/∂θ² [N·m/rad] that muscle tensions cause, (N, D, D).
 
-        It is that of the geometric model at θ (N, D), or from the cache at a posture near θ.
+        The geometric model gives it at θ (N, D), or the cache for a posture near θ.
         """
         joints = self.joints
         at = self._bent.theta[:, joints]

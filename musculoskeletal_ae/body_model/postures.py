@@ -52,21 +52,21 @@ from musculoskeletal_ae.learning.samples import Observations
 if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 
-GRAVITY_NOISE = 0.02  # σ_u, from the noise and the mounting of the accelerometer [rad]
-FIRST_NOISE = 0.002  # initial σ of a length [m]
-LEAST_NOISE = 0.0008  # smallest σ of a length in the weights, for errors of the body model [m]
-#: σ_τ as a share of the muscles' absolute torques at a joint. It is wide, because friction and the
-#: offsets of the tension sensors are common to all samples.
+GRAVITY_NOISE = 0.02  # expect this error of u, by noise and mounting of the accelerometer (σ) [rad]
+FIRST_NOISE = 0.002  # assume this σ of a length in the first iteration [m]
+LEAST_NOISE = 0.0008  # weigh lengths by no smaller σ than this, for errors of the body model [m]
+#: Expect errors of the torque balance (σ_τ) of this share of the muscles' absolute torques at a
+#: joint. The share is high, because all samples have the same friction and sensor offsets.
 TORQUE_NOISE = 0.3
-#: smallest usual residual torque, as a share of the muscles' absolute torques at a joint
+#: assume at least this usual residual torque, as a share of the muscles' absolute torques
 LEAST_TORQUE = 0.01
-SCALINGS = 2  # number of iterations that compute the Birge ratio
-ROUNDS = 12  # largest number of Gauss–Newton iterations
-#: Decrease of the cost, per measured length, below which the iterations end. The step is then far
-#: shorter than the posterior spread, and the noise has settled. With ten times this value, the fit
-#: mistakes a slipped joint sensor for a changed muscle more often.
+SCALINGS = 2  # recompute the Birge ratio this many times
+ROUNDS = 12  # end the fit after this many Gauss–Newton iterations
+#: End the fit if an iteration lowers the cost by less than this, per measured length. The step is
+#: then far shorter than the posterior spread. With ten times this value, the fit mistakes a slipped
+#: joint sensor for a changed muscle more often.
 LEAST_DECREASE = 3e-4
-TYPICAL_STEP = 0.3  # typical step of a posture [rad]
+TYPICAL_STEP = 0.3  # expect a posture to move by this much per iteration [rad]
 
 
 class Weights(NamedTuple):
@@ -86,7 +86,7 @@ class Point(NamedTuple):
 
 
 class GroupFit:
-    """Fit of one group, as a `gauss_newton.Problem`.
+    """Fits one group of joints and muscles; a `gauss_newton.Problem`.
 
     Attributes:
         noise: σ of each muscle's length [m], (M,).
@@ -131,7 +131,7 @@ class GroupFit:
         )
 
     def run(self, start: Unknowns) -> tuple[Unknowns, Array]:
-        """Fit from initial values; return the unknowns and the posterior root of (w, z, e).
+        """Run the fit from initial values; return the unknowns and the posterior root of (w, z, e).
 
         The root R is upper triangular, and (RᵀR)⁻¹ is the covariance of w, z and e.
         """
@@ -191,7 +191,7 @@ class GroupFit:
         return Point(unknowns, self.model.residuals(unknowns))
 
     def weigh(self, point: Point) -> None:
-        """Compute length noise and robust weights at a point, and find joints at their stops."""
+        """Weigh the residuals at a point: compute length noise and robust weights; find stops."""
         residuals, own = point.residuals, point.unknowns.theta[:, self.model.joints]
         self.noise, self.weight = noise_and_weight(
             residuals.length, self._known, self.noise, self._determined, self._least_noise
@@ -346,7 +346,7 @@ def fit_jointly(
     for n, sample in enumerate(samples):
         if sample in body.last_postures:
             theta[n], bent.theta[n], bent.stiffness[n] = body.last_postures[sample]
-    # The remainder is that of the last fit. It is taken at the measured angles where there are any.
+    # Take the remainder of the last fit at the measured angles, where there are any.
     posture = np.where(np.isnan(observed.theta), theta, observed.theta - own * zero)
     remainder = body.remainder.at(posture, observed.tension)
     of_body = replace(observed, length=observed.length - remainder)

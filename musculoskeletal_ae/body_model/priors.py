@@ -15,13 +15,12 @@ from musculoskeletal_ae.body_model.posture_model import PostureModel
 from musculoskeletal_ae.robot.model_errors import ATTACHMENT, ELASTIC
 from musculoskeletal_ae.signals.friction import DRIVE_FRICTION_MEAN, DRIVE_SPREAD
 
-#: Errors of the body model are common to all samples. Therefore all samples together count as at
-#: most this number of independent ones, for joint-sensor offsets, for springs of the joints, for
-#: the constants of motor currents, and for the posterior uncertainty from the torque and the stops
-#: of joints without a sensor.
+#: Count all samples together as at most this many independent ones, because they share the errors
+#: of the body model. This applies to joint-sensor offsets, springs of the joints, constants of
+#: motor currents, and joints without a sensor (torque and stops).
 INDEPENDENT_SAMPLES = 10.0
-SENSOR_NOISE = 0.002  # σ_y of a joint sensor [rad]
-LEAST_ANGLE_NOISE = 1e-6  # smallest σ_y [rad]
+SENSOR_NOISE = 0.002  # expect this noise of a joint sensor (σ_y) [rad]
+LEAST_ANGLE_NOISE = 1e-6  # assume at least this σ_y [rad]
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class Prior:
 
 
 PRIOR = Prior()
-#: prior of a muscle that was replaced or whose tendon was renewed, around its earlier parameters
+#: expect a replaced muscle or tendon to differ this much from its earlier parameters
 REOPENED = Prior(attachment=0.004, elastic=0.3, offset=0.03)
 
 

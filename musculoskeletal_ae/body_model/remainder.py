@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The remainder: what the samples show of the lengths, and the calibrated body cannot express.
+"""The remainder: the part of the measured lengths that the calibrated body cannot express.
 
     l_i(θ, T) = body_i(θ, T; w_i) + g_i(θ, T),   g_i ~ GP(0, k_i),   l_i measured with noise σ_i
 
@@ -10,8 +10,8 @@ R are the joint ranges, (…)_c has the joints that muscle i crosses, and (…)_
 cross. With a large e, g depends only on the joints that a muscle crosses, for example because
 tendons wrap round bones. With e near 1, all joints change all lengths, for example because the
 links of an elastic body bend together. A small c means that tendons stretch unlike their model.
-With a large ν, g is smooth on one scale. With ν near 1, it varies on many scales: it may be rough,
-for example where tendons become slack, and still far samples tell something.
+With a large ν, g is smooth on one scale. With ν near 1, it varies on many scales, for example where
+tendons become slack: it may be rough, and yet distant samples still inform it.
 
 The samples decide how far the body is trusted. The amplitude a, the scales b, e and c, the shape ν
 and the noise σ are those with the largest evidence, which is the probability of the lengths after
@@ -22,9 +22,9 @@ the parameters w of the body have been integrated out over their prior:
 S are the spreads of the prior, and ω the robust weights of the fit. If the body explains the
 lengths, a falls to nearly zero. If it does not, g approaches the true lengths with more samples.
 
-The errors of g are correlated between muscles, for example if one slack tendon lets the link move,
-which changes all other lengths. The correlation is that of the errors of each sample's lengths if
-they are predicted from all other samples.
+The errors of g are correlated between muscles: if one slack tendon lets the link move, all other
+lengths change. The correlation is computed from the errors of each sample's lengths when they are
+predicted from all other samples.
 """
 
 from __future__ import annotations
@@ -48,24 +48,27 @@ if TYPE_CHECKING:
 #: Unknowns of the evidence are the natural logarithms of a, b, e, c, ν and σ, relative to these
 #: units: [m], joint ranges, 1, T_limit, 1 and [m].
 UNITS = np.array([0.002, 0.5, 1.0, 1.0, 1.0, 0.001])
-USUAL = np.array([-1.5, 0.5, 1.0, 2.0, 1.0, -2.0])  # means of their prior
-SPREAD = np.array([2.0, 0.4, 1.0, 1.0, 1.0, 1.5])  # standard deviations of their prior
+#: expect these unknowns of the evidence before the samples (prior means)
+USUAL = np.array([-1.5, 0.5, 1.0, 2.0, 1.0, -2.0])
+#: expect the unknowns of the evidence to deviate from USUAL by this (prior standard deviations)
+SPREAD = np.array([2.0, 0.4, 1.0, 1.0, 1.0, 1.5])
+#: search each unknown of the evidence within these limits
 BOUNDS = ((-8.0, 4.0), (-1.5, 3.0), (0.0, 4.0), (-1.5, 4.0), (0.0, 3.5), (-2.5, 3.0))
-#: initial values of a search: a trusted body, a wrong body, and one with a rough remainder
+#: start a search from these values: a trusted body, a wrong body, and a rough remainder
 STARTS = (
     USUAL,
     USUAL + [2.5, 0.0, 0.0, 0.0, 0.0, 0.0],
     USUAL + [3.0, -1.0, -1.0, 0.0, 0.0, 1.0],
 )
-#: Number of samples below which each search begins with STARTS. The evidence of few samples has
-#: several maxima, which change with each sample. Later searches continue from the last result.
+#: Start every search from STARTS if there are fewer samples than this: the evidence then has many
+#: maxima, which change with each sample. With more samples, continue from the last result.
 FEW_SAMPLES = 60
-ROUNDS = 25  # largest number of iterations of a search that begins with STARTS
-FEW_ROUNDS = 4  # largest number of iterations of a search that continues from an earlier result
-JUDGING = 150  # largest number of samples that the evidence is computed from
-LEAST_SAMPLES = 5  # smallest number of samples from which a remainder is learned
-UNKNOWN = 1.0  # variance of a length that a sample does not describe [m²]
-JITTER = 1e-10  # variance that keeps covariances positive definite [m²]
+ROUNDS = 25  # end a search that starts from STARTS after this many iterations
+FEW_ROUNDS = 4  # end a search that continues from the last result after this many iterations
+JUDGING = 150  # compute the evidence from at most this many samples
+LEAST_SAMPLES = 5  # learn a remainder only from at least this many samples
+UNKNOWN = 1.0  # assume this variance of a length that a sample does not describe [m²]
+JITTER = 1e-10  # add this variance to keep covariances positive definite [m²]
 
 
 class Lengths(NamedTuple):
@@ -74,7 +77,7 @@ class Lengths(NamedTuple):
     theta: Array  # θ [rad], (N, D)
     tension: Array  # T or T_read [N], (N, M)
     deviation: list[Array]  # l − l(θ, T; w̄) of each muscle [m], (N,)
-    by_body: list[Array]  # J S: change of each length with w in units of the spreads [m], (N, P)
+    by_body: list[Array]  # J S: derivatives of lengths by w, times the prior spreads [m], (N, P)
     weight: Array  # robust weights ω, (N, M)
 
     @classmethod
@@ -103,7 +106,7 @@ class Lengths(NamedTuple):
         return cls(observed.theta, observed.tension, deviation, by_body, weight)
 
     def part(self, rows: Ints) -> Lengths:
-        """Return some of the samples."""
+        """Return the part with the samples in `rows` only."""
         deviation, by_body = ([own[rows] for own in part] for part in self[2:4])
         return Lengths(self.theta[rows], self.tension[rows], deviation, by_body, self.weight[rows])
 
@@ -133,7 +136,7 @@ class GroupRemainder:
         return result
 
     def spread(self, theta: Array, tension: Array) -> Array:
-        """Return the posterior standard deviation of each g_i for a known body [m], (N, M)."""
+        """Return the posterior uncertainty (σ) of each g_i for a known body [m], (N, M)."""
         result = np.empty((len(theta), len(self.muscles)))
         amplitude = _constants(self.logarithms)[0]
         parts = zip(self._covariances(theta, tension), self.roots, strict=True)
@@ -143,7 +146,7 @@ class GroupRemainder:
         return result
 
     def text(self) -> str:
-        """Return the constants as text."""
+        """Return the constants of the remainder as a text for people."""
         amplitude, by_theta, ratio, by_tension, tail, noise = _constants(self.logarithms)
         scales = f'b {by_theta:.2f}, e {ratio:.1f}, c {by_tension:.1f}, ν {tail:.1f}'
         return f'a {1e3 * amplitude:.1f} mm, {scales}, σ {1e3 * noise:.2f} mm'
@@ -168,14 +171,14 @@ class Remainder:
     before: Remainder | None = None
 
     def at(self, theta: Array, tension: Array) -> Array:
-        """Return g(θ, T) [m] (N, M) at θ [rad] (N, D) and T [N] (N, M)."""
+        """Return the remainder g [m] (N, M) at θ [rad] (N, D) and T [N] (N, M)."""
         result = np.zeros((len(theta), self.muscle_count))
         for group in self.groups:
             result[:, group.muscles] = group.at(theta, tension)
         return result if self.before is None else result + self.before.at(theta, tension)
 
     def covariance(self, theta: Array, tension: Array) -> Array:
-        """Return the posterior covariance of g [m²] in each state for a known body, (N, M, M)."""
+        """Return the posterior covariance of the remainder [m²] for a known body, (N, M, M)."""
         result = np.zeros((len(theta), self.muscle_count, self.muscle_count))
         for group in self.groups:
             root = group.spread(theta, tension)[..., None] * group.correlation
@@ -183,7 +186,7 @@ class Remainder:
         return result
 
     def drawn_error(self, theta: Array, tension: Array, rng: np.random.Generator) -> Array:
-        """Draw the error of g [m] (N, M) from its posterior, independently for each state."""
+        """Draw errors of g [m] (N, M) from its posterior, independently for each state."""
         result = np.zeros((len(theta), self.muscle_count))
         for group in self.groups:
             spread = group.spread(theta, tension)
@@ -239,7 +242,7 @@ def group_remainder(
     ranges = (robot.upper - robot.lower)[joints]
     scale = np.concatenate([ranges, robot.tension.limit[muscles]])
     if not robot.tension_source.is_known:
-        scale[len(joints) :] = np.inf  # the tensions say nothing
+        scale[len(joints) :] = np.inf  # ignore the tensions
     count = len(lengths.theta)
     rows = np.arange(count)
     if count > JUDGING:
@@ -267,7 +270,7 @@ def group_remainder(
             covariance = kernel + lengths.by_body[m] @ lengths.by_body[m].T + np.diag(noise)
             inverse = cho_solve((cholesky(covariance, lower=True), True), np.eye(count))
             weights[:, m] = inverse @ lengths.deviation[m]
-            # The error of a length predicted from all other samples is α_n/(K⁻¹)_nn, and its
+            # If a length is predicted from all other samples, its error is α_n/(K⁻¹)_nn, with the
             # variance 1/(K⁻¹)_nn.
             used = lengths.weight[:, m] > 0.0
             scores[used, m] = (weights[:, m] / np.sqrt(np.diag(inverse)))[used]
@@ -293,7 +296,7 @@ def _correlation(scores: Array) -> Array:
 
 
 class _Evidence:
-    """Negative logarithm of the evidence, and its derivatives by the six logarithms."""
+    """Computes the negative logarithm of the evidence and its derivatives by six logarithms."""
 
     def __init__(self, lengths: Lengths, scale: Array, crossed: Bools) -> None:
         self._lengths = lengths
@@ -346,7 +349,7 @@ def _alike(crossed: Bools) -> Iterator[tuple[Bools, Ints]]:
 
 
 def _constants(logarithms: Array) -> Array:
-    """Return a [m], b, e, c, ν and σ [m]."""
+    """Return the six constants in their units: a [m], b, e, c, ν and σ [m]."""
     constants: Array = UNITS * np.exp(logarithms)
     return constants
 
@@ -359,7 +362,7 @@ def _parts(inputs: Array, crossed: Bools) -> list[Array]:
 
 
 def _covariance(one: Array, other: Array, crossed: Bools, logarithms: Array) -> Array:
-    """Return k between inputs (N, D+M) and (K, D+M) of muscles that cross some joints, (N, K)."""
+    """Return the prior covariance k of some muscles' lengths between two sets of inputs, (N, K)."""
     _, by_theta, ratio, by_tension, _, _ = _constants(logarithms)
     scale = np.full(one.shape[1], by_tension)
     scale[: len(crossed)] = by_theta * np.where(crossed, 1.0, ratio)
@@ -374,7 +377,7 @@ def _squares(one: Array, other: Array) -> Array:
 
 
 def _kernel(distance: Array, logarithms: Array) -> Array:
-    """Return k for values of q, in the same shape."""
+    """Return the kernel k = a² (1 + q/(2ν))^−ν for values of q, in the same shape."""
     constants = _constants(logarithms)
     amplitude, tail = constants[0], constants[4]
     kernel = np.log1p(distance * (0.5 / tail))

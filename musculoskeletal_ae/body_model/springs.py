@@ -60,7 +60,7 @@ def slope(nominal: JointElasticity, springs: Array, theta: Array, joints: Ints) 
     now = learned(nominal, springs)
     count, places = theta.shape
     result = np.zeros((count, places, 2 * len(joints)))
-    # α of joint j scales row and column j of K by e^{α/2} each.
+    # Differentiate K by α: α of joint j scales row and column j of K by e^{α/2} each.
     result[:, :, : len(joints)] = 0.5 * now.stiffness[:, joints] * theta[:, None, joints]
     torque = theta @ now.stiffness
     for k, j in enumerate(joints.tolist()):

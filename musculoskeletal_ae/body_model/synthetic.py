@@ -11,9 +11,9 @@ from musculoskeletal_ae.mae.default_training import highest_tensions
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
 
-#: share of samples with most muscles near T_bias, as under muscle stiffness control
+#: draw this share of the samples with most tensions near T_bias, as in an arm that holds a posture
 HELD_SHARE = 0.5
-#: share of a joint's range by which postures may exceed its limits, because friction or contact can
+#: let postures exceed the joint limits by this share of the range, because friction or contact can
 #: move a joint slightly beyond a limit
 MARGIN = 0.02
 
@@ -25,7 +25,7 @@ class TrainingData(NamedTuple):
     true: Array  # target of the network's output
 
 
-#: share of the friction that remains unknown although the direction of sliding is estimated
+#: assume that this share of the friction stays unknown although the sliding direction is estimated
 UNKNOWN_FRICTION = 0.25
 
 

@@ -12,7 +12,7 @@ A tendon parallel to the axis of a prismatic joint has r = RACK (`robot/joint_un
 
 doc/explanation/method.md ("An arm must be holdable") defines a sound arm. A joint with a spring
 or a passive tendon may have muscles on one side only, if these muscles can hold the joint. The
-report also shows the one-sided stiffness, for information only. In it, muscles at the tension that
+report also shows the one-sided stiffness, for information only. There, muscles at the tension that
 their modules maintain (T_bias, or 0 for position-controlled modules) count as slack.
 
 A suspended robot, such as a platform that hangs on four tendons, is judged in its equilibria only
@@ -42,32 +42,31 @@ from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.schema import Strict
 
-#: share of postures that a sound arm must at least hold, and in which it must be stiff enough
+#: a sound arm must hold at least this share of the postures, and be stiff enough in as many
 REQUIRED_SHARE = 0.95
-# The required stiffness is the smaller of REQUIRED_STIFFNESS and STIFFNESS_PER_LOAD times the
-# largest load of a joint. With the latter, a change of that load by a tenth moves no joint by more
-# than 0.05 rad.
-REQUIRED_STIFFNESS = 5.0  # [N·m/rad]
-STIFFNESS_PER_LOAD = 2.0  # [1/rad]
-LEAST_INERTIA = 1e-12  # inertia of a joint below which the value is a rounding error [kg·m²]
-#: a muscle counts as slack up to this much above the tension that its module maintains [N], because
+REQUIRED_STIFFNESS = 5.0  # require this joint stiffness, or less if the load is small [N·m/rad]
+#: require no more stiffness than this multiple of the largest load of a joint [1/rad]: a change of
+#: that load by a tenth then moves no joint by more than 0.05 rad
+STIFFNESS_PER_LOAD = 2.0
+LEAST_INERTIA = 1e-12  # regard a smaller inertia of a joint as a rounding error [kg·m²]
+#: count a muscle as slack up to this much above the tension that its module maintains [N], because
 #: the solver rounds
 SLACK_MARGIN = 1e-3
-# A moment arm counts if it is longer than the smaller of COUNTED_ARM and COUNTED_ARM_SHARE of the
-# longest one at its joint, but at least LEAST_COUNTED_ARM.
-COUNTED_ARM = 0.003  # moment arm with which a tension of 300 N produces about 1 N·m [m]
-COUNTED_ARM_SHARE = 0.1
-LEAST_COUNTED_ARM = 1e-4  # [m]
-#: moment arms below this length deviate by half or more in emulated individuals [m]
+COUNTED_ARM = 0.003  # count a moment arm above this, with which 300 N produce about 1 N·m [m]
+COUNTED_ARM_SHARE = 0.1  # also count a moment arm above this share of the longest one at its joint
+LEAST_COUNTED_ARM = 1e-4  # but count no shorter moment arm than this [m]
+#: warn about joints without longer moment arms [m]: shorter ones deviate by half or more in
+#: emulated individuals
 SHORT_ARM = 0.015
-#: share of postures in which a muscle may act with the wrong sign, or a joint may lack muscles on
-#: one side
+#: tolerate this share of postures in which a muscle acts with the wrong sign, or a joint lacks
+#: muscles on one side
 TOLERATED_SHARE = 0.05
-LEAST_DETOUR = 1e-6  # length added by wrapping below which the value is a rounding error [m]
-LONGEST_ARM = 1.0  # moment arm above which the points are assumed to be in millimetres [m]
-MILLIMETRES = 5.0  # typical moment arm above which all points must be in millimetres [m]
-#: ranges above which joint limits are assumed to be in degrees (revolute, [rad]) or in millimetres
-#: (prismatic, [m])
+LEAST_DETOUR = 1e-6  # regard a smaller length added by wrapping as a rounding error [m]
+LONGEST_ARM = 1.0  # warn about a longer moment arm [m]: its points are probably in millimetres
+#: report a fault if the typical moment arm is longer [m]: all points are then in millimetres
+MILLIMETRES = 5.0
+#: warn about a wider range of a joint: its limits are probably in degrees (revolute, [rad]) or in
+#: millimetres (prismatic, [m])
 WIDEST_RANGES = 4.0 * np.pi, 10.0
 DECLARATION_FILE = 'moment_arms.csv'
 COLUMNS = ['muscle', 'joint', 'sign']
@@ -123,7 +122,7 @@ class Setting(NamedTuple):
 
 
 def _slopes(robot: Robot, theta: Array) -> tuple[Array, Array]:
-    """Return `jacobian` and `hessian` of a `Setting`."""
+    """Return the first and second derivatives of the lengths, `jacobian` and `hessian`."""
     jacobian = robot.routes.muscle_jacobian
     return jacobian(theta), muscle_hessian(jacobian, theta)
 
@@ -188,7 +187,7 @@ def check_robot(robot: Robot, postures: int = 200, seed: int = 0) -> RobotCheck:
 
 
 def judge(setting: Setting) -> RobotCheck:
-    """Check whether the muscles of a robot hold and stiffen it in given postures.
+    """Judge whether the muscles of a robot hold and stiffen it in given postures.
 
     Args:
         setting: The robot and the postures.
@@ -208,7 +207,7 @@ def judge(setting: Setting) -> RobotCheck:
 
 
 def measure(setting: Setting) -> RobotCheck:
-    """Compute tensions, stiffness and moment arms in given postures, without any finding."""
+    """Measure tensions, stiffness and moment arms in given postures, without any finding."""
     robot, _, jacobian, _, torque, *_ = setting
     bias, limit = robot.tension.bias, robot.tension.limit
     tension, missing = np.full(jacobian.shape[:2], np.nan), np.zeros(torque.shape)
@@ -257,7 +256,7 @@ def _at_tensions(
 
 
 def _judge_suspended(setting: Setting, found: Equilibria) -> RobotCheck:
-    """Check a suspended robot in its equilibria, which need only be stable (`equilibria`)."""
+    """Judge a suspended robot in its equilibria, which need only be stable (`equilibria`)."""
     robot = setting.robot
     symmetric = 0.5 * (found.gradient + found.gradient.swapaxes(-1, -2))
     result = _at_tensions(setting, found.tension, found.missing, 0.0, symmetric)
@@ -340,7 +339,7 @@ def rounded_text(value: float, least: int = 1, largest: float | None = None) -> 
 
 
 def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int], int]:
-    """Return the signs of moment arms (±1) that `moment_arms.csv` declares.
+    """Read the signs of moment arms (±1) that `moment_arms.csv` declares.
 
     The keys are pairs of indices (muscle, joint). The result is empty if there is no such file.
 

@@ -21,12 +21,14 @@ from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 
-NEAR = 1.0  # standard deviation of θ − θ₀ [rad]
-SHARE = 0.5  # standard deviation of the share of T_limit by which a tension deviates
-BALANCE = 1e-4  # standard deviation of τ, as a share of the typical torque of weight and muscles
+NEAR = 1.0  # expect an equilibrium this far from θ₀ (standard deviation) [rad]
+SHARE = 0.5  # expect a tension to deviate by this share of T_limit (standard deviation)
+#: accept τ of this size (standard deviation), as a share of the typical torque of weight and
+#: muscles
+BALANCE = 1e-4
 DIFFERENCE = 1e-5  # half width of the differences of the weight's torque [rad]
-ROUNDS = 60  # largest number of steps
-#: A posture counts as an equilibrium if no joint lacks a larger share of the typical torque.
+ROUNDS = 60  # end the search after this many steps
+#: count a posture as an equilibrium if no joint lacks a larger share of the typical torque
 BALANCED = 0.01
 
 

@@ -29,8 +29,9 @@ from musculoskeletal_ae.design.checks import (
 )
 from musculoskeletal_ae.robot.description import shown
 
-LEAST_GAIN = 0.01  # smallest gain of a suggested change, in the share of held or stiff postures
-#: changes that are tried, the costliest first, each with its factors, the smallest step first
+#: suggest a change only if it raises the share of held or stiff postures by at least this
+LEAST_GAIN = 0.01
+#: changes to try, the costliest first, each with its factors, the smallest step first
 CHANGES = {
     'limits': (0.8, 0.6),
     'moment arms': (1.25, 1.5, 2.0),
@@ -124,7 +125,7 @@ def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Set
         terms = checks.arm_terms(robot, joint)
         text = f'{terms.name}s at {robot.joints[joint]} {factor:g} times as large'
         return setting._replace(jacobian=setting.jacobian * scale, hessian=hessian), text
-    if what == 'limits':  # the postures are scaled with the limits
+    if what == 'limits':  # scale the postures with the limits
         theta, middle = setting.theta.copy(), 0.5 * (robot.lower + robot.upper)[joint]
         # Round as the user would write the limits into the file.
         unit, digits = robot.units[joint], 4 if robot.units.slides[joint] else 2

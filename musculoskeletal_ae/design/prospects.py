@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What to expect of a robot before minutes of work: found within seconds, and printed first.
+"""Estimates within seconds whether an arm can be learned, before minutes of training.
 
 An arm that its muscles cannot hold explores nothing and therefore learns nothing. `check_robot`
 finds more, but takes longer for large arms.
@@ -17,12 +17,14 @@ from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-POSTURES = 150
+POSTURES = 150  # examine at most this many random postures
 BUDGET = 2.5  # examine no further posture after this time [s]
 LEAST_POSTURES = 20  # examine this many postures, however long it takes
-#: below this share of holdable postures, the arm can explore only where joint stops support it
+#: warn that training is pointless below this share of holdable postures: the arm then explores at
+#: most where joint stops support it
 POINTLESS_SHARE = 0.02
-NEAR_POSTURES = 10  # seek such postures near this many random ones
+#: near this many random postures, seek postures in which joint stops support some joints
+NEAR_POSTURES = 10
 HARD_SHARE = 0.5  # warn below this share of holdable postures
 
 
@@ -32,11 +34,11 @@ class Prospects(NamedTuple):
     robot: Robot
     held: int  # number of postures that the muscles can hold
     postures: int  # number of postures that were examined
-    #: near how many of NEAR_POSTURES random postures muscles and joint stops hold the arm; it is
-    #: counted only if the muscles alone hold hardly any
+    #: near how many of NEAR_POSTURES random postures muscles and joint stops hold the arm; 0 unless
+    #: the muscles alone hold hardly any
     supported: int
     idle: Bools  # whether no muscle moves each joint, (D,)
-    #: the joints that lack torque in most postures that are not held, by their number of postures
+    #: joints that most often lack torque in a posture that is not held, and in how many postures
     lacking: tuple[tuple[str, int], ...]
 
     @property

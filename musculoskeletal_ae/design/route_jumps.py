@@ -13,14 +13,15 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.robot.robot import Robot
 
-LINES = 60  # number of straight lines between random postures along which lengths are examined
-STEPS = 400  # number of postures along each line
-#: smallest second difference of a length along a line that counts as a jump [m]; the differences of
+LINES = 60  # examine lengths along this many straight lines between random postures
+STEPS = 400  # examine this many postures along each line
+#: count a larger second difference of a length along a line as a jump [m]; the differences of
 #: smooth lengths are a hundred times smaller
 JUMP = 0.001
-LEAST_RANGE = 0.3  # smallest share of a joint's range that a suggested limit may leave
-RANGE_MARGIN = 0.03  # distance between a suggested limit and the jumps, as a share of the range
-#: largest number of attempts to draw the points of an emulated individual so that no tendon jumps
+LEAST_RANGE = 0.3  # suggest no limits that leave a smaller share of a joint's range
+#: keep this distance between a suggested limit and the jumps, as a share of the range
+RANGE_MARGIN = 0.03
+#: draw the points of an emulated individual at most this often, to find ones without jumps
 MOST_DRAWS = 50
 
 
@@ -75,7 +76,7 @@ def newly_jumping(
         robot: The geometric model, for its joint limits.
     """
     jump = jumping(lengths, robot)
-    # Nearly always, no length jumps, and the nominal body need not be examined.
+    # Usually no length jumps; then do not examine the nominal body.
     return jump & ~jumping(nominal, robot) if jump.any() else jump
 
 
@@ -139,7 +140,7 @@ def jump_choices(robot: Robot) -> list[str]:
 
 
 def _limit_without_jumps(robot: Robot, there: Array, crossed: Ints) -> str:
-    """Suggest new limits of one joint that exclude all postures in which a length jumps.
+    """Limit one joint so that no length jumps; return its new limits as a suggestion.
 
     Of all joints, the one is chosen that keeps the largest share of its range.
 

@@ -23,17 +23,18 @@ from musculoskeletal_ae.robot.description import RoutePoint, refusal, written
 from musculoskeletal_ae.robot.drawing import draw_arm, save_picture
 from musculoskeletal_ae.robot.robot import Robot
 
-#: share of postures that may fail; the check uses other postures and tolerates a share of 0.05
+#: let this share of postures fail; the check, with other postures, tolerates a share of 0.05
 FAILING_SHARE = 0.02
-PENALTY = 10.0  # weight of failed requirements in the cost; the first term of the cost is below 1
-START_SPREAD = 0.2  # initial standard deviation of x
-TRIES = 40  # number of candidates evaluated for each of the 3P coordinates of the via points
-RESOLUTION = 1e-4  # step to which displacements of via points are rounded [m]
-THIN = 0.003  # width of a muscle in the picture [m]
+#: weight of missed requirements in the cost; above that of the displacement, which is below 1
+PENALTY = 10.0
+START_SPREAD = 0.2  # start the search with this standard deviation of x
+TRIES = 40  # evaluate this many candidates for each of the 3P coordinates of the via points
+RESOLUTION = 1e-4  # round displacements of via points to this step [m]
+THIN = 0.003  # draw muscles this wide in the picture [m]
 
 
 def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array, float, float]:
-    """Search for a change of the via points that makes a robot sound.
+    """Suggest a change of the via points that makes a robot sound.
 
     A muscle that changes the sign of its main action more often than before counts as a failed
     requirement as well.

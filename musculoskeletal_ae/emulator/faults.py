@@ -20,10 +20,10 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, MuscleReading, muscle_reading
 
-SPEED_LIMIT = 0.25  # largest speed of a muscle module's motor [m/s]; chosen by hand
-TURN = 6.2832  # largest turn of the base, by which it is upright again [rad]
-SPIKE_SHARE = 0.05  # fraction of the readings in which one muscle has a spike
-BURST_TIME, BURST_PAUSE = 0.3, 3.0  # mean duration of a burst, and of the pause before it [s]
+SPEED_LIMIT = 0.25  # let a muscle module's motor turn no faster than this [m/s]; chosen by hand
+TURN = 6.2832  # accept no larger turn of the base, which is then upright again [rad]
+SPIKE_SHARE = 0.05  # give one muscle a spike in this share of the readings
+BURST_TIME, BURST_PAUSE = 0.3, 3.0  # let bursts and the pauses before them last this on average [s]
 
 
 class FaultKind(NamedTuple):
@@ -110,20 +110,21 @@ class Fault(NamedTuple):
 
 
 def read_fault(line: str, robot: Robot) -> Fault:
-    """Return the fault that a line describes.
+    """Read the fault that a line describes.
 
     Raises:
         MusculoskeletalError: If the line is not legal; the message lists the legal forms.
     """
     name, *words = (word.strip() for word in line.split(':'))
     if name not in KINDS:
-        raise MusculoskeletalError(f'{line[:80]!r}; legal: {LEGAL}')
+        raise MusculoskeletalError(f'fault {line[:80]!r}: unknown kind; legal: {LEGAL}')
     kind = KINDS[name]
     if name == 'exchange':
         words = words or [robot.joints[0], robot.joints[-1]]
         if len(words) != 2 or not set(words) <= set(robot.joints):
             legal = f'exchange:JOINT:JOINT; joints: {", ".join(robot.joints)}'
-            raise MusculoskeletalError(f'{line[:80]!r}; legal: {legal}')
+            problem = f'fault {line[:80]!r}: expected two joints'
+            raise MusculoskeletalError(f'{problem}; legal: {legal}')
         return Fault(name, ('theta',), np.array([robot.joints.index(word) for word in words]), 0.0)
     quantities: tuple[str, ...] = SENSED if kind.of_quantity else ()
     size, largest, unit = kind.size, kind.largest, kind.unit
@@ -146,13 +147,13 @@ def read_fault(line: str, robot: Robot) -> Fault:
             pass
     if not smallest <= size <= largest:
         legal = f'sizes from {smallest:g} to {largest:g} {unit}'
-        raise MusculoskeletalError(f'{line[:80]!r}; legal: {legal}')
+        raise MusculoskeletalError(f'fault {line[:80]!r}: wrong size; legal: {legal}')
     if words and not kind.of_muscle:
         legal = f'{name}[:SIZE], without the name of a muscle or joint'
-        raise MusculoskeletalError(f'{line[:80]!r}; legal: {legal}')
+        raise MusculoskeletalError(f'fault {line[:80]!r} concerns the whole arm; legal: {legal}')
     if quantities == ('theta',):
         if unknown := [word for word in words if word not in robot.joints]:
-            problem = f'{line[:80]!r}: unknown joint {unknown[0]!r}'
+            problem = f'fault {line[:80]!r}: unknown joint {unknown[0]!r}'
             raise MusculoskeletalError(f'{problem}; legal: {", ".join(robot.joints)}')
         joints = [robot.joints.index(word) for word in words] or range(robot.joint_count)
         return Fault(name, quantities, np.array(joints), size)
@@ -187,7 +188,7 @@ class Faults:
         self.set([])
 
     def set(self, lines: Iterable[str]) -> None:
-        """Activate the faults that the lines describe, and end all other faults.
+        """Set the active faults to those that the lines describe.
 
         Raises:
             MusculoskeletalError: If a line is not legal; the faults are then unchanged.
@@ -234,7 +235,7 @@ class Faults:
         return [fault for fault in self._faults if fault.kind in names]
 
     def pass_time(self, duration: float) -> None:
-        """Advance the time of drifts and bursts by `duration` [s]."""
+        """Pass the time `duration` [s] for drifts and bursts."""
         self._time += duration
 
     def _is_in_burst(self, fault: Fault) -> bool:
@@ -246,7 +247,7 @@ class Faults:
         return is_present
 
     def apply(self, readings: Readings) -> Readings:
-        """Return the readings with all sensor faults applied."""
+        """Apply all sensor faults to readings, and return the result."""
         values = {name: getattr(readings, name).copy() for name in (*SENSED, 'theta')}
         values['tension'] = np.minimum(values['tension'], self.ceiling)
         kinds = 'exchange', 'bias', 'drift', 'burst', 'spike', 'dead_sensor', 'nan_sensor', 'freeze'

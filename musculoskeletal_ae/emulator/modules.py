@@ -29,38 +29,39 @@ from musculoskeletal_ae.robot.joint_units import SLIDE
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-STEP = 0.001  # [s]
+STEP = 0.001  # simulate in steps of this duration [s]
 
-# Modes of a module.
+# modes of a module
 SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 
 # The following values are chosen by hand, because those of Musashi are not public.
-#: rate at which a module in the safe state approaches T_bias [N/s]
+#: let a module in the safe state approach T_bias at this rate [N/s]
 RELEASE_RATE = 100.0
-MOTOR_GAIN = 0.004  # speed of winding in per newton of missing tension [m/s/N]
-POSITION_LAG = 0.02  # time constant of a position-controlled module [s]
+MOTOR_GAIN = 0.004  # wind in at this speed for each newton of missing tension [m/s/N]
+POSITION_LAG = 0.02  # let a position-controlled module follow with this time constant [s]
 # Heat. Each motor is sized for its muscle: constant T_limit heats the average module to 85 °C at
 # the housing and 105 °C in the winding.
-AMBIENT = 25.0  # [°C]
-LOSS = 20.0  # heat loss of a motor at T_limit [W]
-WINDING_CAPACITY, HOUSING_CAPACITY = 20.0, 150.0  # [J/K]
-WINDING_RESISTANCE, HOUSING_RESISTANCE = 1.0, 3.0  # [K/W]
-HEAT_SPREAD = 0.15  # standard deviation of the logarithm of LOSS, the capacities and resistances
+AMBIENT = 25.0  # temperature of the surroundings [°C]
+LOSS = 20.0  # let a motor at T_limit lose this power as heat [W]
+WINDING_CAPACITY, HOUSING_CAPACITY = 20.0, 150.0  # heat capacities of an average module [J/K]
+WINDING_RESISTANCE, HOUSING_RESISTANCE = 1.0, 3.0  # thermal resistances of that module [K/W]
+#: draw LOSS, capacities and resistances with this standard deviation of their logarithms
+HEAT_SPREAD = 0.15
 
-# Sensors. The values are chosen by hand. Noise is one standard deviation. Readings are rounded to
-# the resolution, which is a power of two as for an A/D converter.
-ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # [rad]
-LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # [m]
-TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # [N]
-#: largest noise of a tension sensor relative to T_bias: sensors of weak muscles are finer
+# Sensors. The values are chosen by hand. Each reading gets noise of this standard deviation, and is
+# rounded to this resolution, a power of two as of an A/D converter.
+ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # of joint angles [rad]
+LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # of muscle lengths [m]
+TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # of tensions [N]
+#: limit the noise of a tension sensor to this share of T_bias: sensors of weak muscles are finer
 TENSION_NOISE_SHARE = 0.1
-TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3  # [°C]
+TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3  # of housing temperatures [°C]
 CURRENT_NOISE, CURRENT_RESOLUTION = 1.0, 2.0**-3  # of a motor current, as a tension [N]
-#: errors of a motor current as a measure of tension: standard deviation of the logarithm of the
-#: scale, standard deviation of the offset [N], and mean drive friction as a share of T_limit
+#: draw errors of a motor current as a measure of tension: standard deviation of the scale's
+#: logarithm, standard deviation of the offset [N], and mean drive friction as a share of T_limit
 CURRENT_SCALE, CURRENT_ZERO, DRIVE_FRICTION = 0.15, 5.0, 0.1
-ACCELERATION_NOISE = 0.05  # [m/s²]
-MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # of the position [m] and the orientation [rad]
+ACCELERATION_NOISE = 0.05  # of each axis of an accelerometer [m/s²]
+MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # of a marker's position [m] and orientation [rad]
 
 
 def joint_gear(kinematics: Kinematics) -> Array:
@@ -76,13 +77,13 @@ def joint_gear(kinematics: Kinematics) -> Array:
 class Modules(NamedTuple):
     """Constants of the modules, each of shape (M,)."""
 
-    length_low: Array  # limits of the l to which the motor can wind [m]
-    length_high: Array
+    length_low: Array  # shortest motor-side length that the motor can reach [m]
+    length_high: Array  # longest motor-side length that the motor can reach [m]
     stiffness: Array  # K of muscle stiffness control [N/m]
     follows_position: Array  # 1 for position-controlled modules
     speed: Array  # largest speed [m/s]
     tension_bias: Array  # [N]
-    tension_max: Array
+    tension_max: Array  # [N]
     loss: Array  # k [W/N²]
     winding_capacity: Array  # C₁ [J/K]
     housing_capacity: Array  # C₂
@@ -135,7 +136,7 @@ def wind(
     modules: Modules, muscle: MuscleState, kind: int, command: Command, m: int,
     reading: float, tension: float,
 ) -> float:  # fmt: skip
-    """Turn the motor of one module for one step of 1 ms, as its control law demands.
+    """Wind one module for one step of 1 ms, as its control law demands.
 
     Args:
         modules: Constants of all modules.
@@ -249,7 +250,7 @@ class Arm(ABC):
         self._drive_friction: Array = share * robot.description.tension.limit
         self._mount = self.faults.mount  # turn of the base that the simulation uses
         self._wrench = np.zeros(6)
-        self._friction_factor = 1.0  # friction that varies, as a multiple of the individual's own
+        self._friction_factor = 1.0  # present friction, as a multiple of the individual's own
         self._command = Command(
             np.zeros(robot.muscle_count), length_bias.copy(), self.faults.stuck,
             self.faults.slack, self.faults.zero, self.faults.hot, self.faults.ceiling,
@@ -257,7 +258,7 @@ class Arm(ABC):
         self._muscle = MuscleState(*(np.zeros(robot.muscle_count) for _ in MuscleState._fields))
 
     def _make_modules(self, span: Array, stretch: Array) -> Modules:
-        """Return the modules' constants.
+        """Make the modules' constants.
 
         Args:
             span: Route lengths relative to those at θ = 0 [m], in N postures, (N, M).
@@ -276,7 +277,7 @@ class Arm(ABC):
         return Modules(low, high, robot.stiffness, follows, speed, *limits, *thermal)
 
     def reset(self, theta: Array | None = None) -> None:
-        """Put the arm at rest and at ambient temperature, and repair ruptured tendons.
+        """Reset the arm to rest and to ambient temperature, and repair ruptured tendons.
 
         The external wrench ends. All muscles carry T_bias, and the modules wait for the first
         command. Payload, length offsets and `faults` do not change; a tendon that one of the faults
@@ -298,7 +299,7 @@ class Arm(ABC):
         self._age = 0.0
 
     def _attach(self, which: Bools) -> None:
-        """Wind the selected muscles so that they carry T_bias in the present posture."""
+        """Attach the selected muscles so that they carry T_bias in the present posture."""
         bias = self.robot.tension.bias
         length = self.individual.muscle_lengths(self.theta[None], bias)[0] - self.faults.slack
         self._muscle.length[which] = length[which]
@@ -377,7 +378,7 @@ class Arm(ABC):
 
     @abstractmethod
     def set_payload(self, mass: float) -> None:
-        """Attach a mass [kg] to the hand, as a ball of 5 cm radius at the end effector."""
+        """Set the mass [kg] in the hand, a ball of 5 cm radius at the end effector."""
 
     @property
     @abstractmethod
@@ -394,7 +395,7 @@ class Arm(ABC):
         self._friction_factor = factor
 
     def set_wrench(self, wrench: Array) -> None:
-        """Apply a force [N] and torque [N·m] to the end effector, in the root link's axes, (6,)."""
+        """Set the force [N] and torque [N·m] on the end effector, in the root link's axes, (6,)."""
         self._wrench[:] = wrench
 
     def set_length_offset(self, offset: Array | Sequence[float]) -> None:
@@ -408,11 +409,11 @@ class Arm(ABC):
         """
         if len(offset) not in (1, self.robot.muscle_count):
             legal = f'1 or {self.robot.muscle_count} numbers [m]'
-            raise MusculoskeletalError(f'{list(offset)}; legal: {legal}')
+            raise MusculoskeletalError(f'length offsets {list(offset)}; legal: {legal}')
         self._command.length_error[:] = self._length_bias + np.asarray(offset)
 
     def set_ruptured(self, muscles: Iterable[str]) -> None:
-        """Rupture the named muscles and repair all others; a repaired muscle returns to T_bias.
+        """Set which muscles are ruptured; repair all others, which return to T_bias.
 
         Raises:
             MusculoskeletalError: If a name is unknown; nothing changes then.
@@ -424,7 +425,7 @@ class Arm(ABC):
         self._attach(repaired)
 
     def set_faults(self, lines: Iterable[str]) -> None:
-        """Activate the faults that the lines describe, and end all other faults.
+        """Set the active faults to those that the lines describe.
 
         Muscles whose tendon becomes shorter or whole, because a fault 'slack' or 'rupture' ends,
         return to T_bias.
@@ -456,7 +457,7 @@ class Arm(ABC):
 
     @abstractmethod
     def _turn_gravity(self, mount: Array) -> None:
-        """Simulate with the weight of an arm whose base is turned by `mount` (`Faults.mount`)."""
+        """Turn the gravity of the simulation as for a base turned by `mount` (`Faults.mount`)."""
 
     @abstractmethod
     def _raw_readings(self) -> tuple[Array, Array, Array, Array]:
@@ -470,7 +471,7 @@ class Arm(ABC):
         """Read all sensors once, with noise, bias, resolution and faults."""
         theta, length, tension, housing = self._raw_readings()
         ruptured, rng = self._muscle.ruptured > 0.0, self._rng
-        # A ruptured tendon does not load the sensor, and a tension sensor does not read below zero.
+        # Let the sensor of a ruptured tendon read 0, and no tension sensor less than 0.
         finest = TENSION_NOISE_SHARE * self.robot.description.tension.bias
         fineness = np.minimum(1.0, finest / TENSION_NOISE)
         noise, resolution = fineness * TENSION_NOISE, fineness * TENSION_RESOLUTION
@@ -487,7 +488,7 @@ class Arm(ABC):
         return readings._replace(tension=self.robot.tension_source.known(readings.tension))
 
     def _read_currents(self, tension: Array) -> Array:
-        """Return the tensions that noisy motor currents indicate [N], (M,).
+        """Read the tensions that noisy motor currents indicate [N], (M,).
 
         These tensions include the friction of the drive, which a motor carries in addition to the
         tension of its tendon.

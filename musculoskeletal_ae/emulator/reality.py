@@ -21,7 +21,7 @@ def make_arm(
     friction: bool = True,
     deviates: bool = False,
 ) -> Arm:
-    """Return an emulated arm at rest.
+    """Make an emulated arm, at rest.
 
     Args:
         robot: The robot to emulate.

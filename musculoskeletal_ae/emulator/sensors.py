@@ -12,7 +12,8 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.robot.robot import Robot
 
-MARKER_RATE, HIGHEST_RATE = 10.0, 100.0  # default and largest rate of the marker [Hz]
+MARKER_RATE = 10.0  # publish the marker's pose at this rate by default [Hz]
+HIGHEST_RATE = 100.0  # reject a higher rate of the marker [Hz]
 LEGAL = f'joints, marker[:RATE] (above 0 to {HIGHEST_RATE:g} Hz) and imu:LINK, each once'
 
 
@@ -25,7 +26,7 @@ class Sensors(NamedTuple):
 
 
 def read_sensors(lines: Iterable[str], robot: Robot) -> Sensors:
-    """Return the sensors that the lines describe.
+    """Read which sensors the lines describe.
 
     Raises:
         MusculoskeletalError: If a line is not legal; the message lists the legal forms.
@@ -40,13 +41,14 @@ def read_sensors(lines: Iterable[str], robot: Robot) -> Sensors:
         elif kind == 'imu':
             links = [str(frame.name) for frame in body_frames(robot.kinematics.model)]
             if detail not in links:
-                problem = f'{line[:80]!r}: unknown link {detail[:80]!r}'
+                problem = f'sensor {line[:80]!r}: unknown link {detail[:80]!r}'
                 raise MusculoskeletalError(f'{problem}; legal: {", ".join(links)}')
             sensors = sensors._replace(imu_link=detail)
         else:
-            raise MusculoskeletalError(f'{line[:80]!r}; legal: {LEGAL}')
+            raise MusculoskeletalError(f'{line[:80]!r} describes no sensor; legal: {LEGAL}')
         if kind in kinds:
-            raise MusculoskeletalError(f'{line[:80]!r} is the second sensor of its kind; {LEGAL}')
+            problem = f'sensor {line[:80]!r} is the second sensor of its kind'
+            raise MusculoskeletalError(f'{problem}; legal: {LEGAL}')
         kinds.add(kind)
     return sensors
 
@@ -57,5 +59,5 @@ def _rate(line: str, word: str) -> float:
     except ValueError:
         rate = 0.0
     if not 0.0 < rate <= HIGHEST_RATE:
-        raise MusculoskeletalError(f'{line[:80]!r}; legal: {LEGAL}')
+        raise MusculoskeletalError(f'sensor {line[:80]!r}: wrong rate; legal: {LEGAL}')
     return rate

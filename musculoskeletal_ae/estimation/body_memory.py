@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keeps length offsets and isolated muscles on disk, for the next start of the estimator.
 
-An estimator that finds the file `estimator.offsets` isolates the muscles that it names. It
-considers its length offsets unknown until the next length calibration, because the modules may have
-lost their counts meanwhile. It uses the saved offsets until then, so that estimates and commands
-change little. The file has no offsets if they are known to be zero, as those of absolute sensors
-that were never calibrated. As long as the body is healthy as well, there is no file.
+An estimator that finds the file `estimator.offsets` isolates the muscles that it names. It uses the
+saved length offsets, so that estimates and commands change little. It considers them unknown until
+the next length calibration, because the modules may have lost their counts meanwhile. The file
+contains no offsets if they are known to be zero, as those of absolute sensors that were never
+calibrated. If the body is healthy as well, there is no file.
 
-Without this file, an estimator that has restarted would assume a healthy body with offsets of zero.
-The other nodes would have to conclude from the change that this is wrong.
+Without this file, a restarted estimator would assume a healthy body with offsets of zero, and the
+other nodes would have to infer from the change that this is wrong.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.signals.body_state import MOST_OFFSET, BodyState, LengthOffsets
 
 FILE = 'estimator.offsets'
-LARGEST = 1_000_000  # size limit of the file [bytes]
+LARGEST = 1_000_000  # ignore a larger file [bytes]
 RETRY_INTERVAL = 2.0  # wait this long after a failed attempt to write [s]
 
 
 class SavedBody(NamedTuple):
-    """What the previous estimator has left behind."""
+    """The body state that the previous estimator saved."""
 
     #: offsets [m], (M,), 0 for muscles that the file does not name; None if they were known to be 0
     offset: Array | None
@@ -42,15 +42,15 @@ class SavedBody(NamedTuple):
 
 
 class BodyMemory:
-    """Reads and writes the file.
+    """Reads and writes the file of length offsets and isolated muscles.
 
     Attributes:
-        found: What the previous estimator has left behind; None if there was none.
+        found: The body state that the previous estimator saved; None if there was none.
         problem: Why the present body state is not saved, as a text for users, or ''.
     """
 
     def __init__(self, directory: Path | None, muscles: Sequence[str]) -> None:
-        """Read the file.
+        """Read the file of the previous estimator.
 
         Args:
             directory: Directory of the file. With None, nothing is read or saved.
@@ -74,7 +74,7 @@ class BodyMemory:
                     self.found = self._read(self._file)
 
     def _read(self, file: Path) -> SavedBody:
-        """Return the content of the file; offsets of 0 and no isolated muscle if it is damaged."""
+        """Read the file; return offsets of 0 and no isolated muscle if it is damaged."""
         nothing = SavedBody(np.zeros(len(self._muscles)), (), 0)
         with suppress(MusculoskeletalError, ValueError, TypeError, KeyError, AttributeError):
             content = json.loads(
@@ -91,7 +91,7 @@ class BodyMemory:
         return nothing
 
     def note(self, body: BodyState) -> None:
-        """Save the present body state if it has changed.
+        """Note the present body state, and save it if it has changed.
 
         Provisional offsets of a calibration are not saved. If writing fails, `problem` states the
         reason, and a later call tries again.
@@ -128,8 +128,8 @@ class BodyMemory:
         }
         file.parent.mkdir(parents=True, exist_ok=True)
         # Write without fsync, which could delay an estimate by 0.1 s. If the process is killed,
-        # nothing that was written is lost. A power failure may leave an empty file, which counts as
-        # a damaged one.
+        # nothing that was written is lost. A power failure may leave an empty file; a reader treats
+        # it as damaged.
         new = file.with_name(f'.{FILE}')
         new.write_text(json.dumps(content), encoding='utf-8')
         new.replace(file)

@@ -33,17 +33,18 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-#: bandwidth of the filter [1/s]; damping ratio 0.5 (critical damping would be a third slower)
+#: filter with this bandwidth [1/s] and a damping ratio of 0.5 (critical damping is a third slower)
 BANDWIDTH = 25.0
-LARGEST_USUAL = 20.0  # F₀: largest usual force at the hand [N]
+LARGEST_USUAL = 20.0  # F₀: assume no larger force at the hand in normal use [N]
 REGULARISATION = np.eye(3) / LARGEST_USUAL**2
-#: distance from a limit below which a joint counts as at its stop [rad]; about as large as the
-#: error of the estimate
+#: count a joint as at its stop below this distance from the limit [rad], which is about the error
+#: of the estimate
 AT_STOP = 0.06
-TURNED = 0.02  # motion of a joint after which G is evaluated again [rad]
-#: threshold of d; for five healthy arms that explored for ten minutes each, d was at most 8.6
+TURNED = 0.02  # evaluate G again after a joint has moved by this much [rad]
+#: report contact if d exceeds this; on five healthy arms that explored for ten minutes each, d was
+#: at most 8.6
 CONTACT = 10.0
-IN_A_ROW = 2  # number of consecutive messages with d > CONTACT that count as a contact
+IN_A_ROW = 2  # report contact after this many consecutive messages with d > CONTACT
 
 
 class Contact(NamedTuple):
@@ -132,7 +133,7 @@ class ContactEstimator:
             self._weight = 1.0 / healthy.spread**2
 
     def reset(self) -> None:
-        """Restart the filter, for example after a jump of the clock."""
+        """Reset the filter, for example after a jump of the clock."""
         self._filter.reset()
         self.velocity: Array = np.zeros(self._robot.joint_count)
         self._beyond = 0  # consecutive messages with d > CONTACT

@@ -8,12 +8,11 @@
                          ▲                                                              │
                          └───────── isolated muscles, anomaly ──────────────────────────┘
 
-The body state consists of the length offsets, the isolated muscles and the anomaly. When one of
-them changes, only the estimator creates a new body state, which its node publishes.
-`length_trust.py` decides which length
-offsets are known; the other parts provide evidence. During a length calibration, only the
-detectors that do not need lengths report findings. `suspects.py` describes the sequence from a
-rupture to resuming.
+The body state consists of the length offsets, the isolated muscles and the anomaly. Only the
+estimator creates a new one, when one of these changes; its node publishes it. `length_trust.py`
+decides which length offsets are known, on the evidence of the other parts. During a length
+calibration, only the detectors that do not need lengths report findings. `suspects.py` describes
+the sequence from a rupture to resuming.
 """
 
 import math
@@ -56,13 +55,13 @@ from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.limits import Persistence
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
-#: Age up to which measured joint angles are used with a message [s]. It is much shorter than
-#: SILENCE, because an older reading belongs to another posture of a moving arm.
+#: Use measured joint angles with a message only if they are younger than this [s]. It is much
+#: shorter than SILENCE, because an older reading belongs to another posture of a moving arm.
 JOINTS_AGE = 0.05
 
 
 class Output(NamedTuple):
-    """The results of one message.
+    """What the estimator has computed from one message.
 
     Attributes:
         sample: The readings.
@@ -249,7 +248,7 @@ class Estimator:
         self._note(evidence, found=LengthOffsets(offset, unknown.deviation))
 
     def calibrate_lengths(self, posture: tuple[float, ...] = ()) -> None:
-        """Start a length calibration, while the arm stands in a posture or moves gently.
+        """Calibrate the lengths from now on, while the arm stands in a posture or moves gently.
 
         Args:
             posture: Positions of the joints at which the arm stands [rad or m], (D,); () if it
@@ -291,7 +290,7 @@ class Estimator:
         return self.joint_check.trust
 
     def confirm_joint_sensors(self) -> tuple[int, ...]:
-        """Take the joint sensors as they are, as the user wants; return the joints concerned.
+        """Confirm the joint sensors, as the user wants; return the joints concerned.
 
         Sensors in doubt are trusted again, and the readings of the doubtful time count as well.
         Sensors without readings count as removed until they report again.
@@ -320,7 +319,7 @@ class Estimator:
         self.isolate(muscle for muscle in self.body.isolated if muscle not in restored)
 
     def reset(self, isolating: Iterable[int] = ()) -> None:
-        """Clear the anomaly, and consider the body healthy in its present state.
+        """Reset the anomaly, and consider the body healthy in its present state.
 
         Args:
             isolating: Muscles (indices) that the caller isolates next; they need not be healthy.
@@ -349,7 +348,7 @@ class Estimator:
     # -- messages -------------------------------------------------------------------------------
 
     def take(self, message: Any, time: float, now: float, delay: float = 0.0) -> Output | None:
-        """Estimate the state from a message of muscle_states, and check for faults.
+        """Take a message of muscle_states: estimate the state, and check for faults.
 
         Args:
             message: The message, or a `MuscleReading`.
@@ -389,7 +388,7 @@ class Estimator:
         return posture_of_marker(self.robot, pose, start)
 
     def report(self, now: float) -> Report:
-        """Return the status for /diagnostics."""
+        """Report the status for /diagnostics."""
         return status.report(self, now)
 
     def conditions(self, now: float) -> tuple[Condition, ...]:
@@ -419,7 +418,7 @@ class Estimator:
         pause = max(elapsed, sent_apart)
         if pause > INTERRUPTION:
             # What happened in the pause is unknown: the driver may have received no commands, or
-            # the whole computer may have stood still.
+            # the whole computer may have stopped.
             self.health.reset()
         if pause > SILENCE:
             self.contact.reset()
@@ -506,14 +505,14 @@ class Estimator:
         muscles: Iterable[int] | None = None,
         found: LengthOffsets | None = None,
     ) -> None:
-        """Decide by new evidence on length offsets, and use the result (`LengthTrust.take`)."""
+        """Note new evidence on length offsets, and use the decision on it (`LengthTrust.take`)."""
         if self.trust.take(evidence, muscles, found):
             self._update_body(offsets=self.trust.offsets)
 
     def _update_body(self, **changes: Any) -> None:
-        """Change attributes of the body state, and the anomaly as `suspects` says.
+        """Change attributes of the body state, and take its anomaly from `suspects`.
 
-        A body state that differs from the one before has the next generation.
+        If the body state then differs from the previous one, its generation increases by one.
         """
         suspects, before = self.suspects, self.body
         body = replace(before, anomaly=suspects.anomaly, suspect=suspects.suspect, **changes)
@@ -522,7 +521,7 @@ class Estimator:
             self.stream.use_body(self.body)
 
     def _measured_theta(self, readings: Array) -> Array | None:
-        """Return fresh readings (D,), or None if a joint sensor has none or is not used."""
+        """Return the readings (D,) if all are fresh and their sensors are used; otherwise None."""
         is_known = not self.joint_trust.unused and np.isfinite(readings).all()
         return readings if is_known else None
 
@@ -546,7 +545,7 @@ class Estimator:
     def _check_suspect(self, isolating: Iterable[int]) -> None:
         """Check that the suspects may be used again, unless they are among the muscles `isolating`.
 
-        If the length of one has jumped since the finding, its length offset is then confirmed.
+        Then confirm the length offset of each suspect whose length has jumped since the finding.
 
         Raises:
             MusculoskeletalError: If the suspect may not be used yet.

@@ -16,7 +16,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-#: longest time from a fault to its finding [s]; messages of this time may already be wrong
+#: discard the messages of this time before a finding [s]: the fault may have begun so much earlier
 DETECTION_DELAY = 2.0
 
 

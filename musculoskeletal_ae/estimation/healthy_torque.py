@@ -16,17 +16,17 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION
 
-MEMORY = 180.0  # largest time constant of the average; only time in motion counts [s]
-MOVING = 0.05  # norm of the joint velocities above which an arm moves [rad/s]
-#: multiple of σ to which torques are clipped, because larger torques indicate contact
+MEMORY = 180.0  # average over at most this much time in motion (time constant) [s]
+MOVING = 0.05  # count an arm as moving above this norm of the joint velocities [rad/s]
+#: clip torques to this multiple of σ, because larger ones indicate contact
 OUTLIER = 5.0
-LEAST_SPREAD = 1e-3  # smallest σ [N·m]
+LEAST_SPREAD = 1e-3  # assume at least this σ [N·m]
 
 
 class HealthyTorque:
     """Measures the external torque σ that is wrongly estimated for a healthy moving arm.
 
-    The average covers the last minutes of motion, with whichever networks the torque was estimated.
+    The average covers the last minutes of motion, even if the network changed meanwhile.
     """
 
     def __init__(self, joint_count: int) -> None:
@@ -60,6 +60,7 @@ class HealthyTorque:
         if self._time > LEAST_MOTION:
             square = np.minimum(square, OUTLIER**2 * self._square)
         self._time = min(self._time + dt, MEMORY)
-        # A torque of exactly 0 means that the joint is at its stop, where τ_ext is not known.
+        # A torque of exactly 0 means that the joint is at its stop, where τ_ext is unknown; keep
+        # its σ.
         change = np.where(torque == 0.0, 0.0, square - self._square)
         self._square = self._square + dt / self._time * change

@@ -47,40 +47,40 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.joint_trust import NOT_USED, JointTrust, SensorTrust
 
-SPACING = 0.5  # shortest time between two messages that count [s]
-#: a message counts if the estimate of a joint has moved by this much since the last one that
+SPACING = 0.5  # count at most one message in this time [s]
+#: count a message only if the estimate of a joint has moved by this much since the last one that
 #: counted [rad]
 MOVED = 0.03
-EARLIER = 600  # largest number of earlier messages, at least 5 min of motion
+EARLIER = 600  # keep this many earlier messages, which are at least 5 min of motion
 #: Count no message with more evidence for an external load than this (`contact.py`, d). Under a
 #: load that was not learned, the estimate may be wrong, and not the joint sensor.
 LOADED = 3.0
-ENOUGH = 80  # judge a sensor by this many earlier messages at least
-NEWEST = 48  # number of newest messages, which are judged by all messages before them
-#: Windows in which a sensor is judged: number of messages, smallest limit of the median of |x|
-#: [rad], and limit in healthy spreads of x. The short window finds large errors fast; the long one
+ENOUGH = 80  # judge a sensor by at least this many earlier messages
+NEWEST = 48  # judge this many of the newest messages, by all messages before them
+#: Judge a sensor in these windows: number of messages, smallest limit of the median of |x| [rad],
+#: and limit in healthy spreads of x. The short window finds large errors fast; the long one
 #: averages over more postures.
 WINDOWS = ((6, 0.12, 7.0), (24, 0.07, 3.0), (NEWEST, 0.06, 2.2))
-#: Multiply the limits by 1 + FEW/n if there are n earlier messages
+#: multiply the limits by 1 + FEW/n if there are n earlier messages
 FEW = 20.0
-#: Trust a sensor again once the median of |x| is below AGREEING_LIMIT [rad], or below
-#: AGREEING_SPREADS healthy spreads of x. It has to be so over the newest AGREEING messages and over
-#: the newer half of them.
+#: Trust a sensor again once the median of |x| is below AGREEING_LIMIT [rad] or AGREEING_SPREADS
+#: healthy spreads of x, both over the newest AGREEING messages and over the newer half of them.
 AGREEING, AGREEING_LIMIT, AGREEING_SPREADS = 12, 0.035, 1.0
-#: Smallest healthy spread of r [m], which bounds the precision of any length sensor
+#: assume at least this healthy spread of a length residual [m], because no length sensor is more
+#: precise
 LEAST_SPREAD = 0.0005
-#: Doubt joint sensors if the assumption that they are false leaves a sum of squares of Δ that is
-#: smaller than this share of the one that a change of any single muscle leaves
+#: Doubt joint sensors if false joint sensors would leave a smaller sum of squares of Δ than this
+#: share of what a change of any single muscle would leave
 BETTER = 0.7
 USES = 10  # compute the medians of the earlier messages again after this many messages
-TO_SIGMA = 1.48  # standard deviation of a normal distribution, in medians of absolute deviations
-#: doubt a sensor with fewer earlier messages if its reading differs from the estimate by this much
-#: [rad]
+TO_SIGMA = 1.48  # multiply a median of absolute deviations by this to get the standard deviation
+#: doubt a sensor even with few earlier messages if its reading differs from the estimate by this
+#: much [rad]
 GROSS = 0.8
 
 
 class _Message(NamedTuple):
-    """Readings of one message that counts."""
+    """The readings of one message that counts for the judgement."""
 
     time: float  # [s]
     theta: Array  # readings of the joint sensors [rad], (D,); NaN where unknown or in doubt
@@ -94,7 +94,7 @@ class _Usual(NamedTuple):
     deviation: Array  # θ − θ̂ [rad], (D,); 0 if unknown
     deviation_spread: Array  # [rad], (D,); NaN if unknown
     known_count: Ints  # number of these messages, (D,)
-    residual: Array  # r [m], (M,)
+    residual: Array  # l − l_net(θ̂, T_end) [m], (M,)
     residual_spread: Array  # [m], (M,)
 
 
@@ -112,7 +112,7 @@ class JointSensorCheck:
         self.trust = JointTrust.full(robot.joint_count)
         #: messages in order of time; the last NEWEST of them are judged by the earlier ones
         self._messages: deque[_Message] = deque(maxlen=EARLIER + NEWEST)
-        #: θ − θ̂ [rad] (D,) and r [m] (M,) of each message with the network in use
+        #: θ − θ̂ [rad] (D,) and l − l_net(θ̂, T_end) [m] (M,) of each message with the network in use
         self._compared: deque[tuple[Array, Array]] = deque(maxlen=EARLIER + NEWEST)
         self._since = 0.0  # time since the last message that counted [s]
         #: estimate at the last message that counted [rad], (D,)
@@ -121,7 +121,7 @@ class JointSensorCheck:
         self._uses = 0  # number of messages judged by `_usual`
 
     def use(self, mae: Mae) -> None:
-        """Use another network; its isolated muscles are ignored."""
+        """Use another network from now on, and ignore the muscles that it isolates."""
         self._mae, self._usual = mae, None
         self._compared.clear()
         if not self._messages:
@@ -136,21 +136,21 @@ class JointSensorCheck:
         self._compared.extend(zip(deviation, residual - mae.lengths(estimate, tension)))
 
     def drop_newest(self) -> None:
-        """Discard the newest messages, because an anomaly has been found."""
+        """Drop the newest messages, because an anomaly has been found."""
         for _ in range(min(NEWEST, len(self._messages))):
             self._messages.pop()
             self._compared.pop()
 
     def forget(self) -> None:
-        """Discard all messages, because the length offsets have changed; the trust stays."""
+        """Forget all messages, because the length offsets have changed; the trust stays."""
         self._usual = None
         self._messages.clear()
         self._compared.clear()
 
     def confirm(self) -> tuple[int, ...]:
-        """Trust all doubted sensors, because the user has confirmed them; return their joints.
+        """Confirm all doubted sensors, as the user wants; return their joints.
 
-        Their earlier readings are no anchor any more, because they contradict the confirmed ones.
+        Later readings are not compared with those from before the doubt, which contradict them.
         """
         joints, doubted = self.trust.doubted, self.trust.is_doubted
         if not joints:
@@ -196,7 +196,7 @@ class JointSensorCheck:
         if self._mae is None or self._since < SPACING - 1e-9 or np.isnan(theta).all():
             return
         has_moved = (np.abs(estimate - self._counted_at) > MOVED).any()
-        # A sensor that is far off is also found while the arm stands still.
+        # Look for readings that are far off even while the arm stands still.
         usual = 0.0 if self._usual is None else self._usual.deviation
         is_far = np.abs(theta - estimate - usual) > GROSS
         if not (has_moved or (is_far & ~self.trust.is_doubted).any()):
@@ -209,7 +209,7 @@ class JointSensorCheck:
         if len(self._messages) >= WINDOWS[0][0]:
             self._judge()
         if len(self._messages) > NEWEST:
-            # Readings of a sensor that is not used are no anchor.
+            # Do not compare later readings with those of a sensor that is not used.
             unused = ~self.trust.is_used
             self._messages[-1 - NEWEST].theta[unused] = np.nan
             self._compared[-1 - NEWEST][0][unused] = np.nan
@@ -225,7 +225,7 @@ class JointSensorCheck:
         doubted = self.trust.is_doubted
         for count, limit in self._limits(usual):
             new = (_median(np.abs(excess[-count:])) > limit) & ~doubted
-            # At least the newer half of a window that exceeds the limit shows the change.
+            # If a window exceeds the limit, at least its newer half shows the change.
             rows = -(count // 2)
             if new.any() and self._explains(new, excess[rows:], usual):
                 self._set(new, SensorTrust.DOUBTED, excess)
@@ -236,7 +236,7 @@ class JointSensorCheck:
             self._give_up(agrees)
 
     def _compute_usual(self) -> _Usual:
-        """Return medians and spreads of the earlier messages."""
+        """Compute the medians of the earlier messages, and their spreads about them."""
         earlier = list(self._compared)[:-NEWEST]
         deviation, residual = (
             np.array([each[part] for each in earlier]).reshape(len(earlier), len(values))
@@ -292,13 +292,13 @@ class JointSensorCheck:
         tension = np.array([message.tension for message in messages])
         length = np.nan_to_num([message.length for message in messages])
         estimate = mae.estimate(tension, length).theta
-        # Usual errors of readings and lengths are no sign of a fault.
+        # Remove the usual errors of readings and lengths, which are no sign of a fault.
         read = estimate + np.nan_to_num(excess)
         length = length - np.nan_to_num(usual.residual)
         used = ~np.isin(np.arange(length.shape[1]), mae.isolated)
 
         def misfit(is_free: Bools, muscles: Bools) -> float:
-            """Return the misfit of the lengths of some muscles if some joints have any angle."""
+            """Return how badly some lengths fit if the joints `is_free` may have any angle."""
             theta = np.where(is_free, estimate, read)
             change = (length - mae.lengths(theta, tension)) / spread
             jacobian = mae.muscle_jacobian(theta, tension) / spread[:, None]
@@ -313,7 +313,7 @@ class JointSensorCheck:
         return by_joints < BETTER * by_muscle
 
     def _give_up(self, joints: Bools) -> None:
-        """Discard the newest readings of joints, except those by which they are trusted again."""
+        """Give up the newest readings of joints, except those by which they are trusted again."""
         for place in range(max(-NEWEST, -len(self._messages)), -AGREEING):
             self._messages[place].theta[joints] = self._compared[place][0][joints] = np.nan
 

@@ -8,9 +8,9 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-# A larger error than these means that the camera sees a different marker or is not calibrated.
-MARKER_DISTANCE = 0.05  # largest error of the position [m]
-MARKER_ANGLE = 0.3  # largest error of the orientation [rad]
+# A larger error means that the camera sees another marker or is not calibrated.
+MARKER_DISTANCE = 0.05  # reject a pose with a larger error of the position [m]
+MARKER_ANGLE = 0.3  # reject a pose with a larger error of the orientation [rad]
 
 
 def posture_of_marker(robot: Robot, pose: pin.SE3, start: Array) -> Array:

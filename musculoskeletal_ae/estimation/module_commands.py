@@ -6,9 +6,9 @@ import math
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
 
-#: Age above which a command is out of date [s]. Modules without commands for this time enter their
-#: safe state (doc/howto/your_driver.md). This does not depend on the pauses of this process, so it
-#: is measured on the steady clock.
+#: Ignore a command that is older than this [s]: modules without commands for this time enter their
+#: safe state (doc/howto/your_driver.md). The age is measured on the steady clock, because the
+#: modules do not wait for pauses of this process.
 COMMAND_AGE = 0.5
 
 
@@ -21,7 +21,7 @@ class ModuleCommands:
         self._time = -math.inf  # time of the newest command [s]
 
     def note(self, now: float, length: Array | None = None, tension: Array | None = None) -> None:
-        """Store target lengths [m] (M,) or target tensions [N] (M,) that were sent at `now` [s]."""
+        """Note target lengths [m] (M,) or target tensions [N] (M,) that were sent at `now` [s]."""
         self._length, self._tension, self._time = length, tension, now
 
     def length(self, now: float) -> Array | None:

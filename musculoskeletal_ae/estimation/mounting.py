@@ -35,20 +35,21 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-DIRECTIONS = 162  # number of directions u, which are about 16° apart
-#: masses m of a payload, as shares of the mass of the moving links
+DIRECTIONS = 162  # compare this many directions u, which are about 16° apart
+#: compare these masses m of a payload, as shares of the mass of the moving links
 PAYLOADS = 0.0, 0.3, 0.6, 1.2
-UPRIGHT = 25.0  # angle up to which a direction counts as that of `robot.urdf` [°]
-#: σ_j as a share of the muscles' absolute torques at the joint: the share with which S is smallest
+UPRIGHT = 25.0  # count a direction within this angle as that of `robot.urdf` [°]
+#: try these σ_j, as shares of the muscles' absolute torques at the joint; the one with the smallest
+#: S counts
 NOISE = 0.08, 0.16, 0.32
-LEAST_NOISE = 0.1  # smallest σ_j [N·m]
-FREEDOM = 4.0  # ν: with larger residuals, a posture counts less
-MOVED = 0.2  # motion of a joint after which a posture counts again [rad]
-#: shortest time between two postures that count [s]: noise of the readings makes the estimate jump
+LEAST_NOISE = 0.1  # assume at least this σ_j [N·m]
+FREEDOM = 4.0  # ν: let larger residuals count less than their squares
+MOVED = 0.2  # count a posture again only after a joint has moved by this much [rad]
+#: count at most one posture in this time [s], because noise makes the estimate jump
 SPACING = 0.5
-AT_STOP = 0.12  # distance from a limit below which a joint may rest at its stop [rad]
-MEMORY = 100  # largest number of the newest postures by which the direction is judged
-ENOUGH = 30  # smallest number of postures by which the direction is judged
+AT_STOP = 0.12  # expect that a joint may rest at its stop within this distance from the limit [rad]
+MEMORY = 100  # judge the direction by at most this many of the newest postures
+ENOUGH = 30  # judge the direction by at least this many postures
 #: Report another direction of gravity from this evidence on. On learned arms that explored
 #: (foreign, individuals 0 and 1), it was at most 33 in 150 s. It reached 78 and 86 in the 70 s
 #: after the base had been turned by 176°.
@@ -73,7 +74,7 @@ class Tilt(NamedTuple):
 
     @property
     def text(self) -> str:
-        """A sentence for users."""
+        """The direction of gravity that the tensions show, as a sentence for users."""
         x, y, z = self.direction
         return (
             f'the tensions show that gravity acts along ({x:.1f}, {y:.1f}, {z:.1f}) of the root '
@@ -121,11 +122,11 @@ class MountingCheck:
         self._is_learned = mae.anomaly is not None and mae.anomaly.calibrated
 
     def reset(self) -> None:
-        """Discard all evidence, for example after a reset by the user."""
+        """Reset the check: discard all evidence, for example after a reset by the user."""
         self.tilt: Tilt | None = None
         self.evidence = 0.0
-        self._counted_at = np.full(self._robot.joint_count, np.inf)  # θ that counted last
-        self._since = SPACING  # time since then [s]
+        self._counted_at = np.full(self._robot.joint_count, np.inf)  # last θ that counted
+        self._since = SPACING  # time since the last posture that counted [s]
         #: terms of S for each posture, newest first, (noise levels, payloads, directions)
         self._costs: deque[Array] = deque(maxlen=MEMORY)
 
@@ -167,7 +168,7 @@ class MountingCheck:
         return cost
 
     def _judge(self) -> None:
-        # Smallest S by number of the newest postures and by direction
+        # Sum the newest n postures for each n, and take the best noise level and payload.
         best = np.cumsum(self._costs, axis=0)[ENOUGH - 1 :].min(axis=(1, 2))
         is_upright = self._angles <= UPRIGHT
         upright, other = best[:, is_upright].min(axis=1), best[:, ~is_upright].min(axis=1)
@@ -190,7 +191,7 @@ class MountingCheck:
         return theta < robot.lower + AT_STOP, theta > robot.upper - AT_STOP
 
     def _regressors(self, theta: Array) -> tuple[Array, Array]:
-        """Return Y of the arm and of a mass of 1 kg in the hand, (D, 3) each."""
+        """Return matrices from gravity to torques, of the arm and of 1 kg in the hand, (D, 3)."""
         kinematics, model = self._robot.kinematics, self._model
         angles, columns = kinematics.tree.angles(theta), []
         for unit in np.eye(3):

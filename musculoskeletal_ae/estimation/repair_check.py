@@ -84,7 +84,7 @@ class RepairCheck(NamedTuple):
         return float(self.sample.motor_tension[muscle]) < LIMITS.slack_share * bias
 
     def _length_error(self, muscle: int) -> float:
-        """Return l − l' of a muscle [m]."""
+        """Return by how much the length of a muscle deviates from the posture (l − l') [m]."""
         theta, sample = self.theta, self.sample
         if theta is None:
             others = self.mae.without({*self.isolated, muscle})

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.estimator import Estimator
     from musculoskeletal_ae.mae.mae import Mae
 
-#: a sensor whose readings are impossible in at least this share is itself at fault
+#: call the sensor itself faulty if at least this share of its readings is impossible
 ALL = 0.9
 UNKNOWN_TENSION = 'unknown: tension_source is none'
 
 
 def report(core: Estimator, now: float) -> Report:
-    """Return the status of an estimator; `now` is the time of a steady clock [s].
+    """Report the status of an estimator; `now` is the time of a steady clock [s].
 
     The value `verification` is an identifier for programs, and `last outcome` is one of
     `verification.Outcome`.
@@ -87,7 +87,7 @@ def _isolated(core: Estimator) -> Iterator[Condition]:
             continue
         name, fault = core.robot.muscles[muscle], core.suspects.faults.get(muscle)
         detail = name if fault is None else f'{name} ({fault})'
-        # A muscle that a user has isolated need not be faulty.
+        # Advise no repair of a muscle that a user has isolated, because it need not be faulty.
         steps = None if fault is not None else (Step.RESTORE_MUSCLES,)
         yield ConditionKind.MUSCLE_ISOLATED.condition(detail, [name], steps=steps)
 

@@ -58,24 +58,27 @@ from musculoskeletal_ae.signals.limits import LIMITS
 WINDING_CHANGE = 0.001
 CLASSIFICATION_TIME = 0.8  # classify the suspect after it was wound in for this time [s]
 PATIENCE = 8.0  # let a suspect stay isolated if it was not wound in within this time [s]
-LONGEST = 10.0  # longest duration of a verification, with the time for winding in [s]
-FAR = 0.025  # smallest |l − l'| that noise and network errors do not explain [m]
-RUPTURE_CHANGE = 0.005  # decrease of l − l' when the rest of a ruptured tendon is wound in [m]
-#: T_bias for which CLOSE and JAM_EXCESS apply [N]; for a lower T_bias, they are scaled down
+LONGEST = 10.0  # end a verification within this time, including the time for winding in [s]
+FAR = 0.025  # count |l − l'| as a fault from this on; noise and network errors are smaller [m]
+#: conclude a rupture if winding in lowers l − l' by this much: the loose end is wound in [m]
+RUPTURE_CHANGE = 0.005
+#: CLOSE and JAM_EXCESS apply to this T_bias [N]; scale them down for a lower one
 USUAL_BIAS = 30.0
-CLOSE = 8.0  # absolute tolerance of the difference between T and T_ref [N]
-#: tolerance of the difference between T and T_ref, relative to T_ref − T_bias; also the smallest
-#: rise of T that counts as rising, relative to the rise of T_ref
+CLOSE = 8.0  # tolerate this difference between T and T_ref [N]
+#: tolerate in addition this difference between T and T_ref, relative to T_ref − T_bias; count T as
+#: rising only if it rises by this share of the rise of T_ref
 SHARE = 0.35
-JAM_EXCESS = 20.0  # T − T_ref above which a suspect that was not wound in is jammed [N]
-STRETCHED = 1.5  # stretch above which a healthy tendon has tension, relative to that at T_bias
-LONGEST_WINDING = 2.5  # longest duration of winding in a slack tendon [s]
-BEHIND = 0.005  # decrease of a position command that a healthy module follows [m]
-STANDS = 0.0005  # largest motion of a jammed muscle module [m]
-# T_ref of a position-controlled module is found by bisection.
-HIGHEST_TENSION = 5000.0  # upper end of the search [N]
-HALVINGS = 40  # number of bisection steps
-FROZEN = 1e-6  # range of the readings below which a sensor is frozen [m] or [N]
+#: call a suspect that was not wound in jammed if T exceeds T_ref by more than this [N]
+JAM_EXCESS = 20.0
+#: expect a healthy tendon to have tension above this stretch, relative to that at T_bias
+STRETCHED = 1.5
+LONGEST_WINDING = 2.5  # wind in a slack tendon for at most this time [s]
+BEHIND = 0.005  # judge whether a module follows once its position command has decreased by this [m]
+STANDS = 0.0005  # call a module jammed if it moved by at most this [m]
+# T_ref of a position-controlled module is found by bisection, over 0 to HIGHEST_TENSION.
+HIGHEST_TENSION = 5000.0  # end the search for T_ref at this tension [N]
+HALVINGS = 40  # end the search for T_ref after this many bisection steps
+FROZEN = 1e-6  # call a sensor frozen if its readings vary by less than this [m] or [N]
 
 
 class Outcome(Enum):
@@ -89,7 +92,7 @@ class Outcome(Enum):
     TENSION_SENSOR_FROZEN = 'tension_sensor_frozen'
     NOT_WOUND_IN = 'not_wound_in'
     TENSION_UNKNOWN = 'tension_unknown'
-    # isolated at once, without a verification
+    # outcomes of muscles that are isolated at once, without a verification
     VALUES_MISSING = 'values_missing'
     SENSOR_SATURATED = 'sensor_saturated'
 
@@ -123,20 +126,20 @@ class _Reading(NamedTuple):
     """Readings of the suspect, its command, and the length expected from the other muscles."""
 
     tension: float  # T [N]
-    length: float  # l [m]
-    command: float  # l_target [m]
-    likely: float  # l' [m]
+    length: float  # measured length l [m]
+    command: float  # length command l_target [m]
+    likely: float  # length l' that the other muscles indicate [m]
 
 
 class _Row(NamedTuple):
     """Readings of the suspect at one moment while it was wound in."""
 
     tension: float  # T [N]
-    length: float  # l [m]
-    demand: float  # T_ref [N]
-    excess: float  # l − l' [m]
-    command: float  # l_target [m]
-    stretch: float  # x [m]
+    length: float  # measured length l [m]
+    demand: float  # tension T_ref that a healthy muscle would have [N]
+    excess: float  # measured length minus the one that the other muscles indicate [m]
+    command: float  # length command l_target [m]
+    stretch: float  # stretch x of the series elastic element [m]
 
 
 class ModuleLaw:
@@ -262,7 +265,7 @@ class Verification:
         if self._time < PATIENCE:
             return None
         if tension > demand + JAM_EXCESS * self._scale:
-            # the tension is high although the suspect was not wound in
+            # The tension is too high although the suspect was not wound in.
             return VerificationVerdict(Outcome.JAMMED)
         return VerificationVerdict(Outcome.NOT_WOUND_IN)
 

@@ -54,11 +54,11 @@ from musculoskeletal_ae.remedy import REPAIR
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly
 
-ACQUITTALS = 2  # number of suspects verified as healthy after which the next one is not verified
-WITHIN = 60.0  # time during which a suspect verified as healthy counts [s]
+ACQUITTALS = 2  # verify no further suspect after this many were verified as healthy
+WITHIN = 60.0  # count a suspect that was verified as healthy for this long [s]
 
 
-#: reactions to findings that leave no doubt which muscle is faulty
+#: isolate without a verification after these reactions: there is no doubt which muscle is faulty
 AT_ONCE = Reaction.ISOLATE_AT_ONCE, Reaction.ISOLATE_ONLY
 
 
@@ -111,7 +111,7 @@ class SuspectHandling:
         return f'{self._robot.muscles[muscle]}: {verdict}'
 
     def take(self, finding: Finding, isolated: Iterable[int], now: float) -> tuple[int, ...]:
-        """Latch a finding and isolate its muscle, if the settings and the kind of finding say so.
+        """Take a finding: latch it and isolate its muscle, if the settings and its kind say so.
 
         Args:
             finding: The finding of a detector.
@@ -167,7 +167,7 @@ class SuspectHandling:
     def conclude(
         self, verdict: VerificationVerdict, isolated: Iterable[int], now: float
     ) -> tuple[int, ...]:
-        """End verification and anomaly; return the indices of the muscles isolated from now on.
+        """Conclude verification and anomaly; return which muscles (indices) stay isolated.
 
         A healthy suspect is restored, a faulty one stays isolated.
         """
@@ -177,11 +177,11 @@ class SuspectHandling:
             self._acquitted.append(now)
         else:
             self.faults[self.verification.muscle] = verdict
-            self.verification = None  # `clear` then leaves the suspect isolated
+            self.verification = None  # so that `clear` leaves the suspect isolated
         return self.clear(isolated)
 
     def clear(self, isolated: Iterable[int]) -> tuple[int, ...]:
-        """End the anomaly; return the indices of the muscles that are isolated from now on.
+        """Clear the anomaly; return the indices of the muscles that are isolated from now on.
 
         A suspect that is being verified is restored, because a reset declares it healthy.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Route points of a learned body that are for no muscle worse than those of the robot directory.
+"""Learned route points, except for muscles that the points of the robot directory describe better.
 
 Learned points are fitted to the lengths of the network. A fit may be worse than the input for some
 muscles: if the learned arm deviates in ways that route points cannot express, or if a tendon slips
@@ -18,20 +18,20 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.description import Route, RoutePoint
 from musculoskeletal_ae.robot.robot import Robot
 
-POSTURES = 400  # number of postures in which routes are compared with the network
+POSTURES = 400  # compare routes with the network in this many postures
 #: identifies the place of a route point: its link, and its position there in units of 1e-7 m
 Place = tuple[str, tuple[int, ...]]
 
 
 class Errors(NamedTuple):
-    """Differences between routes and a network, for each muscle (M,)."""
+    """How far routes differ from a network, for each muscle (M,)."""
 
     lengths: Array  # standard deviation of the length [m]
     arms: Array  # moment arms: norm over the joints, root mean square over the postures [m]
 
 
 class LearnedRoutes(NamedTuple):
-    """Learned route points, and what they are better for."""
+    """Routes with learned points, and the muscles that keep their original points."""
 
     routes: tuple[Route, ...]
     kept: dict[str, str]  # reason why a muscle keeps its points, by muscle

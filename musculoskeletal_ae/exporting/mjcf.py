@@ -76,7 +76,7 @@ class ExportReport(NamedTuple):
     kept: dict[str, str]  # why a muscle keeps the points of the robot directory, by muscle
 
     def text(self, robot: Robot, offsets: Array) -> str:
-        """Return the report as a text; `offsets` are the offsets of the controls [m], (M,)."""
+        """Return the report as text; `offsets` [m] (M,) lead from measured lengths to controls."""
         counts = f'{robot.joint_count} joints, {robot.muscle_count} muscles, {POSTURES} postures'
         units = f'{"":<28}{"[mm]":>10}{"[mm]":>12}{"[mm]":>8}{"[mm]":>9}{"[m]":>11}'
         head = f'{"muscle":<28}{"length":>10}{"moment arm":>12}{"of":>8}{"spring":>9}{"offset":>11}'
@@ -107,7 +107,7 @@ def kept_text(kept: dict[str, str]) -> str:
 
 
 def export_into(robot: Robot, mae: Mae, file: Path, out: Path, seed: int = 0) -> str:
-    """Write a copy of a user's MJCF file with learned attachment points, and `report.txt`.
+    """Export learned attachment points into a copy of a user's MJCF file, with `report.txt`.
 
     Args:
         robot: The robot that was imported from the file.
@@ -171,7 +171,7 @@ def loads_in_mjx(model: Any) -> str:
 
 
 def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> ExportReport:
-    """Write `model.xml` and `report.txt` of a learned body into a new or empty directory.
+    """Export a learned body as `model.xml` and `report.txt` into a new or empty directory.
 
     Raises:
         MusculoskeletalError: If the directory is not empty, or MuJoCo does not load the model.

@@ -23,7 +23,7 @@ INCLUDE = re.compile(r'<include\b[^>]*?\bfile\s*=\s*["\']([^"\']*)["\'][^>]*>')
 COMPILER = re.compile(r'<compiler\b[^>]*>')
 ATTRIBUTE = r'\b{name}\s*=\s*(["\'])(.*?)\1'
 FOLDERS = 'meshdir', 'texturedir', 'assetdir'
-SAME = 1e-6  # difference from the compiled model up to which a stated position is the same [m]
+SAME = 1e-6  # count a site's position as that of the compiled model up to this difference [m]
 
 
 class UserFile:
@@ -61,8 +61,9 @@ class UserFile:
     def _movable_sites(self) -> dict[str, Array]:
         """Return the positions of the sites that can be moved by changing the text [m], by name.
 
-        These are the sites whose text states the position that they have in the compiled model. A
-        site in a `frame`, a replica, or one that `fromto` places has another.
+        These are the sites whose text states the position that they have in the compiled model. The
+        text of a site in a `frame` or a replica, or of one that `fromto` places, states another
+        position.
         """
         found = dict[str, list[Array]]()
         for text in self.texts.values():
@@ -80,7 +81,7 @@ class UserFile:
         return sites
 
     def places(self, links: dict[str, str]) -> dict[Place, str]:
-        """Return the names of the movable sites by their places.
+        """Return the names of the movable sites by where they are.
 
         Args:
             links: Name of the link of each body, by the name of the body.
@@ -93,7 +94,7 @@ class UserFile:
         return places
 
     def move(self, name: str, xyz: Array) -> None:
-        """Change the position of a site to `xyz` [m], (3,), in the frame of its body."""
+        """Move a site to `xyz` [m], (3,), in the frame of its body."""
         position = ' '.join(f'{value + 0.0:.9g}' for value in np.round(xyz, 9).tolist())
         for file, text in self.texts.items():
             for match in SITE.finditer(_without_comments(text)):
@@ -114,7 +115,7 @@ class UserFile:
         Raises:
             MusculoskeletalError: If MuJoCo does not load the result.
         """
-        # The file that includes a changed file changes, too.
+        # A file that includes a changed file must change too, because it names the copy.
         before = -1
         while before != len(self._changed):
             before = len(self._changed)
@@ -159,7 +160,7 @@ class UserFile:
         return result
 
     def _placed_elsewhere(self, file: Path, names: dict[Path, str]) -> tuple[str, bool]:
-        """Return a text for another folder, and whether it states the folder of meshes."""
+        """Return a file's text for another folder, and whether it states the folder of meshes."""
         text, is_stated = self.texts[file], False
         edits = list[tuple[int, int, str]]()
         plain = _without_comments(text)

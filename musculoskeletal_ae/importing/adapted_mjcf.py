@@ -26,9 +26,10 @@ from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.importing.source import Source
 from musculoskeletal_ae.robot.urdf import parse_xml
 
+#: write this comment at the top of the file
 NOTE = ' written by import_robot for the robot directory in which it lies '
 HAND = 'hand of the emulator'  # name of the body at the end effector
-#: attributes by which other elements name an element of each kind, by their tag
+#: for each tag, the attributes by which other elements refer to an element of this kind
 REFERENCES: dict[str, dict[str, tuple[str, ...]]] = {
     'joint': {'joint': ('joint', 'joint1', 'joint2')},
     'tendon': {'tendon': ('tendon1', 'tendon2')},
@@ -44,7 +45,7 @@ ACTUATION = 'actuatorfrclimited', 'actuatorfrcrange', 'actuatorgroupdisable', 'a
 
 
 class AdaptedModel:
-    """The text of `model.xml`.
+    """The text of `model.xml`, adapted from the user's model.
 
     Attributes:
         root: The root element.
@@ -69,8 +70,8 @@ class AdaptedModel:
             balls: The names of the three hinges of each ball joint.
         """
         self._source, self._model, self._names, self._balls = source, model, names, balls
-        # A model that MuJoCo writes has no includes and no replicated elements. Each place is given
-        # in the frame of a body, and the elements of a kind have the order of their indices.
+        # MuJoCo writes a model without includes and replicated elements. It gives each place in the
+        # frame of a body, and keeps elements of a kind in the order of their indices.
         self.root = parse_xml(Path('model.xml'), spec.to_xml())
         world = self._section('worldbody')
         self._bodies = [world, *world.iter('body')]
@@ -138,15 +139,16 @@ class AdaptedModel:
             turn = pin.Quaternion(place.rotation).coeffs()
             self._bodies[i].set('quat', _text(np.roll(turn, 1)))
         for j in np.flatnonzero(~self._is_held).tolist():
-            # A held joint of the same body may move the others.
+            # If a joint of the same body is held, its position moves the body's other joints.
             pose = poses[model.jnt_bodyid[j]]
             self._joints[j].set('pos', _text(pose.actInv(data.xanchor[j])))
             self._joints[j].set('axis', _text(pose.rotation.T @ data.xaxis[j]))
 
     def _place_routes(self) -> None:
-        """Write the exact places of sites and wrapped objects; MuJoCo writes six digits only.
+        """Write the exact places of sites and wrapped objects.
 
-        In the sixth digit, a site on the rim of an object could get inside it.
+        MuJoCo rounds them to six digits. Such an error could move a site on the rim of an object
+        into the object.
         """
         model, world = self._model, self._section('worldbody')
         sites = {site.get('name'): site for site in world.iter('site')}
@@ -157,13 +159,13 @@ class AdaptedModel:
             if name := item.get('geom'):
                 geom, element = model.geom(name), geoms[name]
                 sizes = 1 if geom.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE else 2
-                element.attrib.pop('mesh', None)  # an object that was fitted to a mesh
+                element.attrib.pop('mesh', None)  # the fitted size follows
                 element.set('size', _text(geom.size[:sizes]))
                 element.set('pos', _text(geom.pos))
                 element.set('quat', _text(geom.quat))
 
     def _remove_held_joints(self) -> None:
-        """Remove held joints, what refers to them, and contact pairs of two immobile bodies."""
+        """Remove held joints, elements that name them, and contact pairs of two immobile bodies."""
         model = self._model
         held = {self._names['joint'][j] for j in np.flatnonzero(self._is_held)}
         moves = np.zeros(model.nbody, dtype=bool)

@@ -35,13 +35,13 @@ from musculoskeletal_ae.robot.urdf import MOST_PARTS, ONE_AXIS, parse_xml, read_
 
 Limits = dict[str, tuple[float, float]]  # lower and upper limit of each joint [rad] or [m]
 
-ROUND = 'SPHERICAL', 'CYLINDRICAL'  # via points that are wraps
-#: attributes that SDF 1.6 does not have, and that change the meaning of poses and axes
+ROUND = 'SPHERICAL', 'CYLINDRICAL'  # count via points of these kinds as wraps
+#: reject SDF 1.6 files with these attributes: SDF 1.6 lacks them, and they change poses and axes
 FRAMES = 'relative_to', 'expressed_in', 'rotation_format'
 
 
 def read_cardsflow(file: Path, root: ET.Element) -> Source:
-    """Return the robot of a cardsflow.xml and of the model.urdf or model.sdf beside it."""
+    """Read the robot of a cardsflow.xml and of the model.urdf or model.sdf beside it."""
     limits_file = file.parent / 'joint_limits.yaml'
     limits = _read_limits(limits_file)
     for model, read in (('model.urdf', _read_urdf), ('model.sdf', _read_sdf)):
@@ -113,7 +113,7 @@ def read_cardsflow(file: Path, root: ET.Element) -> Source:
 
 
 def _read_limits(file: Path) -> dict[str, tuple[float, float]]:
-    """Return the limits of joints in a joint_limits.yaml, or {} if there is no such file."""
+    """Read the limits of joints in a joint_limits.yaml; {} if there is no such file."""
     if not os.path.lexists(file):
         return {}
     document, limits = read_yaml(file, refuse), dict[str, tuple[float, float]]()
@@ -132,9 +132,9 @@ def _read_limits(file: Path) -> dict[str, tuple[float, float]]:
 
 
 def _measure(source: Source) -> None:
-    """Set `source.lengths` to a function that computes the lengths of all straight routes.
+    """Let `source.lengths` measure the lengths of all straight routes.
 
-    CARDSflow, too, connects the points of a straight route by straight lines.
+    Only straight routes can be compared: CARDSflow, too, connects their points by straight lines.
     """
     straight = {n: r for n, r in source.routes.items() if not any(isinstance(p, Wrap) for p in r)}
     joints = [n for n, j in zip(source.model.names, source.model.joints) if j.shortname() in KINDS]
@@ -152,7 +152,7 @@ def _measure(source: Source) -> None:
 
 
 def read_urdf_skeleton(file: Path, root: ET.Element) -> Source:
-    """Return the robot of a URDF, with a placeholder muscle over each joint."""
+    """Read the robot of a URDF, with a placeholder muscle over each joint."""
     source, _ = _read_urdf(file, root)
     carried = {source.place(link)[0]: link for link in reversed(source.links)}
     names = distinct(safe_name(f'muscle_of_{joint}', '') for joint in source.model.names[1:])
@@ -177,7 +177,7 @@ def _endless(*ends: str | None) -> bool:
 def _read_urdf(
     file: Path, root: ET.Element, limits_and_file: tuple[Limits, str] = ({}, '')
 ) -> tuple[Source, dict[str, Array]]:
-    """Return the links and joints of a URDF, read by pinocchio, and each link's centre of mass.
+    """Read the links and joints of a URDF by pinocchio, and each link's centre of mass.
 
     `limits_and_file` are limits that replace those of the URDF, and the name of their file.
     """
@@ -220,7 +220,7 @@ def _read_urdf(
 def _read_sdf(
     file: Path, root: ET.Element, limits_and_file: tuple[Limits, str] = ({}, '')
 ) -> tuple[Source, dict[str, Array]]:
-    """Return the links and joints of an SDF with one model, and each link's centre of mass.
+    """Read the links and joints of an SDF with one model, and each link's centre of mass.
 
     `limits_and_file` are limits that replace those of the SDF, and the name of their file.
     """
@@ -267,7 +267,7 @@ def _read_sdf(
         lost = sorted({*above, *above.values(), *links} - {'world'} - set(order)) or order
         raise refuse(file, f'expected a tree of links with one root; outside it: {", ".join(lost)}')
     source.above = above
-    #: for each link, index of the joint that carries it, and the joint's pose in the model
+    #: for each link, the index of the joint that carries it, and the joint's pose in the model
     stands: dict[str, tuple[int, pin.SE3]] = {}
     for name in order:
         carrier, at = stands.get(above.get(name, ''), (0, pin.SE3.Identity()))
@@ -292,7 +292,7 @@ def _read_sdf(
                 carrier = source.add_joint(label, carrier, here_in, slides, axis, limits)
                 at = here
             elif kind != 'fixed':
-                source.note('held fixed', f'joint {label}: it is {kind}')
+                source.note('held fixed', f'joint {label}: its type {kind} is not supported')
         stands[name] = carrier, at
         own = links[name].find('inertial')
         parts = None if own is None else own.find('inertia')

@@ -31,7 +31,7 @@ from musculoskeletal_ae.robot.joint_tree import resolved
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
-LARGEST = 20_000_000  # largest file [bytes]
+LARGEST = 20_000_000  # refuse a larger file [bytes]
 OPENSIM = (
     'OpenSim models are not read; convert this model to MJCF with MyoConverter '
     '(https://github.com/MyoHub/myoconverter) and import the .xml file that it writes'
@@ -45,17 +45,17 @@ READERS = {
 
 
 class Imported(NamedTuple):
-    """An imported robot."""
+    """An imported robot, with notes on the import and a comparison with its source."""
 
     robot: Robot
-    #: properties that were chosen, dropped, held fixed, renamed or approximated
+    #: what the import chose, dropped, held fixed, renamed or approximated
     notes: tuple[str, ...]
     #: comparison with the source's own engine; None if this engine computes no lengths
     comparison: Comparison | None
 
 
 def read_source(file: Path) -> Source:
-    """Return the robot of a file of any supported format, which the root element identifies.
+    """Read the robot of a file of any supported format, which the root element identifies.
 
     Raises:
         SourceError: If the file is not valid; the message names the file, the problem and the legal
@@ -63,13 +63,13 @@ def read_source(file: Path) -> Source:
         RobotDescriptionError: If the file cannot be read as XML, or if a URDF is not valid.
     """
     text = read_text(file, refuse, LARGEST)
-    # Look for OpenSim before parsing, because some of its tags are not valid XML.
+    # Look for OpenSim before parsing, because some of its files are not valid XML.
     if '<OpenSimDocument' in text:
         raise refuse(file, OPENSIM)
     try:
         root = parse_xml(file, text)
     except RobotDescriptionError as error:
-        # MuJoCo accepts some invalid XML, such as two attributes without a space between them.
+        # Let MuJoCo read invalid XML, too: it accepts, for example, attributes without a space.
         loose = isinstance(error.__cause__, ET.ParseError)
         if not (loose and re.match(r'(\s|<\?.*?\?>|<!--.*?-->)*<mujoco[\s/>]', text, re.DOTALL)):
             raise
@@ -97,7 +97,8 @@ def import_robot(
     Args:
         file: The file.
         out: A new or empty directory.
-        loaded: Gets the new robot before it is compared with the source, which takes longer.
+        loaded: Function that gets the new robot before the comparison with the source, which takes
+            long.
         chain: Options of `cut`.
 
     Raises:
@@ -124,7 +125,7 @@ def import_robot(
 
 
 def run(args: Namespace) -> int:
-    """Import a file, print the report, and return the exit status."""
+    """Run an import, print the report, and return the exit status."""
     chain = {name: getattr(args, name) for name in ('joints', 'muscles', 'without', 'base', 'end')}
     robot, notes, comparison = import_robot(args.file, args.out, show_prospects, **chain)
     for note, count in Counter(notes).items():
@@ -146,7 +147,7 @@ def run(args: Namespace) -> int:
 
 
 def show_prospects(robot: Robot) -> None:
-    """Print what can be expected of a robot."""
+    """Print how well a robot will probably learn and move (`design/prospects.py`)."""
     for line in prospects(robot).lines():
         print(line, flush=True)
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Limits of joints that springs turn back, where the muscles can hold them in a part of the range.
+"""Smaller limits for joints that their muscles can hold in a part of the range only.
 
-The muscles of such a joint pull it in one direction. If a tendon passes over the axis of the joint
-inside its range, the muscle pulls the other way beyond it, like the spring. The joint then snaps to
-its stop, and nothing can bring it back. Without such a limit, an arm is lost there in its first
-second.
+The muscles of such a joint pull it in one direction, against a spring. If a tendon passes over the
+axis of the joint inside its range, the muscle pulls the other way beyond it, like the spring. The
+joint then snaps to its stop, and nothing can bring it back: without smaller limits, an emulated arm
+ends there in its first second.
 """
 
 from typing import NamedTuple
@@ -14,9 +14,9 @@ import numpy as np
 from musculoskeletal_ae.design.checks import TOLERATED_SHARE, Setting, measure
 from musculoskeletal_ae.robot.robot import Robot
 
-POSTURES = 600
-PARTS = 20  # number of equal parts into which the range of a joint is divided
-#: keep a part of a range in which this share of the postures is held, relative to the best part
+POSTURES = 600  # check the muscles in this many random postures
+PARTS = 20  # divide the range of a joint into this many equal parts
+#: keep a part of the range if its share of held postures is at least this, relative to the best one
 KEPT_SHARE = 0.5
 
 
@@ -24,8 +24,8 @@ class HeldRange(NamedTuple):
     """The part of a joint's range that its muscles can hold."""
 
     joint: str
-    low: float  # [rad or m]
-    high: float  # [rad or m]
+    low: float  # [rad] or [m]
+    high: float  # [rad] or [m]
 
 
 def held_ranges(robot: Robot) -> list[HeldRange]:

@@ -48,15 +48,15 @@ check_mujoco()
 COUNTS = {
     'body': 'nbody', 'joint': 'njnt', 'tendon': 'ntendon', 'actuator': 'nu', 'equality': 'neq',
 }  # fmt: skip
-RANGE_POSTURES = 200  # postures in which the range of a tendon's length is measured
-LEAST_REACH = 1e-3  # smallest distance of a far end from the origin of its body [m]
-#: largest plausible force of an actuator [N]; MuJoCo computes larger forces for muscles without an
-#: initial moment arm
+RANGE_POSTURES = 200  # measure the range of a tendon's length in this many postures
+LEAST_REACH = 1e-3  # a far end has to be at least this far from the origin of its body [m]
+#: ignore a larger force of an actuator [N]: MuJoCo computes it for muscles without an initial
+#: moment arm
 STRONGEST = 1e6
 
 
 def read_mjcf(file: Path, root: ET.Element) -> Source:
-    """Return the robot of an MJCF file, whose root element is `root`.
+    """Read the robot of an MJCF file, whose root element is `root`.
 
     Raises:
         SourceError: If MuJoCo cannot load the file.
@@ -70,7 +70,7 @@ def read_mjcf(file: Path, root: ET.Element) -> Source:
     mujoco.set_mju_user_warning(warnings.append)
     try:
         spec = mujoco.MjSpec.from_file(str(file))
-        spec.compiler.fusestatic = False  # fused bodies could not be links
+        spec.compiler.fusestatic = False  # keep all bodies, because the links are bodies
         model = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         raise refuse(file, f'MuJoCo cannot load it: {" ".join(str(error).split())}') from error
@@ -218,7 +218,8 @@ class _Reader:
             stiffness, damping = m.jnt_stiffness[j], float(m.dof_damping[m.jnt_dofadr[j]])
             if m.jnt_type[j] not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
                 for effect in ('springs',) * bool(stiffness) + ('damping',) * bool(damping):
-                    source.note('dropped', f'{effect}: joint {name} is neither a hinge nor a slide')
+                    reason = 'which is neither a hinge nor a slide'
+                    source.note('dropped', f'{effect} of joint {name}, {reason}')
                 continue
             if stiffness:
                 rest = float(m.qpos_spring[m.jnt_qposadr[j]])
@@ -230,7 +231,7 @@ class _Reader:
             shares = {self.names['joint'][m.wrap_objid[w]]: float(m.wrap_prm[w]) for w in path}
             low, high = m.tendon_lengthspring[t]
             name = f'tendon {self.names["tendon"][t]}'
-            if high - low > 1e-9:  # its spring is slack in between
+            if high - low > 1e-9:  # the spring of the tendon is slack between two lengths
                 continue
             source.springs.append(Spring(shares, float(m.tendon_stiffness[t]), float(low), name))
 
@@ -246,7 +247,7 @@ class _Reader:
             source.passive.append(PassiveTendon(name, *parts))
             self.passive[name] = t
         for kind, effect in (('joint', 'jnt_stiffness'), ('tendon', 'tendon_stiffness')):
-            # Recent versions of MuJoCo have springs whose force is a polynomial.
+            # Report springs whose force is a polynomial, which recent versions of MuJoCo have.
             higher = np.asarray(getattr(m, f'{effect}poly', np.zeros((0, 1))))
             for i in np.flatnonzero(higher.any(axis=1)).tolist():
                 problem = f'nonlinear stiffness: {kind} {self.names[kind][i]}'
@@ -447,7 +448,7 @@ class _Reader:
         if axis is not None and side is not None and side_link is None:
             out = side - m.geom_pos[geom]
             if np.linalg.norm(np.cross(axis, out)) < 1e-9 and np.linalg.norm(out) >= radius:
-                # MuJoCo moves a side site on the axis of a cylinder in the same way.
+                # Move a side site away from the axis of a cylinder, as MuJoCo does.
                 side = side + radius * turn.T @ data.geom_xmat[geom][::3]
         link = self.names['body'][body]
         return Wrap(link, m.geom_pos[geom].copy(), radius, axis, side, side_link)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lengths of passive tendons as polynomials of the joint angles (`robot/passive_tendons.py`).
 
-The source's own engine computes the lengths. The degree is the lowest with which the polynomial
-agrees with them to ACCURACY, or the best among those with at most MOST_TERMS terms.
+The source's own engine computes the lengths. The polynomial has the lowest degree at which it
+agrees with them to ACCURACY. If no degree does, it is the best polynomial with at most MOST_TERMS
+terms.
 """
 
 from itertools import combinations_with_replacement
@@ -12,10 +13,10 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
-ACCURACY = 5e-3  # error of the slope relative to its size, up to which a polynomial is accepted
-HIGHEST = 9  # highest degree
-MOST_TERMS = 130
-SAMPLES = 600  # postures in which a polynomial is fitted, and as many in which it is compared
+ACCURACY = 5e-3  # accept a polynomial if its slope is wrong by at most this share
+HIGHEST = 9  # try no higher degree
+MOST_TERMS = 130  # try no polynomial with more terms
+SAMPLES = 600  # fit a polynomial in this many postures, and compare it in as many others
 
 
 class Polynomial(NamedTuple):
@@ -34,7 +35,7 @@ def powers(joints: int, degree: int) -> Array:
         for total in range(degree + 1)
         for chosen in combinations_with_replacement(range(joints), total)
     ]
-    # Without joints, `bincount` of an empty selection still has the right size.
+    # The shape has to be stated for 0 joints.
     return np.array([np.asarray(row, dtype=np.int64) for row in rows]).reshape(-1, joints)
 
 

@@ -30,29 +30,30 @@ from musculoskeletal_ae.robot.kinematics import link_placement, reduced
 from musculoskeletal_ae.robot.robot import Robot
 
 KINDS = REVOLUTE + PRISMATIC
-POSTURES = 1000  # number of postures in which lengths are compared
-ARM_POSTURES = 200  # number of postures in which moment arms are compared
-PROBES = 20  # postures in which it is found which joints change the length of a passive tendon
-MOVED = 1e-8  # change of a length from which on a joint counts as moving a tendon [m]
-WRONG_LENGTH = 5e-5  # error of a passive tendon's polynomial from which on it is reported [m]
+POSTURES = 1000  # compare lengths in this many postures
+ARM_POSTURES = 200  # compare moment arms in this many postures
+PROBES = 20  # search the joints that change the length of a passive tendon in this many postures
+MOVED = 1e-8  # count a joint as moving a tendon if it changes the length by at least this [m]
+WRONG_LENGTH = 5e-5  # report a passive tendon whose polynomial is wrong by at least this [m]
 TURN = 1e-5  # step of the numerical derivatives that give moment arms [rad]
-SHORT_ARM = 1e-3  # length of a moment arm below which its sign is not compared [m]
-LISTED = 12  # largest number of names in a message
-# Tensions of a muscle whose largest tension the source states: `limit` is that tension.
-MAX_SHARE = 1.5  # tension.max, relative to the limit
-#: tension.bias, relative to the limit, if the source lets the muscle be slack. Modules and their
-#: sensors need a tension that is not 0.
+SHORT_ARM = 1e-3  # do not compare the sign of a shorter moment arm [m]
+LISTED = 12  # list at most this many names in a message
+# The largest tension that the source states for a muscle becomes its tension.limit.
+MAX_SHARE = 1.5  # set tension.max to this multiple of the limit
+#: set tension.bias to this share of the limit if the muscle may be slack in the source; modules and
+#: their sensors need a tension above 0
 BIAS_SHARE = 0.01
-# Muscles of a source whose tendons do not stretch get elements that are as stiff as the emulated
-# modules can regulate, but not stiffer than needed.
-RIGID_STIFFNESS = 1e5  # largest stiffness of an element at tension.max [N/m]
-RIGID_ELONGATION = 5e-4  # elongation at the limit that is short enough to count as none [m]
+# If tendons do not stretch in the source, give the muscles elastic elements that are as stiff as
+# the emulated modules can regulate, but no stiffer than needed.
+RIGID_STIFFNESS = 1e5  # make no element stiffer than this at tension.max [N/m]
+#: let a rigid element stretch by this at the limit, which counts as nothing [m]
+RIGID_ELONGATION = 5e-4
 EARTH = 9.81  # gravity of the earth [m/s²]
-#: ± limits of joints without limits, by whether the joint is prismatic: [rad] or [m]
+#: give a joint without limits ± these, by whether it is prismatic: [rad] or [m]
 UNLIMITED = {False: np.pi, True: 0.5}
 
-#: function that computes the absolute length of each muscle in N postures [m], (N,), from the
-#: positions of joints, (N,) each; joints without positions are at rest
+#: returns the absolute length of each muscle in N postures [m], (N,), from joint positions, (N,)
+#: each; joints without positions are at rest
 Lengths = Callable[[dict[str, Array]], dict[str, Array]]
 
 
@@ -103,7 +104,7 @@ class Source:
     strength: dict[str, float] = field(default_factory=dict)  # largest tension [N], if known
     #: tension that the actuators of a muscle always exert [N]; 0 if missing
     least: dict[str, float] = field(default_factory=dict)
-    #: whether tendons do not stretch in the source; otherwise, their elasticity is unknown
+    #: whether tendons do not stretch in the source; otherwise, nobody stated their elasticity
     is_rigid: bool = False
     springs: list[Spring] = field(default_factory=list)
     damping: dict[str, float] = field(default_factory=dict)  # by joint [N·m·s/rad]
@@ -122,7 +123,7 @@ class Source:
     above: dict[str, str] = field(default_factory=dict)  # parent of each link, if known
 
     def note(self, kind: str, text: str) -> None:
-        """Add a line to the report: `kind`, such as 'chosen' or 'dropped', and then `text`."""
+        """Note a line for the report: `kind`, such as 'chosen' or 'dropped', and then `text`."""
         self.notes.append(f'{kind}: {printable(text)}')
 
     def lost(self) -> list[str]:
@@ -201,7 +202,7 @@ class Source:
         return float(self.model.lowerPositionLimit[q]), float(self.model.upperPositionLimit[q])
 
     def reduce_range(self, joint: str, low: float, high: float) -> None:
-        """Set the limits of a joint [rad or m] to the part that its muscles can hold."""
+        """Reduce the limits of a joint [rad or m] to the part that its muscles can hold."""
         before = ', '.join(f'{end:.4g}' for end in self.span(joint))
         q = self.model.joints[self.model.getJointId(joint)].idx_q
         for limits, end in (('lowerPositionLimit', low), ('upperPositionLimit', high)):
@@ -219,7 +220,7 @@ class Source:
         return self.model.joints[self.model.getJointId(joint)].shortname() in PRISMATIC
 
     def settle(self) -> None:
-        """Set the rest position of each coupled joint from the rest position of its master."""
+        """Settle each coupled joint in the rest position that follows from that of its master."""
         for slave, c in self.couplings.items():
             self.rest[slave] = float(c.value(self.rest.get(c.master, 0.0)))
 
@@ -265,7 +266,7 @@ def tip(source: Source) -> str:
 
 
 def numbers(text: str | None, count: int, where: str) -> Array:
-    """Return the numbers in an XML text.
+    """Return the `count` numbers in an XML text.
 
     Raises:
         ValueError: If the text is not `count` finite numbers; the message names `where`.
@@ -382,7 +383,7 @@ def cut(
         raise SourceError(f'--joints: {kind} joint {missing[0]!r}; joints: {", ".join(free)}')
     if end:
         above = {model.names[i] for i in model.supports[source.place(end)[0]]}
-        # Masters of coupled joints in the chain move the chain as well.
+        # Keep masters of coupled joints in the chain, because they move the chain as well.
         wanted &= above | {c.master for slave, c in couplings.items() if slave in above}
     source.settle()
     source.couplings = {s: c for s, c in couplings.items() if s in movable and c.master in wanted}
@@ -540,7 +541,7 @@ def _modules(source: Source, muscle: str) -> dict[str, Any]:
 
 
 def _note_chosen_constants(source: Source) -> None:
-    """Add a note for each constant of the muscle modules that the source does not state."""
+    """Note each constant of the muscle modules that the import chose."""
     if any(source.strength.values()):
         least = ', or the tension that its actuators always exert' if source.least else ''
         source.note(

@@ -30,27 +30,28 @@ from musculoskeletal_ae.learning.samples import Observations, Sample, SampleStor
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, anomaly, residuals
 
-CAPACITY = 4000  # default of the largest number of kept messages
-SPACING = 0.1  # time between kept messages [s]
-LEAST_TIME = 60.0  # healthy time that is required to calibrate a detector [s]
-#: number of distinct rests in the healthy time, and of learned samples, that are required to
-#: calibrate a detector
+CAPACITY = 4000  # keep at most this many messages by default
+SPACING = 0.1  # keep one message in this time [s]
+LEAST_TIME = 60.0  # calibrate a detector only after this much healthy time [s]
+#: calibrate a detector only with this many distinct rests in the healthy time and as many learned
+#: samples
 LEAST_SAMPLES = 20
-#: Threshold relative to the largest healthy d, once the body is well known. An unknown load of
-#: 3.6 kg doubles d; a ruptured tendon multiplies it by six to ten within 0.3 s.
+#: Multiply the largest healthy d by this to get the threshold, once the body is well known. An
+#: unknown load of 3.6 kg doubles d; a ruptured tendon multiplies it by six to ten within 0.3 s.
 MARGIN = 3.5
-#: n_few: number of samples with which the threshold is twice as large as with many samples, because
-#: few samples determine the body poorly
+#: n_few: double the threshold if there are this many samples, because few samples determine the
+#: body poorly
 FEW_SAMPLES = 20.0
-#: Share of Σ's own diagonal that is mixed into Σ. Otherwise combinations of muscles that did not
-#: occur in the messages would look impossible.
+#: Mix this share of Σ's own diagonal into Σ. Otherwise combinations of muscles that did not occur
+#: in the messages would look impossible.
 DIAGONAL_SHARE = 0.1
-GLITCH_SHARE = 0.002  # largest share of the messages that is excluded as glitches
-GLITCH_RATIO = 3.0  # smallest d of a glitch, relative to the largest d of all other messages
-POSTURES = 200  # number of stored postures that show where the detector was calibrated
+GLITCH_SHARE = 0.002  # exclude at most this share of the messages as glitches
+#: exclude a message as a glitch if its d is this multiple of the largest d of all others
+GLITCH_RATIO = 3.0
+POSTURES = 200  # store this many postures, which show where the detector was calibrated
 # Messages from which the network learns must be recent, because tendons creep and bed in.
-RECENT_TIME = 3600.0  # largest age of a recent message [s]
-RECENT_RESTS = 200  # a message is recent if fewer rest samples than this came after it
+RECENT_TIME = 3600.0  # learn from a message only if it is younger than this [s]
+RECENT_RESTS = 200  # learn from a message only if fewer rest samples than this came after it
 
 
 class Healthy(NamedTuple):
@@ -118,9 +119,9 @@ class Reservoir:
             self._rests.add(rest)
 
     def use_isolated(self, isolated: Iterable[int]) -> None:
-        """Forget all messages if a muscle was isolated in some of them, but is not isolated now.
+        """Forget all messages if some lack the values of a muscle that is used from now on.
 
-        These messages lack the values of that muscle. `isolated` are the muscles isolated now.
+        `isolated` are the muscles that are isolated from now on.
         """
         if self._missing - frozenset(isolated):
             self.clear()
@@ -130,21 +131,21 @@ class Reservoir:
         self._kept = [row for row in self._kept if row[-1] <= self.time - seconds]
 
     def remove_angles(self, joint: int, seconds: float) -> None:
-        """Mark θ of a joint as not measured in the messages of the last `seconds`."""
+        """Remove θ of a joint from the messages of the last `seconds`."""
         place = 3 * self._muscles + joint
         for row in self._kept:
             if row[-1] > self.time - seconds:
                 row[place] = np.nan
 
     def clear(self) -> None:
-        """Forget all messages and rests, for example after the body has changed."""
+        """Clear all messages and rests, for example after the body has changed."""
         self._missing = frozenset()
         self._kept.clear()
         self._offered, self._since, self.time = 0, 0.0, 0.0
         self._rests.clear()
 
     def healthy(self) -> Healthy:
-        """Return the messages in the selection, with the healthy time and the number of rests."""
+        """Return the healthy messages that were kept, with healthy time and number of rests."""
         m, count = self._muscles, len(self._rests)
         if not self._kept:
             return Healthy(np.empty((0, 3 * m), np.float32), self.time, count)
@@ -199,7 +200,7 @@ def is_calibrated(mae: Mae) -> bool:
 
 
 def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | None:
-    """Return statistics of a network's residuals, or None if there are fewer than two messages."""
+    """Calibrate on healthy messages: return statistics of residuals, None below two messages."""
     if len(healthy.messages) < 2:
         return None
     tension, length, direction = np.split(healthy.messages.astype(float), 3, axis=1)

@@ -35,7 +35,7 @@ from musculoskeletal_ae.signals.pairing import Paired, Pairing
 SENSOR, MARKER, NONE = 'sensor', 'marker', 'none'
 NO_MESSAGES = 'no muscle_states are received'
 NO_JOINTS = 'muscle_states are received without usable joint angles'
-SPREAD = 0.02  # standard deviation of θ measured by a camera [rad]
+SPREAD = 0.02  # assume this error of θ measured by a camera (standard deviation) [rad]
 
 
 class SampleCollector:
@@ -141,7 +141,7 @@ class SampleCollector:
         self._pairing.joints(time, measured)
 
     def take(self, time: float, message: Any, delay: float = 0.0) -> Paired[MuscleSample] | None:
-        """Check a message of muscle_states, and pair it with θ.
+        """Take a message of muscle_states: check it, and pair it with θ.
 
         Args:
             time: Time of reception [s].
@@ -245,7 +245,7 @@ class SampleCollector:
         self.joint_trust = trust
 
     def reset(self) -> None:
-        """Discard incomplete samples, for example after a backward jump of the clock."""
+        """Reset the collector: discard incomplete samples, for example after a clock jump."""
         self._stream.reset()
         self._joint_stream.reset()
         self._pairing.reset()

@@ -12,7 +12,7 @@ from musculoskeletal_ae.mae.mae import Mae
 
 
 class Job(NamedTuple):
-    """Inputs of an update."""
+    """Everything that an update needs."""
 
     observed: Observations  # the samples, oldest first
     healthy: Healthy  # messages of the healthy arm
@@ -22,7 +22,7 @@ class Job(NamedTuple):
 
 
 class Update(NamedTuple):
-    """Result of an update."""
+    """Everything that an update returns."""
 
     mae: Mae  # the trained network
     loss: float  # training loss

@@ -14,7 +14,7 @@ from collections import deque
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.joint_trust import JointTrust, SensorTrust
 
-MOST_RECENT = 400  # number of newest samples whose times are known
+MOST_RECENT = 400  # remember the times of this many newest samples
 
 
 class JointHistory:
@@ -39,7 +39,7 @@ class JointHistory:
         self._recent.append((now, self._samples.accepted))
 
     def use(self, trust: JointTrust) -> tuple[int, ...]:
-        """Remove or put back angles, as another trust requires; return the newly unused joints."""
+        """Use another trust: remove or put back angles; return the newly unused joints."""
         before, self._trust = self._trust, trust
         new = tuple(j for j in trust.unused if before.is_used[j])
         for j in new:

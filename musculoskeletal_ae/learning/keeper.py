@@ -7,11 +7,11 @@
 
 The learner does not judge its networks. It saves a candidate when the estimator has accepted it. If
 the estimator rejects the newest one, the learner returns to the network that the estimator uses.
-The estimator adds the residual torque to a network that it accepts; it is saved, and continued in
-the next candidate.
-Without an estimator nobody rejects a network, and each one is saved at once.
+The estimator adds the residual torque to a network that it accepts; the learner saves it and copies
+it into the next candidate. Without an estimator nobody rejects a network, and each one is saved at
+once.
 
-A save precedes everything that follows from it. A failed save is retried, and does not prevent the
+A network is saved before it is published. A failed save is retried, and does not prevent the
 publication.
 """
 
@@ -53,7 +53,7 @@ class Publication:
         self._published_at = -math.inf
 
     def take(self, now: float) -> bytes | None:
-        """Return the checkpoint if it is due for publication at `now` [s], else None."""
+        """Take the checkpoint if it is due for publication at `now` [s]; return None otherwise."""
         if not self._is_pending or is_recent(self._published_at, now):
             return None
         self._is_pending, self._published_at = False, now
@@ -103,7 +103,7 @@ class CheckpointKeeper:
         return replace(mae, version=1 + max(mae.version, self._highest_version))
 
     def use(self, mae: Mae) -> None:
-        """Number a network and publish it as a candidate; save it if there is no estimator."""
+        """Use a new network: number it, publish it as a candidate; save it if no estimator runs."""
         self._publish(self.numbered(mae))
         if self._in_use is None:
             self._save_newest(self.publication.checkpoint)
@@ -118,7 +118,7 @@ class CheckpointKeeper:
 
     def _publish(self, mae: Mae) -> None:
         if mae.touch is not None and not mae.touch.time:
-            # Updates do not measure the residual torque; earlier networks have it.
+            # Copy the residual torque from the last network, because updates do not measure it.
             mae = _with_torque_of(self.mae, mae)
         self.mae = mae
         self._highest_version = max(self._highest_version, mae.version)
@@ -130,14 +130,14 @@ class CheckpointKeeper:
         self.store()
 
     def clear(self) -> None:
-        """Forget all networks of the learner."""
+        """Clear all networks of the learner."""
         self.mae = self._saved = self.checkpoint = None
         self.publication.offer(None)
 
     # -- decisions of the estimator -------------------------------------------------------------
 
     def note_accepted(self, mae: Mae) -> None:
-        """Record that the estimator uses this network, and save the newest one if it is the same.
+        """Note that the estimator uses this network, and save the newest one if it is the same.
 
         The newest network differs from it while a decision is pending, after a rejection, and if a
         user has chosen a network for the estimator.
@@ -156,13 +156,13 @@ class CheckpointKeeper:
             self._return_if_rejected()
 
     def note_rejected(self, version: int, reason: str) -> None:
-        """Record that the estimator has rejected the network of this version, and why.
+        """Note that the estimator has rejected the network of this version, and why.
 
         A network may be rejected after it was accepted, if an anomaly follows soon.
         """
         self.rejected, self.last_rejected = self.rejected + 1, reason
         self._rejected_version = version
-        # The version may be that of an earlier learner; no network may be mistaken for that one.
+        # The version may be that of an earlier learner; give no network the same one.
         self._highest_version = max(self._highest_version, version)
         self._return_if_rejected()
 
@@ -193,7 +193,7 @@ class CheckpointKeeper:
         return None if self._state is None else self._state.load(self._samples)
 
     def store(self, changed: bool = True) -> None:
-        """Save samples and network if they have `changed`.
+        """Store samples and network on disk if they have `changed`.
 
         If they have not, check that the files still exist. In both cases, a failed save is retried.
         """

@@ -11,7 +11,7 @@ The estimator validates the candidates (`estimation/network_validation/`). Whate
 training continues from the newest samples and weights.
 
 Muscles that the estimator has isolated are not learned: samples do not describe them. A network
-states without which muscles it was learned; nobody isolates a muscle because of that.
+states without which muscles it was learned; this alone isolates no muscle.
 
 The caller supplies the time: the ROS clock, recorded time or simulated time. All rules for
 collecting samples and starting updates use this time. A recording is therefore learned in the same
@@ -125,8 +125,8 @@ class Learner:
         if saved is not None:
             self._start(saved)
             return
-        # There is no usable saved network, but there may be saved samples. Repeat as many updates
-        # as the samples caused when they were collected.
+        # Without a usable saved network, repeat as many updates as the saved samples caused when
+        # they were collected.
         self.scheduler.restart(updates_to_repeat=len(self.samples))
         if mae is not None:
             self.begin(mae)
@@ -160,7 +160,7 @@ class Learner:
         self.collector.imu(time, link, acceleration)
 
     def take(self, message: Any, time: float, delay: float = 0.0) -> None:
-        """Learn from a message of muscle_states.
+        """Take a message of muscle_states, and learn from it.
 
         Args:
             message: The message, or a `MuscleReading`.
@@ -285,7 +285,7 @@ class Learner:
         self.enabled = enabled
 
     def reset(self) -> None:
-        """Discard incomplete samples, for example after a backward jump of the clock."""
+        """Reset the collector: discard incomplete samples, for example after a clock jump."""
         self.collector.reset()
 
     # -- samples → checkpoints ------------------------------------------------------------------
@@ -324,16 +324,16 @@ class Learner:
         self.keeper.use(mae)
 
     def note_accepted(self, mae: Mae) -> None:
-        """Record that the estimator uses this network; see `CheckpointKeeper`."""
-        # Its detector may have been calibrated before a muscle was changed.
+        """Note that the estimator uses this network; see `CheckpointKeeper`."""
+        # The detector of this network may have been calibrated before a muscle was changed.
         self.keeper.note_accepted(mae if self.scheduler.statistics_hold else uncalibrated(mae))
 
     def note_rejected(self, version: int, reason: str) -> None:
-        """Record that the estimator has rejected the network of this version, and why."""
+        """Note that the estimator has rejected the network of this version, and why."""
         self.keeper.note_rejected(version, reason)
 
     def _forget(self, muscle: int, newest: int = 0) -> None:
-        """Record that only the last `newest` samples describe a muscle, and schedule an update.
+        """Forget what all but the last `newest` samples say about a muscle; schedule an update.
 
         All messages of the healthy arm are discarded.
         """
@@ -344,11 +344,11 @@ class Learner:
     # -- beginning and end ----------------------------------------------------------------------
 
     def begin(self, mae: Mae) -> None:
-        """Start from a network, because no saved network could be loaded; samples are kept."""
+        """Begin with a network, because no saved network could be loaded; samples are kept."""
         self._start(self.keeper.numbered(mae))
 
     def replace(self, mae: Mae | None) -> None:
-        """Discard all samples and start again from a network, or without one.
+        """Replace samples and network by another network, or by nothing.
 
         The previous samples and network are saved as a backup first.
 
@@ -443,7 +443,7 @@ class Learner:
         return 0.0 if math.isinf(self._polled_at) else self.collector.usable.age(self._polled_at)
 
     def report(self, _: float = 0.0) -> Report:
-        """Return the learner's status for /diagnostics."""
+        """Report the learner's status for /diagnostics."""
         return learner_report(self)
 
     def conditions(self, _: float) -> tuple[Condition, ...]:

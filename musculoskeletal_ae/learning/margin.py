@@ -12,7 +12,7 @@ from typing import NamedTuple
 from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.learning.samples import Sample
 
-#: Largest number of messages held back, which bounds the memory if the clock stands still. Even at
+#: Hold back at most this many messages, which bounds the memory if the clock stands still. Even at
 #: 1 kHz, fewer messages than this arrive within DETECTION_DELAY.
 MOST_WAITING = 5000
 
@@ -51,7 +51,7 @@ class AnomalyMargin:
         return self.is_anomaly or self._time < self._closed_until
 
     def pass_time(self, dt: float) -> None:
-        """Advance the time by `dt` [s], to the time of the next message."""
+        """Pass the time `dt` [s], until the next message."""
         self._time += dt
 
     def hold(self, dt: float, reading: Sample, rest: Sample | None) -> list[Waiting]:
@@ -80,5 +80,5 @@ class AnomalyMargin:
         return lost
 
     def reset(self) -> None:
-        """Discard the messages held back, for example after a backward jump of the clock."""
+        """Reset the margin: discard messages held back, for example after a clock jumped back."""
         self._waiting.clear()

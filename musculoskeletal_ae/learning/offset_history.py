@@ -24,10 +24,10 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.limits import LIMITS
 
-#: largest difference between two correct calibrations of the same arm [m]
+#: count the offsets of two calibrations as different only above this [m]
 CALIBRATION_SPREAD = 0.008
-HELD_TIME = 5.0  # time before a finding in which samples may be wrong [s]
-#: smallest jump of a length between two messages that is always detected [m]
+HELD_TIME = 5.0  # hold back samples from this long before a finding [s]
+#: rely on it that a larger jump of a length between two messages is detected [m]
 DETECTED_JUMP = LIMITS.step + LIMITS.speed * LIMITS.longest_step
 
 

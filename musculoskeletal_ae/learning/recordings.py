@@ -34,17 +34,17 @@ from musculoskeletal_ae.signals.muscle_readings import muscle_reading
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 from musculoskeletal_ae.tables.table import Table
 
-#: Number of updates from a table of resting postures, and training steps in each of them. On a
+#: Learn a table of resting postures in this many updates with this many training steps each. On a
 #: running arm, each rest causes an update of fewer steps.
 UPDATES, REST_STEPS = 8, 400
-#: Recordings with fewer different resting postures are learned from slow moments of the motion.
+#: learn from slow moments of the motion if a recording has fewer different resting postures
 LEAST_RESTS = 20
 
 
 def learn_table(
     learner: Learner, table: Table, progress: Callable[[float], None] | None = None
 ) -> str:
-    """Pass a table to a learner; create the learner with `steps=REST_STEPS` if it is at rest.
+    """Learn from a table; create the learner with `steps=REST_STEPS` if the table is at rest.
 
     `progress` is called with the seconds or updates since its last call (`work`).
 
@@ -78,7 +78,7 @@ def count_postures(
     from_motion: bool = False,
     enough: float = math.inf,
 ) -> int:
-    """Return how many different postures a learner would learn from a recording.
+    """Count the different postures that a learner would learn from a recording.
 
     Args:
         robot: The recorded robot.
@@ -115,14 +115,14 @@ def work(table: Table) -> float:
 
 
 def without_pauses(steps: ArrayLike) -> Array:
-    """Return the times between messages [s], in which a pause of the recording counts little."""
+    """Return the times between messages [s], with longer pauses cut to LONGEST_PAUSE."""
     return np.minimum(steps, LONGEST_PAUSE / 1e9)
 
 
 def learn_rests(
     learner: Learner, rests: Pairs, progress: Callable[[float], None] | None = None
 ) -> None:
-    """Store resting postures as samples, and make UPDATES updates.
+    """Learn resting postures: store them as samples, and make UPDATES updates.
 
     Implausible rows are not stored, but counted in `learner.collector.rejected`. The direction in
     which the tendons slid before each rest is unknown.
@@ -154,7 +154,7 @@ def learn_rests(
 def learn(
     learner: Learner, recording: Pairs, progress: Callable[[float], None] | None = None
 ) -> str:
-    """Pass a recording to a learner, message by message, as on a running arm.
+    """Learn from a recording, message by message, as on a running arm.
 
     This function plays the part of the estimator node: it validates the networks, and an estimator
     decides when learning has to stop. `progress` is called with the recorded seconds since its last
@@ -250,12 +250,12 @@ def table_errors(mae: Mae, table: Table) -> Array:
 
 
 def error(mae: Mae, recording: Pairs) -> float:
-    """Return the mean of ‖θ_est − θ‖₂ [rad] over all messages with θ, for joints with sensors."""
+    """Return the mean norm of a network's errors at the joints with sensors [rad]."""
     return mean_error(errors(mae, recording))
 
 
 def mean_error(off: Array) -> float:
-    """Return the mean of ‖θ_est − θ‖₂ [rad] of errors (N, D), for joints with sensors."""
+    """Return the mean norm of the errors (N, D) of the joints with sensors [rad]."""
     is_known = np.isfinite(off).any(axis=1)
     return float(np.linalg.norm(np.nan_to_num(off), axis=1)[is_known].mean())
 

@@ -25,13 +25,13 @@ from musculoskeletal_ae.learning.samples import NOTHING, Sample
 REST_TIME = 0.3  # count the arm as resting after it has been still for this long [s]
 JOINT_RATE = 0.02  # count a joint as moving above this speed [rad/s]
 LENGTH_RATE = 0.002  # count a muscle as moving above this speed [m/s]
-LONGEST_PART = 1.0  # longest part of a rest that one sample averages [s]
-#: largest number of readings in a rest, which bounds the memory if the clock stands still
+LONGEST_PART = 1.0  # average at most this much of a rest in one sample [s]
+#: keep at most this many readings of a rest, which bounds the memory if the clock stands still
 MOST_READINGS = 20_000
-#: Smallest number of readings in each half of the window. With fewer readings, noise could hide a
-#: drift. If messages are slow, the window is therefore longer than REST_TIME.
+#: Require this many readings in each half of the window, and lengthen it if messages are slow: with
+#: fewer readings, noise could hide a drift.
 LEAST_READINGS = 4
-NOISE_FACTOR = 3.0  # largest difference of means that counts as noise, in standard errors
+NOISE_FACTOR = 3.0  # count a difference of means as noise up to this many standard errors
 
 
 class ReadingWindow:
@@ -46,7 +46,7 @@ class ReadingWindow:
         self._first = 0
 
     def clear(self) -> None:
-        """Forget all readings."""
+        """Clear all readings."""
         self.readings.clear()
 
     @property
@@ -55,7 +55,7 @@ class ReadingWindow:
         return self.readings[0][0]
 
     def append(self, time: float, reading: Sample) -> None:
-        """Add a reading received at `time` [s]."""
+        """Append a reading received at `time` [s]."""
         held = min(len(self.readings), MOST_READINGS - 1)  # a full window loses its oldest reading
         self._first += len(self.readings) - held
         row = np.concatenate((reading.length, reading.theta))
@@ -123,7 +123,7 @@ class RestDetector:
         self.reset()
 
     def reset(self) -> None:
-        """Clear the window, for example after a jump of the clock."""
+        """Reset the detector: clear the window, for example after a jump of the clock."""
         self._window.clear()
         self._time = 0.0  # time of the last reading, as the sum of all `dt` [s]
         self._read_at = 0.0  # time of the last usable message [s]

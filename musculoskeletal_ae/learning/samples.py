@@ -22,12 +22,13 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.signals.friction import Transmission
 
-CAPACITY = 400  # default of the largest number of samples in a store
-#: Tendon creep is estimated once the number of accepted samples exceeds this share of the capacity,
-#: if the same share of the samples has all joint angles.
+CAPACITY = 400  # keep at most this many samples by default
+#: Estimate tendon creep once the number of accepted samples exceeds this share of the capacity, and
+#: this share of the samples has all joint angles.
 CREEP_SHARE = 0.5
 NOTHING: Array = np.zeros(0)  # stands for a quantity that was not measured
-#: typical moment arm, which converts lengths to angles where not all joint angles were measured [m]
+#: divide lengths by this typical moment arm to compare them with angles, where not all joint angles
+#: were measured [m]
 MOMENT_ARM = 0.04
 JOINT_DISTANCE = 0.05  # count two samples as different if an angle differs by more [rad]
 TENSION_DISTANCE = 10.0  # count two samples as different if a tension differs by more [N]
@@ -136,7 +137,7 @@ class SampleStore:
         return bool((np.nanmax(np.abs(points[:-1] - points[-1]), axis=1) > 1.0).all())
 
     def add(self, sample: Sample, known: Bools | None = None, number: int | None = None) -> None:
-        """Store a sample as the newest one.
+        """Add a sample as the newest one.
 
         Args:
             sample: The sample.
@@ -156,7 +157,7 @@ class SampleStore:
         return [*self.samples, *(each.sample for each in self.held)]
 
     def forget(self, muscle: int, newest: int = 0) -> None:
-        """Record that only the last `newest` samples still describe a muscle."""
+        """Forget what all but the last `newest` samples say about a muscle."""
         for known in self.known[: len(self.known) - newest]:
             known[muscle] = False
         for held in self.held:
@@ -177,7 +178,7 @@ class SampleStore:
         self.held_offset = offset
 
     def put_back_held(self) -> None:
-        """Reinsert the held samples at their original positions."""
+        """Put back the held samples at their original positions."""
         for each in self.held:
             place = bisect(self.numbers, each.number)
             self.samples.insert(place, each.sample)
@@ -186,12 +187,12 @@ class SampleStore:
         self.held = []
 
     def drop_held(self) -> int:
-        """Forget the held samples; return their number."""
+        """Drop the held samples; return their number."""
         count, self.held = len(self.held), []
         return count
 
     def remove_angles(self, joint: int, numbers: Set[int]) -> dict[int, float]:
-        """Mark θ of a joint as not measured in the samples with these numbers.
+        """Remove θ of a joint from the samples with these numbers.
 
         Returns:
             The removed angles [rad] by number of the sample.
@@ -231,7 +232,7 @@ class SampleStore:
         return len(places)
 
     def clear(self) -> None:
-        """Forget all samples."""
+        """Clear all samples."""
         self.samples: list[Sample] = []  # the oldest first
         self.known: list[Bools] = []  # whether each sample describes each muscle, (M,)
         self.numbers: list[int] = []  # position of each among all samples ever accepted, from 1
@@ -260,7 +261,7 @@ class SampleStore:
         """
         theta, tension, length = (np.array(part) for part in [*zip(*samples, strict=True)][:3])
         unread = np.isnan(theta).any(axis=1, keepdims=True)
-        # Where not all joint angles were measured, compare the muscle lengths as well.
+        # Where not all joint angles were measured, compare samples by muscle lengths as well.
         by_length = np.where(unread, length / (MOMENT_ARM * JOINT_DISTANCE), np.nan)
         by_angle, by_tension = theta / JOINT_DISTANCE, tension / TENSION_DISTANCE
         return np.concatenate([by_angle, by_tension, by_length], axis=1)

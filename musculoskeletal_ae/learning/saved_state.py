@@ -15,7 +15,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-CHECKSUM = 4  # size of the checksum at the start [bytes]
+CHECKSUM = 4  # begin a state file with a checksum of this size [bytes]
 
 Values = tuple[float, ...]
 
@@ -125,7 +125,9 @@ def from_bytes(data: bytes, robot: Robot) -> SavedState:
         )
     for sample in (*state.samples, *state.held):
         if not _fits(sample, robot, len(state.muscles)):
-            raise StateError(f'sample {sample.number} does not fit the robot')
+            raise StateError(
+                f'the arrays of sample {sample.number} do not have the sizes of this robot'
+            )
     if state.held and len(state.held_offset) != len(state.muscles):
         raise StateError(
             f'held_offset has {len(state.held_offset)} values; legal: one for each of the '

@@ -13,9 +13,9 @@ from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae.mae import Mae
 
 STEPS = 50  # training steps in one update of preset `default`; 100 would reduce the error by 3 %
-#: shortest time between the starts of two updates, and between two checkpoints [s]
+#: let at least this time pass between the starts of two updates, and between two checkpoints [s]
 LEAST_INTERVAL = 1.0
-#: number of samples required for the first update of an arm without joint sensors
+#: require this many samples for the first update of an arm without joint sensors
 LEAST_BLIND = 20
 
 
@@ -42,15 +42,15 @@ class UpdateScheduler:
         self._updates_to_repeat = 0
 
     def restart(self, updates_to_repeat: int = 0) -> None:
-        """Start again; run at least `updates_to_repeat` updates even without new data."""
+        """Restart; run at least `updates_to_repeat` updates even without new data."""
         self._updates_to_repeat, self.last_update = updates_to_repeat, None
 
     def note_news(self) -> None:
-        """Record that there are new data to learn from."""
+        """Note that there are new data to learn from."""
         self._has_news = True
 
     def note_change(self) -> None:
-        """Record that a muscle is relearned, which invalidates the detector's statistics."""
+        """Note that a muscle is relearned, which invalidates the detector's statistics."""
         self.statistics_hold = False
         self._has_changed = self._has_news = True
 
@@ -62,7 +62,7 @@ class UpdateScheduler:
     def begin(
         self, now: float, samples: SampleStore, healthy: Reservoir, isolated: tuple[int, ...]
     ) -> Job:
-        """Return the job of an update that begins at `now` [s], and record its beginning."""
+        """Begin an update at `now` [s]; return its job."""
         self._has_news = self.updates + 1 < self._updates_to_repeat
         self._began_at, self._has_changed = now, False
         return Job(

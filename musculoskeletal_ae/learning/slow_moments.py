@@ -36,7 +36,7 @@ class SlowMoments:
         self.reset()
 
     def reset(self) -> None:
-        """Discard all readings, for example after a jump of the clock."""
+        """Reset the detector: discard all readings, for example after a jump of the clock."""
         self._time = 0.0  # time of the newest reading since the start of the period [s]
         self._readings: list[tuple[float, Sample]] = []  # of the moment that has not ended
         self._slowest: tuple[float, Sample] | None = None  # speed and mean of a moment

@@ -28,10 +28,10 @@ from musculoskeletal_ae.robot.robot import Robot
 
 NEWEST, PREVIOUS, LOCK = 'learner.state', 'previous.state', 'lock'
 NETWORK = 'network.safetensors'
-#: largest size of a state file [bytes]; the states of the shipped arms are 100 times smaller
+#: refuse a larger state file [bytes]; the states of the shipped arms are 100 times smaller
 LARGEST = 1 << 26
-CHECK_INTERVAL = 0.5  # time between checks that the files still exist [s]
-RETRY_INTERVAL = 2.0  # time between attempts to save after a failed one [s]
+CHECK_INTERVAL = 0.5  # check at this interval that the files still exist [s]
+RETRY_INTERVAL = 2.0  # try again to save after this time [s]
 
 
 class StateStore:
@@ -139,7 +139,7 @@ class StateStore:
             return None
 
     def _read(self, file: Path) -> SavedState | None:
-        """Return the state in a file; rename the file to a backup if it is unusable."""
+        """Read the state in a file; rename the file to a backup if it is unusable."""
         if not file.exists():
             return None
         try:
@@ -155,7 +155,7 @@ class StateStore:
     # -- writing --------------------------------------------------------------------------------
 
     def keep(self, samples: SampleStore, network: bytes | None, changed: bool = True) -> None:
-        """Save the state if it has `changed`, and retry a failed save (see `trouble`).
+        """Keep the state on disk: save it if it has `changed`, and retry a failed save (`trouble`).
 
         Call this method often. If the state has not changed, the method only checks from time to
         time that the files still exist.
@@ -227,7 +227,7 @@ class StateStore:
             self._note_backup(reason, backup)
 
     def _check_in_place(self) -> None:
-        """Open the directory if it is closed; raise an OSError if it or the state was removed."""
+        """Check that the state is in place, or raise an OSError; open a closed directory."""
         if self._lock is None:
             self._open()
             return

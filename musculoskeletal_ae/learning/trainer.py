@@ -48,7 +48,7 @@ class Trainer:
         self._update: Update | None = None
 
     def begin(self, mae: Mae) -> None:
-        """Let training start from the network `mae`, and discard any earlier job."""
+        """Begin to train the network `mae`, and discard any earlier job."""
         self._updater = self.preset.make_updater(self.robot, mae, self.seed)
         self._update = None
 
@@ -83,15 +83,15 @@ class Trainer:
 
 # -- separate training process --------------------------------------------------------------------
 
-NICENESS = 5  # number that is added to the niceness of the node
-FIRST_PAUSE = 1.0  # pause before a lost training process is restarted [s]; doubles each time
-LONGEST_PAUSE = 60.0  # largest value of this pause [s]
+NICENESS = 5  # add this to the niceness of the node
+FIRST_PAUSE = 1.0  # wait this long before restarting a lost training process [s]; doubles each time
+LONGEST_PAUSE = 60.0  # wait at most this long before a restart [s]
 # A process counts as hung if it has not answered within PATIENCE, plus PATIENCE_PER_STEP for each
-# training step. The first answer may take longer, because imports can take minutes on a slow disk.
-PATIENCE_AT_FIRST = 300.0  # time for the first answer, instead of PATIENCE [s]
-PATIENCE = 60.0  # longest wait for an answer without training steps [s]
-PATIENCE_PER_STEP = 0.1  # additional wait for each training step [s]
-LONGEST_ENDING = 2.0  # longest wait for a killed process to end [s]
+# training step. The first answer may take longer, because imports take minutes on a slow disk.
+PATIENCE_AT_FIRST = 300.0  # wait this long for the first answer [s]
+PATIENCE = 60.0  # wait this long for an answer without training steps [s]
+PATIENCE_PER_STEP = 0.1  # wait this much longer for each training step [s]
+LONGEST_ENDING = 2.0  # wait at most this long for a killed process to end [s]
 
 
 class TrainerProcess(Trainer):
@@ -114,7 +114,7 @@ class TrainerProcess(Trainer):
         self._restart_at = self._deadline = math.inf
 
     def begin(self, mae: Mae) -> None:
-        """Replace the process by a new one that continues from a network."""
+        """Begin with a network in a new process, which replaces the present one."""
         self.close()
         self._mae = mae
         self._start()

@@ -3,9 +3,9 @@
 
 1. Fit the calibrated body to the samples (`body_model/`). Shift the network's lengths by the mean
    change of each muscle's length, so that length offsets and creep need no training.
-2. Draw synthetic samples of the body, and replace some of them by real ones: rest samples and
-   motion samples. There are many more motion samples than rest samples. They also contain what rest
-   samples and the body model lack, such as tendon sliding.
+2. Draw synthetic samples of the body, and replace some of them by real ones: rest samples and the
+   far more numerous motion samples. Motion samples show effects that rest samples and the body
+   model lack, such as tendon sliding.
 3. Train the network on these samples for a bounded number of steps.
 4. Compute the statistics of the residuals on healthy messages (`calibration`), and the expected
    covariance of the estimation errors (`covariance`).
@@ -40,12 +40,12 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.robot.robot import Robot
 
-REAL_SHARE = 0.1  # share of the training samples that rest samples replace
-#: share of the training samples that motion samples replace if there are many of them; with
-#: MANY_MESSAGES motion samples, half of this share
+REAL_SHARE = 0.1  # replace this share of the training samples by rest samples
+#: replace at most this share of the training samples by motion samples; with MANY_MESSAGES of them,
+#: half of this share
 MOVING_SHARE = 0.3
-USES = 3  # mean number of times that a training sample is used
-LEAST_WEIGHT = 0.3  # smallest robust weight with which a rest sample is used for training
+USES = 3  # use each training sample this often on average
+LEAST_WEIGHT = 0.3  # train only with rest samples of at least this robust weight
 
 
 def learned_steps(mae: Mae) -> int:
@@ -85,8 +85,8 @@ class BodyUpdater(Updater):
         job = job._replace(healthy=job.healthy._replace(learned=learned, judging=judging))
         self._trainer.move(self.body_fit.lengthened())
         contradicted = contradicted_muscles(observed, fit)
-        # Several contradicted muscles do not indicate replaced muscles, but for example contact.
-        # The robust weights then exclude the newest samples, until they are the majority.
+        # If several muscles are contradicted, the cause is probably contact and not replaced
+        # muscles. The robust weights then exclude the newest samples, until they are the majority.
         if self._statistics_held and not job.statistics_hold:
             self._trainer.restart()
         self._statistics_held = job.statistics_hold
@@ -129,7 +129,7 @@ class BodyUpdater(Updater):
         )
 
     def _put(self, data: TrainingData, real: Observations, places: slice) -> None:
-        """Replace the training samples at `places` by random real samples.
+        """Put random real samples into the training data at `places`.
 
         The tensions of real samples are converted to bone-side tensions, and their target lengths
         are corrected for the creep since the samples were taken.

@@ -28,9 +28,9 @@ from musculoskeletal_ae.mae.network import Network, to_mae
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.robot.robot import Robot
 
-#: text that separates initial training and online learning in `Mae.training`
+#: separate initial training and online learning by this text in `Mae.training`
 LEARNED = '; learned online: '
-NEWEST = 20  # number of newest samples over which the estimation error is computed
+NEWEST = 20  # compute the estimation error over this many newest samples
 
 
 class Updater(ABC):
@@ -46,7 +46,7 @@ class Updater(ABC):
         return None
 
     def update(self, job: Job) -> Update:
-        """Run one update and return its result.
+        """Update body and network once; return the result.
 
         The duration is bounded, because the numbers of samples and training steps are bounded.
         """

@@ -33,31 +33,34 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.schema import Strict, convert
 from musculoskeletal_ae.signals.friction import LARGEST_GAIN
 
-FORMAT_VERSION = 1  # version of the file format
-#: largest size of a checkpoint [bytes]; those of the shipped robots have a hundredth of this size
+FORMAT_VERSION = 1  # reject checkpoints of any other version of the file format
+#: reject a larger checkpoint [bytes]; those of the shipped robots are a hundred times smaller
 MAX_BYTES = 64 * 1024 * 1024
-MAX_HEADER_BYTES = 1024 * 1024  # largest size of a checkpoint's header [bytes]
-# No trained network has values beyond the following limits. Values beyond them could overflow when
-# `Mae` folds units and standardisation into the layers.
-LARGEST = 1e9  # largest absolute value of any number
-SMALLEST_STD = 1e-9  # smallest standard deviation
-LARGEST_FRICTION = 5.0  # largest μ; the tensions at the ends of a tendon then differ 150-fold
-SMALLEST_EIGENVALUE = 1e-12  # smallest eigenvalue of a covariance, relative to the largest one
-#: smallest eigenvalue of the springs' stiffness, relative to the largest one; springs have no
-#: negative eigenvalue, except for rounding errors
+MAX_HEADER_BYTES = 1024 * 1024  # reject a checkpoint with a larger header [bytes]
+# Reject values beyond the following limits: no trained network has them, and they could overflow
+# when `Mae` folds units and standardisation into the layers.
+LARGEST = 1e9  # reject any number with a larger absolute value
+SMALLEST_STD = 1e-9  # reject a smaller standard deviation
+#: reject a larger μ; it would make the tensions at the ends of a tendon differ 150-fold
+LARGEST_FRICTION = 5.0
+#: reject a covariance whose smallest eigenvalue is not above this multiple of the largest one
+SMALLEST_EIGENVALUE = 1e-12
+#: reject a stiffness matrix of the springs with an eigenvalue below this multiple of the largest
+#: one; rounding can make eigenvalues slightly negative, springs cannot
 SMALLEST_SPRING_EIGENVALUE = -1e-6
-#: reject a network if its postures of a prismatic joint span less than this share of the joint's
-#: range; networks from before θ of such joints was in rad have a 17 times smaller span.
-#: A network whose inputs are not standardised does not tell its span.
+#: Reject a network if its postures of a prismatic joint span less than this share of the joint's
+#: range. Networks from before θ of such joints was in rad have a 17 times smaller span. A network
+#: whose inputs are not standardised passes, because its span is unknown.
 LEAST_SPAN = 0.25
-#: largest absolute values in the estimate of the middle posture: θ [rad], T [N], l [m], G [m/rad]
+#: reject a network whose estimate of the middle posture exceeds these: θ [rad], T [N], l [m], G
+#: [m/rad]
 LARGEST_ESTIMATES = (100.0, 1e5, 100.0, 1e5)
 
 Count = Annotated[int, Meta(ge=0, le=2**53)]
 Names = Annotated[tuple[str, ...], Meta(min_length=1, max_length=1000)]
 Units = Annotated[int, Meta(ge=1, le=4096)]
 Threshold = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
-#: entries of the metadata that are attributes of `Mae` with the same name
+#: copy these entries of the metadata to and from the attributes of `Mae` with the same name
 SHARED = (
     'joints', 'muscles', 'groups', 'isolated', 'activation', 'preset', 'version', 'training',
 )  # fmt: skip
@@ -212,7 +215,7 @@ def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoin
 
 
 def restored(data: bytes, robot: Robot | None = None) -> Mae:
-    """Return the network like `from_bytes`, with errors that state only the problem.
+    """Return the network like `from_bytes`, but raise errors that state the problem only.
 
     Args:
         data: The bytes.
@@ -242,7 +245,7 @@ def _metadata(data: bytes) -> Metadata:
     """Return the metadata of safetensors bytes."""
     if len(data) > MAX_BYTES:
         raise CheckpointError(f'it has {len(data)} bytes; legal: at most {MAX_BYTES}')
-    if len(data) < 10:  # the size of the header in 8 bytes, and the shortest header
+    if len(data) < 10:  # 8 bytes for the size of the header, and at least 2 for the header
         problem = f'not safetensors: it has {len(data)} bytes; legal: at least 10'
         raise CheckpointError(problem)
     size, most = int.from_bytes(data[:8], 'little'), min(MAX_HEADER_BYTES, len(data) - 8)
@@ -257,8 +260,8 @@ def _metadata(data: bytes) -> Metadata:
         problem = f'no metadata ({error}); this is not a checkpoint of musculoskeletal_ae'
         raise CheckpointError(problem) from error
     values = {key: _json(text, key) for key, text in entries.items()}
-    # The version is checked first, because a file of another version may violate the schema in
-    # many ways, and the error should name the cause.
+    # Check the version first: a file of another version may violate the schema in many ways, and
+    # the error should name the cause.
     version = values.get('format_version')
     if version is True or version != FORMAT_VERSION:
         problem = f'format_version {version!r:.100}; legal: {FORMAT_VERSION}'
@@ -329,8 +332,8 @@ def _check_covariance(name: str, covariance: Array) -> None:
         least, most = np.linalg.eigvalsh(covariance)[[0, -1]]  # one value if the matrix is (1, 1)
     except np.linalg.LinAlgError as error:
         raise CheckpointError(f'tensor {name}: its eigenvalues cannot be computed') from error
-    # A covariance is positive definite. The covariance of the residuals must not be close to
-    # singular either, because the detector inverts it.
+    # Require a covariance that is positive definite and, because the detector inverts that of the
+    # residuals, not nearly singular.
     if not least > SMALLEST_EIGENVALUE * most:
         raise CheckpointError(
             f'tensor {name} has eigenvalues from {least:g} to {most:g}; the smallest must '
@@ -428,7 +431,7 @@ def _check_fit(mae: Mae, robot: Robot) -> None:
 
 
 def save(mae: Mae, path: str | Path) -> None:
-    """Write a checkpoint file atomically.
+    """Save a network as a checkpoint file, atomically.
 
     Raises:
         OSError: If the file cannot be written.
@@ -437,7 +440,7 @@ def save(mae: Mae, path: str | Path) -> None:
 
 
 def load(path: str | Path, robot: Robot | None = None) -> Mae:
-    """Read and check a checkpoint file (see `from_bytes`).
+    """Load and check a checkpoint file (see `from_bytes`).
 
     Raises:
         CheckpointError: If the file cannot be read, is invalid or does not fit the robot.

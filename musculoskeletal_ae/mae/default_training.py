@@ -4,19 +4,18 @@
     L = ‖θ − θ_calc‖ + ‖T − T_calc‖ + ‖l − l_calc‖ + ‖G − G_calc‖
 
 Each norm is in units of the standard deviation of the data, so that all have similar weight. G is
-the muscle Jacobian ∂l/∂θ of the lengths that the network restores from θ and T. Control needs it.
-Each sample has a twin, which is a close neighbour. The difference between the length errors of the
-two, divided by their distance, serves as the error of G. Every sample passes through all three
-masks. Muon updates the matrices, with a step size that rises and then falls to zero.
+the muscle Jacobian ∂l/∂θ of the lengths that the network restores from θ and T; control needs it.
+Each sample has a close neighbour, its twin. The error of G is the difference between the length
+errors of sample and twin, divided by their distance. Every sample passes through all three masks.
+Muon updates the matrices, with a step size that rises and then falls to zero.
 
-LAYERS and STEPS apply to an arm with 5 joints and 10 muscles. A body of several groups
-that share no joint or muscle gets a block of the network for each group. The layers of a larger
-group grow in proportion to its D + M. If they grew by the square root, the error of θ of a
-body with 17 joints and 40 muscles would be 0.0045 instead of 0.0030 rad per joint. The number of
-mini-batches in initial training grows with D + M of the largest group to the power of 1.5. With
-this power, the estimation error from T and l is a tenth lower for the larger body than for the arm
-with 5 joints. If the number grew in proportion to D + M, the error would be higher than for the
-arm.
+LAYERS and STEPS apply to an arm with 5 joints and 10 muscles. If groups of joints and muscles share
+neither, each group gets its own block of the network. The layers of a larger group grow in
+proportion to its D + M. If they grew by the square root, the error of θ of a body with 17 joints
+and 40 muscles would be 0.0045 instead of 0.0030 rad per joint. The number of mini-batches grows
+with D + M of the largest group to the power of 1.5: the estimation error from T and l is then a
+tenth lower for the larger body than for the arm with 5 joints, and with growth in proportion it
+would be higher.
 """
 
 import math
@@ -41,29 +40,29 @@ from musculoskeletal_ae.mae.units import LENGTH_SCALE, State, scale_vector
 from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.robot import Robot
 
-LAYERS = Layers((200, 100), 'silu')  # hidden layers of the encoder, and activation
-STEPS = 3000  # number of mini-batches
-BATCH = 128  # number of samples of a mini-batch
-SAMPLES = 200_000  # largest number of different samples
-STEP_SIZE = 0.004  # step size of the biases; `optimiser` derives the step size of the matrices
-REFERENCE = 5 + 10  # D + M of the arm to which LAYERS and STEPS apply
-# `size` counts at most this number of muscles per joint, because further muscles add equations, but
-# no unknowns.
+LAYERS = Layers((200, 100), 'silu')  # give the reference arm these hidden layers
+STEPS = 3000  # train the reference arm on this many mini-batches
+BATCH = 128  # train on this many samples at once
+SAMPLES = 200_000  # draw at most this many different samples
+STEP_SIZE = 0.004  # train biases with this step size; `optimiser` derives that of the matrices
+REFERENCE = 5 + 10  # scale LAYERS and STEPS for a body with another D + M than this
+# Count at most this many muscles per joint in `size`, because further muscles add equations, but no
+# unknowns.
 COUNTED_MUSCLES = 2.5
 
-# Fraction of samples with tensions beyond tension.limit. Payloads can cause such tensions. With
-# these samples, the estimator loses accuracy only gradually beyond the limit.
+# Draw this fraction of samples with tensions beyond tension.limit, as payloads can cause. With
+# them, the estimator loses accuracy only gradually beyond the limit.
 OVERLOAD_SHARE = 0.2
-# Samples of θ exceed each joint limit by up to this fraction of the range. A network is least
+# Let samples of θ exceed each joint limit by up to this fraction of the range. A network is least
 # accurate at the edge of its training data, and arms do rest at their limits.
 POSTURE_MARGIN = 0.05
-# Distance between a sample and its twin, in standard deviations of θ. Over this distance, routes
-# are almost linear, but float32 still resolves the difference.
+# Draw each twin at this distance from its sample, in standard deviations of θ. Over this distance,
+# routes are almost linear, and float32 still resolves the difference.
 TWIN_DISTANCE = 0.1
-# Lower limit of the standard deviation that standardisation divides by, in scaled units. Without
-# it, standardisation would amplify the noise of a joint or muscle that hardly varies.
+# Standardise by no smaller standard deviation than this, in scaled units. A smaller one would
+# amplify the noise of a joint or muscle that hardly varies.
 LEAST_SPREAD = 1e-4
-RISE = 0.05  # fraction of the training during which the step size rises
+RISE = 0.05  # let the step size rise during this fraction of the training
 
 # -- size --------------------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ from musculoskeletal_ae.mae.training import Progress, TrainedNetwork, random_sta
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
-HELD_OUT_STATES = 5000  # number of held-out states from which the first statistics are computed
+HELD_OUT_STATES = 5000  # compute the first statistics from this many held-out states
 
 
 class Trained(NamedTuple):

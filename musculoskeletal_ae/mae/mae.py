@@ -53,15 +53,16 @@ from musculoskeletal_ae.signals.friction import Transmission
 Layer = tuple[Array, Array]
 
 # Constants of the estimate with isolated muscles.
-ROUNDS = 15  # largest number of Gauss–Newton steps
-LENGTH_NOISE = 0.0003  # standard deviation of the sensor noise that is added to Σ [m]
-LENGTH_SPREAD = 0.003  # standard deviation of each length if there are no anomaly statistics [m]
+ROUNDS = 15  # end the fit of θ after this many Gauss–Newton steps
+LENGTH_NOISE = 0.0003  # add sensor noise of this standard deviation to Σ [m]
+#: without anomaly statistics, assume this standard deviation of each length [m]
+LENGTH_SPREAD = 0.003
 
 
 class BlockDiagonal:
     """A weight (in, out) that consists of blocks, each with its own inputs and outputs."""
 
-    __array_ufunc__ = None  # lets numpy use __rmatmul__ for x @ weight
+    __array_ufunc__ = None  # makes numpy call __rmatmul__ for x @ weight
 
     def __init__(self, blocks: Sequence[Singles], into: Ints | None, out: Ints | None) -> None:
         """Combine blocks.
@@ -96,7 +97,7 @@ class BlockDiagonal:
 def product(x: Singles, weight: Singles | BlockDiagonal) -> Singles:
     """Return x @ weight, shape (..., out), for x (..., in).
 
-    The method `dot` is used where possible. The operator @ takes 0.4 µs longer, which is as much as
+    This function calls `dot` where possible, because the operator @ takes 0.4 µs longer: as much as
     the whole product of one row with a layer.
     """
     if x.ndim > 2 or isinstance(weight, BlockDiagonal):
@@ -164,7 +165,7 @@ ACTIVATIONS = {
     'tanh': Activation(_tanh, _tanh_slope, 1.0),
     'silu': Activation(_silu, _silu_slope, 0.5),
 }
-LINEAR = Activation(_linear, _linear_slope, 1.0)  # at the latent layer, between two joined stacks
+LINEAR = Activation(_linear, _linear_slope, 1.0)  # join two stacks by this at the latent layer
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,8 +227,8 @@ class Stack:
         """
         x, tangent = values.astype(np.float32), directions.astype(np.float32)
         for i, (weight, bias) in enumerate(self.layers):
-            # numpy would multiply each (K, in) matrix separately. One product of all rows is twice
-            # as fast.
+            # Multiply all rows at once: numpy would multiply each (K, in) matrix separately, which
+            # takes twice as long.
             shape = tangent.shape[:-1]
             if len(shape) > 1:
                 tangent = tangent.reshape(-1, tangent.shape[-1])
@@ -384,7 +385,7 @@ class Mae:
         return self._enter[mask](np.concatenate((one, two), axis=-1))
 
     def decode(self, z: Array) -> State:
-        """Return (θ, T, l) in SI units from z of shape (..., D+M)."""
+        """Decode (θ, T, l) in SI units from z of shape (..., D+M)."""
         joints, muscles = len(self.joints), len(self.muscles)
         values = self._leave(z)
         return State(values[..., :joints], values[..., joints:-muscles], values[..., -muscles:])
@@ -411,7 +412,7 @@ class Mae:
         return state._replace(theta=theta)
 
     def fit_posture(self, tension: Array, length: Array, root: Array, start: Array) -> Array:
-        """Return the most likely posture for measured lengths, θ [rad], (..., D).
+        """Fit the most likely posture to measured lengths; return θ [rad], (..., D).
 
         Args:
             tension: Bone-side tension T_end [N], (..., M).

@@ -118,7 +118,7 @@ class Network(nn.Module):
         return self.encoder(x)  # (N, D+M)
 
     def decode(self, z: Tensor) -> Tensor:
-        """Return scaled (θ, T, l), (N, D+2M), of z (N, D+M)."""
+        """Decode scaled (θ, T, l), (N, D+2M), from z (N, D+M)."""
         return self.decoder(z) * self.std + self.mean
 
     def forward(self, values: Tensor, mask: Tensor) -> Tensor:

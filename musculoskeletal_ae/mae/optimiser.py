@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.optim.adam import adam
 
 TINY = 1e-20  # keeps the root of a zero matrix finite
-MOMENTUM = 0.95  # decay of Muon's momentum per step
+MOMENTUM = 0.95  # multiply Muon's momentum by this in each step
 # Coefficients (a, b, c) of the Newton–Schulz polynomials a x + b x³ + c x⁵. Applied one after the
 # other, they bring every singular value close to 1.
 POLYNOMIALS = (
@@ -27,9 +27,8 @@ POLYNOMIALS = (
     (2.8769, -3.1427, 1.2046),
     (2.8366, -3.0525, 1.2012),
 )
-# For matrices whose smaller side is longer than this, an eigendecomposition takes half the time of
-# the polynomials. It was measured for 413 × 827, as in the network of a hand of 23 joints; for
-# 163 × 327, both take the same time.
+# Use an eigendecomposition for matrices whose smaller side is longer than this. At 413 × 827, as in
+# a hand of 23 joints, it takes half the time of the polynomials; at 163 × 327, as long as they do.
 LARGE = 256
 #: raise eigenvalues to at least this multiple of the largest; float32 does not resolve smaller ones
 LEAST_EIGENVALUE = 1e-7
@@ -69,8 +68,8 @@ class Optimiser:
         self._matrices = [p for p in parameters if muon and p.ndim == 2]
         self._momenta = [torch.zeros_like(p) for p in self._matrices]
         self._step_size = step_size
-        # The state of Adam is kept here for the function `adam`, because constructing
-        # torch.optim.Adam would load torch's compiler, which takes a second or more.
+        # Keep the state of Adam here, for the function `adam`: constructing torch.optim.Adam would
+        # load torch's compiler, which takes a second or more.
         self._others = [p for p in parameters if not muon or p.ndim != 2]
         self._moments = [[torch.zeros_like(p) for p in self._others] for _ in range(2)]
         self._counts = [p.new_zeros(()) for p in self._others]

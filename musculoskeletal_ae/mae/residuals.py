@@ -19,12 +19,13 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, State
 
-# Lowest standard deviation of a residual in scaled units. It corresponds to 0.02 N or 0.01 mm,
-# which is below any sensor's resolution. This lower limit keeps the covariance invertible if a
-# network restores some combination of its inputs perfectly.
+# Assume at least this standard deviation of a residual in scaled units: 0.02 N or 0.01 mm, which no
+# sensor resolves. It keeps the covariance invertible if a network restores some combination of its
+# inputs perfectly.
 FLOOR = 1e-4
-ANYTHING = 10.0  # standard deviation of a residual that is ignored, in scaled units
-LEAST_MOTION = 60.0  # duration of motion that calibrated touch statistics require [s]
+ANYTHING = 10.0  # give residuals that are ignored this standard deviation, in scaled units
+#: trust touch statistics only if they cover at least this duration of motion [s]
+LEAST_MOTION = 60.0
 
 
 def residuals(
@@ -54,11 +55,11 @@ def anomaly(error: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class AnomalyStatistics:
-    """Mean and covariance of the residuals e (module docstring) over healthy data."""
+    """Mean and covariance of the residuals e = (T_est − T, l_est − l) over healthy data."""
 
     mean: Array  # mean μ of e, (2M,)
     covariance: Array  # covariance Σ of e, symmetric and positive definite, (2M, 2M)
-    calibrated: bool  # whether they describe the real arm in its present state well enough
+    calibrated: bool  # whether enough data of the real arm, in its present state, are included
     samples: int  # number of residuals e from which mean and covariance were computed
     #: thresholds of the detectors, by name; all are finite
     thresholds: Mapping[str, float] = field(default_factory=dict)

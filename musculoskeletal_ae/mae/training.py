@@ -60,7 +60,7 @@ def shuffled(samples: Array, batch: int, rng: np.random.Generator) -> Iterator[A
 
 
 def check_device(device: str) -> None:
-    """Raise a MusculoskeletalError if torch cannot use a device."""
+    """Check that torch can use a device; raise a MusculoskeletalError otherwise."""
     try:
         # An available device may still fail to compute, so compute something.
         torch.ones(1, device=device).sum().item()
@@ -78,8 +78,8 @@ def train_on(device: str) -> None:
         MusculoskeletalError: If torch cannot use the device.
     """
     check_device(device)
-    # While a default device is set, every call of torch is slower, and a training step takes a
-    # fifth longer. No default device is therefore set for the CPU.
+    # Set no default device for the CPU: while one is set, every call of torch is slower, and a
+    # training step takes a fifth longer.
     torch.set_default_device(None if device == 'cpu' else device)
 
 

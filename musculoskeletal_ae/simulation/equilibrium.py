@@ -41,13 +41,13 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import REVERSAL
 from musculoskeletal_ae.simulation.load import Load, LoadTree, hold
 
-#: l_target of muscles without a command [m]; MSC then holds T_bias, and modules that follow
-#: positions hold their length
+#: use this l_target for muscles without a command [m]; MSC then holds T_bias, and modules that
+#: follow positions hold their length
 PAID_OUT = np.inf
-#: K_stiff of position-controlled modules [N/m]; 400 N move such a module by a millimetre
+#: give position-controlled modules this K_stiff [N/m]; 400 N move such a module by a millimetre
 RIGID = 4e5
-#: B without the dampers, divided by Σ_i |∂l_i/∂θ| [N·s/rad]. With it, motions take as long as on
-#: the emulated arm; values from 8 to 20 do equally well.
+#: Multiply Σ_i |∂l_i/∂θ| by this to get B without the dampers [N·s/rad]. Motions then take as long
+#: as on the emulated arm; values from 8 to 20 do equally well.
 VISCOSITY = 12.0
 JACOBIAN_POSTURES = 100  # average |∂l_i/∂θ| over this many postures
 LEAST_VISCOSITY = 0.1  # use at least this B, such as at a joint that no muscle crosses [N·m·s/rad]
@@ -55,7 +55,7 @@ LEAST_VISCOSITY = 0.1  # use at least this B, such as at a joint that no muscle 
 #: network errors
 JOINT_SPEED = 5.0
 MODULE_SPEED = 0.25  # let muscle modules wind no faster than this, as in the emulator [m/s]
-ROUNDS = 3  # find the tendons whose friction reverses in a step in at most this many rounds
+ROUNDS = 3  # search in at most this many rounds for the tendons whose friction reverses in a step
 FARTHEST = 0.05  # let a position command run ahead of the module by at most this distance [m]
 POSTURES_PER_COEFFICIENT = 10  # fit a cubic to this many postures per coefficient
 
@@ -79,7 +79,7 @@ class Body(NamedTuple):
     most: Array  # T_max [N]
     span: Array  # distance of l_target below l at which T reaches T_max [m]
     loose: Array  # distance of l_target above l beyond which T no longer changes [m]
-    friction: Array  # tendon friction coefficient μ
+    friction: Array  # tendon friction μ
     speed: Array  # largest speed of the module [m/s]; infinite if it is not stated
     # constants of the series elastic elements, as in `SeriesElastic`
     force: Array
@@ -125,7 +125,7 @@ def clip(value: float, low: float, high: float) -> float:
 def follow(
     command: float, followed: float, length: float, span: float, loose: float, most: float
 ) -> float:
-    """Return the length [m] that a muscle module has reached on the way to a command.
+    """Follow a command: return the length [m] that a muscle module has reached on the way.
 
     Args:
         command: l_target [m].
@@ -136,17 +136,16 @@ def follow(
         most: Largest distance that the module winds in a step [m].
     """
     reached = followed + clip(command - followed, -most, most)
-    # Limit the position of the module. Beyond these limits the tension no longer changes, and the
-    # module would only lose time on the way back.
+    # Stop the module where the tension no longer changes; it would only lose time on the way back.
     return clip(reached, length - span, length + max(loose, most))
 
 
 @njit(cache=True)
 def combine(shares: Array, rows: Array, total: Array) -> None:
-    """Fill `total` (W, N) with rowsᵀ @ shares, from rows (K, W) and shares (K, N)."""
+    """Combine rows (K, W) with shares (K, N): fill `total` (W, N) with rowsᵀ @ shares."""
     terms, width = rows.shape
     total[:] = 0.0
-    # The innermost loop should be long, because a core computes several numbers at once.
+    # Make the innermost loop long, because a core computes several numbers at once.
     if total.shape[1] == 1:
         row = total.reshape(width)
         for k in range(terms):
@@ -216,7 +215,7 @@ def add_slopes(
 def turn(
     body: Body, theta: Array, push: Array, matrix: Array, most: float, fixed: Array, arrived: Array
 ) -> None:
-    """Fill `arrived` with θ (D, N) after the Newton step Δθ that solves matrix · Δθ = push.
+    """Turn the joints by the Newton step of matrix · Δθ = push; fill `arrived` with θ (D, N).
 
     Δθ is scaled down so that no joint moves by more than `most` [rad]. A joint that `push` presses
     against its stop stays there, and forced joints move towards their angles in `fixed`. Only the
@@ -245,7 +244,7 @@ def turn(
         for n in range(arms):
             if held[d, n]:
                 turned[d, n] = 0.0
-    # Gaussian elimination. The viscosity on the diagonal makes pivoting unnecessary.
+    # Eliminate (Gauss); the viscosity on the diagonal makes pivoting unnecessary.
     for d in range(joints):
         for e in range(d + 1, joints):
             for n in range(arms):
@@ -273,7 +272,7 @@ def advance(
     robot: Handle, state: ArmState, after: ArmState, h: float, passed: Array, pulled: Array,
     command: Array, wrench: Array, fixed: Array,
 ) -> None:  # fmt: skip
-    """Compute the state of N arms after a step of h [s], and write it into `after`.
+    """Advance N arms by a step of h [s], and write their states into `after`.
 
     The last axis of all arrays is that of the arms.
 
@@ -329,8 +328,9 @@ def advance(
             stiffness, bias, most = body.stiffness[m], body.bias[m], body.most[m]
             friction = body.friction[m]
             for n in range(arms):
-                # While the friction of a tendon reverses, it acts like a stiff spring. Its
-                # stiffness is constant here, but decreases gradually on the real arm.
+                # While the friction of a tendon reverses, it acts like a stiff spring. On the real
+                # arm, its stiffness decreases gradually; here it is constant until the friction has
+                # reversed.
                 rubbed, turns = friction * end[m, n], abs(turning[m, n]) < 1.0
                 rub = rubbed / REVERSAL if turns else 0.0
                 lost[m, n] = 0.0 if turns else rubbed * (turning[m, n] - slid[m, n])
@@ -342,8 +342,8 @@ def advance(
                 soft[m, n] = stiffness / (give[m, n] + stiffness * by_motor)
                 slack = compliance[m, n] * lost[m, n] - by_motor * (aim - tension[m, n])
                 wanted[m, n] = aim + soft[m, n] * slack
-                # Where T is clipped to T_bias or T_max, it does not depend on the length, so the
-                # stiffness of the muscle is left out of the Newton matrix (semismooth Newton).
+                # Leave the stiffness of a muscle out of the Newton matrix where T is clipped to
+                # T_bias or T_max, and does not depend on the length (semismooth Newton).
                 settled = clip(wanted[m, n], bias, most)
                 rise = settled - tension[m, n]
                 moved = (compliance[m, n] * lost[m, n] - by_motor * rise) / give[m, n]
@@ -402,7 +402,7 @@ class QuasiStatics:
         self._viscosity = viscosity + robot.kinematics.elasticity.damping
 
     def use(self, mae: Mae, robot: Robot) -> None:
-        """Set the network, and the robot with the currently isolated muscles.
+        """Use a network, and the robot with the currently isolated muscles.
 
         Raises:
             FloatingPointError: If the network's lengths are not finite at some posture.
@@ -411,7 +411,7 @@ class QuasiStatics:
         robot = robot.with_elasticity(mae.elasticity)
         self._robot, elastic, self._mae = robot, robot.series_elastic, mae
         self.tree = Load(robot.kinematics).tree
-        # A noisy fit may return a slightly negative friction, which would drive the arm.
+        # Raise a slightly negative friction, as a noisy fit may return it: it would drive the arm.
         friction = np.maximum(mae.friction, 0.0)
         bias, most = robot.tension.bias, robot.tension.max
         farthest = np.full_like(most, FARTHEST)
@@ -464,7 +464,7 @@ class Slopes:
     """
 
     def __init__(self, robot: Robot) -> None:
-        """Draw the postures of the fits over all joint ranges; tensions are in mid-range."""
+        """Draw postures over all joint ranges, to which `fit` fits; tensions are in mid-range."""
         most = max(len(group.joints) for group in robot.groups)
         count = POSTURES_PER_COEFFICIENT * comb(most + 3, 3)
         self._postures = robot.random_postures(count, np.random.default_rng(0))

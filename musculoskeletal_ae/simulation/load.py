@@ -120,7 +120,7 @@ def place(tree: LoadTree, theta: Array, pose: Array) -> None:
 
 @njit(cache=True)
 def hold(tree: LoadTree, theta: Array, wrench: Array, load: Array, gradient: Array) -> None:
-    """Fill load [N·m] (D, N) and its gradient ∂load/∂θ [N·m/rad] (D, D, N) at θ [rad] (D, N).
+    """Hold the arms: fill load [N·m] (D, N) and ∂load/∂θ [N·m/rad] (D, D, N) at θ [rad] (D, N).
 
     The wrench [N, N·m] (6, N) acts at the end effector's origin, in axes of the root link. The
     gradient includes the wrench's force, but not its torque.

@@ -12,7 +12,7 @@ class SimulatedBody(Protocol):
     """Steps N simulated arms of one robot; `Preset.make_simulator` returns an instance."""
 
     def use(self, mae: Any, robot: Robot) -> None:
-        """Set the network, and the robot with the currently isolated muscles."""
+        """Use a network, and the robot with the currently isolated muscles."""
 
     def step(
         self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array

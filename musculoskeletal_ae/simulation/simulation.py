@@ -82,7 +82,7 @@ class Simulation:
         self.start_from(np.zeros((arms, robot.joint_count)))
 
     def use(self, mae: Mae) -> None:
-        """Set a new network; the arms then move from their present state to its equilibrium.
+        """Use a new network; the arms then move from their present state to its equilibrium.
 
         Raises:
             FloatingPointError: If the new network cannot be simulated; the current network then
@@ -97,7 +97,7 @@ class Simulation:
         self.use(self.mae)
 
     def start_from(self, theta: Array) -> None:
-        """Put the arms at θ [rad] (N, D), within the joint limits, with T_bias and no command.
+        """Start from θ [rad] (N, D), within the joint limits, with T_bias and no command.
 
         If the number of arms changes, wrenches and forced angles are reset as well.
 
@@ -150,7 +150,7 @@ class Simulation:
         return [*compress(robot.joints, stopped), *compress(robot.muscles, full)]
 
     def report(self) -> Report:
-        """Return the status of the first arm: forced joints, external wrench and limits."""
+        """Report the status of the first arm: forced joints, external wrench and limits."""
         values = {'checkpoint version': str(self.mae.version)}
         fixed, wrench, command = self.fixed[0], self.wrench[0], self.command[0]
         if forced := ', '.join(compress(self.robot.joints, np.isfinite(fixed))):

@@ -4,7 +4,7 @@
 from musculoskeletal_ae.options import Parser, exit_status, number, whole
 from musculoskeletal_ae.process_signals import import_heavy
 
-REACH = 0.02  # default of --reach [m]
+REACH = 0.02  # let --suggest move a via point by at most this, unless --reach is given [m]
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -9,7 +9,8 @@ from musculoskeletal_ae.experiments import NAMES, PAPER
 from musculoskeletal_ae.options import Parser, exit_status, whole
 from musculoskeletal_ae.process_signals import import_heavy
 
-# Two minutes of exploration are enough to calibrate the detector, so that every result has a value.
+# With --quick, explore for two minutes: enough to calibrate the detector, so that every result has
+# a value.
 QUICK_MINUTES, QUICK_SEEDS = 2.0, (0,)
 MINUTES, SEEDS = 10.0, (0, 1, 2, 3, 4)
 

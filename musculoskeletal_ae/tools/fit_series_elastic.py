@@ -19,14 +19,17 @@ from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.series_elastic import DEFAULT, SeriesElastic
 
 COLUMNS = ['tension', 'absolute_length', 'elongation']
-EXAMPLE_TENSIONS = (5.0, 15.0, 30.0, 60.0, 110.0, 200.0, 330.0, 500.0)  # [N]
-EXAMPLE_LENGTHS = (0.15, 0.30, 0.45, 0.60)  # [m]
-EXAMPLE_NOISE = 1e-4  # standard deviation of the noise [m]: the resolution of a caliper
-LEAST_FORCE, MOST_FORCE = 1e-3, 1e3  # range of `force`, relative to the highest tension
-ROUNDS = 200  # largest number of Gauss–Newton steps
-ENOUGH = 1e-9  # decrease of the sum of squares, relative to the noise, by the last step
-LEAST_ELONGATION = -0.002  # smallest legal elongation [m]; noise can make it negative
-#: largest length of a muscle on a testbed [m]; larger numbers are probably in another unit
+#: write rows with these tensions into the example table [N]
+EXAMPLE_TENSIONS = (5.0, 15.0, 30.0, 60.0, 110.0, 200.0, 330.0, 500.0)
+EXAMPLE_LENGTHS = (0.15, 0.30, 0.45, 0.60)  # write rows for muscles of these lengths [m]
+#: add noise of this standard deviation to the example table [m]: the resolution of a caliper
+EXAMPLE_NOISE = 1e-4
+LEAST_FORCE, MOST_FORCE = 1e-3, 1e3  # keep `force` in this range, relative to the highest tension
+ROUNDS = 200  # end the fit after this many Gauss–Newton steps
+#: end the fit if a step lowers the sum of squares by less than this, relative to the noise
+ENOUGH = 1e-9
+LEAST_ELONGATION = -0.002  # reject a smaller elongation [m]; noise can make it slightly negative
+#: reject a longer muscle on a testbed [m]; larger numbers are probably in another unit
 LONGEST = 10.0
 
 
@@ -103,8 +106,8 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
         slope = elastic.by_logarithms(absolute_length, tension)
         return error / EXAMPLE_NOISE, slope / EXAMPLE_NOISE
 
-    # A linear spring would need an infinite `force`, and a tendon without an element an infinite
-    # `rate`. Both are bounded here.
+    # Without bounds, a linear spring would get an infinite `force`, and a tendon without an element
+    # an infinite `rate`.
     most = tension.max()
     low, high = np.log([[LEAST_FORCE * most, 1e-3, 1e-12], [MOST_FORCE * most, 1e6, 1.0]])
     start = np.log(list(DEFAULT.values()))

@@ -23,7 +23,7 @@ from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.joint_units import RACK
 from musculoskeletal_ae.robot.robot import Robot
 
-HELD_OUT_STATES = 5000  # number of states of the geometric model over which errors are averaged
+HELD_OUT_STATES = 5000  # average errors over this many states of the geometric model
 ENTERED = {
     Mask.THETA_TENSION: '① (θ, T)',
     Mask.TENSION_LENGTH: '② (T, l)',
@@ -33,7 +33,7 @@ SYMBOLS = {'theta': 'θ', 'tension': 'T', 'length': 'l'}
 
 
 def prepare(args: Namespace) -> Robot:
-    """Check the output files, choose the device, and return the robot, before any training.
+    """Prepare the training: check the output files, choose the device, and return the robot.
 
     Raises:
         MusculoskeletalError: If a file cannot be written or the robot is unusable.

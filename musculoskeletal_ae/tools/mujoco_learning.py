@@ -34,12 +34,12 @@ from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.model_training import train_on_model
 
-HELD_OUT = 60.0  # duration of the motion in which the error is measured; it is not learned [s]
-CHAIN = 'joints', 'muscles', 'without', 'base', 'end'  # options of `import_robot`
+HELD_OUT = 60.0  # measure the error in a motion of this duration, which is not learned [s]
+CHAIN = 'joints', 'muscles', 'without', 'base', 'end'  # pass these options on to `import_robot`
 
 
 def train(args: Namespace) -> None:
-    """Import, train, explore and learn; write the network, the robot and the learned model.
+    """Train on a MuJoCo file: import, explore and learn; write network, robot and learned model.
 
     Raises:
         MusculoskeletalError: If the file cannot be imported, or if the muscles of the model can
@@ -83,7 +83,9 @@ def _imported(args: Namespace, folder: Path) -> Robot:
         found = prospects(robot)
         print(*found.lines(), sep='\n', flush=True)
         if found.is_pointless:
-            raise MusculoskeletalError(f'{args.mujoco}: its muscles cannot hold it, see above')
+            raise MusculoskeletalError(
+                f'{args.mujoco}: the muscles cannot hold the arm, so nothing was trained'
+            )
 
     chain = {name: getattr(args, name) for name in CHAIN}
     imported = convert.import_robot(args.mujoco, folder, check, **chain)

@@ -3,12 +3,12 @@
 
     python -m musculoskeletal_ae.tools.network_cache ROBOT PRESET [quick]
 
-prints the file of an initial network for bringup.sh, and creates its directory. With `quick`, it is
-that of a shortened training, unless the network of the whole training is there.
+prints the file of an initial network for bringup.sh, and creates its directory. With `quick`, the
+file is that of a shortened training, unless a network with the complete training exists.
 
 The name of the file contains a hash of everything that determines the network: the two files of the
 robot directory, and the code that reads them and trains. Another robot, or another version of the
-package, therefore has another file. The network is that of the default seed.
+package, therefore has another file. The network is trained with the default seed.
 
 This module imports nothing slow.
 """
@@ -22,7 +22,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.directories import find_robot
 
 PACKAGE = Path(__file__).resolve().parents[1]
-#: files and directories of the package that determine an initial network
+#: hash these files and directories of the package, because they determine an initial network
 CODE = (
     'robot',
     'mae',
@@ -83,7 +83,7 @@ def main(arguments: list[str]) -> int:
     robot, preset, *quick = arguments
     try:
         file = network_file(robot, preset)
-        if quick and not file.is_file():  # otherwise, the whole training is there already
+        if quick and not file.is_file():  # otherwise, the network with the complete training exists
             file = network_file(robot, preset, True)
         file.parent.mkdir(parents=True, exist_ok=True)
     except (MusculoskeletalError, OSError) as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tell whether a recording is one of a given robot, and otherwise of which.
+"""Tells whether a recording is one of a given robot, and if not, of which robot it is.
 
     python -m musculoskeletal_ae.tools.recorded_robot BAG ROBOT [NAMESPACE]
 
@@ -20,7 +20,7 @@ from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
-BEGINNING = 2_000_000_000  # first part of a recording, in which most wrong robots are noticed [ns]
+BEGINNING = 2_000_000_000  # read this time of a recording first [ns]; it reveals most wrong robots
 
 
 def misfit(bag: Bag, name: str, namespace: str | None = None) -> str:
@@ -35,9 +35,9 @@ def misfit(bag: Bag, name: str, namespace: str | None = None) -> str:
         MusculoskeletalError: If the robot or the recording is unusable.
     """
     robot = Robot.load(name)
-    # raises errors that have nothing to do with the robot
+    # Raise errors that do not depend on the robot first.
     interface_topics(bag, namespace, robot.description.motor_topics)
-    # The first messages may be bad ones, so the whole recording is read before it is refused.
+    # The first messages may be bad ones, so read the whole recording before refusing it.
     for stop in bag.start + BEGINNING, LATEST:
         problem = _problem(bag, robot, namespace, stop)
         if not problem:

@@ -54,15 +54,15 @@ from musculoskeletal_ae.tables.table import Table, TableError
 from musculoskeletal_ae.tools.model_training import prepare, train_on_model
 from musculoskeletal_ae.tools.network_cache import network_file
 
-LEAST_OFFSET = 0.002  # smallest joint-sensor offset that is shown [rad]
-#: A held-out recording repeats what was learned if more than REPEATED_SHARE of its postures are
-#: closer than REPEATED [rad] to a learned one. Between two explorations of a neck of two joints
-#: with the same seed, this was 70 % of the postures, and 2 % with different seeds.
+LEAST_OFFSET = 0.002  # do not show a smaller joint-sensor offset [rad]
+#: Warn that a held-out recording repeats what was learned if more than REPEATED_SHARE of its
+#: postures are closer than REPEATED [rad] to a learned one. Between two explorations of a neck of
+#: two joints with the same seed, 70 % of the postures were; with different seeds, 2 %.
 REPEATED, REPEATED_SHARE = 0.03, 0.25
-#: largest length zero of a table that needs no --estimate-zeros [m]; of five emulated arms, the
-#: lengths differ by up to 15 mm from those of the geometric model
+#: refuse a table whose length zeros are larger, unless --estimate-zeros is given [m]; on five
+#: emulated arms, lengths differ from the geometric model by up to 15 mm
 LARGEST_ZERO = 0.03
-#: A table is refused if more than this share of the values of a joint or muscle is impossible.
+#: refuse a table if more than this share of the values of a joint or muscle is impossible
 MOST_IMPOSSIBLE = 0.5
 
 
@@ -80,9 +80,9 @@ class Source(NamedTuple):
 
 
 def train(args: Namespace) -> None:
-    """Learn from recordings in order; print the errors on them and on held-out recordings."""
+    """Train on recordings in order; print the errors on them and on held-out recordings."""
     robot = prepare(args)
-    # All recordings are read first, because training takes minutes and one may be unusable.
+    # Read all recordings first, because training takes minutes and one may be unusable.
     sources = _csv_sources(robot, args) if args.from_csv else _bag_sources(robot, args)
     warnings = list(_warnings(robot, sources, bool(args.from_csv)))
     _warn(warnings)  # also before the training, because the user may want to stop here
@@ -92,7 +92,7 @@ def train(args: Namespace) -> None:
     CheckpointValidator(robot).check(mae)
     steps = REST_STEPS if at_rest else STEPS
     learner = Learner(robot, mae, args.preset, args.seed, steps=steps, from_motion=from_motion)
-    # A recording that does not tell which muscles were isolated is of the arm of this network.
+    # A recording that does not say which muscles were isolated belongs to the arm of this network.
     learner.use_body(learner.body.with_isolated(mae.isolated))
     before = [table_errors(mae, source.table) for source in sources]
     try:
@@ -100,7 +100,7 @@ def train(args: Namespace) -> None:
             if source.is_held_out:
                 continue
             stop = _learn_and_show(learner, source)
-            if stop and stop != unchanged(learner):  # otherwise, the error below says so
+            if stop and stop != unchanged(learner):  # otherwise, an error at the end says so
                 warnings.append(f'{source.name}: {stop}')
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(_keep(learner, args)) from interrupt
@@ -230,7 +230,7 @@ def _zeros(robot: Robot, sources: list[Source], estimate: bool) -> Array:
 
 
 def _check_range(robot: Robot, source: Source) -> None:
-    """Raise a TableError if most values of a joint or muscle are impossible."""
+    """Check whether most values of a joint or muscle are possible; otherwise raise a TableError."""
     rows = source.table.rows
     margin = LIMITS.joint_outside * (robot.upper - robot.lower)
     (low_length, low_tension, *_), (high_length, high_tension, *_) = possible_readings(robot)
@@ -332,7 +332,7 @@ def _learns_from_motion(robot: Robot, sources: list[Source], preset: str) -> boo
 
 
 def _count(robot: Robot, sources: list[Source], enough: int, *, from_motion: bool) -> int:
-    """Return how many postures would be learned, counted up to `enough`."""
+    """Count how many postures would be learned, up to `enough`."""
     count = 0
     learned = [source for source in sources if not source.is_held_out]
     what = 'slow moments' if from_motion else 'resting postures'
@@ -382,7 +382,7 @@ def offset_text(robot: Robot, zero: Array) -> str:
 
 
 def _keep(learner: Learner, args: Namespace) -> str:
-    """Save the network of an interrupted run beside `--out`; return a sentence that says so.
+    """Keep the network of an interrupted run beside `--out`; return a sentence that says so.
 
     The file of `--out` does not change: it may have the network of an earlier, complete run.
     """
@@ -476,7 +476,7 @@ def anomaly_in(
 
 
 def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
-    """Return the paired messages of a bag, and print progress, and warnings about unused messages.
+    """Read the paired messages of a bag; print progress, and warnings about unused messages.
 
     Args:
         path: The bag.

@@ -106,7 +106,7 @@ def _entry(text: str) -> tuple[str, str]:
 
 
 def _check_source(parser: Parser, args: argparse.Namespace) -> None:
-    """End with an error if an option does not suit the recordings."""
+    """Check that the options suit the recordings; end with an error otherwise."""
     if args.from_bag and args.from_csv:
         parser.error(
             '--from-bag and --from-csv cannot be combined; learn from the bags first, then run '

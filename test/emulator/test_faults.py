@@ -188,7 +188,7 @@ def test_lines_describe_the_sensors_of_an_arm(robot, lines, sensors):
 @pytest.mark.parametrize(
     ('lines', 'legal'),
     [
-        (['radar'], "'radar'; legal: joints, marker"),
+        (['radar'], "'radar' describes no sensor; legal: joints, marker"),
         (['joints:3'], 'legal: joints, marker'),
         (['marker:0'], 'above 0 to 100 Hz'),
         (['marker:nan'], 'above 0 to 100 Hz'),

@@ -49,7 +49,7 @@ SENSORS = {
     'kind': (['radar'], FORMS, [['joints'], ['marker'], ['imu:hand']]),
     'rate': (['marker:1000'], FORMS, [lambda match: [f'marker:{match[1]}'], ['marker:1e-3']]),
     'link': (['imu:knee'], LINKS, members(lambda link: [f'imu:{link}'])),
-    'second': (['marker', 'marker:5'], f'is the second sensor of its kind; {FORMS}',
+    'second': (['marker', 'marker:5'], f'is the second sensor of its kind; legal: {FORMS}',
                [['marker:5'], ['joints', 'marker', 'imu:hand']]),
 }  # fmt: skip
 

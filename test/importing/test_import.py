@@ -461,7 +461,7 @@ def test_an_import_that_is_interrupted_leaves_nothing(mjcf, tmp_path, monkeypatc
     ('old', 'new', 'expected'),
     [
         ('<pose>0 0 0.1', '<pose relative_to="base">0 0 0.1', 'only SDF 1.6 is supported'),
-        ('type="revolute"', 'type="ball"', 'remains; held fixed: joint shoulder: it is ball'),
+        ('type="revolute"', 'type="ball"', 'remains; held fixed: joint shoulder: its type ball'),
         ('<joint', '<link name="arm"/><joint', "link 'arm' is listed twice; expected unique names"),
         ('</model>', '<model name="palm"/></model>', 'expected a single <model>'),
     ],

@@ -27,17 +27,17 @@ from musculoskeletal_ae.importing.adapted_mjcf import HAND
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.robot import Robot
 
-GUIDES_EVERY = 5  # number of steps between two updates of the guides
-HISTORY = 64  # largest delay of a sensor, as a number of steps
-HOUR = 3600.0  # duration of an hour [s]
-BEDDING_TIME = 2.0 * HOUR  # time constant with which a new tendon lengthens [s]
-NUDGE = 1e-7  # change of the joint angles where MuJoCo's wrapping fails [rad]
-SLIP_TIME = 5.0 * HOUR  # mean time between two slips of a tendon on its spool [s]
+GUIDES_EVERY = 5  # update the guides after this many steps
+HISTORY = 64  # permit no larger delay of a sensor, as a number of steps
+HOUR = 3600.0  # [s]
+BEDDING_TIME = 2.0 * HOUR  # let a new tendon lengthen with this time constant [s]
+NUDGE = 1e-7  # change the joint angles by this where MuJoCo's wrapping fails [rad]
+SLIP_TIME = 5.0 * HOUR  # let a tendon slip on its spool once in this time on average [s]
 OTHER_ROUTE = 0.02  # refuse a file if the length of a muscle differs by more in most postures [m]
 
 
 class ForeignBody:
-    """True lengths, moment arms, elastic laws and sensor errors of one arm.
+    """The true lengths, moment arms, elastic laws and sensor errors of one emulated arm.
 
     These properties are those of the arm at rest, before its tendons have aged.
     """
@@ -148,7 +148,7 @@ def _imported_model(robot: Robot, file: Path, draw: Draw, deviates: bool) -> Any
     theta = robot.random_postures(100, np.random.default_rng(0))
     relative = given.absolute_lengths(theta) - given.length_at_zero
     off = np.abs(relative - robot.muscle_lengths(theta, np.zeros(robot.muscle_count)))
-    typical = np.median(off, axis=0)  # a length that jumps may differ in some postures
+    typical = np.median(off, axis=0)  # ignores the few postures in which a length jumps
     for m in np.flatnonzero(typical > OTHER_ROUTE):
         name, millimetres = robot.muscles[m], 1e3 * typical[m]
         problem = f'muscle {name!r} is typically {millimetres:.0f} mm longer or shorter there'
@@ -194,7 +194,7 @@ class LateSensors:
         self._play = theta + self._zero
 
     def start(self, now: Array) -> None:
-        """Fill the whole history with the present values of all sensed quantities, (D + 3 M,)."""
+        """Start with the present values of all sensed quantities as history, (D + 3 M,)."""
         self._history[:] = now
 
     def append(self, now: Array) -> None:
@@ -203,7 +203,7 @@ class LateSensors:
         self._history[self._steps % HISTORY] = now
 
     def read(self, jitter: float) -> tuple[Array, Array, Array, Array]:
-        """Return the sensed quantities as they were before the delays of their messages.
+        """Read the sensed quantities as they were before the delays of their messages.
 
         Args:
             jitter: Time that is added to the delays [s]; may be negative.
@@ -332,7 +332,7 @@ class ForeignArm(Arm):
         self.reset()
 
     def _set_joint_friction(self) -> None:
-        """Add friction to each joint, in proportion to its load by weight and muscles at T_bias."""
+        """Set the friction of each joint by its largest load from weight and muscles at T_bias."""
         robot, draw, body = self.robot, self._draw, self.individual
         theta = robot.random_postures(200, draw.rng('load'))
         torque = robot.kinematics.holding_torque(theta)
@@ -373,7 +373,7 @@ class ForeignArm(Arm):
         self._sensors.stand(theta)
 
     def reset(self, theta: Array | None = None) -> None:
-        """Put the arm at rest at θ [rad], (D,), as `Arm.reset` does.
+        """Reset the arm to rest at θ [rad], (D,), as `Arm.reset` does.
 
         The age of the tendons, and thus their lengthening, does not change.
         """
@@ -407,7 +407,7 @@ class ForeignArm(Arm):
         return friction
 
     def set_payload(self, mass: float) -> None:
-        """Attach a mass [kg] to the hand, as a ball of 5 cm radius at the end effector."""
+        """Set the mass [kg] in the hand, a ball of 5 cm radius at the end effector."""
         self._model.body_mass[self._hand] = mass
         self._model.body_inertia[self._hand] = 0.4 * mass * 0.05**2
         mujoco.mj_setConst(self._model, mujoco.MjData(self._model))

@@ -27,15 +27,15 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.emulator.foreign.effects import NONE, Draw, Effects
 from musculoskeletal_ae.robot.robot import Robot
 
-ATTACHMENT = 0.1  # σ of a displacement, relative to the typical moment arm
-FARTHEST = 0.005  # largest σ of a displacement [m]
-SLACK = 0.05  # σ of the slack, relative to the typical moment arm
-LONGEST = 0.002  # largest σ of the slack [m]
-MASS = 0.1  # σ of the logarithm of a mass
-#: σ of the offset of tension sensors, relative to T_bias: modules that keep a low tension have
-#: sensors that can measure it
+ATTACHMENT = 0.1  # displace points by this σ, relative to the typical moment arm
+FARTHEST = 0.005  # displace points by no larger σ [m]
+SLACK = 0.05  # change tendon lengths by this σ, relative to the typical moment arm
+LONGEST = 0.002  # change tendon lengths by no larger σ [m]
+MASS = 0.1  # draw the logarithm of a mass with this σ
+#: draw offsets of tension sensors with this σ, relative to T_bias: modules that keep a low tension
+#: have sensors that can measure it
 ZERO = 0.1
-POSTURES = 200  # number of postures over which moment arms are averaged
+POSTURES = 200  # average moment arms over this many postures
 
 
 def effects(robot: Robot) -> Effects:
@@ -85,7 +85,7 @@ class Attachments:
         self.move(np.ones(len(self._sites), dtype=bool))
 
     def move(self, muscles: Bools) -> None:
-        """Draw new positions for the sites of the muscles in the mask `muscles`, (M,).
+        """Move the sites of the muscles in the mask `muscles`, (M,), to newly drawn positions.
 
         A site that would lie inside an object that a tendon wraps around keeps its original
         position.
@@ -123,7 +123,7 @@ def _is_inside(model: Any, site: int) -> bool:
 
 
 def change_masses(model: Any, draw: Draw) -> None:
-    """Scale mass and inertia of each body by a random factor."""
+    """Change mass and inertia of each body by a random factor."""
     factor = np.exp(MASS * draw.rng('masses').normal(size=model.nbody))
     model.body_mass[:] *= factor
     model.body_inertia[:] *= factor[:, None]

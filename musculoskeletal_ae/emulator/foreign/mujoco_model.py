@@ -25,16 +25,18 @@ from musculoskeletal_ae.robot.joint_tree import JointPoses
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-ARMATURE, DAMPING = 0.005, 0.4  # of a joint module [kg·m²], [N·m·s/rad]; chosen by hand
-# The following four are the σ that `Effects.links` multiplies.
-LENGTH_SPREAD, TURN_SPREAD = 0.005, np.radians(2.0)  # of link lengths [m] and joint axes [rad]
-MASS_SPREAD, CENTRE_SPREAD = 0.15, 0.02  # of the logarithm of masses, and of their centres [m]
-THICKEST = 0.045  # largest radius of the head of a bone, or of a muscle [m]
-POSTURES = 300  # number of random postures in which the radii of heads and muscles are fitted
-# Constraint stiffness (solimp) of couplings. With MuJoCo's default, which disregards the ratio of a
-# coupling, a prismatic joint that follows a revolute one would lag by centimetres.
+#: give each joint module this inertia and damping [kg·m²], [N·m·s/rad]; chosen by hand
+ARMATURE, DAMPING = 0.005, 0.4
+#: change link lengths [m] and joint axes [rad] by these σ times `Effects.links`
+LENGTH_SPREAD, TURN_SPREAD = 0.005, np.radians(2.0)
+#: change logarithms of masses, and their centres [m], by these σ times `Effects.links`
+MASS_SPREAD, CENTRE_SPREAD = 0.15, 0.02
+THICKEST = 0.045  # permit no larger radius of the head of a bone, or of a muscle [m]
+POSTURES = 300  # fit the radii of heads and muscles in this many random postures
+# Couple joints with this constraint stiffness (solimp). MuJoCo's default disregards the ratio of a
+# coupling: a prismatic joint that follows a revolute one would lag by centimetres.
 STIFF = [0.9999, 0.9999, 0.001, 0.5, 2.0]
-SPRING = 'spring'  # first word of the names of springs that couple joints
+SPRING = 'spring'  # begin the names of springs that couple joints with this word
 
 Place = tuple[int, Array]  # joint, and position in its frame [m]
 Obstacle = tuple[int, Array, Array]  # joint, and centre [m] and axis in its frame
@@ -73,7 +75,7 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
     model, names, links = kin.model, list(kin.model.names), draw.sizes.links
     spec.option.gravity = model.gravity.linear
     spec.compiler.balanceinertia, spec.compiler.degree = True, False
-    spec.compiler.boundmass = 1e-6  # for links without mass
+    spec.compiler.boundmass = 1e-6  # lets MuJoCo accept links without mass
     off = links * draw.rng('links').normal(size=(model.njoints, 4, 3))
     bodies, gear = [spec.worldbody], joint_gear(kin)
     springs, units = robot.units.elasticity_outside(_drawn_springs(robot, draw)), robot.units
@@ -280,7 +282,7 @@ def _obstacle(
         turn, origin = poses.rotation[:, carrier], poses.translation[:, carrier]
         away = [poses.rotation[:, c] @ at + poses.translation[:, c] - origin for c, at in ends]
         local = [np.einsum('nji,nj->ni', turn, each) - middle for each in away]
-        along = cylinder * ((local[1] - local[0]) @ axis)  # on a cylinder the path is a helix
+        along = cylinder * ((local[1] - local[0]) @ axis)  # on a cylinder: a helix
         local = [each - cylinder * np.outer(each @ axis, axis) for each in local]
         apart = [np.linalg.norm(each, axis=1) for each in local]
         radius = np.linspace(0.0, min(0.8 * min(map(np.min, apart)), THICKEST), 30)[:, None]
@@ -290,7 +292,7 @@ def _obstacle(
         for each in apart:
             touching = touching - np.arccos(radius / np.maximum(each, 1e-12))
             way = way + np.sqrt(each**2 - radius**2)
-        # Two straight tangents, and the arc between them.
+        # The bent tendon consists of two straight tangents and the arc between them.
         bent = np.hypot(way + radius * touching, along)
         straight = np.hypot(np.linalg.norm(local[1] - local[0], axis=1), along)
         longer = np.max(np.where(touching > 0.0, bent - straight, 0.0), axis=1)
@@ -373,5 +375,5 @@ def other_robot(robot: Robot, file: Path, problem: str) -> MusculoskeletalError:
 def set_options(model: Any) -> None:
     """Set the time step and the other options of the simulation in a compiled model."""
     model.opt.timestep, model.opt.integrator = STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    # A diverged simulation stays diverged until `Arm.reset`.
+    # Let a diverged simulation stay diverged until `Arm.reset`; MuJoCo would reset it by itself.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET

@@ -30,21 +30,22 @@ from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.robot import Robot
 
 # Modelling constants, chosen by hand. The magnitudes of the effects are in `effects.py`.
-SLIDING = 0.0003  # sliding distance over which friction builds up [m]
-BREAKING = 0.0005  # sliding distance that ends stiction [m]
-STICKING = 0.5  # time constant with which stiction builds up at rest [s]
-#: elongation over which rubber changes from one side of its hysteresis loop to the other [m]
+SLIDING = 0.0003  # let friction build up over this sliding distance [m]
+BREAKING = 0.0005  # end stiction after this sliding distance [m]
+STICKING = 0.5  # let stiction build up at rest with this time constant [s]
+#: let rubber change from one side of its hysteresis loop to the other over this elongation [m]
 LOOP = 0.003
-RIDGE = 5.0  # percentage of a route's lengths that lie beyond the ridge [%]
-BACK = 0.003  # distance before the ridge at which the tendon slips back [m]
-GUIDES = 1.0  # bend of the tendon between its motor and its first route point [rad]
-SPOOL = 0.01  # radius of the spool [m]
-# Time constants [s]: four of creep, which is equally large in each of four decades of time, and two
-# of the delayed stretch of a tendon.
+RIDGE = 5.0  # let this percentage of a route's lengths lie beyond the ridge [%]
+BACK = 0.003  # let the tendon slip back this far before the ridge [m]
+GUIDES = 1.0  # assume this bend of the tendon between its motor and its first route point [rad]
+SPOOL = 0.01  # assume this radius of a spool [m]
+#: let slow elongations build up with these time constants [s]: four of creep, equally large in each
+#: of four decades of time, and two of the delayed stretch of a tendon
 TIMES = np.array([1.0, 10.0, 100.0, 1000.0, 800.0, 14400.0])
-LATE = np.array([0.75, 0.25])  # shares of the delayed stretch with the last two time constants
-KNOTS = 200  # number of entries of the table of an elastic law
-GIVING = 0.1  # time constant with which a route point yields to its load [s]
+#: give the last two time constants these shares of the delayed stretch
+LATE = np.array([0.75, 0.25])
+KNOTS = 200  # tabulate an elastic law with this many entries
+GIVING = 0.1  # let a route point yield to its load with this time constant [s]
 
 
 class Springs:
@@ -78,7 +79,7 @@ class Springs:
         law[rng.uniform(size=count) >= draw.sizes.laws] = 0
         stiffness = 1.0 + draw.sizes.stiffness * rng.uniform(-1.0, 1.0, count)
         element = laws[law, :, np.arange(count)].T / stiffness
-        stretch = sheet.wire_stretch * at_zero  # of the whole tendon, immediate and delayed [m/N]
+        stretch = sheet.wire_stretch * at_zero  # immediate and delayed stretch of each tendon [m/N]
         #: delayed stretch of the tendons [m/N], (M,)
         self.late: Array = stretch * draw.about('recovery', count)
         #: immediate elongation of elements and tendons [m], (K, M)
@@ -148,7 +149,7 @@ Guides = namedtuple('Guides', 'tendon point kind start count site body turn plac
 def make_tendons(
     robot: Robot, springs: Springs, at_zero: Array, span: Array, bend: Array, draw: Draw
 ) -> Tendons:
-    """Draw the constants of the tendons.
+    """Make the tendons' constants from random draws.
 
     Args:
         robot: The robot.
@@ -212,7 +213,7 @@ def load_cell(tendons: Tendons, m: int, tension: float, temperature: float) -> f
 
 @njit(cache=True)
 def read(tendons: Tendons, muscle: MuscleState, memory: Memory, command: Command, m: int) -> None:
-    """Write the readings of the sensors of module m into `memory`."""
+    """Read the sensors of module m into `memory`."""
     memory.reading[m] = spooled(tendons, m, muscle.length[m])
     memory.reading[m] += command.length_error[m] + command.zero[m]
     memory.cell[m] = load_cell(tendons, m, muscle.tension[m], muscle.housing[m])
@@ -227,7 +228,7 @@ GuideParts = namedtuple('GuideParts', 'guides tension bend')
 
 @njit(cache=True)
 def make_handle(parts: TendonParts | GuideParts) -> Handle:
-    """Pack `parts` into one argument for `tendons_step` or `guides_step`; arrays are shared."""
+    """Make a handle, by which `tendons_step` or `guides_step` gets `parts`; arrays are shared."""
     return Handle(parts)
 
 

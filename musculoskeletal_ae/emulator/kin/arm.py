@@ -33,13 +33,15 @@ from musculoskeletal_ae.robot.kinematics import joint_space_inertia
 from musculoskeletal_ae.robot.passive_torque import add_passive
 from musculoskeletal_ae.robot.robot import Robot
 
-SLIDING_DISTANCE = 0.0005  # sliding distance over which tendon friction builds up [m]
-# Joints.
-ARMATURE = 0.004  # rotor and bearing inertia of a joint module [kg·m²]; chosen by hand
-STICKING_ANGLE = 0.003  # angle over which joint friction builds up [rad]
-VISCOUS = 0.5  # viscous friction of a joint [N·m·s/rad]
-STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0  # of the joint limits [N·m/rad], [N·m·s/rad]
-STOP_LOAD = 40.0  # load by weight and muscles at T_bias above which stops are stiffer [N·m]
+SLIDING_DISTANCE = 0.0005  # let tendon friction build up over this sliding distance [m]
+#: give each joint module this inertia of rotor and bearings [kg·m²]; chosen by hand
+ARMATURE = 0.004
+STICKING_ANGLE = 0.003  # let joint friction build up over this angle [rad]
+VISCOUS = 0.5  # give each joint this viscous friction [N·m·s/rad]
+#: give the stops at joint limits this stiffness [N·m/rad] and damping [N·m·s/rad]
+STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0
+#: stiffen the stops of a joint if weight and muscles at T_bias load it by more than this [N·m]
+STOP_LOAD = 40.0
 
 
 #: Constants of one individual for the compiled step: series elastic elements, tendons and sensors
@@ -93,7 +95,7 @@ def tension_from_elongation(elongation: float, force: float, rate: float, stretc
 
 @njit(cache=True)
 def make_handle(parts: Parts) -> Handle:
-    """Pack `parts` into one argument for `muscle_step`. The arrays are shared, not copied."""
+    """Make a handle, by which `muscle_step` gets `parts`. The arrays are shared, not copied."""
     return Handle(parts)
 
 
@@ -247,14 +249,14 @@ class EmulatedArm(modules.Arm):
         self._joint.q[:] = self.robot.kinematics.tree.angles(theta)
 
     def set_payload(self, mass: float) -> None:
-        """Attach a mass [kg] to the hand, as a ball of 5 cm radius at the end effector."""
+        """Set the mass [kg] in the hand, a ball of 5 cm radius at the end effector."""
         load = pin.Inertia.FromSphere(mass, 0.05) if mass > 0.0 else pin.Inertia.Zero()
         placed = load.se3Action(pin.SE3(np.eye(3), self._body.effector))
         self._model.inertias[self._body.effector_joint] = self._bare_inertia + placed
 
     @property
     def tendon_friction(self) -> Array:
-        """Friction μ of each tendon along its route, shape (M,)."""
+        """How strongly each tendon rubs along its route (friction μ), shape (M,)."""
         return self.individual.tendon_friction.copy()
 
     @property

@@ -17,7 +17,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.wrapping import WrapObjects
 
-THICKEST_BONE = 0.04  # largest radius of a bone's head [m]
+THICKEST_BONE = 0.04  # permit no larger radius of a bone's head [m]
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Spread:
     spring_rest: float = 0.05
 
 
-#: No differences: a body equal to the geometric model, without friction.
+#: make a body that equals the geometric model, without friction
 NOMINAL = Spread(**{field.name: 0.0 for field in fields(Spread)})
 
 
@@ -194,7 +194,7 @@ def _objects(
     described = np.random.default_rng([seed, 0x3AB]).uniform(0.9, 1.1, count)
     for s, ends in enumerate(zip(routes.first, routes.second, strict=True)):
         if objects.swivels[s]:
-            continue  # its tendon enters it at the centre of the object
+            continue  # keep the radius of a pulley, because its tendon enters it at the centre
         if objects.radius[s] > 0.0:
             turn, origin = (part[:, objects.joint[s]] for part in poses[:2])
             away = true[:, ends] - (origin + turn @ objects.centre[s])[:, None]

@@ -94,7 +94,7 @@ def point_of(placed: Placed, joint: int, point: Array) -> Vector:
 
 @njit(cache=True)
 def fill(row: Array, values: Vector | Array) -> None:
-    """Copy values into a row; numba needs seconds to compile `row[:] = values`."""
+    """Fill a row with values; numba needs seconds to compile `row[:] = values` instead."""
     for i in range(len(row)):
         row[i] = values[i]
 

@@ -14,11 +14,11 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
 
-FROZEN_TIME = 1.0  # duration of identical readings after which a sensor may be frozen [s]
-#: share of the messages near T_bias in which a reading changes if its sensor has noise there, and
-#: the smallest number of messages from which this share is known
+FROZEN_TIME = 1.0  # suspect a sensor whose reading has stayed the same for this long [s]
+#: conclude that a sensor has noise near T_bias if its reading changes in the share NOISY of the
+#: messages there, of which there must be at least ENOUGH
 NOISY, ENOUGH = 0.9, 1000
-MOVED = 0.006  # predicted motion of the muscle above which its constant reading is a fault [m]
+MOVED = 0.006  # report a constant reading if the muscle should have moved by more than this [m]
 
 
 class FrozenSensor(Detector):
@@ -43,7 +43,7 @@ class FrozenSensor(Detector):
         self._stop_observing()
 
     def reset(self) -> None:
-        """Restart the measurement of how long readings have been constant."""
+        """Reset the detector: measure anew how long readings have been constant."""
         self._last = None
         self._unchanged_time[:] = 0.0
         self._stop_observing()

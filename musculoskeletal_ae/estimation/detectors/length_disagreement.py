@@ -14,8 +14,8 @@ by as much as the offset.
 
 A joint sensor with an offset δθ changes g as well, but like a change of posture: Δ = −G δθ, where G
 is the muscle Jacobian ∂l/∂θ. Because muscles outnumber joints, arbitrary errors of lengths rarely
-have this form. If some δθ explains most of Δ, and more of it than a wrong length of one muscle,
-nothing is reported here, because the joint sensors are false (`joint_sensor_check.py`); otherwise,
+have this form. If some δθ explains most of Δ, and more of it than a wrong length of one muscle, the
+joint sensors are false: nothing is reported here, and `joint_sensor_check.py` decides. Otherwise,
 the lengths are reported. If only one length disagrees with θ, only its muscle is reported.
 
 A healthy tendon that is shorter than l_net is stretched and has tension. If a tendon is shorter but
@@ -36,9 +36,9 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-SPACING = 0.1  # time between two values of g [s]
-COUNT = 10  # number of values in the median of g
-LASTING = 1.0  # time for which Δ has to exceed its limits before it is reported [s]
+SPACING = 0.1  # compute g at this interval [s]
+COUNT = 10  # take the median of g over this many values
+LASTING = 1.0  # report lengths once Δ has exceeded its limits for this long [s]
 
 
 class Largest(NamedTuple):
@@ -84,19 +84,18 @@ class Largest(NamedTuple):
 #     after 20 to 60 s of learning         Δ 0.032 m, 0.013 m
 #     networks with a calibrated detector  Δ 0.013 m, 0.006 m     g 0.013 m, 0.006 m
 #
-# With the limits for calibrated networks, an error of 0.05 m of a single muscle is detected in
-# every posture.
-CHANGE_YOUNG = Largest(0.06, 0.028)  # limits of Δ with networks that are not calibrated
-GAP_YOUNG = Largest(0.08, 0.045)  # limits of g with networks that are not calibrated
-CHANGE_LEARNED = Largest(0.035, 0.016)  # limits of Δ with calibrated networks
-GAP_LEARNED = Largest(0.035, 0.016)  # limits of g with calibrated networks
-HEALTHY_SPACING = 1.0  # time between the healthy messages from which g_usual is computed [s]
-HEALTHY_COUNT = 60  # largest number of messages from which g_usual is computed
-ENOUGH = 5  # smallest number of messages from which g_usual is computed
-#: Δ relative to its limits up to which a message counts as healthy; this value is low, so that
+# The limits for calibrated networks detect an error of 0.05 m of a single muscle in every posture.
+CHANGE_YOUNG = Largest(0.06, 0.028)  # limits of Δ with networks whose detector is not calibrated
+GAP_YOUNG = Largest(0.08, 0.045)  # limits of g with networks whose detector is not calibrated
+CHANGE_LEARNED = Largest(0.035, 0.016)  # limits of Δ with networks whose detector is calibrated
+GAP_LEARNED = Largest(0.035, 0.016)  # limits of g with networks whose detector is calibrated
+HEALTHY_SPACING = 1.0  # keep a healthy message for g_usual at this interval [s]
+HEALTHY_COUNT = 60  # compute g_usual from at most this many messages
+ENOUGH = 5  # compute g_usual from at least this many messages
+#: count a message as healthy if Δ is at most this multiple of its limits; the value is low, so that
 #: g_usual does not follow a drift
 HEALTHY_EXCESS = 0.5
-#: largest part of Δ that a joint-sensor offset may leave unexplained, relative to Δ
+#: blame the joint sensors only if an offset leaves at most this share of Δ unexplained
 UNEXPLAINED = 0.5
 
 
@@ -130,13 +129,13 @@ class LengthDisagreement(Detector):
         self._compute_usual()
 
     def reset(self) -> None:
-        """Discard the last messages, but not the differences that are usual on the healthy arm."""
+        """Reset the detector: discard the last messages, but keep the usual differences."""
         self._recent: deque[Array] = deque(maxlen=COUNT)
         self._since, self._unmeasured, self._beyond = 0.0, 0.0, 0.0
         self.gap = None
 
     def forget(self) -> None:
-        """Discard the last messages and the usual differences, because length offsets changed."""
+        """Forget the last messages and the usual differences, because length offsets changed."""
         self.reset()
         self._healthy.clear()
         self._compute_usual()
@@ -238,7 +237,7 @@ class LengthDisagreement(Detector):
             'length differs from that at the measured posture by '
             f'{largest.text(change, self._used, muscle)}'
         )
-        by_muscle = np.delete(change, muscle)  # unexplained if this length is wrong
+        by_muscle = np.delete(change, muscle)  # what stays unexplained if this length is wrong
         limit = min(UNEXPLAINED * np.linalg.norm(change), np.linalg.norm(by_muscle))
         if np.linalg.norm(unexplained) <= limit:
             return None  # false joint sensors explain it, which `joint_check` judges

@@ -14,7 +14,7 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding
 from musculoskeletal_ae.robot.robot import Robot
 
-SILENT = 0.15  # time with NaN for the same muscle after which it is reported [s]
+SILENT = 0.15  # report a muscle once it alone has reported NaN for this long [s]
 
 
 class MissingValues(Detector):

@@ -42,21 +42,21 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
 
 FAULTY = 1.0  # report a module after this time of evidence [s]
-SMOOTHING = 0.1  # time constant by which differences and speeds are smoothed [s]
-#: a winch that turns at this share of its largest speed, if that is known, cannot do more
+SMOOTHING = 0.1  # smooth differences and speeds with this time constant [s]
+#: expect no more of a winch that turns at this share of its largest speed, if that is known
 FULL_SPEED = 0.5
-#: speed at which the slowest healthy module corrects a difference of T_limit [m/s]
+#: expect a healthy module to correct a difference of T_limit at least this fast [m/s]
 CORRECTING = 0.2
-#: tolerance of T − T_ref: a share of T_limit, and a share of T_ref for errors of the sensor's gain
-#: and of the module's stiffness
+#: tolerate a difference T − T_ref of this share of T_limit, plus this share of T_ref for errors of
+#: the sensor's gain and of the module's stiffness
 ALLOWED, ALLOWED_SHARE = 0.04, 0.1
-#: excess of e above the tolerance, relative to T_limit, at which the evidence grows fastest
+#: let the evidence grow fastest once e exceeds the tolerance by this share of T_limit
 CLEAR = 0.05
-SURE = 2.0  # number of standard deviations of an uncertain tension that are tolerated
-BEHIND = 0.005  # tolerance of |l − l_target| of a position-controlled module [m]
-CLEARLY_BEHIND = 0.005  # excess of e above it at which the evidence grows fastest [m]
-LAG = 0.6  # lag of the slowest healthy position-controlled module [s]
-FULL = 0.9  # share of T_max above which a position-controlled module cannot pull harder
+SURE = 2.0  # tolerate this many standard deviations of an uncertain tension
+BEHIND = 0.005  # tolerate this |l − l_target| of a position-controlled module [m]
+CLEARLY_BEHIND = 0.005  # let the evidence grow fastest once e exceeds BEHIND by this [m]
+LAG = 0.6  # expect a healthy position-controlled module to lag by at most this [s]
+FULL = 0.9  # expect no more of a position-controlled module above this share of T_max
 
 
 class ModuleFollowing(Detector):
@@ -67,11 +67,11 @@ class ModuleFollowing(Detector):
         self.reset()
 
     def use(self, mae: Mae) -> None:
-        """Monitor the muscles that are not isolated in this network."""
+        """Use another network: monitor the muscles that are not isolated in it."""
         self._robot = self._complete_robot.without(mae.isolated)
 
     def reset(self) -> None:
-        """Discard all evidence."""
+        """Reset the detector: discard all evidence."""
         count = self._complete_robot.muscle_count
         self._evidence: Array = np.zeros(count)  # time of evidence [s]
         self._length: Array | None = None  # l in the previous message [m]
@@ -108,14 +108,14 @@ class ModuleFollowing(Detector):
         return Finding(muscle, ConditionKind.MODULE_NOT_FOLLOWING, text, others)
 
     def _differences(self, observation: Observation) -> Array | None:
-        """Return T − T_ref [N], (M,); None without a command."""
+        """Return tension minus demanded tension T − T_ref [N], (M,); None without a command."""
         if observation.demand is None:
             return None
         difference: Array = observation.sample.motor_tension - self._reference(observation.demand)
         return difference
 
     def _reference(self, demand: Array) -> Array:
-        """Return T_ref [N], (M,): what a command demands, but at most T_max."""
+        """Return the demanded tension T_ref [N], (M,): that of a command, but at most T_max."""
         return np.minimum(demand, self._complete_robot.tension.max)
 
     def _growth(self, observation: Observation, away: Array, correcting: Array) -> Array:
@@ -150,7 +150,7 @@ class PositionFollowing(ModuleFollowing):
     """Reports a position-controlled module that has not followed its target length."""
 
     def _differences(self, observation: Observation) -> Array | None:
-        """Return l − l_target [m], (M,); None without a command."""
+        """Return length minus commanded length l − l_target [m], (M,); None without a command."""
         if observation.command is None:
             return None
         return observation.sample.length - observation.command

@@ -46,9 +46,10 @@ NORM = 'norm'  # name of the threshold of A in a checkpoint
 #: name a muscle as well if d without it is below the threshold, and at most this multiple of d
 #: without the suspect
 EQUALLY_LIKELY = 1.5
-IN_A_ROW = 5  # number of consecutive messages above the threshold that lead to a finding
-NEAR = 0.25  # distance to a calibrated posture above which the threshold grows [joint ranges]
-WIDEST = 3.0  # largest factor by which the threshold is raised
+IN_A_ROW = 5  # report the suspect after this many consecutive messages above the threshold
+#: raise the threshold at this distance from the nearest calibrated posture [joint ranges]
+NEAR = 0.25
+WIDEST = 3.0  # raise the threshold by no larger factor than this
 
 
 class Reading(NamedTuple):
@@ -105,11 +106,11 @@ class ResidualDistance(Detector):
             self.threshold = statistics.thresholds.get(self.threshold_name, np.inf)
 
     def reset(self) -> None:
-        """Discard the count of consecutive messages above the threshold."""
+        """Reset the detector: discard the count of messages above the threshold."""
         self._beyond = 0
 
     def forget_reading(self) -> None:
-        """Discard the last reading, for example when the length offsets change."""
+        """Forget the last reading, for example when the length offsets change."""
         self.reading = None
 
     def step(self, observation: Observation) -> Finding | None:
@@ -190,7 +191,7 @@ class ResidualDistance(Detector):
     def _evidence(
         self, observation: Observation, distance: float, has_slack: bool, waits: bool
     ) -> str:
-        """Count messages above the threshold; return evidence after five in a row, otherwise ''.
+        """Count messages above the threshold; return a text after five in a row, otherwise ''.
 
         Args:
             observation: The message.
@@ -218,8 +219,8 @@ class ResidualDistance(Detector):
     def _suspects(self, bone_tension: Array, length: Array, candidates: Bools) -> list[int]:
         """Return the indices of the suspect muscles among the candidates, the most suspect first.
 
-        This is the muscle whose removal makes the residual of the other muscles most likely on a
-        healthy arm. The others are muscles whose removal does so nearly as well.
+        Without the first muscle, the residual of the other muscles is most likely on a healthy arm.
+        Muscles follow without which it is nearly as likely.
 
         Args:
             bone_tension: Bone-side tensions [N], (M,).

@@ -11,9 +11,9 @@ sensor, its amplifier or the driver. A muscle is reported in two cases:
   higher. A frozen sensor is not lower in between (`frozen_sensor.py`).
 - Its reading stays the same although its module winds in. The sensor may then also be frozen.
 
-Drivers whose readings often repeat are not checked, and neither are
-messages that repeat the readings of most muscles, as those of a simulator without noise at rest.
-Values near T_bias are not checked, because an ideal module may hold exactly T_bias.
+A sensor is not checked if its readings often repeat. Messages that repeat the readings of most
+muscles are skipped, such as those of a simulator without noise at rest. Values near T_bias are not
+checked, because an ideal module may hold exactly T_bias.
 
 Such a muscle is no longer safe: while its command demands more than T_sat, the module winds in
 without seeing the tension grow, and neither the limiter nor the watchdog sees it. Emulated arms of
@@ -28,18 +28,20 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.robot.robot import Robot
 
-WINDING_TIME = 0.5  # report a module that winds in after its reading was the same for this long [s]
-WOUND = 0.005  # and after it has wound in by this length meanwhile [m]
+#: report a module that winds in if its reading has stayed the same for this long [s]
+WINDING_TIME = 0.5
+WOUND = 0.005  # report a module whose reading stays the same once it has wound in by this [m]
 LASTING = 0.15  # count a visit to a value after the reading has stayed exactly there this long [s]
 VISITS = 2  # report a muscle after this number of visits at the same value
 SAME = 2e-3  # two visits are at the same value if they differ by less than this share of it
 BELOW = 0.1  # count another visit only after the reading was lower by this share of the value
 #: forget a value after the reading has been higher for this long [s]; a spike is shorter
 BEYOND = 0.05
-#: share of the messages in which a reading below the highest ones differs from the previous one
+#: check a sensor only if more than this share of its readings below the highest ones differ from
+#: the previous one
 VARYING = 0.5
-MEMORY = 10.0  # time constant of this share [s]
-LEAST = 1.5  # lowest T_sat, relative to T_bias
+MEMORY = 10.0  # average the share of differing readings over this time (time constant) [s]
+LEAST = 1.5  # check only readings above this multiple of T_bias
 
 
 class SaturatedSensor(Detector):
@@ -50,12 +52,12 @@ class SaturatedSensor(Detector):
         self._limit = robot.description.tension.limit
         self._bias = robot.description.tension.bias
         self._highest: Array = np.zeros(count)  # highest reading of two successive ones [N]
-        #: share of the messages below it in which the reading differed from the previous one
+        #: share of the lower readings that differed from the previous one
         self._varying: Array = np.zeros(count)
         self.reset()
 
     def reset(self) -> None:
-        """Forget all visits."""
+        """Reset the detector: forget all visits."""
         count = self._robot.muscle_count
         self._before: Array = np.full(count, np.nan)  # reading of the previous message [N]
         self._unchanged: Array = np.zeros(count)  # time without a change of the reading [s]
@@ -64,7 +66,7 @@ class SaturatedSensor(Detector):
         self._value: Array = np.full(count, np.nan)  # value of the last visit [N]
         self._visits: Ints = np.zeros(count, dtype=np.int64)
         self._has_visits = False  # whether any muscle has visited a value
-        self._has_left = np.ones(count, dtype=bool)  # whether it was lower since the last visit
+        self._has_left = np.ones(count, dtype=bool)  # whether readings fell since the last visit
 
     def step(self, observation: Observation) -> Finding | None:
         """Report a muscle whose reading was clipped often enough, or while its module winds in."""

@@ -38,17 +38,18 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS, share_outside
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-#: number of standard deviations of the stretch above which a tendon without tension is ruptured
+#: report a tendon without tension if its stretch exceeds the expected one by this many standard
+#: deviations
 SIGMAS = 3.0
-#: Number of standard deviations by which a tension has to exceed T_slack, so that its tendon is
-#: surely taut. Tensions from motor currents have a standard deviation; that of sensors counts as 0.
+#: Count a tendon as taut if its tension exceeds T_slack by this many standard deviations. Those of
+#: motor currents are known; that of a sensor counts as 0.
 SURE = 2.0
-#: Number of consecutive messages in which a tendon has to be taut. The first of them then certainly
-#: came before the tendon began to lose its tension.
+#: Take the stretch of a taut tendon from the first of this many consecutive messages in which it
+#: was taut: that message certainly came before the tendon began to lose its tension.
 RECENT = 5
 SLACK_LENGTH = 0.06  # wait until a muscle module has wound in this much slack [m]
 SLACK_SPEED = 0.005  # count a muscle module as stationary below this winding speed [m/s]
-DEAD_TIME = 0.5  # time without tension after which a muscle is reported [s]
+DEAD_TIME = 0.5  # report a muscle that has had no tension for this long [s]
 
 
 class SlackTendon(Detector):
@@ -69,12 +70,12 @@ class SlackTendon(Detector):
         self.is_winding_in: Bools = np.zeros(muscle_count, dtype=bool)
 
     def use(self, mae: Mae) -> None:
-        """Monitor the muscles that are not isolated in this network."""
+        """Use another network: monitor the muscles that are not isolated in it."""
         self._mae = mae
         self._robot = self._complete_robot.without(mae.isolated)
 
     def reset(self) -> None:
-        """Restart the measurement of how long tendons have been slack."""
+        """Reset the detector: measure anew how long tendons have been slack."""
         self._slack_time[:] = self._idle_time[:] = 0.0
 
     def step(self, observation: Observation) -> Finding | None:
@@ -95,7 +96,7 @@ class SlackTendon(Detector):
             self.is_winding_in[:] = False
             return None
         begins = is_slack & (self._slack_time == 0.0)
-        # Remove the part of the length that the posture explains.
+        # The estimated posture explains a part of the length; remove it.
         excess = length - self._robot.routes.relative_lengths(theta) if is_slack.any() else length
         self._taut_excess = np.where(begins, excess, self._taut_excess)
         self._slack_time = np.where(is_slack, self._slack_time + dt, 0.0)
@@ -154,13 +155,13 @@ class StretchedTendon(SlackTendon):
         self._taut_predictions = dict[int, tuple[MuscleSample, Bools, Prediction]]()
 
     def use(self, mae: Mae) -> None:
-        """Monitor the muscles that are not isolated in this network."""
+        """Use another network: monitor the muscles that are not isolated in it."""
         super().use(mae)
         self._errors = LengthErrors(self._complete_robot, mae)
         self._taut_predictions.clear()
 
     def reset(self) -> None:
-        """Restart the measurement of how long tendons have been stretched without tension."""
+        """Reset the detector: measure anew how long tendons have been stretched without tension."""
         super().reset()
         self._recent.clear()
         self._taut_count[:] = 0

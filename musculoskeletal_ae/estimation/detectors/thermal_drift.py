@@ -12,7 +12,7 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.signals.heat import Heat
 
-COOL = 60.0  # largest temperature of a cool winding [°C]
+COOL = 60.0  # report changed modules only if their windings are hotter than this [°C]
 
 
 class ThermalDrift(Detector):

@@ -114,7 +114,7 @@ class CheckedCalibration:
         return self._calibration.time - self._calibration.enough
 
     def step(self, sample: MuscleSample, dt: float, theta: Array | None) -> Evidence | None:
-        """Continue the calibration by one message.
+        """Continue the calibration with the readings of one message.
 
         Args:
             sample: The readings.

@@ -35,24 +35,25 @@ from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_readings import Row
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement, decide, single_faults
 
-SPACING = 0.25  # time between two messages that are kept [s]
-USUAL_COUNT = 120  # number of messages whose median A is the usual one
-ENOUGH = 20  # smallest number of messages from which the usual A is known
-RECENT = 20  # number of the newest of these messages by which a finding is judged
-ANOMALOUS = 2.0  # judge by the messages whose A is above this multiple of the usual A
+SPACING = 0.25  # keep one message in this time [s]
+USUAL_COUNT = 120  # take the median A of this many messages as the usual one
+ENOUGH = 20  # know the usual A only from at least this many messages
+RECENT = 20  # judge a finding by this many of the newest messages
+ANOMALOUS = 2.0  # judge only by messages whose A is above this multiple of the usual A
 #: assume an exchange only if A after putting the columns back is below this multiple of the usual A
 USUAL = 1.5
-#: assume an exchange only if putting the columns back divides A by at least this factor. With both
-#: factors, in moments of two learned arms, an exchange explained 3 of 475 shifts of one or two
-#: lengths, and it was recognised in 194 of 229 exchanges.
+#: Assume an exchange only if putting the columns back divides A by at least this factor. In moments
+#: of two learned arms, USUAL and BETTER together blamed an exchange for 3 of 475 shifts of one or
+#: two lengths, and recognised 194 of 229 exchanges.
 BETTER = 3.0
-SILENT = 0.3  # pause of all messages after which the driver may have restarted [s]
+#: assume that the driver may have restarted after a pause of all messages of this length [s]
+SILENT = 0.3
 #: judge a finding by the lengths around a silence for this time after it [s]
 RESTARTED = 5.0
 #: a length that has changed by more than this during a silence may belong to another muscle [m]
 DISCONTINUOUS = 0.02
-#: assume another wiring only if it divides the change of the concerned lengths during the silence
-#: by at least this factor, and if this change was larger than that of the other lengths by it
+#: assume another wiring only if it divides the change of its lengths during the silence by at least
+#: this factor, and if that change exceeds the change of all other lengths by this factor
 CONTINUOUS = 3.0
 #: kinds of findings to which an exchange can lead
 EXPLAINED = frozenset(
@@ -88,7 +89,7 @@ class ExchangeCheck:
         self._mae = mae
 
     def read(self, states: Array, now: float) -> None:
-        """Note the raw l of a message, accepted or not, and whether a silence has ended with it.
+        """Read the raw l of a message, accepted or not, and note whether a silence has ended.
 
         Args:
             states: The raw readings, (Q, M).
@@ -102,7 +103,7 @@ class ExchangeCheck:
         self._newest = now, length
 
     def note(self, observation: Observation) -> None:
-        """Keep a message in regular intervals, while the length offsets are known."""
+        """Note a message at regular intervals, while the length offsets are known."""
         self._since += observation.dt
         if self._since < SPACING - 1e-9:
             return
@@ -160,7 +161,7 @@ class ExchangeCheck:
         return finding_of(changed) if len(changed) > 1 else None
 
     def _judge_silence(self) -> WiringJudgement | None:
-        """Return which wiring makes lengths continue over the last silence; None if unknown."""
+        """Judge which wiring makes lengths continue over the last silence; None if unknown."""
         if self._silence is None or self._mae is None:
             return None
         _, before, after = self._silence
@@ -168,7 +169,7 @@ class ExchangeCheck:
         straight = Wiring.straight(self._robot.muscle_count)
 
         def change(wiring: Wiring, columns: Bools) -> float:
-            """Return how far lengths change over the silence if wired so, RMS of `columns`."""
+            """Return how far lengths change over the silence with this wiring (RMS)."""
             gap = wiring.signed(after) - before
             return float(np.sqrt(np.square(gap[columns]).mean())) if columns.any() else 0.0
 
@@ -186,7 +187,7 @@ class ExchangeCheck:
         return WiringJudgement(best, tuple(wiring for _, wiring in explaining), (), least)
 
     def _judge(self, observation: Observation) -> WiringJudgement | None:
-        """Return which wiring restores the usual A; None if that cannot be judged."""
+        """Judge which wiring restores the usual A; return None if that cannot be judged."""
         mae, sample = self._mae, observation.sample
         if mae is None or mae.anomaly is None or not mae.anomaly.calibrated:
             return None
@@ -199,7 +200,7 @@ class ExchangeCheck:
         tension, length = (np.array(part) for part in zip(*messages))
 
         def scores(wiring: Wiring) -> Array:
-            """Return A of all messages if their columns are wired in this way."""
+            """Return the anomaly scores of all messages with their columns wired in this way."""
             ordered, shifted = wiring.unsigned(tension), wiring.signed(length) - offset
             state = mae.estimate(ordered, shifted)
             return anomaly(residuals(state, ordered, shifted, mae.isolated))
@@ -218,7 +219,7 @@ class ExchangeCheck:
             value = float(np.median(scores(wiring)))
             return value if value < USUAL * usual else math.inf
 
-        # An exchange makes both lengths jump, if they differ by enough.
+        # Consider only the lengths that jumped, if any: an exchange makes both lengths jump.
         columns = sample.jumped or np.flatnonzero(used).tolist()
         faults = single_faults(straight, columns, signs=self._may_have_restarted)
         others = [(other, cost(other)) for other in faults]

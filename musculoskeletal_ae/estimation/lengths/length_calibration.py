@@ -27,31 +27,33 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import UNKNOWN, LengthOffsets
 from musculoskeletal_ae.signals.wiring import WiringJudgement, judge
 
-ENOUGH_WITH_ANGLES = 20.0  # required duration of gentle motion with measured joint angles [s]
-ENOUGH = 38.0  # required duration of gentle motion without measured joint angles [s]
-STANDING = 1.0  # required duration of standing in a stated posture [s]
-FIRST_FIT = 0.5  # time until the first fit, and between fits of an arm that stands [s]
-FIT_INTERVAL = 2.0  # time between two later fits [s]
+ENOUGH_WITH_ANGLES = 20.0  # require this duration of gentle motion with measured joint angles [s]
+ENOUGH = 38.0  # require this duration of gentle motion without measured joint angles [s]
+STANDING = 1.0  # require an arm to stand in a stated posture for this long [s]
+#: begin the first fit after this time, and fits of an arm that stands at this interval [s]
+FIRST_FIT = 0.5
+FIT_INTERVAL = 2.0  # begin later fits of a moving arm at this interval [s]
 #: A fit consists of short pieces of work, each of which takes 1 to 2 ms. At each message, one piece
 #: is done for every PIECE_TIME [s] since the previous message, but at least one and at most
 #: MOST_PIECES. A fit therefore takes equally long with messages at 50 to 200 Hz.
 PIECE_TIME = 0.005
-MOST_PIECES = 4  # largest number of pieces of work for one message
-#: median residual of a length above which a fit is rejected [m]; correct offsets leave 0.0003 m
+MOST_PIECES = 4  # do at most this many pieces of work at one message
+#: reject a fit with a larger median residual of a length [m]; correct offsets leave 0.0003 m
 LARGEST_RESIDUAL = 0.02
-#: cost per residual above which a fit is rejected: correct offsets cost 0.2 to 0.5, offsets of a
-#: wrong posture 1.1, and pure noise 0.95
+#: reject a fit with a larger cost per residual: correct offsets cost 0.2 to 0.5, offsets of a wrong
+#: posture 1.1, and pure noise 0.95
 LARGEST_COST = 0.75
-#: remedy if the order or the sign of the readings is wrong
+#: advise these steps if the order or the sign of the readings is wrong
 CORRECT_DRIVER = Step.CORRECT_WIRING, Step.CALIBRATE_LENGTHS
-#: remedy if a calibration in gentle motion fails, for which a network that has not learned the arm
-#: may be too inexact
+#: advise this if a calibration in gentle motion fails: it needs an accurate network, which one that
+#: has not learned the arm may not be
 OTHER_WAY = (
     'provide joint sensors; or set zero_posture, hold the arm there, and call estimator/zero'
 )
-CORRELATED = 10.0  # number of successive moments that together count as one independent moment
-BEYOND_STOP = 0.01  # fraction of its range by which a stated joint angle may exceed a limit
-MAD_TO_DEVIATION = 1.48  # ratio of standard deviation to median absolute deviation
+CORRELATED = 10.0  # count this many successive moments as one independent moment
+BEYOND_STOP = 0.01  # let a stated joint angle exceed a limit by this share of the joint's range
+#: multiply a median absolute deviation by this to get the standard deviation
+MAD_TO_DEVIATION = 1.48
 
 
 class LengthCalibration:
@@ -177,7 +179,7 @@ class LengthCalibration:
         self._judge(fit, moments, is_enough)
 
     def _judge(self, fit: Fit, moments: Moments, is_enough: bool) -> None:
-        """Make a fit the newest estimate of the offsets, and decide whether it is reliable.
+        """Judge whether a fit is reliable, and make it the newest estimate of the offsets.
 
         `is_enough` says whether there was enough motion for reliable offsets when the fit began.
         """

@@ -44,10 +44,10 @@ from musculoskeletal_ae.mae.units import LENGTH_SCALE
 from musculoskeletal_ae.robot.model_errors import ELASTIC, length_variances
 from musculoskeletal_ae.robot.robot import Robot
 
-POSTURES = 300  # number of random postures over which variances are averaged
-SENSOR_NOISE = 0.0003  # standard deviation of the noise of a length [m]
-#: Width of the correlation ρ, as a share of the joint ranges. The learner finds
-#: similar widths for tendons that wrap round bones (b in `body_model/remainder.py`).
+POSTURES = 300  # average variances over this many random postures
+SENSOR_NOISE = 0.0003  # assume this noise of a length (standard deviation) [m]
+#: Correlate errors over this share of the joint ranges (width of ρ). The learner finds similar
+#: widths for tendons that wrap round bones (b in `body_model/remainder.py`).
 SMOOTHNESS = 0.35
 
 
@@ -100,7 +100,7 @@ class LengthErrors:
     def predict(
         self, length: Array, tension: Array, spread: Array | float, used: Bools, start: Array
     ) -> Prediction:
-        """Fit a posture to the lengths of some muscles, and predict the lengths of all.
+        """Predict the lengths of all muscles in a posture that is fitted to the lengths of some.
 
         Args:
             length: Measured lengths [m], (M,).

@@ -26,24 +26,25 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement, decide, single_faults
 
 # Constants of the search for initial values.
-DRAWN_POSTURES = 3200  # number of random postures whose torques at the first moment are compared
-FITTED_POSTURES = 400  # number of the best drawn postures, which are fitted coarsely to the lengths
-COMPARED_FITS = 30  # number of the best coarse fits, which are then also compared by torque
-REFINED_FITS = 6  # number of the best coarse fits, which are refined
-FEW_MOMENTS = 24  # number of moments that the search uses
-BATCH = 20  # number of postures that are fitted during one message
-COARSE_LENGTH = 0.01  # standard deviation of a length in coarse fits [m]
-COARSE_TORQUE = 2.0  # standard deviation of a torque in coarse fits [N·m]
-COARSE_ANGLE = 0.1  # standard deviation of the excess over joint limits in coarse fits [rad]
+DRAWN_POSTURES = 3200  # compare the torques of this many random postures at the first moment
+FITTED_POSTURES = 400  # fit this many of the best drawn postures coarsely to the lengths
+COMPARED_FITS = 30  # compare this many of the best coarse fits also by torque
+REFINED_FITS = 6  # refine this many of the best coarse fits
+FEW_MOMENTS = 24  # search on this many moments
+BATCH = 20  # fit this many postures during one message
+COARSE_LENGTH = 0.01  # assume this standard deviation of a length in coarse fits [m]
+COARSE_TORQUE = 2.0  # assume this standard deviation of a torque in coarse fits [N·m]
+#: assume this standard deviation of the excess over joint limits in coarse fits [rad]
+COARSE_ANGLE = 0.1
 
 # Constants of the judgement of the wiring.
-LIKELY = 3  # number of the likeliest wirings that are fitted to all moments
-MOST_FAULTS = 3  # largest number of exchanges and reversed signs that are searched for
+LIKELY = 3  # fit this many of the likeliest wirings to all moments
+MOST_FAULTS = 3  # search for at most this many exchanges and reversed signs
 
-FARTHEST = 0.3  # largest offset [m]
-ROUNDS = 20  # largest number of Gauss–Newton steps
-FIRST_ROUNDS = 6  # largest number of Gauss–Newton steps in the search for initial values
-LEAST_DECREASE = 3e-5  # decrease of the cost, per residual, that ends the Gauss–Newton steps
+FARTHEST = 0.3  # prefer drawn postures that imply no larger offset than this [m]
+ROUNDS = 20  # end the fit after this many Gauss–Newton steps
+FIRST_ROUNDS = 6  # end a fit in the search for initial values after this many Gauss–Newton steps
+LEAST_DECREASE = 3e-5  # end a fit if a step lowers the cost by less than this, per residual
 
 
 class Fit(NamedTuple):
@@ -101,7 +102,7 @@ class LengthFit:
         few = moments.rows(_few(moments))
         guesses = yield from self._guesses(moments, few)
         likeliest = yield from self._best(guesses, few, FIRST_ROUNDS)
-        # A few moments may mislead. All moments decide between the new start and the earlier fit.
+        # Let all moments decide between the new start and the earlier fit: a few may mislead.
         candidates = [likeliest.constants]
         if before is not None:
             candidates.append(before.constants)
@@ -141,7 +142,7 @@ class LengthFit:
         return judgement
 
     def _start(self, fit: Fit, moments: Moments, before: Wiring, after: Wiring, rows: Ints) -> Fit:
-        """Return an initial fit of one wiring, from a fit of another one.
+        """Start the fit of one wiring: return initial values, from a fit of another wiring.
 
         The postures are kept, and so are all constants except the length offsets of the muscles
         whose columns change.
@@ -170,7 +171,7 @@ class LengthFit:
         return fit.cost / self._count(fit.theta)
 
     def _count(self, theta: Array) -> int:
-        """Return the number of length and torque residuals in the postures `theta`, (K, D)."""
+        """Count the length and torque residuals in the postures `theta`, (K, D)."""
         return len(theta) * (self._robot.muscle_count + self._robot.joint_count)
 
     # -- search for a start ---------------------------------------------------------------------
@@ -200,7 +201,7 @@ class LengthFit:
         """
         mae = self._mae
         tension = np.tile(moments.tension[0], (FITTED_POSTURES, 1))
-        # The balance of torques excludes most postures before any offset is known.
+        # Keep the postures whose torques balance best; this needs no offsets.
         drawn, unbalanced = list[Array](), list[Array]()
         for _ in range(DRAWN_POSTURES // FITTED_POSTURES):
             drawn.append(self._robot.random_postures(FITTED_POSTURES, self._rng))

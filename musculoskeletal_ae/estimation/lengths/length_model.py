@@ -26,31 +26,32 @@ from musculoskeletal_ae.gauss_newton import Equations, RightSides, SolvedStep, s
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-LENGTH_NOISE = 0.0004  # standard deviation of the network's error of a length [m]
-#: standard deviation of the network's error of a joint torque, apart from friction [N·m]
+LENGTH_NOISE = 0.0004  # assume this error of the network's lengths (standard deviation) [m]
+#: assume this error of the network's joint torques, apart from friction (standard deviation) [N·m]
 TORQUE_NOISE = 0.4
-LIMIT_NOISE = 0.05  # standard deviation of the excess of a joint angle over its limits [rad]
-NOISE_FACTORS = 0.3, 5.0  # smallest and largest factor of LENGTH_NOISE for a single muscle
-ISOLATED_WEIGHT = 1e-6  # weight of an isolated muscle's length relative to a used muscle's
-AT_STOP = 0.03  # distance from a joint limit below which the stop may carry torque [rad]
+LIMIT_NOISE = 0.05  # let joint angles exceed their limits by this much (standard deviation) [rad]
+NOISE_FACTORS = 0.3, 5.0  # multiply LENGTH_NOISE of a single muscle by a factor within these limits
+#: weigh the length of an isolated muscle by this, relative to that of a used muscle
+ISOLATED_WEIGHT = 1e-6
+#: expect that a stop may carry torque within this distance from the joint limit [rad]
+AT_STOP = 0.03
 
 # Prior of the constants; the mean is 0 except for FRICTION.
-OFFSET = 0.1  # prior standard deviation of a length offset [m]
-FRICTION = 0.05  # prior mean and standard deviation of the friction coefficient μ of a tendon
-#: prior standard deviation of a tension sensor's offset [N]; it covers the error of the gain
+OFFSET = 0.1  # expect a length offset of this size (σ) [m]
+FRICTION = 0.05  # expect this friction coefficient μ of a tendon, with σ of the same size
+#: expect a tension sensor's offset of this size (σ) [N]; it covers the error of the gain
 TENSION_OFFSET = 1.5
-#: prior standard deviation of the Coulomb torque of a joint, relative to the largest torque of the
-#: weight
+#: expect a Coulomb torque of each joint of this size (σ), relative to the weight's largest torque
 JOINT_FRICTION = 0.03
 
-STICKING = 0.003  # motion after a reversal over which the friction of a joint changes sign [rad]
-#: lower limit of the largest torque of the weight, relative to the largest torque of the muscles at
-#: T_bias
+#: after a reversal, let the friction of a joint change its sign over this motion [rad]
+STICKING = 0.003
+#: assume at least this largest torque of the weight, relative to that of the muscles at T_bias
 LEAST_WEIGHT = 0.1
 
 STEP = 1e-3  # step of numerical derivatives, of θ [rad] and of μ
-LARGEST_STEP = 0.3  # largest change of an angle in a Gauss–Newton step [rad]
-SMALL = 1e-6  # added to the diagonals of A, so that A is positive definite
+LARGEST_STEP = 0.3  # change an angle by at most this in a Gauss–Newton step [rad]
+SMALL = 1e-6  # add this to the diagonals of A, so that A is positive definite
 
 
 class LengthModel:
@@ -70,7 +71,7 @@ class LengthModel:
         postures = robot.random_postures(64, rng)
         weight = np.abs(robot.kinematics.weight_torque(postures)).max()
         moment_arms = np.abs(robot.routes.muscle_jacobian(postures))
-        # Joints with a vertical axis have friction although they carry no weight.
+        # Relate friction also to the muscles: a joint with a vertical axis carries no weight.
         by_bias = (robot.description.tension.bias @ moment_arms).max()
         weight = max(weight, LEAST_WEIGHT * by_bias)
         counts = muscle_count, muscle_count, muscle_count, joint_count

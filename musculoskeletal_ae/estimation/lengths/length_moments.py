@@ -16,10 +16,11 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
-WINDOW = 0.25  # duration of the window over which one moment averages [s]
-MOVED = 0.002  # change of a muscle's length above which the arm has moved [m]
-FASTEST = 0.05  # speed of a muscle above which inertial forces are not negligible [m/s]
-MOST = 240  # largest number of moments that are kept
+WINDOW = 0.25  # average the readings of a moment over this time [s]
+MOVED = 0.002  # count the arm as moved if a muscle's length has changed by more than this [m]
+#: skip moments in which a muscle is faster, because inertial forces matter then [m/s]
+FASTEST = 0.05
+MOST = 240  # keep at most this many moments
 
 
 class Moments(NamedTuple):

@@ -53,7 +53,7 @@ class Transition(NamedTuple):
 _ANY, _UNKNOWN = frozenset(Trust), frozenset({Trust.UNKNOWN})
 _KNOWN, _REVOKED = frozenset({Trust.KNOWN}), frozenset({Trust.REVOKED})
 
-#: what follows from each evidence; nothing leads back to the assumption of the start
+#: change the trust as each evidence demands; nothing leads back to the assumption of the start
 TRANSITIONS = {
     Evidence.NOT_CALIBRATED: Transition(_ANY, Trust.UNKNOWN),
     Evidence.RESTARTED: Transition(_ANY, Trust.UNKNOWN),
@@ -63,7 +63,7 @@ TRANSITIONS = {
     Evidence.MOVED: Transition(_KNOWN, Trust.KNOWN),
     Evidence.CONFIRMED: Transition(_KNOWN, Trust.KNOWN),
 }
-#: what follows from a finding whose kind revokes length offsets
+#: revoke known offsets after a finding whose kind revokes length offsets
 REVOCATION = Transition(_KNOWN, Trust.REVOKED)
 
 
@@ -91,7 +91,7 @@ class LengthTrust:
         muscles: Iterable[int] | None = None,
         found: LengthOffsets | None = None,
     ) -> bool:
-        """Decide by new evidence; return whether this has changed an offset or a trust.
+        """Take new evidence; return whether it has changed an offset or a trust.
 
         Args:
             evidence: The evidence, or the kind of a finding that revokes length offsets.
@@ -118,7 +118,7 @@ class LengthTrust:
 
     @property
     def doubts(self) -> dict[str, tuple[int, ...]]:
-        """Why offsets are not known: texts for users, with the indices of the muscles."""
+        """Reasons, for users, why length offsets are not known, with the muscles concerned."""
         doubts = dict[str, tuple[int, ...]]()
         for muscle in self.offsets.not_known:
             text = _text(self.evidence[muscle])

@@ -34,23 +34,23 @@ from musculoskeletal_ae.robot.robot import Robot
 # Limits relative to joint sensors. A good learned network differed from joint sensors by 0.29 rad
 # although the network before it differed by 0.18 rad. Lengths of good learned networks differed by
 # up to 0.03 m.
-ANGLE_FLOOR = 0.35  # error of a joint that is always permitted [rad]
-LENGTH_FLOOR = 0.06  # error of a length that is always permitted [m]
-ANGLE_WORSE = 1.5  # largest error relative to the error of the network in use
-#: a network that a user has chosen is called worse than the one in use from this error on [rad]
+ANGLE_FLOOR = 0.35  # permit this error of a joint in any case [rad]
+LENGTH_FLOOR = 0.06  # permit this error of a length in any case [m]
+ANGLE_WORSE = 1.5  # permit this multiple of the error of the network in use
+#: call a network that a user has chosen worse than the one in use only from this error on [rad]
 ANGLE_CLEAR = 0.1
 # Limits relative to the network in use. The first update of an initial network changed θ by up to
 # 0.56 rad and lengths by up to 0.05 m; an update of a learned network changed θ by up to 0.31 rad.
-ANGLE_MOVED = 0.45  # largest difference of θ from a learned network [rad]
-ANGLE_MOVED_INITIAL = 0.8  # largest difference of θ from an initial network [rad]
-LENGTH_MOVED = 0.07  # largest difference of a length from a network of either kind [m]
+ANGLE_MOVED = 0.45  # permit this difference of θ from a learned network [rad]
+ANGLE_MOVED_INITIAL = 0.8  # permit this difference of θ from an initial network [rad]
+LENGTH_MOVED = 0.07  # permit this difference of a length from a network of either kind [m]
 # A minute of learning changed the shape of initial networks by 0.32 and of learned networks by
 # 0.18. Multiplying all lengths by 1.5 changes it by 0.5.
-SHAPE_MOVED = 0.3  # largest relative difference in shape from a learned network
-SHAPE_MOVED_INITIAL = 0.42  # largest relative difference in shape from an initial network
+SHAPE_MOVED = 0.3  # permit this relative difference in shape from a learned network
+SHAPE_MOVED_INITIAL = 0.42  # permit this relative difference in shape from an initial network
 
-BY_SENSORS = 'joint sensors'  # source of a reference
-BY_NETWORK = 'the network in use'  # source of a reference
+BY_SENSORS = 'joint sensors'  # name joint sensors so, as the source of a reference
+BY_NETWORK = 'the network in use'  # name the network in use so, as the source of a reference
 
 
 class Agreement(NamedTuple):

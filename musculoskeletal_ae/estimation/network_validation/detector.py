@@ -18,9 +18,10 @@ from musculoskeletal_ae.estimation.network_validation.recent_messages import LEA
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, residuals
 
-#: smallest permitted measure with a ruptured muscle; the muscle with the largest measure counts
+#: require at least this ratio with a ruptured muscle; the muscle with the largest ratio counts
 LEAST_RUPTURED = 0.1
-WIDENED = 3.5  # smallest ratio of an inherited threshold to the highest d of the messages
+#: raise an inherited threshold to at least this multiple of the largest d of the messages
+WIDENED = 3.5
 
 
 def measures(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> Iterator[float]:

@@ -15,10 +15,10 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.network_validation.recent_messages import RecentMessages
 from musculoskeletal_ae.mae.mae import Mae
 
-WORSE = 2.0  # largest permitted error, relative to the error of the network in use
-#: error that is always permitted: of T [N] and of l [m]
+WORSE = 2.0  # permit this multiple of the error of the network in use
+#: permit these errors of T [N] and l [m] in any case
 FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}
-#: a network is called worse than the one in use from this error of a length on [m]
+#: call a network worse than the one in use only from this error of a length on [m]
 CLEAR = 0.01
 
 

@@ -39,15 +39,15 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.robot import Robot
 
-POSTURES = 64  # number of fixed states
+POSTURES = 64  # check a network on this many fixed states
 SCALE = 'scale of l by ①'  # name of the error of the common factor
 
-#: largest permitted relative errors; healthy networks have smaller ones (`python -m bench gate`)
+#: permit these relative errors; healthy networks have smaller ones (`python -m bench gate`)
 LIMITS = {
     'θ by ①': 0.6,
-    'T by ①': 1.35,  # exchanging two muscles gives √2
+    'T by ①': 1.35,  # permit less than √2, the error after an exchange of two muscles
     'l by ①': 1.7,
-    'θ by ②': 1.3,  # a joint that the muscles do not determine gives 1
+    'θ by ②': 1.3,  # permit more than 1, the error of a joint that the muscles do not determine
     'T by ②': 1.35,
     'l by ②': 0.6,
     'θ by ③': 0.7,
@@ -60,13 +60,13 @@ LIMITS = {
 }
 LEAST_SPREAD = 0.04  # divide errors of lengths by at least this standard deviation [m]
 LEAST_ARM = 0.01  # divide errors of G by moment arms of at least this size [m]
-# The constants of a real elastic element may be e^±1.5 times those of the model. Its elongation is
-# therefore fitted as that of the model times a factor between these two.
+# Fit the elongation as that of the model times a factor between these two. The constants of a real
+# elastic element may be e^±1.5 times those of the model.
 STIFFEST, SOFTEST = 0.2, 4.5
 INELASTIC = 1e-12  # divide a slope by at least this, for muscles without elongation [m²]
-#: largest error of a poorly determined joint, relative to the error of the best affine map
+#: permit this multiple of the best affine map's error at a poorly determined joint
 UNDETERMINED = 1.2
-#: number of states to which the affine map is fitted; its error is measured on as many other states
+#: fit the affine map to this many states, and measure its error on as many others
 AFFINE = 1000
 
 
@@ -193,9 +193,9 @@ class PostureCheck:
 
     @cached_property
     def _undetermined(self) -> Array:
-        """Permitted relative error of a joint that the muscles determine only poorly, (D,).
+        """Permitted relative error of each joint, (D,), for joints that muscles determine poorly.
 
-        It follows from the error of the best affine map from tensions and lengths to joint angles.
+        It is a multiple of the error of the best affine map from tensions and lengths to angles.
         """
         theta, tension, length = self._states(2 * AFFINE)
         ones = np.ones((2 * AFFINE, 1))

@@ -9,9 +9,9 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 
-SPAN = 10.0  # time that the kept messages cover [s]
-SPACING = 0.1  # shortest time between two kept messages [s]
-LEAST = 20  # smallest number of messages on which a network can be validated
+SPAN = 10.0  # keep messages that are no older than this [s]
+SPACING = 0.1  # keep one message in this time [s]
+LEAST = 20  # validate a network on at least this many messages
 
 
 class _Message(NamedTuple):
@@ -23,7 +23,7 @@ class _Message(NamedTuple):
 
 
 class RecentMessages:
-    """The healthy messages of the last 10 s, thinned out. All times are of one steady clock [s]."""
+    """The healthy messages of the last 10 s, at most one in 0.1 s, by a steady clock [s]."""
 
     def __init__(self, joint_count: int) -> None:
         self._unmeasured = np.full(joint_count, np.nan)
@@ -51,7 +51,7 @@ class RecentMessages:
         theta: Array | None,
         is_healthy: bool,
     ) -> None:
-        """Store a message if the arm is healthy and the last stored message is at least 0.1 s old.
+        """Note a message if the arm is healthy and the last stored message is at least 0.1 s old.
 
         Args:
             tension: Tensions as read [N], (M,).
@@ -80,10 +80,10 @@ class RecentMessages:
         return mae.transmission.end(tension, sliding), length
 
     def drop_after(self, time: float) -> None:
-        """Discard the messages that are newer than a time [s]."""
+        """Drop the messages that are newer than a time [s]."""
         while self._messages and self._messages[-1].time > time:
             self._messages.pop()
 
     def clear(self) -> None:
-        """Discard all messages."""
+        """Clear all messages."""
         self._messages.clear()

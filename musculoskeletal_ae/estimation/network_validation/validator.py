@@ -44,9 +44,9 @@ from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-PROOF = 10.0  # time in use without an anomaly after which a network is proven [s]
-MOST_USED = 20  # largest number of networks that are kept for a rollback
-RELEARNING_TIME = 600.0  # time after its repair during which a muscle may be relearned [s]
+PROOF = 10.0  # count a network as proven after this time in use without an anomaly [s]
+MOST_USED = 20  # keep at most this many networks for a rollback
+RELEARNING_TIME = 600.0  # expect that a muscle may be relearned for this long after its repair [s]
 
 
 class CheckpointValidator:
@@ -105,12 +105,12 @@ class CheckpointValidator:
         self._messages.note(tension, length, sliding, now, theta, is_healthy=not self._is_anomaly)
 
     def start(self) -> None:
-        """Discard all networks and messages, so that the next network counts as the first one."""
+        """Start without networks and messages, so that the next network counts as the first one."""
         self._used.clear()
         self.forget()
 
     def forget(self) -> None:
-        """Discard the messages, for example when the length offsets change."""
+        """Forget the messages, for example when the length offsets change."""
         self._messages.clear()
 
     def check(self, mae: Mae, is_chosen: bool = False) -> None:
@@ -137,7 +137,7 @@ class CheckpointValidator:
         """
         faults, steps = list[str](), self._steps(mae.without(self.isolated), is_chosen)
         while True:
-            # An overflow is a large error of the candidate, not a reason for a warning.
+            # Suppress warnings of overflows, which count as large errors of the candidate.
             with np.errstate(all='ignore'):
                 try:
                     fault = next(steps)
@@ -154,7 +154,7 @@ class CheckpointValidator:
         self._repaired_at |= dict.fromkeys(muscles, now)
 
     def take(self, mae: Mae, now: float) -> None:
-        """Record that this network is in use from the time `now` [s] on."""
+        """Take this network as the one in use from the time `now` [s] on."""
         self._used.append((now, mae))
         while len(self._used) > 1 and now - self._used[1][0] >= PROOF:
             del self._used[0]
@@ -198,9 +198,9 @@ class CheckpointValidator:
         return check.comparisons(mae)
 
     def weakness(self, mae: Mae) -> str:
-        """Say in what a network is clearly worse on recent messages than a learned one in use.
+        """State what a network does clearly worse, on recent messages, than a learned one in use.
 
-        Joint sensors tell, or else the lengths that each network computes at its own estimate.
+        Joint sensors decide, or else the lengths that each network computes at its own estimate.
 
         Returns:
             The quantity, its error and that of the network in use; '' if it is not clearly worse,
