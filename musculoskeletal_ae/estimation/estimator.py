@@ -40,6 +40,7 @@ from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthT
 from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
 from musculoskeletal_ae.estimation.mounting import MountingCheck
+from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.estimation.repair_check import RepairCheck
 from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.estimation.state_estimator import Estimate, StateEstimator
@@ -101,8 +102,7 @@ class Estimator:
         contact: The contact estimator.
         healthy_torque: Measures the external torque that is wrongly estimated without contact.
         mounting: Checks the direction of gravity.
-        unsuitable_because: Why the network in use fits this arm worse than the one before; '' if it
-            does not.
+        networks: Decides which network is used.
         sample: The last sample; None before the first.
         output: Results of the last message with an estimate; None before the first, and from the
             start of a length calibration until its first estimate.
@@ -136,7 +136,7 @@ class Estimator:
         self.contact = ContactEstimator(robot)
         self.healthy_torque = HealthyTorque(robot.joint_count)
         self.mounting = MountingCheck(robot)
-        self.unsuitable_because = ''
+        self.networks = CheckpointValidator(robot, self.use)
         self.sample: MuscleSample | None = None
         self.output: Output | None = None
         self.measured: Array | None = None
@@ -189,15 +189,13 @@ class Estimator:
         """Use these settings from the next message on."""
         self.suspects.settings = settings
 
-    def use(self, mae: Mae, unsuitable_because: str = '') -> Mae:
+    def use(self, mae: Mae) -> Mae:
         """Use another network and its healthy statistics, without the isolated muscles.
 
         A running length calibration starts again, because its estimate depends on the network.
 
         Args:
             mae: The network.
-            unsuitable_because: Why it fits this arm worse than the network before; '' if it does
-                not.
 
         Returns:
             The network with all muscles, and with the residual torque that was measured so far.
@@ -208,7 +206,6 @@ class Estimator:
         """
         mae = self.healthy_torque.put_into(mae)
         reduced = mae.without(self.body.isolated)
-        self.unsuitable_because = unsuitable_because
         self.health.use(reduced)
         self.joint_check.use(reduced)
         self.contact.use(reduced)
@@ -230,7 +227,7 @@ class Estimator:
         self.suspects.on_isolated(isolated)
         self._update_body(isolated=isolated)
         if isolated != before and self.state.complete_mae is not None:
-            self.use(self.state.complete_mae, self.unsuitable_because)
+            self.use(self.state.complete_mae)
         self.health.reset()
 
     def distrust_lengths(self, evidence: Evidence, offset: Array | None = None) -> None:

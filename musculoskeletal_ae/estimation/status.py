@@ -54,8 +54,8 @@ def conditions(core: Estimator, now: float) -> tuple[Condition, ...]:
         present.append(ConditionKind.READINGS_REJECTED.condition(reason))
     if core.mounting.tilt is not None:
         present.append(ConditionKind.OTHER_MOUNTING.condition(core.mounting.tilt.text))
-    if core.unsuitable_because:
-        present.append(ConditionKind.UNSUITABLE_NETWORK.condition(core.unsuitable_because))
+    if weakness := core.networks.unsuitable_because:
+        present.append(ConditionKind.UNSUITABLE_NETWORK.condition(weakness))
     if core.state.mae is None:
         present.append(ConditionKind.NO_CHECKPOINT.condition(steps=[Step.PROVIDE_CHECKPOINT]))
     return tuple(present)

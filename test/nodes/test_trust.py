@@ -24,6 +24,7 @@ from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
 from musculoskeletal_ae.nodes.learner import Learner
 from musculoskeletal_ae.nodes.sim import Sim
 from musculoskeletal_ae.ros.messages import LATCHED, array_message, joint_message
+from musculoskeletal_ae.signals.body_state import Anomaly
 
 HERE = np.array([-0.5, -1.2])
 REFUSED = 'mae_checkpoint: does not explain the arm'
@@ -92,7 +93,7 @@ def test_an_anomaly_rejects_a_network_that_is_being_validated(arm, trained):
     first, candidates = estimator.core.state.complete_mae, estimator.candidates
     arm.graph.send_network(checkpoint.to_bytes(replace(trained['paper'], version=67)))
     arm.graph.wait(lambda: candidates.queue.is_busy, 'the validation')
-    candidates.on_anomaly(True)
+    candidates.follow(estimator.core.body.with_anomaly(Anomaly.FOUND, 0))
     arm.graph.wait(lambda: decisions, 'the decision')
     assert decisions[-1].key == '67'
     assert 'anomaly' in decisions[-1].value
@@ -121,7 +122,8 @@ def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_n
 
     arm.graph.wait(is_used, 'the new network')
     decisions = arm.graph.listen(KeyValue, 'rejected_checkpoint', LATCHED)
-    arm.estimator.candidates.on_anomaly(True)
+    body = arm.estimator.core.body
+    arm.estimator.candidates.follow(body.with_anomaly(Anomaly.FOUND, 0))
     arm.graph.wait(
         lambda: decisions and 'soon after' in decisions[-1].value, 'the rejection of the new one'
     )
