@@ -246,6 +246,6 @@ def stated_theta(robot: Robot, posture: tuple[float, ...]) -> Array | None:
     low, high = robot.lower - beyond, robot.upper + beyond
     if theta.shape == low.shape and ((theta >= low) & (theta <= high)).all():
         return theta
-    limits = zip(units, units.to_position(robot.lower), units.to_position(robot.upper))
-    legal = ', '.join(f'{low:.6g} to {high:.6g} {unit.position}' for unit, low, high in limits)
+    limits = zip(units, robot.lower, robot.upper)
+    legal = ', '.join(unit.range_text(low, high, '.6g') for unit, low, high in limits)
     raise MusculoskeletalError(f'zero_posture is {list(posture)}; legal: an empty list, or {legal}')
