@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The core of the node `estimator`: estimates the joint angles and monitors the body's health.
 
-    muscle_states ─► MuscleStream ─► MuscleSample ─► StateEstimator ─► Estimate ─► HealthMonitor
+    muscle_states ─► MuscleStream ─► MuscleSample ─►    estimate    ─► Estimate ─► HealthMonitor
                          ▲                │                              │              │ Finding
                          │                ▼                              ▼              ▼
                      BodyState ◄── LengthCalibration              ContactEstimator   SuspectHandling
@@ -31,6 +31,7 @@ from musculoskeletal_ae.estimation import status
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
 from musculoskeletal_ae.estimation.detectors.joint_disagreement import GAP_LEARNED, GAP_YOUNG
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
+from musculoskeletal_ae.estimation.estimate import Estimate, estimate
 from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
@@ -43,7 +44,6 @@ from musculoskeletal_ae.estimation.mounting import MountingCheck
 from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.estimation.repair_check import RepairCheck
 from musculoskeletal_ae.estimation.settings import EstimatorSettings
-from musculoskeletal_ae.estimation.state_estimator import Estimate, StateEstimator
 from musculoskeletal_ae.estimation.suspects import SuspectHandling
 from musculoskeletal_ae.estimation.verification import LONGEST
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -95,7 +95,8 @@ class Estimator:
         trust: Decides which length offsets are known.
         stream: Converts messages into samples.
         heat: Thermal models of the muscle modules.
-        state: The state estimator.
+        mae: The network in use, without the isolated muscles; None before the first.
+        complete_mae: The same network with all muscles.
         health: The detectors.
         suspects: The latched finding and its verification.
         calibration: The running length calibration, or None.
@@ -128,7 +129,8 @@ class Estimator:
         self.trust = LengthTrust(robot.muscle_count)
         self.body = BodyState(self.trust.offsets, generation=first_generation)
         self.stream = MuscleStream(robot, self.body)
-        self.state = StateEstimator()
+        self.mae: Mae | None = None
+        self.complete_mae: Mae | None = None
         self.health = HealthMonitor(robot, preset)
         self.heat = self.health.heat
         self.suspects = SuspectHandling(robot)
@@ -147,11 +149,6 @@ class Estimator:
         self.joint_check = JointCheck(robot)
         #: usable readings of the joint sensors [rad] and their times [s], (2, D); NaN if unknown
         self._readings = np.full((2, robot.joint_count), np.nan)
-
-    @property
-    def mae(self) -> Mae | None:
-        """The network in use, without the isolated muscles."""
-        return self.state.mae
 
     @property
     def cause(self) -> str:
@@ -211,7 +208,7 @@ class Estimator:
         self.contact.use(reduced)
         self.mounting.use(reduced)
         self.stream.use_transmission(reduced.transmission)
-        self.state.use(mae, self.body.isolated)
+        self.complete_mae, self.mae = mae, reduced
         if self.calibration is not None:
             posture = self.calibration.posture
             self.calibration = CheckedCalibration(self.robot, reduced, posture)
@@ -226,8 +223,8 @@ class Estimator:
         isolated = self.body.with_isolated(muscles).isolated
         self.suspects.on_isolated(isolated)
         self._update_body(isolated=isolated)
-        if isolated != before and self.state.complete_mae is not None:
-            self.use(self.state.complete_mae)
+        if isolated != before and self.complete_mae is not None:
+            self.use(self.complete_mae)
         self.health.reset()
 
     def distrust_lengths(self, evidence: Evidence, offset: Array | None = None) -> None:
@@ -345,7 +342,7 @@ class Estimator:
         """Estimate the state from a message of muscle_states, and check for faults.
 
         Args:
-            message: The message, or a `MuscleReading`.
+            message: The message, or its rows (`muscle_reading`).
             time: Time of the message [s].
             now: Time on the steady clock [s].
             delay: How late the message is, compared with the fastest one [s].
@@ -440,15 +437,16 @@ class Estimator:
                 return None
             guess = newest
             sample = sample.shifted(self.body.offsets.offset - before.offset)
-        estimate = self.state.step(sample.bone_tension, sample.length_read - guess.offset)
+        assert self.mae is not None
+        of_sample = estimate(self.mae, sample.bone_tension, sample.length_read - guess.offset)
         if self.suspects.verification is not None:
-            self._verify(sample, estimate, dt, now)
+            self._verify(sample, of_sample, dt, now)
         demand = self._commands.demand(self.robot, sample.length, now)
         known = self.body.offsets.known
         readings = self._fresh_readings(now)
         self.measured = self._measured_theta(readings)
         command = self._commands.length(now)
-        observation = Observation(sample, estimate, demand, dt, known, self.measured, command)
+        observation = Observation(sample, of_sample, demand, dt, known, self.measured, command)
         finding = self.health.step(observation)
         detected = self._handle(finding, now)
         if detected:
@@ -458,12 +456,12 @@ class Estimator:
         contact = None
         if known and self.robot.tension_source.is_known:
             pull = sample.bone_tension * self.body.used
-            contact = self.contact.step(estimate.state.theta, pull, sent_apart)
+            contact = self.contact.step(of_sample.state.theta, pull, sent_apart)
             if self.suspects.finding is None:
                 self.healthy_torque.step(contact.torque, self.contact.velocity, sent_apart)
-                self.mounting.step(estimate.state.theta, pull, contact.torque, dt)
+                self.mounting.step(of_sample.state.theta, pull, contact.torque, dt)
         self.output = Output(
-            sample, estimate.state, estimate.covariance, estimate.anomaly, detected, contact
+            sample, of_sample.state, of_sample.covariance, of_sample.anomaly, detected, contact
         )
         return self.output
 
@@ -541,7 +539,7 @@ class Estimator:
     @property
     def _repair_check(self) -> RepairCheck | None:
         """A check of the newest readings; None before the first and without a network."""
-        sample, mae, body = self.sample, self.state.complete_mae, self.body
+        sample, mae, body = self.sample, self.complete_mae, self.body
         if sample is None or mae is None:
             return None
         limits = GAP_LEARNED if self.health.residual.is_calibrated else GAP_YOUNG

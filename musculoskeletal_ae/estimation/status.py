@@ -28,7 +28,7 @@ def report(core: Estimator, now: float) -> Report:
     The value `verification` is an identifier for programs, and `last outcome` is one of
     `verification.Outcome`.
     """
-    mae, present = core.state.mae, conditions(core, now)
+    mae, present = core.mae, conditions(core, now)
     if mae is None:
         return Report('', {}, present)
     values = {
@@ -56,7 +56,7 @@ def conditions(core: Estimator, now: float) -> tuple[Condition, ...]:
         present.append(ConditionKind.OTHER_MOUNTING.condition(core.mounting.tilt.text))
     if weakness := core.networks.unsuitable_because:
         present.append(ConditionKind.UNSUITABLE_NETWORK.condition(weakness))
-    if core.state.mae is None:
+    if core.mae is None:
         present.append(ConditionKind.NO_CHECKPOINT.condition(steps=[Step.PROVIDE_CHECKPOINT]))
     return tuple(present)
 

@@ -90,7 +90,7 @@ def test_of_networks_received_during_a_validation_all_nodes_use_the_last_without
 def test_an_anomaly_rejects_a_network_that_is_being_validated(arm, trained):
     estimator = arm.estimator
     decisions = arm.graph.listen(KeyValue, 'rejected_checkpoint', LATCHED)
-    first, candidates = estimator.core.state.complete_mae, estimator.candidates
+    first, candidates = estimator.core.complete_mae, estimator.candidates
     arm.graph.send_network(checkpoint.to_bytes(replace(trained['paper'], version=67)))
     arm.graph.wait(lambda: candidates.queue.is_busy, 'the validation')
     candidates.follow(estimator.core.body.with_anomaly(Anomaly.FOUND, 0))
@@ -98,7 +98,7 @@ def test_an_anomaly_rejects_a_network_that_is_being_validated(arm, trained):
     assert decisions[-1].key == '67'
     assert 'anomaly' in decisions[-1].value
     assert not candidates.queue.is_busy
-    assert estimator.core.state.complete_mae is first
+    assert estimator.core.complete_mae is first
 
 
 def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_nodes(
