@@ -80,8 +80,8 @@ class Estimator(Shell):
         self.follow_parameter('zero_posture', self._on_posture)
         if self.parameter('zero_at_start'):
             self.core.distrust_lengths(Evidence.NOT_CALIBRATED)
-        elif found is not None and found.offset is not None:
-            self.core.distrust_lengths(Evidence.RESTARTED, found.offset)
+        elif found is not None and not found.offsets.known:
+            self.core.distrust_lengths(Evidence.RESTARTED, found.offsets.offset)
         self.follow_parameter('isolate_muscles', self._on_isolate_muscles)
         self.core.isolate([*self.muscles_to_isolate, *(() if found is None else found.isolated)])
         self.candidates.subscribe()
