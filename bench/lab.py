@@ -41,7 +41,6 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.state import StateStore
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.signals.body_state import BodyState
-from musculoskeletal_ae.signals.muscle_readings import MuscleReading
 
 CORES = 2  # simulate a computer with this many cores
 #: let a process wait for the processor for this mean time, for each process per core [s]
@@ -249,7 +248,7 @@ class Lab:
         read = self.arm.sense()
         states = np.array([read.length, read.tension, read.temperature])
         for packet in self.wire.readings(now, Packet(states, read.theta)):
-            content = MuscleReading(packet.states.ravel()), packet.theta
+            content = packet.states, packet.theta
             for process in (self._estimating, self.controlling, self._learning):
                 process.send(Message(now, content))
 

@@ -18,7 +18,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, MuscleReading, muscle_reading
+from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, muscle_reading
 
 SPEED_LIMIT = 0.25  # largest speed of a muscle module's motor [m/s]; chosen by hand
 TURN = 6.2832  # largest turn of the base, by which it is upright again [rad]
@@ -86,8 +86,8 @@ class Readings(NamedTuple):
         """The readings of the muscle modules by the names of their quantities, (M,) each."""
         return {name: value for name, value in self._asdict().items() if name != 'theta'}
 
-    def message(self, robot: Robot) -> MuscleReading:
-        """Return the readings of the muscle modules as a message of `muscle_states`."""
+    def message(self, robot: Robot) -> Array:
+        """Return the readings of the muscle modules as the rows of a message, (Q, M)."""
         return muscle_reading(robot, **self.muscles)
 
 

@@ -163,7 +163,7 @@ class Learner:
         """Learn from a message of muscle_states.
 
         Args:
-            message: The message, or a `MuscleReading`.
+            message: The message, or its rows (`muscle_reading`).
             time: Time of reception [s].
             delay: How late the message is (`Arrival.delay`) [s].
 

@@ -202,7 +202,7 @@ class MuscleStream:
     def take(
         self, message: Any, time: float, now: float | None = None, delay: float = 0.0
     ) -> MuscleSample:
-        """Check and convert a message, or a `MuscleReading`.
+        """Check and convert a message, or its rows (`muscle_reading`).
 
         Args:
             message: The message.
