@@ -249,9 +249,7 @@ class JointCheck:
         A network that has learned little makes large errors in new postures. Without tensions, a
         load changes the estimates as false joint sensors would.
         """
-        statistics = None if self._mae is None else self._mae.anomaly
-        has_learned = statistics is not None and statistics.calibrated
-        return has_learned and self._has_tensions
+        return self._mae is not None and self._mae.is_calibrated and self._has_tensions
 
     def _limits(self, usual: _Usual) -> Iterator[tuple[int, Array]]:
         """Yield the length of each window and the limits of the median of |x| [rad], (D,)."""

@@ -322,10 +322,11 @@ class CheckpointValidator:
         If `mae` has no calibrated detector of its own, the copy that is returned has the detector
         of the network in use.
         """
-        statistics = None if self.mae is None else self.mae.anomaly
-        has_own = mae.anomaly is not None and mae.anomaly.calibrated
-        if has_own or statistics is None or not statistics.calibrated:
+        in_use = self.mae
+        if mae.is_calibrated or in_use is None or not in_use.is_calibrated:
             return mae
+        statistics = in_use.anomaly
+        assert statistics is not None
         repaired = [m for m, at in self._repaired_at.items() if 0.0 <= now - at < RELEARNING_TIME]
         statistics = statistics.ignoring(repaired)
         return detector.with_detector_of(statistics, mae, self._messages, self.isolated)
