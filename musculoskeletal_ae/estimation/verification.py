@@ -52,7 +52,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.limits import slack_tension
 
 #: count the suspect as being wound in once its length command has decreased by more than this [m]
 WINDING_CHANGE = 0.001
@@ -199,7 +199,7 @@ class PositionLaw(ModuleLaw):
         """
         stretch = self.stretch(row)
         if is_reference:  # for a slack tendon, x_0 − L_e(T_0) is unknown and assumed to be 0
-            is_slack = row.tension < LIMITS.slack_share * self.bias
+            is_slack = row.tension < slack_tension(self.bias)
             self._reference = 0.0 if is_slack else stretch - self._elongation(row.tension)
         wanted, low, high = stretch - self._reference, 0.0, HIGHEST_TENSION
         for _ in range(HALVINGS):
@@ -271,7 +271,7 @@ class Verification:
         first_quarter = slice(max(len(tension) // 4, 1))
         last_quarter = slice(-max(len(tension) // 4, 1), None)
         reached, wanted, beside = map(_late_median, (tension, demand, excess))
-        is_slack = reached < LIMITS.slack_share * self._bias
+        is_slack = reached < slack_tension(self._bias)
         follows_the_winch = excess[0] - excess[-1] > RUPTURE_CHANGE
         if np.ptp(length) < FROZEN:
             return VerificationVerdict(Outcome.LENGTH_SENSOR_FROZEN)
@@ -296,7 +296,7 @@ class Verification:
     def _judge_position(self, law: PositionLaw) -> VerificationVerdict | None:
         rows = self._rows[len(self._rows) // 2 :]
         tension, length, demand, excess, command, stretch = np.median(rows[-10:], axis=0)
-        is_slack = tension < LIMITS.slack_share * self._bias
+        is_slack = tension < slack_tension(self._bias)
         is_stretched = stretch > law.stretched
         may_wait = self._watched < LONGEST_WINDING and self._time < LONGEST
         if is_slack and not is_stretched and may_wait:
