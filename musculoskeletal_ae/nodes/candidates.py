@@ -58,7 +58,7 @@ class Candidates:
         """Subscribe to candidates, and follow the parameter `checkpoint`."""
         node = self._node
         node.needed.add(CANDIDATES)
-        node.follow_parameter('checkpoint', self._use_file, self._read)
+        node.parameters.follow('checkpoint', self._use_file, self._read)
         node.listen(UInt8MultiArray, CANDIDATES, self.queue.propose, LATCHED)
 
     def follow(self, body: BodyState) -> None:

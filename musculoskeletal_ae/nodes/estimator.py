@@ -77,15 +77,15 @@ class Estimator(Shell):
             self.needed.expect_rate('muscle_states', self.rate)
         self.posture: tuple[float, ...] = ()  # value of the parameter zero_posture
         self.muscles_to_isolate: tuple[int, ...] = ()  # value of the parameter isolate_muscles
-        self.follow_parameter('zero_posture', self._on_posture)
+        self.parameters.follow('zero_posture', self._on_posture)
         if self.parameter('zero_at_start'):
             self.core.distrust_lengths(Evidence.NOT_CALIBRATED)
         elif found is not None and not found.offsets.known:
             self.core.distrust_lengths(Evidence.RESTARTED, found.offsets.offset)
-        self.follow_parameter('isolate_muscles', self._on_isolate_muscles)
+        self.parameters.follow('isolate_muscles', self._on_isolate_muscles)
         self.core.isolate([*self.muscles_to_isolate, *(() if found is None else found.isolated)])
         self.candidates.subscribe()
-        self.follow_parameter(
+        self.parameters.follow(
             'on_anomaly', lambda value: self.core.configure(EstimatorSettings(on_anomaly=value))
         )
         self.follow_muscle_messages(self._on_muscles)
