@@ -25,8 +25,7 @@ from std_srvs.srv import Trigger
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation.body_memory import BodyMemory
-from musculoskeletal_ae.estimation.estimator import Estimator as Core
-from musculoskeletal_ae.estimation.estimator import Output
+from musculoskeletal_ae.estimation.estimator import Estimator, Output
 from musculoskeletal_ae.estimation.lengths.length_calibration import stated_theta
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
 from musculoskeletal_ae.estimation.settings import EstimatorSettings
@@ -55,7 +54,7 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample, RejectionErro
 OWN_TOPICS = [topic for topic, author in AUTHORS.items() if author == 'the estimator']
 
 
-class Estimator(Shell):
+class EstimatorNode(Shell):
     """Passes messages, parameters and services to the core estimator; publishes its results."""
 
     def __init__(self, **options: Any) -> None:
@@ -64,7 +63,7 @@ class Estimator(Shell):
         found = self.memory.found
         # The time distinguishes the body states of this estimator from those of an earlier one.
         generation = max(time.time_ns() // 1_000_000, 0 if found is None else found.generation + 1)
-        self.core = Core(self.robot, self.parameter('preset'), generation)
+        self.core = Estimator(self.robot, self.parameter('preset'), generation)
         self.candidates = Candidates(self, self.core.networks)
         self.core.networks.accepted = self._accepted
         self._advertise()

@@ -31,7 +31,7 @@ from musculoskeletal_ae.ros.messages import RELIABLE, serve
 PACE_TIME = 5.0  # average the real-time factor over this time [s]
 
 
-class HardwareEmulator(ArmNode):
+class HardwareEmulatorNode(ArmNode):
     """Passes commands and faults to the emulated arm; publishes its measurements."""
 
     def __init__(self, **options: Any) -> None:

@@ -18,7 +18,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
-from musculoskeletal_ae.learning import learner
+from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.trainer import TrainerProcess
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -36,7 +36,7 @@ POLL_PERIOD = 0.05  # check the training process at this interval [s]
 JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
 
 
-class Learner(Shell):
+class LearnerNode(Shell):
     """Passes messages, parameters and services to the core learner; publishes its networks."""
 
     is_time_critical = False
@@ -44,7 +44,7 @@ class Learner(Shell):
     def __init__(self, **options: Any) -> None:
         super().__init__('learner', **options)
         value = self.parameter
-        self.core = learner.Learner(
+        self.core = Learner(
             self.robot,
             preset=value('preset'),
             seed=value('seed'),

@@ -32,7 +32,7 @@ from musculoskeletal_ae.simulation.simulation import Simulation
 TEMPERATURE = 25.0  # report this temperature of all modules [°C]
 
 
-class Sim(ArmNode):
+class SimNode(ArmNode):
     """Passes commands and wrenches to the simulation of the learned body; publishes its states."""
 
     def __init__(self, **options: Any) -> None:
