@@ -9,7 +9,7 @@ from scipy.special import gammaincinv
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
-from musculoskeletal_ae.body_model.fit import Fit
+from musculoskeletal_ae.body_model.fit import FittedBody
 from musculoskeletal_ae.body_model.priors import INDEPENDENT_SAMPLES, PRIOR
 from musculoskeletal_ae.body_model.synthetic import UNKNOWN_FRICTION
 from musculoskeletal_ae.learning.samples import Observations
@@ -35,7 +35,7 @@ CONTAINED_SHARE = 0.95  # share of the errors that the ellipsoid of a covariance
 def estimate_covariance(
     mae: Mae,
     body: CalibratedBody,
-    fit: Fit,
+    fit: FittedBody,
     tension: Array,
     seed: int,
     judging: Observations | None,
@@ -75,7 +75,7 @@ def estimate_covariance(
     return _spread(offset + ratio * (error - offset))
 
 
-def drive_covariance(body: CalibratedBody, fit: Fit) -> Array | None:
+def drive_covariance(body: CalibratedBody, fit: FittedBody) -> Array | None:
     """Return the posterior covariances of the constants γ, b and F of motor currents.
 
     `Transmission` explains the constants. All samples together count as at most
@@ -109,7 +109,7 @@ def drive_covariance(body: CalibratedBody, fit: Fit) -> Array | None:
 def _drawn_errors(
     mae: Mae,
     body: CalibratedBody,
-    fit: Fit,
+    fit: FittedBody,
     theta: Array,
     tension: Array,
     rng: np.random.Generator,

@@ -42,7 +42,7 @@ LEAST_NOISE = 0.0003  # smallest σ of a length at rest [m]
 LEAST_BEFORE_CHANGE = 8
 
 
-class Fit(NamedTuple):
+class FittedBody(NamedTuple):
     """Result of a fit."""
 
     #: l − l(θ, T; w) [m], (N, M), at the measured angles, or at fitted ones where there are none
@@ -59,7 +59,7 @@ def fit_body(
     observed: Observations,
     prior_mean: list[Array] | None = None,
     guess: Array | None = None,
-) -> Fit:
+) -> FittedBody:
     """Fit the parameters of a body in place, together with the samples' postures.
 
     The fit starts from the present parameters. A muscle counts as changed if at least
@@ -90,8 +90,10 @@ def fit_body(
     means, spreads = map(list, zip(*priors, strict=True))
     is_learned = prior_mean is not None
 
-    def fitted() -> Fit:
-        return Fit(*fit_jointly(body, observed, start, means, spreads, LEAST_NOISE, is_learned))
+    def fitted() -> FittedBody:
+        return FittedBody(
+            *fit_jointly(body, observed, start, means, spreads, LEAST_NOISE, is_learned)
+        )
 
     fit = fitted()
     own = np.isfinite(observed.theta) & (observed.spread == 0.0)

@@ -95,7 +95,7 @@ class Readings(NamedTuple):
 SENSED = tuple(quantity.name for quantity in QUANTITIES if quantity.name in SIZES)
 
 
-class Fault(NamedTuple):
+class EmulatedFault(NamedTuple):
     """One fault, parsed from a line."""
 
     kind: str
@@ -109,7 +109,7 @@ class Fault(NamedTuple):
         return self.kind, self.quantities, tuple(self.which.tolist()), self.size
 
 
-def read_fault(line: str, robot: Robot) -> Fault:
+def read_fault(line: str, robot: Robot) -> EmulatedFault:
     """Return the fault that a line describes.
 
     Raises:
@@ -124,7 +124,9 @@ def read_fault(line: str, robot: Robot) -> Fault:
         if len(words) != 2 or not set(words) <= set(robot.joints):
             legal = f'exchange:JOINT:JOINT; joints: {", ".join(robot.joints)}'
             raise MusculoskeletalError(f'{line[:80]!r}; legal: {legal}')
-        return Fault(name, ('theta',), np.array([robot.joints.index(word) for word in words]), 0.0)
+        return EmulatedFault(
+            name, ('theta',), np.array([robot.joints.index(word) for word in words]), 0.0
+        )
     quantities: tuple[str, ...] = SENSED if kind.of_quantity else ()
     size, largest, unit = kind.size, kind.largest, kind.unit
     smallest = -largest if kind.signed else 0.0
@@ -155,9 +157,9 @@ def read_fault(line: str, robot: Robot) -> Fault:
             problem = f'{line[:80]!r}: unknown joint {unknown[0]!r}'
             raise MusculoskeletalError(f'{problem}; legal: {", ".join(robot.joints)}')
         joints = [robot.joints.index(word) for word in words] or range(robot.joint_count)
-        return Fault(name, quantities, np.array(joints), size)
+        return EmulatedFault(name, quantities, np.array(joints), size)
     muscles = robot.muscle_indices([':'.join(words)] if words else robot.muscles)
-    return Fault(name, quantities, np.array(muscles), size)
+    return EmulatedFault(name, quantities, np.array(muscles), size)
 
 
 class Faults:
@@ -166,7 +168,7 @@ class Faults:
     def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
         """Start without faults."""
         self._robot, self._rng = robot, rng
-        self._faults: tuple[Fault, ...] = ()
+        self._faults: tuple[EmulatedFault, ...] = ()
         self._frozen: dict[tuple[str, int], float] = {}
         self._reordered: Readings | None = None  # readings that are sent after the next ones
         self._queue: list[tuple[float, Readings]] = []
@@ -230,14 +232,14 @@ class Faults:
             axis = np.array([fault.kind == 'mount_x', fault.kind == 'mount_y', False], dtype=float)
             self.mount = self.mount @ pin.exp3(fault.size * axis)
 
-    def _of(self, *names: str) -> list[Fault]:
+    def _of(self, *names: str) -> list[EmulatedFault]:
         return [fault for fault in self._faults if fault.kind in names]
 
     def pass_time(self, duration: float) -> None:
         """Advance the time of drifts and bursts by `duration` [s]."""
         self._time += duration
 
-    def _is_in_burst(self, fault: Fault) -> bool:
+    def _is_in_burst(self, fault: EmulatedFault) -> bool:
         until, is_present = self._bursts[fault.key]
         while self._time >= until:
             is_present = not is_present

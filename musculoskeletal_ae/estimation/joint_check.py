@@ -73,7 +73,7 @@ TO_SIGMA = 1.48  # standard deviation of a normal distribution, in medians of ab
 GROSS = 0.8
 
 
-class _Message(NamedTuple):
+class _CountedMessage(NamedTuple):
     """Readings of one message that counts."""
 
     time: float  # [s]
@@ -105,7 +105,7 @@ class JointCheck:
         self._mae: Mae | None = None
         self.trust = JointTrust.full(robot.joint_count)
         #: messages in order of time; the last NEWEST of them are judged by the earlier ones
-        self._messages: deque[_Message] = deque(maxlen=EARLIER + NEWEST)
+        self._messages: deque[_CountedMessage] = deque(maxlen=EARLIER + NEWEST)
         #: θ − θ̂ [rad] (D,) and r [m] (M,) of each message with the network in use
         self._compared: deque[tuple[Array, Array]] = deque(maxlen=EARLIER + NEWEST)
         self._since = 0.0  # time since the last message that counted [s]
@@ -195,7 +195,7 @@ class JointCheck:
         self._since, self._counted_at = 0.0, estimate
         length = np.where(sample.usable, sample.length, np.nan)
         tension = np.nan_to_num(sample.bone_tension)
-        self._messages.append(_Message(now, theta.copy(), tension, length))
+        self._messages.append(_CountedMessage(now, theta.copy(), tension, length))
         self._compared.append((theta - estimate, length - self._mae.lengths(estimate, tension)))
         if len(self._messages) >= WINDOWS[0][0]:
             self._judge()
