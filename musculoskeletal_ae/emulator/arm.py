@@ -25,7 +25,7 @@ from numba import njit
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator import modules, wrapping
 from musculoskeletal_ae.emulator.individual import Individual
-from musculoskeletal_ae.emulator.modules import STEP, ModuleInputs, Modules, MuscleState
+from musculoskeletal_ae.emulator.modules import STEP, Command, Modules, MuscleState
 from musculoskeletal_ae.emulator.wrapping import Placed
 from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.kinematics import joint_space_inertia
@@ -150,7 +150,7 @@ def muscle_step(arm: Handle, kind: int, acceleration: Array) -> None:
 
 @njit(cache=True)
 def _step_muscles(
-    body: Body, constants: Modules, muscle: MuscleState, kind: int, command: ModuleInputs,
+    body: Body, constants: Modules, muscle: MuscleState, kind: int, command: Command,
     absolute: Array,
 ) -> None:  # fmt: skip
     for m in range(absolute.shape[0]):

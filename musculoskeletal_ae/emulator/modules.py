@@ -90,7 +90,7 @@ class Modules(NamedTuple):
     housing_resistance: Array  # R₂
 
 
-class ModuleInputs(NamedTuple):
+class Command(NamedTuple):
     """Commands to the modules, and faults of the modules, each of shape (M,)."""
 
     value: Array  # target lengths [m] or tensions [N]
@@ -132,7 +132,7 @@ def friction_state(state: float, moved: float, distance: float) -> float:
 
 @njit(cache=True)
 def wind(
-    modules: Modules, muscle: MuscleState, kind: int, command: ModuleInputs, m: int,
+    modules: Modules, muscle: MuscleState, kind: int, command: Command, m: int,
     reading: float, tension: float,
 ) -> float:  # fmt: skip
     """Turn the motor of one module for one step of 1 ms, as its control law demands.
@@ -186,7 +186,7 @@ def _turn(modules: Modules, muscle: MuscleState, m: int, speed: float) -> float:
 
 
 @njit(cache=True)
-def heat(modules: Modules, muscle: MuscleState, command: ModuleInputs, m: int) -> None:
+def heat(modules: Modules, muscle: MuscleState, command: Command, m: int) -> None:
     """Update the temperatures of module m after one step of 1 ms at its present tension."""
     inner = (muscle.winding[m] - muscle.housing[m]) / modules.winding_resistance[m]
     outer = (muscle.housing[m] - AMBIENT) / modules.housing_resistance[m]
@@ -250,7 +250,7 @@ class Arm(ABC):
         self._mount = self.faults.mount  # turn of the base that the simulation uses
         self._wrench = np.zeros(6)
         self._friction_factor = 1.0  # friction that varies, as a multiple of the individual's own
-        self._command = ModuleInputs(
+        self._command = Command(
             np.zeros(robot.muscle_count), length_bias.copy(), self.faults.stuck,
             self.faults.slack, self.faults.zero, self.faults.hot, self.faults.ceiling,
         )  # fmt: skip

@@ -25,7 +25,7 @@ from numba import njit
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator import modules
 from musculoskeletal_ae.emulator.effects import Draw
-from musculoskeletal_ae.emulator.modules import AMBIENT, STEP, ModuleInputs, MuscleState
+from musculoskeletal_ae.emulator.modules import AMBIENT, STEP, Command, MuscleState
 from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -211,9 +211,7 @@ def load_cell(tendons: Tendons, m: int, tension: float, temperature: float) -> f
 
 
 @njit(cache=True)
-def read(
-    tendons: Tendons, muscle: MuscleState, memory: Memory, command: ModuleInputs, m: int
-) -> None:
+def read(tendons: Tendons, muscle: MuscleState, memory: Memory, command: Command, m: int) -> None:
     """Write the readings of the sensors of module m into `memory`."""
     memory.reading[m] = spooled(tendons, m, muscle.length[m])
     memory.reading[m] += command.length_error[m] + command.zero[m]
