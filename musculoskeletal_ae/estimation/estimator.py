@@ -36,7 +36,7 @@ from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
 from musculoskeletal_ae.estimation.joint_check import JointCheck
-from musculoskeletal_ae.estimation.lengths.checked_calibration import CheckedCalibration
+from musculoskeletal_ae.estimation.lengths.length_calibration import LengthCalibration
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthTrust
 from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
@@ -134,7 +134,7 @@ class Estimator:
         self.health = HealthMonitor(robot, preset)
         self.heat = self.health.heat
         self.suspects = SuspectHandling(robot)
-        self.calibration: CheckedCalibration | None = None
+        self.calibration: LengthCalibration | None = None
         self.contact = ContactEstimator(robot)
         self.healthy_torque = HealthyTorque(robot.joint_count)
         self.mounting = MountingCheck(robot)
@@ -211,7 +211,7 @@ class Estimator:
         self.complete_mae, self.mae = mae, reduced
         if self.calibration is not None:
             posture = self.calibration.posture
-            self.calibration = CheckedCalibration(self.robot, reduced, posture)
+            self.calibration = LengthCalibration(self.robot, reduced, posture)
         return mae
 
     def isolate(self, muscles: Iterable[int]) -> None:
@@ -249,7 +249,7 @@ class Estimator:
             MusculoskeletalError: If there is no network, if the posture is not valid, or if no
                 posture is stated for a robot whose tensions are unknown.
         """
-        self.calibration = CheckedCalibration(self.robot, self.mae, posture)
+        self.calibration = LengthCalibration(self.robot, self.mae, posture)
         self.distrust_lengths(Evidence.CALIBRATING)
         self.health.residual.forget_reading()
         self.output = None
@@ -596,13 +596,14 @@ class Estimator:
         self.health.reset()
 
     def _calibrate(
-        self, calibration: CheckedCalibration, sample: MuscleSample, dt: float, now: float
+        self, calibration: LengthCalibration, sample: MuscleSample, dt: float, now: float
     ) -> LengthOffsets | None:
         """Continue the length calibration, and return the newest estimate of the offsets.
 
         The result is None before the first estimate.
         """
-        evidence = calibration.step(sample, dt, self._measured_theta(self._fresh_readings(now)))
+        theta = self._measured_theta(self._fresh_readings(now))
+        evidence = calibration.step(sample.motor_tension, sample.length_read, dt, theta)
         if evidence is not None:
             self._note(evidence, found=calibration.offsets)
         if evidence is Evidence.CALIBRATED:
