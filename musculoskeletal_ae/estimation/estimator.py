@@ -94,7 +94,6 @@ class Estimator:
         body: The body state, with a new generation after each change.
         trust: Decides which length offsets are known.
         stream: Converts messages into samples.
-        heat: Thermal models of the muscle modules.
         mae: The network in use, without the isolated muscles; None before the first.
         complete_mae: The same network with all muscles.
         health: The detectors.
@@ -132,7 +131,6 @@ class Estimator:
         self.mae: Mae | None = None
         self.complete_mae: Mae | None = None
         self.health = HealthMonitor(robot, preset)
-        self.heat = self.health.heat
         self.suspects = SuspectHandling(robot)
         self.calibration: LengthCalibration | None = None
         self.contact = ContactEstimator(robot)
@@ -402,7 +400,7 @@ class Estimator:
             sent_apart = max(sample.sent_at - before.sent_at, 0.0)
         self.joint_stream.pass_time(min(elapsed, LONGEST_STEP))
         temperature = np.where(self.body.used, sample.temperature, np.nan)
-        self.heat.step(sample.motor_tension, temperature, elapsed)
+        self.health.heat.step(sample.motor_tension, temperature, elapsed)
         if self.mae is None:
             return None
         self.stepped_at = now

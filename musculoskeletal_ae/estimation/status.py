@@ -74,7 +74,7 @@ def _finding(core: Estimator) -> Iterator[Condition]:
 
 
 def _changed_modules(core: Estimator) -> Iterator[Condition]:
-    for muscle, change in core.heat.changed.items():
+    for muscle, change in core.health.heat.changed.items():
         name = core.robot.muscles[muscle]
         yield ConditionKind.MODULE_CHANGED.condition(f'the module of {name} {change}', [name])
 
@@ -174,7 +174,7 @@ def _residuals(core: Estimator) -> dict[str, str]:
     residual, output = core.health.residual, core.output
     if output is None or residual.reading is None:
         return {}
-    suspect = next(iter(core.heat.changed), residual.reading.suspect)
+    suspect = next(iter(core.health.heat.changed), residual.reading.suspect)
     if core.suspects.finding is not None:
         suspect = core.suspects.finding.muscle
     values = {
