@@ -47,7 +47,7 @@ def test_the_choices_that_a_jumping_length_leaves_are_named(tmp_path):
     )
     assert jumps_at == f'length jump: {jump}'
     assert '(--without straightener), or accept' in choices
-    pattern = r'limiting (\w+) to \[(.*), (.*)\] rad excludes this jump'
+    pattern = r'limiting (\w+) to the range (.*) to (.*) rad excludes this jump'
     joint, low, high = re.search(pattern, limit).groups()
     j = robot.joints.index(joint)
     robot.lower[j], robot.upper[j] = float(low), float(high)
