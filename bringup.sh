@@ -343,10 +343,9 @@ train_once() {
     return
   fi
   say "training the initial network of $robot (once; it takes a minute or two)"
+  # Its tables go to the log alone; prospects, warnings, progress and the error are also shown.
   launch train --robot "$robot" --preset "$preset" --out "$checkpoint" "${quick[@]}" \
-    > >(tee -p "$logs/train.log" | sed -un -e '/^training: /p' -e '/^warning: /p' \
-      -e '/^[0-9].* random postures can be held/p' \
-      -e 's/^error on the geometric model: \([^(]*[^ (]\).*/-- initial network: \1 on the geometric model/p') 2>&1
+    >>"$logs/train.log" 2> >(tee -pa "$logs/train.log")
   wait_for train || died train $?
 }
 

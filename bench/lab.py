@@ -35,14 +35,12 @@ from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
-from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
-from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
+from musculoskeletal_ae.exceptions import CheckpointError, MessageError
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_TIME
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.state import StateStore
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.signals.body_state import BodyState
-from musculoskeletal_ae.signals.muscle_readings import MuscleReading
 
 CORES = 2  # simulate a computer with this many cores
 #: let a process wait for the processor for this mean time, for each process per core [s]
@@ -195,7 +193,7 @@ class Lab:
         self.estimator = Estimator(robot)
         self.controller = Controller(robot, seed=EXPLORATION_STREAM + seed)
         self.learner = Learner(robot, initial, seed=seed, steps=STEPS, trainer=Seldom)
-        self.validator = CheckpointValidator(robot)  # validates networks for the estimator
+        self._connect_networks()
         self.rejected_networks: list[str] = []  # why the estimator rejected networks
         self._candidate: Mae | None = None  # newest network that the learner published
         #: reliable messages that wait for controller and learner, and estimates and command
@@ -225,7 +223,7 @@ class Lab:
             each(self)
         if self.learner.mae is not self._candidate and self._runs_estimator:
             self._candidate = self.learner.mae
-            self._validate(self._candidate)
+            self.estimator.networks.decide(self._candidate, now)
         if (at := self.driver.runs(now)) is not None:
             self._drive(at)
         if (at := self._estimating.runs(now)) is not None:
@@ -250,7 +248,7 @@ class Lab:
         read = self.arm.sense()
         states = np.array([read.length, read.tension, read.temperature])
         for packet in self.wire.readings(now, Packet(states, read.theta)):
-            content = MuscleReading(packet.states.ravel()), packet.theta
+            content = packet.states, packet.theta
             for process in (self._estimating, self.controlling, self._learning):
                 process.send(Message(now, content))
 
@@ -270,7 +268,7 @@ class Lab:
                 self._estimates.append(output.state.theta)
                 if core.body.offsets.known:
                     sample = output.sample
-                    self.validator.message(
+                    core.networks.message(
                         sample.tension_read,
                         sample.length,
                         sample.sliding,
@@ -284,55 +282,32 @@ class Lab:
         core = self.estimator
         if (trust := core.joint_trust) is not self._published_trust:
             self._published_trust = trust
-            self.validator.forget()
+            core.networks.forget()
             self._to_learner.append(lambda: self.learner.use_joint_trust(trust))
         if core.body is not self._published_body:
-            before, body = self._published_body, core.body
-            self._published_body = body
+            body = self._published_body = core.body
             self._to_controller.append(lambda: self.controller.use_body(body))
             self._to_learner.append(lambda: self.learner.use_body(body))
-            self.validator.isolated = body.isolated
-            if before is None or body.offsets != before.offsets:
-                self.validator.forget()
-            if body.has_anomaly != (before is not None and before.has_anomaly):
-                self._follow_anomaly(body.has_anomaly)
+            core.networks.follow(body, self.now)
 
-    def _follow_anomaly(self, detected: bool) -> None:
-        """Replace a network that was accepted shortly before an anomaly."""
-        doubtful = self.validator.mae
-        older = self.validator.anomaly(detected, self.now)
-        if older is not None and doubtful is not None:
-            self._use(older)
-            self._reject(doubtful, 'an anomaly was detected soon after it was accepted')
-
-    def _validate(self, candidate: Mae) -> None:
-        """Let the estimator validate a network of the learner and, if it is accepted, use it."""
-        if self.validator.is_in_use(candidate):
-            return
-        try:
-            self.validator.check(candidate)
-        except MusculoskeletalError as error:
-            self.rejected_networks.append(str(error))
-            self._reject(candidate, str(error))
-            return
-        self._use(self.validator.with_detector(candidate, self.now))
+    def _connect_networks(self) -> None:
+        """Tell the other nodes what the estimator decides on networks."""
+        self.estimator.networks.accepted = self._accepted
+        self.estimator.networks.rejected = self._rejected
 
     def choose_network(self, mae: Mae) -> bool:
         """Let a user choose a network for the estimator; return whether it is accepted."""
         try:
-            self.validator.check(mae, is_chosen=True)
-        except MusculoskeletalError as error:
-            self.rejected_networks.append(str(error))
+            self.estimator.networks.choose(mae, self.now)
+        except CheckpointError:
             return False
-        self._use(mae, self.validator.weakness(mae))
         return True
 
-    def _reject(self, mae: Mae, reason: str) -> None:
+    def _rejected(self, mae: Mae, reason: str) -> None:
+        self.rejected_networks.append(reason)
         self._to_learner.append(lambda: self.learner.note_rejected(mae.version, reason))
 
-    def _use(self, mae: Mae, unsuitable_because: str = '') -> None:
-        mae = self.estimator.use(mae, unsuitable_because)
-        self.validator.take(mae, self.now)
+    def _accepted(self, mae: Mae) -> None:
         self.controller.use(mae)
         self._to_learner.append(lambda: self.learner.note_accepted(mae))
         if Evidence.NOT_CALIBRATED in self.estimator.trust.evidence:  # it waits for a network
@@ -396,7 +371,7 @@ class Lab:
             left = self.estimator.body  # a real estimator saves it
             self.estimator = Estimator(robot, first_generation=left.generation + 1)
             self.estimator.isolate(left.isolated)
-            self.validator = CheckpointValidator(robot)
+            self._connect_networks()
             self._candidate, self._published_body = None, None
             self._published_trust = self.estimator.joint_trust
             self._estimates.clear()
@@ -428,7 +403,7 @@ class Lab:
             if lab.now >= at and start in lab.before_step:
                 lab.before_step = [each for each in lab.before_step if each is not start]
                 lab._candidate = lab.learner.mae
-                lab._validate(lab._candidate)
+                lab.estimator.networks.decide(lab._candidate, lab.now)
                 lab.publish()
 
         return start

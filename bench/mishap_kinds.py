@@ -893,7 +893,7 @@ OTHER_NETWORK: list[Mae] = []
 
 def wrong_network(lab: Lab, _: Rng) -> Case:
     """An operator sets the parameter `checkpoint` to the network of another individual."""
-    before = lab.estimator.state.complete_mae
+    before = lab.estimator.complete_mae
     is_used = lab.choose_network(OTHER_NETWORK[0])
 
     def mend(lab: Lab) -> None:

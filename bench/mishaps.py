@@ -306,7 +306,7 @@ class Course:
             elif step is Step.RESTORE_MUSCLES:
                 isolated = lab.estimator.body.isolated
                 lab.estimator.restore(isolated)
-                lab.validator.declare_repaired(isolated, lab.now)
+                lab.estimator.networks.declare_repaired(isolated, lab.now)
                 lab.publish()
             elif step is Step.WAIT_UNTIL_COOL:
                 self._wait_until_cool()
@@ -335,7 +335,7 @@ class Course:
         finding = lab.estimator.suspects.finding
         lab.estimator.reset()
         if finding is not None:
-            lab.validator.declare_repaired(finding.muscles, lab.now)
+            lab.estimator.networks.declare_repaired(finding.muscles, lab.now)
         lab.publish()
 
     def _mend_named(self, by: list[Statement]) -> str:

@@ -60,7 +60,7 @@ class Stop(NamedTuple):
         return f'{self.action.name.lower().replace("_", " ")}; ends {self.clears.value}'
 
 
-class Reaction(Enum):
+class FindingReaction(Enum):
     """Consequence of a finding: what the estimator does about it."""
 
     WARN = 'reports it'
@@ -96,7 +96,7 @@ class Declaration(NamedTuple):
     text: str  # what happened, for users
     steps: tuple[Step, ...] = ()  # the remedy
     stop: Stop | None = None  # consequence of a stop cause
-    reaction: Reaction | None = None  # consequence of a finding
+    reaction: FindingReaction | None = None  # consequence of a finding
     revokes: Revokes | None = None  # length offsets that a finding revokes
 
 
@@ -119,7 +119,7 @@ class ConditionKind(Enum):
         text: str,
         steps: tuple[Step, ...],
         stop: Stop | None,
-        reaction: Reaction | None,
+        reaction: FindingReaction | None,
         revokes: Revokes | None,
     ) -> None:
         self.identifier, self.owner, self.level = identifier, owner, level
@@ -244,7 +244,7 @@ class ConditionKind(Enum):
         'is slack, its winch is jammed, or its sensor reads too little',
         'a muscle shows no tension',
         REPAIR,
-        reaction=Reaction.ISOLATE,
+        reaction=FindingReaction.ISOLATE,
     )
     MODULE_NOT_FOLLOWING = Declaration(
         'module_not_following',
@@ -255,7 +255,7 @@ class ConditionKind(Enum):
         'a reading is wrong, or commands do not arrive',
         'a module does not follow its commands',
         REPAIR,
-        reaction=Reaction.ISOLATE,
+        reaction=FindingReaction.ISOLATE,
     )
     SENSOR_FROZEN = Declaration(
         'sensor_frozen',
@@ -264,7 +264,7 @@ class ConditionKind(Enum):
         'a length or tension sensor repeats one reading',
         'a sensor repeats one reading',
         REPAIR,
-        reaction=Reaction.ISOLATE,
+        reaction=FindingReaction.ISOLATE,
     )
     RESIDUAL_DISTANCE = Declaration(
         'residual_distance',
@@ -273,7 +273,7 @@ class ConditionKind(Enum):
         'tensions and lengths disagree with the learned body by more than on the healthy arm',
         'the readings do not fit the learned body',
         REPAIR,
-        reaction=Reaction.ISOLATE,
+        reaction=FindingReaction.ISOLATE,
     )
     LENGTH_JUMP = Declaration(
         'length_jump',
@@ -282,7 +282,7 @@ class ConditionKind(Enum):
         'the length of one muscle has jumped',
         'the length of a muscle has jumped',
         (Step.CHECK_TENDON, Step.CALIBRATE_LENGTHS),
-        reaction=Reaction.ISOLATE,
+        reaction=FindingReaction.ISOLATE,
         revokes=Revokes.ONE,
     )
     LENGTHS_JUMPED = Declaration(
@@ -292,7 +292,7 @@ class ConditionKind(Enum):
         'the lengths of several muscles have jumped',
         'several lengths have jumped',
         (Step.CALIBRATE_LENGTHS,),
-        reaction=Reaction.STOP,
+        reaction=FindingReaction.STOP,
         revokes=Revokes.ALL,
     )
     MUSCLES_EXCHANGED = Declaration(
@@ -303,7 +303,7 @@ class ConditionKind(Enum):
         'commands',
         'the driver uses another order or sign of muscles',
         (Step.CORRECT_WIRING, Step.CALIBRATE_LENGTHS),
-        reaction=Reaction.STOP,
+        reaction=FindingReaction.STOP,
         revokes=Revokes.ALL,
     )
     LENGTH_DISAGREES = Declaration(
@@ -313,7 +313,7 @@ class ConditionKind(Enum):
         'the length of one muscle disagrees with the joint sensors',
         'the length of a muscle disagrees with the joint sensors',
         (Step.CHECK_TENDON, Step.CALIBRATE_LENGTHS),
-        reaction=Reaction.ISOLATE,
+        reaction=FindingReaction.ISOLATE,
         revokes=Revokes.ONE,
     )
     LENGTHS_DISAGREE = Declaration(
@@ -323,7 +323,7 @@ class ConditionKind(Enum):
         'the lengths of several muscles disagree with the joint sensors',
         'several lengths disagree with the joint sensors',
         (Step.CALIBRATE_LENGTHS,),
-        reaction=Reaction.STOP,
+        reaction=FindingReaction.STOP,
         revokes=Revokes.ALL,
     )
     JOINT_SENSORS_DOUBTED = Declaration(
@@ -334,7 +334,7 @@ class ConditionKind(Enum):
         'learned',
         'joint sensors are not used, because they disagree with the muscle lengths',
         (Step.CHECK_JOINT_SENSOR,),
-        reaction=Reaction.WARN,
+        reaction=FindingReaction.WARN,
     )
     JOINT_READINGS_IMPOSSIBLE = Declaration(
         'joint_readings_impossible',
@@ -370,7 +370,7 @@ class ConditionKind(Enum):
         'the length or the tension of one muscle has been NaN for 0.15 s',
         'the length or the tension of a muscle is NaN',
         REPAIR,
-        reaction=Reaction.ISOLATE_ONLY,
+        reaction=FindingReaction.ISOLATE_ONLY,
     )
     SENSOR_SATURATED = Declaration(
         'sensor_saturated',
@@ -380,7 +380,7 @@ class ConditionKind(Enum):
         'pull more than it reads',
         'a tension sensor saturates below tension.limit',
         (Step.REPAIR_SENSOR, Step.RESET_ESTIMATOR),
-        reaction=Reaction.ISOLATE_AT_ONCE,
+        reaction=FindingReaction.ISOLATE_AT_ONCE,
     )
     HOT_MODULE_CHANGED = Declaration(
         'thermal_drift',
@@ -389,7 +389,7 @@ class ConditionKind(Enum):
         'the constants of the thermal model of a hot module have changed',
         'a hot module heats or cools otherwise than before',
         REPAIR,
-        reaction=Reaction.ISOLATE,
+        reaction=FindingReaction.ISOLATE,
     )
     MODULE_CHANGED = Declaration(
         'module_changed',
@@ -398,7 +398,7 @@ class ConditionKind(Enum):
         'the constants of the thermal model of a cool module have changed',
         'a cool module heats or cools otherwise than before',
         (Step.CHECK_MODULE,),
-        reaction=Reaction.WARN,
+        reaction=FindingReaction.WARN,
     )
 
     # -- the body: isolated muscles, length offsets, network ------------------------------------

@@ -95,8 +95,10 @@ def read_muscle_states(
 def muscle_rows(message: Any, muscles: int) -> Array:
     """Return the rows of a message of muscle_states, (Q, M), without a check of their values.
 
-    Optional rows that the message lacks are NaN.
+    Optional rows that the message lacks are NaN. A `message` that is an array has all rows.
     """
+    if isinstance(message, np.ndarray):
+        return message.astype(float)
     lacking = 0
     for quantity in reversed(QUANTITIES):
         expected = muscles * (len(QUANTITIES) - lacking)

@@ -11,10 +11,10 @@ from std_msgs.msg import Float64MultiArray
 from musculoskeletal_ae.arrival import LONGEST_STEP
 from musculoskeletal_ae.awake_clock import PAUSE
 from musculoskeletal_ae.message_reading import read_array, read_muscle_states
-from musculoskeletal_ae.nodes.controller import Controller
-from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
-from musculoskeletal_ae.nodes.learner import Learner
+from musculoskeletal_ae.nodes.controller import ControllerNode
+from musculoskeletal_ae.nodes.estimator import EstimatorNode
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
+from musculoskeletal_ae.nodes.learner import LearnerNode
 
 RATE = 50.0  # rate of the arm's messages [Hz]; 100 Hz would take twice the processor time
 RATE_LIMIT = 0.2  # rate limit of length commands [m/s]
@@ -22,10 +22,10 @@ RATE_LIMIT = 0.2  # rate limit of length commands [m/s]
 PATIENT = 10.0
 IMPATIENT = 1.0  # max_age while a test waits for a stop because of missing data [s]
 NODES = {
-    'hardware_emulator': HardwareEmulator,
-    'estimator': Estimator,
-    'controller': Controller,
-    'learner': Learner,
+    'hardware_emulator': HardwareEmulatorNode,
+    'estimator': EstimatorNode,
+    'controller': ControllerNode,
+    'learner': LearnerNode,
 }
 
 

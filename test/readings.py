@@ -3,15 +3,13 @@
 
 import numpy as np
 
-from musculoskeletal_ae.signals.muscle_readings import MuscleReading
-
 
 def reading(states, robot=None):
-    """Return the rows of l [m], T [N] and temperature [°C], (3, M), as a message.
+    """Return a reading: the rows of l [m], T [N] and temperature [°C], (3, M).
 
     A `robot` that measures motor currents reports currents instead of tensions.
     """
     rows = np.array(states, dtype=float)
     if robot is not None:
         rows[1] = robot.tension_source.to_message(rows[1])
-    return MuscleReading(rows.ravel())
+    return rows

@@ -11,7 +11,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
-from musculoskeletal_ae.body_model.fit import Fit, fit_body, fit_to_network
+from musculoskeletal_ae.body_model.fit import FittedBody, fit_body, fit_to_network
 from musculoskeletal_ae.body_model.remainder import Remainder
 from musculoskeletal_ae.body_model.synthetic import held_tensions
 from musculoskeletal_ae.learning.samples import Observations
@@ -72,7 +72,7 @@ class BodyFit:
         self._prior_mean = None
         self.body = CalibratedBody(self.body.robot.with_elasticity(None))
 
-    def fit(self, observed: Observations, guess: Array) -> Fit:
+    def fit(self, observed: Observations, guess: Array) -> FittedBody:
         """Fit the body to samples.
 
         Args:
@@ -95,7 +95,7 @@ class BodyFit:
         return length.mean(axis=0)
 
 
-def contradicted_muscles(observed: Observations, fit: Fit) -> tuple[tuple[int, int], ...]:
+def contradicted_muscles(observed: Observations, fit: FittedBody) -> tuple[tuple[int, int], ...]:
     """Return the muscles that seem to have changed, because their newest samples misfit the body.
 
     The newest samples of such a muscle all have large length residuals of the same sign, while

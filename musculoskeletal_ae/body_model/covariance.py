@@ -9,7 +9,7 @@ from scipy.special import gammaincinv
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
-from musculoskeletal_ae.body_model.fit import Fit
+from musculoskeletal_ae.body_model.fit import FittedBody
 from musculoskeletal_ae.body_model.priors import INDEPENDENT_SAMPLES, PRIOR
 from musculoskeletal_ae.body_model.synthetic import UNKNOWN_FRICTION
 from musculoskeletal_ae.learning.samples import Observations
@@ -34,7 +34,7 @@ CONTAINED_SHARE = 0.95  # the ellipsoid of a covariance has to contain this shar
 def estimate_covariance(
     mae: Mae,
     body: CalibratedBody,
-    fit: Fit,
+    fit: FittedBody,
     tension: Array,
     seed: int,
     judging: Observations | None,
@@ -74,7 +74,7 @@ def estimate_covariance(
     return _spread(offset + ratio * (error - offset))
 
 
-def drive_covariance(body: CalibratedBody, fit: Fit) -> Array | None:
+def drive_covariance(body: CalibratedBody, fit: FittedBody) -> Array | None:
     """Return the posterior covariances of each motor current's scale, offset and friction.
 
     `Transmission` explains the constants. All samples together count as at most
@@ -108,7 +108,7 @@ def drive_covariance(body: CalibratedBody, fit: Fit) -> Array | None:
 def _drawn_errors(
     mae: Mae,
     body: CalibratedBody,
-    fit: Fit,
+    fit: FittedBody,
     theta: Array,
     tension: Array,
     rng: np.random.Generator,

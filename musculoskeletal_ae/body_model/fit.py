@@ -43,7 +43,7 @@ LEAST_NOISE = 0.0003  # assume at least this σ of a length at rest [m]
 LEAST_BEFORE_CHANGE = 8
 
 
-class Fit(NamedTuple):
+class FittedBody(NamedTuple):
     """The noise, weights, postures and uncertainty that a fit has found."""
 
     #: measured minus computed lengths [m], (N, M), at measured angles, or else at fitted ones
@@ -60,7 +60,7 @@ def fit_body(
     observed: Observations,
     prior_mean: list[Array] | None = None,
     guess: Array | None = None,
-) -> Fit:
+) -> FittedBody:
     """Fit the parameters of a body in place, together with the samples' postures.
 
     The fit starts from the present parameters. A muscle counts as changed if at least
@@ -91,8 +91,10 @@ def fit_body(
     means, spreads = map(list, zip(*priors, strict=True))
     is_learned = prior_mean is not None
 
-    def fitted() -> Fit:
-        return Fit(*fit_jointly(body, observed, start, means, spreads, LEAST_NOISE, is_learned))
+    def fitted() -> FittedBody:
+        return FittedBody(
+            *fit_jointly(body, observed, start, means, spreads, LEAST_NOISE, is_learned)
+        )
 
     fit = fitted()
     own = np.isfinite(observed.theta) & (observed.spread == 0.0)

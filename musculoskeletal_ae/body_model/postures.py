@@ -78,7 +78,7 @@ class Weights(NamedTuple):
     gravity: Array  # (N, 3J)
 
 
-class Point(NamedTuple):
+class PosturePoint(NamedTuple):
     """Values of the unknowns, and the residuals at these values."""
 
     unknowns: Unknowns
@@ -141,7 +141,7 @@ class GroupFit:
         self._widen(fit.point.residuals, root)
         return fit.point.unknowns, root
 
-    def _posterior(self, point: Point) -> Array:
+    def _posterior(self, point: PosturePoint) -> Array:
         """Return the posterior root of (w, z, e) at the solution.
 
         The spreads of the prior are scaled by the Birge ratio √(χ²/γ). χ² is the square of the
@@ -186,11 +186,11 @@ class GroupFit:
             variance = np.square(scaled).sum(axis=0)
             self.noise[m] = np.hypot(self.noise[m], np.sqrt(variance.mean()))
 
-    def point(self, unknowns: Unknowns) -> Point:
+    def point(self, unknowns: Unknowns) -> PosturePoint:
         """Return these values of the unknowns with their residuals."""
-        return Point(unknowns, self.model.residuals(unknowns))
+        return PosturePoint(unknowns, self.model.residuals(unknowns))
 
-    def weigh(self, point: Point) -> None:
+    def weigh(self, point: PosturePoint) -> None:
         """Weigh the residuals at a point: compute length noise and robust weights; find stops."""
         residuals, own = point.residuals, point.unknowns.theta[:, self.model.joints]
         self.noise, self.weight = noise_and_weight(
@@ -211,7 +211,7 @@ class GroupFit:
     def _pull(self, unknowns: Unknowns) -> tuple[Array, Array]:
         return self.stops.pull(unknowns.theta[:, self.model.joints], self.prior.repeated)
 
-    def cost(self, point: Point) -> float:
+    def cost(self, point: PosturePoint) -> float:
         """Return the cost of a point with the present weights."""
         unknowns, residuals = point
         weights, prior = self._weights, self.prior
@@ -227,7 +227,7 @@ class GroupFit:
             + prior.spring_precision @ self._springs(unknowns) ** 2
         )
 
-    def equations(self, point: Point) -> Equations:
+    def equations(self, point: PosturePoint) -> Equations:
         """Return the normal equations of θ, and of (w, z, e)."""
         model, weights, residuals = self.model, self._weights, point.residuals
         count, places = model.by_sensor.shape
@@ -276,7 +276,7 @@ class GroupFit:
         precisions = (self.prior.precision[column] for column in self.model.columns)
         return np.array([determined(c, p) for c, p in zip(curvature, precisions, strict=True)])
 
-    def right_sides(self, point: Point) -> RightSides:
+    def right_sides(self, point: PosturePoint) -> RightSides:
         """Return the right-hand sides of the normal equations at `point`."""
         unknowns, residuals = point
         weights, prior = self._weights, self.prior
@@ -300,7 +300,7 @@ class GroupFit:
         """Return the corrections of the group's springs, (2S,): α of all S springs, then β."""
         return unknowns.springs[:, self.model.sprung].ravel()
 
-    def moved(self, point: Point, step: SolvedStep) -> Point:
+    def moved(self, point: PosturePoint, step: SolvedStep) -> PosturePoint:
         """Return the unknowns after a step of the solver, with their residuals."""
         theta, zero, parameters, springs = point.unknowns
         joints, size = self.model.joints, self.model.parameter_count

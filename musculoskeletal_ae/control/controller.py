@@ -241,7 +241,7 @@ class Controller:
         """Check and filter a message of muscle_states, and use its values from now on.
 
         Args:
-            message: The message, or a `MuscleReading`.
+            message: The message, or its rows (`muscle_reading`).
             now: Time of reception by the steady clock [s].
             delay: How late the message is (`Arrival.delay`) [s].
 

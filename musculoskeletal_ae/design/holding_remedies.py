@@ -133,10 +133,8 @@ def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Set
             round(float(middle + factor * (end[joint] - middle)) * unit.radian, digits)
             for end in (robot.lower, robot.upper)
         )
-        text = f'[{low:.{digits}f}, {high:.{digits}f}]'
-        if robot.units.slides[joint]:
-            text += f' {unit.position}'
         low, high = low / unit.radian, high / unit.radian
+        text = unit.range_text(low, high, f'.{digits}f')
         share = (theta[:, joint] - robot.lower[joint]) / (robot.upper - robot.lower)[joint]
         theta[:, joint] = low + share * (high - low)
         return Setting.of(robot, theta), f'limits of {robot.joints[joint]} {text}'

@@ -92,7 +92,7 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
     )
     required = required_stiffness(robot, result.required)
     desired = DESIRED_SHARE * robot.tension.limit
-    tension = f'T in [{shown(robot.tension.bias)}, {shown(robot.tension.limit)}] N'
+    tension = f'T from {shown(robot.tension.bias)} to {shown(robot.tension.limit)} N'
     lines = [
         f'{robot.description.directory}',
         f'{robot.joint_count} joints, {robot.muscle_count} muscles; {count} postures, seed {seed}',

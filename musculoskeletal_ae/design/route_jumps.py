@@ -118,7 +118,7 @@ def jump_choices(robot: Robot) -> list[str]:
         there = theta[bends[:, m] > JUMP]
         crossed = np.flatnonzero(robot.routes.crossed[m])
         place = ', '.join(
-            f'{robot.joints[j]} in '
+            f'{robot.joints[j]} from '
             f'{robot.units[j].range_text(there[:, j].min(), there[:, j].max())}'
             for j in crossed
         )
@@ -162,5 +162,5 @@ def _limit_without_jumps(robot: Robot, there: Array, crossed: Ints) -> str:
             share = (kept[1] - kept[0]) / (high - low)
             if share > best:
                 best = share
-                text = f'{robot.joints[j]} to {robot.units[j].range_text(*kept)}'
+                text = f'{robot.joints[j]} to the range {robot.units[j].range_text(*kept)}'
     return text

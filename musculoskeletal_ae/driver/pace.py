@@ -28,7 +28,7 @@ LONGEST_STALL = 1.0  # blame the driver for any longer gap, even if this compute
 LEAST_LOST = 0.05  # report a loss of more than this fraction of the messages
 
 
-class _Message(NamedTuple):
+class _Received(NamedTuple):
     came: float  # time of reception [s]
     came_awake: float  # time of reception by a clock that stops while this process is blocked [s]
     sent: float  # source time by the driver's clock [s]; NaN if unknown
@@ -41,7 +41,7 @@ class Pace:
     def __init__(self, rate: float, clock: AwakeClock) -> None:
         """Prepare to check that messages arrive at a rate [Hz]; `clock` shows pauses."""
         self._rate = rate
-        self._messages: list[_Message] = []
+        self._messages: list[_Received] = []
         self._awake = clock
 
     @property
@@ -51,7 +51,7 @@ class Pace:
 
     def message(self, came: float, sent: float, number: int) -> None:
         """Record when a message was received and when it was sent [s], and its sequence number."""
-        self._messages.append(_Message(came, self._awake.at(came), sent, number))
+        self._messages.append(_Received(came, self._awake.at(came), sent, number))
 
     def judge(self, verdict: Verdict, now: float) -> None:
         """Judge the rate and the gaps until `now` [s], and add the results to `verdict`."""

@@ -18,7 +18,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, MuscleReading, muscle_reading
+from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, muscle_reading
 
 SPEED_LIMIT = 0.25  # let a muscle module's motor turn no faster than this [m/s]; chosen by hand
 TURN = 6.2832  # accept no larger turn of the base, which is then upright again [rad]
@@ -86,8 +86,8 @@ class Readings(NamedTuple):
         """The readings of the muscle modules by the names of their quantities, (M,) each."""
         return {name: value for name, value in self._asdict().items() if name != 'theta'}
 
-    def message(self, robot: Robot) -> MuscleReading:
-        """Return the readings of the muscle modules as a message of `muscle_states`."""
+    def message(self, robot: Robot) -> Array:
+        """Return the readings of the muscle modules as the rows of a message, (Q, M)."""
         return muscle_reading(robot, **self.muscles)
 
 
@@ -95,7 +95,7 @@ class Readings(NamedTuple):
 SENSED = tuple(quantity.name for quantity in QUANTITIES if quantity.name in SIZES)
 
 
-class Fault(NamedTuple):
+class EmulatedFault(NamedTuple):
     """One fault, parsed from a line."""
 
     kind: str
@@ -109,7 +109,7 @@ class Fault(NamedTuple):
         return self.kind, self.quantities, tuple(self.which.tolist()), self.size
 
 
-def read_fault(line: str, robot: Robot) -> Fault:
+def read_fault(line: str, robot: Robot) -> EmulatedFault:
     """Read the fault that a line describes.
 
     Raises:
@@ -125,7 +125,8 @@ def read_fault(line: str, robot: Robot) -> Fault:
             legal = f'exchange:JOINT:JOINT; joints: {", ".join(robot.joints)}'
             problem = f'fault {line[:80]!r}: expected two joints'
             raise MusculoskeletalError(f'{problem}; legal: {legal}')
-        return Fault(name, ('theta',), np.array([robot.joints.index(word) for word in words]), 0.0)
+        exchanged = np.array([robot.joints.index(word) for word in words])
+        return EmulatedFault(name, ('theta',), exchanged, 0.0)
     quantities: tuple[str, ...] = SENSED if kind.of_quantity else ()
     size, largest, unit = kind.size, kind.largest, kind.unit
     smallest = -largest if kind.signed else 0.0
@@ -156,9 +157,9 @@ def read_fault(line: str, robot: Robot) -> Fault:
             problem = f'fault {line[:80]!r}: unknown joint {unknown[0]!r}'
             raise MusculoskeletalError(f'{problem}; legal: {", ".join(robot.joints)}')
         joints = [robot.joints.index(word) for word in words] or range(robot.joint_count)
-        return Fault(name, quantities, np.array(joints), size)
+        return EmulatedFault(name, quantities, np.array(joints), size)
     muscles = robot.muscle_indices([':'.join(words)] if words else robot.muscles)
-    return Fault(name, quantities, np.array(muscles), size)
+    return EmulatedFault(name, quantities, np.array(muscles), size)
 
 
 class Faults:
@@ -167,7 +168,7 @@ class Faults:
     def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
         """Start without faults."""
         self._robot, self._rng = robot, rng
-        self._faults: tuple[Fault, ...] = ()
+        self._faults: tuple[EmulatedFault, ...] = ()
         self._frozen: dict[tuple[str, int], float] = {}
         self._reordered: Readings | None = None  # readings that are sent after the next ones
         self._queue: list[tuple[float, Readings]] = []
@@ -231,14 +232,14 @@ class Faults:
             axis = np.array([fault.kind == 'mount_x', fault.kind == 'mount_y', False], dtype=float)
             self.mount = self.mount @ pin.exp3(fault.size * axis)
 
-    def _of(self, *names: str) -> list[Fault]:
+    def _of(self, *names: str) -> list[EmulatedFault]:
         return [fault for fault in self._faults if fault.kind in names]
 
     def pass_time(self, duration: float) -> None:
         """Pass the time `duration` [s] for drifts and bursts."""
         self._time += duration
 
-    def _is_in_burst(self, fault: Fault) -> bool:
+    def _is_in_burst(self, fault: EmulatedFault) -> bool:
         until, is_present = self._bursts[fault.key]
         while self._time >= until:
             is_present = not is_present

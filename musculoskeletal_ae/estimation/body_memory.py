@@ -18,11 +18,9 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.signals.body_state import MOST_OFFSET, BodyState, LengthOffsets
@@ -32,20 +30,13 @@ LARGEST = 1_000_000  # ignore a larger file [bytes]
 RETRY_INTERVAL = 2.0  # wait this long after a failed attempt to write [s]
 
 
-class SavedBody(NamedTuple):
-    """The body state that the previous estimator saved."""
-
-    #: offsets [m], (M,), 0 for muscles that the file does not name; None if they were known to be 0
-    offset: Array | None
-    isolated: tuple[int, ...]  # indices of the isolated muscles
-    generation: int
-
-
 class BodyMemory:
     """Reads and writes the file of length offsets and isolated muscles.
 
     Attributes:
-        found: The body state that the previous estimator saved; None if there was none.
+        found: The body state that the previous estimator has left behind; None if there was none.
+            Its offsets are known only if they were known to be zero, otherwise they are unknown,
+            with 0 for muscles that the file does not name.
         problem: Why the present body state is not saved, as a text for users, or ''.
     """
 
@@ -60,7 +51,7 @@ class BodyMemory:
         self._file: Path | None = None
         self._was_decided = True  # whether the last offsets were known or revoked
         self._saved: tuple[LengthOffsets, tuple[int, ...]] | None = None  # what the file contains
-        self.found: SavedBody | None = None
+        self.found: BodyState | None = None
         self._has_file = False
         self._noted: BodyState | None = None  # the body state of the last call of `note`
         self._next_attempt = 0.0
@@ -73,9 +64,9 @@ class BodyMemory:
                 if self._has_file:
                     self.found = self._read(self._file)
 
-    def _read(self, file: Path) -> SavedBody:
-        """Read the file; return offsets of 0 and no isolated muscle if it is damaged."""
-        nothing = SavedBody(np.zeros(len(self._muscles)), (), 0)
+    def _read(self, file: Path) -> BodyState:
+        """Return the content of the file; unknown offsets of 0 if it is damaged."""
+        unknown = LengthOffsets.unknown(len(self._muscles))
         with suppress(MusculoskeletalError, ValueError, TypeError, KeyError, AttributeError):
             content = json.loads(
                 read_text(file, lambda _, problem: MusculoskeletalError(problem), LARGEST)
@@ -84,11 +75,13 @@ class BodyMemory:
             isolated = tuple(m for m, name in enumerate(self._muscles) if name in names)
             saved = content['offset']
             if saved is None and generation >= 0:
-                return SavedBody(None, isolated, generation)
+                known = LengthOffsets.none(len(self._muscles))
+                return BodyState(known, isolated, generation=generation)
             offset = np.array([float(saved.get(name, 0.0)) for name in self._muscles])
             if (np.abs(offset) <= MOST_OFFSET).all() and generation >= 0:
-                return SavedBody(offset, isolated, generation)
-        return nothing
+                offsets = LengthOffsets(offset, unknown.deviation)
+                return BodyState(offsets, isolated, generation=generation)
+        return BodyState(unknown)
 
     def note(self, body: BodyState) -> None:
         """Note the present body state, and save it if it has changed.

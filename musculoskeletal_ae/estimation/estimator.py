@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The core of the node `estimator`: estimates the joint angles and monitors the body's health.
 
-    muscle_states ─► MuscleStream ─► MuscleSample ─► StateEstimator ─► Estimate ─► HealthMonitor
+    muscle_states ─► MuscleStream ─► MuscleSample ─►    estimate    ─► Estimate ─► HealthMonitor
                          ▲                │                              │              │ Finding
                          │                ▼                              ▼              ▼
                      BodyState ◄── LengthCalibration              ContactEstimator   SuspectHandling
@@ -29,18 +29,19 @@ from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation import status
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
+from musculoskeletal_ae.estimation.estimate import Estimate, estimate
 from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
 from musculoskeletal_ae.estimation.joint_sensor_check import JointSensorCheck
-from musculoskeletal_ae.estimation.lengths.checked_calibration import CheckedCalibration
+from musculoskeletal_ae.estimation.lengths.length_calibration import LengthCalibration
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthTrust
 from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
 from musculoskeletal_ae.estimation.mounting import MountingCheck
+from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.estimation.repair_check import LARGEST_LEARNED, LARGEST_YOUNG, RepairCheck
 from musculoskeletal_ae.estimation.settings import EstimatorSettings
-from musculoskeletal_ae.estimation.state_estimator import Estimate, StateEstimator
 from musculoskeletal_ae.estimation.suspect_verification import LONGEST
 from musculoskeletal_ae.estimation.suspects import SuspectHandling
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -91,16 +92,15 @@ class Estimator:
         body: The body state, with a new generation after each change.
         trust: Decides which length offsets are known.
         stream: Converts messages into samples.
-        heat: Thermal models of the muscle modules.
-        state: The state estimator.
+        mae: The network in use, without the isolated muscles; None before the first.
+        complete_mae: The same network with all muscles.
         health: The detectors.
         suspects: The latched finding and its verification.
         calibration: The running length calibration, or None.
         contact: The contact estimator.
         healthy_torque: Measures the external torque that is wrongly estimated without contact.
         mounting: Checks the direction of gravity.
-        unsuitable_because: Why the network in use fits this arm worse than the one before; '' if it
-            does not.
+        networks: Decides which network is used.
         sample: The last sample; None before the first.
         output: Results of the last message with an estimate; None before the first, and from the
             start of a length calibration until its first estimate.
@@ -127,15 +127,15 @@ class Estimator:
         self.trust = LengthTrust(robot.muscle_count)
         self.body = BodyState(self.trust.offsets, generation=first_generation)
         self.stream = MuscleStream(robot, self.body)
-        self.state = StateEstimator()
+        self.mae: Mae | None = None
+        self.complete_mae: Mae | None = None
         self.health = HealthMonitor(robot, preset)
-        self.heat = self.health.heat
         self.suspects = SuspectHandling(robot)
-        self.calibration: CheckedCalibration | None = None
+        self.calibration: LengthCalibration | None = None
         self.contact = ContactEstimator(robot)
         self.healthy_torque = HealthyTorque(robot.joint_count)
         self.mounting = MountingCheck(robot)
-        self.unsuitable_because = ''
+        self.networks = CheckpointValidator(robot, self.use)
         self.sample: MuscleSample | None = None
         self.output: Output | None = None
         self.measured: Array | None = None
@@ -150,11 +150,6 @@ class Estimator:
         self.joint_check = JointSensorCheck(robot)
         #: usable readings of the joint sensors [rad] and their times [s], (2, D); NaN if unknown
         self._readings = np.full((2, robot.joint_count), np.nan)
-
-    @property
-    def mae(self) -> Mae | None:
-        """The network in use, without the isolated muscles."""
-        return self.state.mae
 
     @property
     def cause(self) -> str:
@@ -192,15 +187,13 @@ class Estimator:
         """Use these settings from the next message on."""
         self.suspects.settings = settings
 
-    def use(self, mae: Mae, unsuitable_because: str = '') -> Mae:
+    def use(self, mae: Mae) -> Mae:
         """Use another network and its healthy statistics, without the isolated muscles.
 
         A running length calibration starts again, because its estimate depends on the network.
 
         Args:
             mae: The network.
-            unsuitable_because: Why it fits this arm worse than the network before; '' if it does
-                not.
 
         Returns:
             The network with all muscles, and with the residual torque that was measured so far.
@@ -211,16 +204,15 @@ class Estimator:
         """
         mae = self.healthy_torque.put_into(mae)
         reduced = mae.without(self.body.isolated)
-        self.unsuitable_because = unsuitable_because
         self.health.use(reduced)
         self.joint_check.use(reduced)
         self.contact.use(reduced)
         self.mounting.use(reduced)
         self.stream.use_transmission(reduced.transmission)
-        self.state.use(mae, self.body.isolated)
+        self.complete_mae, self.mae = mae, reduced
         if self.calibration is not None:
             posture = self.calibration.posture
-            self.calibration = CheckedCalibration(self.robot, reduced, posture)
+            self.calibration = LengthCalibration(self.robot, reduced, posture)
         return mae
 
     def isolate(self, muscles: Iterable[int]) -> None:
@@ -232,8 +224,8 @@ class Estimator:
         isolated = self.body.with_isolated(muscles).isolated
         self.suspects.on_isolated(isolated)
         self._update_body(isolated=isolated)
-        if isolated != before and self.state.complete_mae is not None:
-            self.use(self.state.complete_mae, self.unsuitable_because)
+        if isolated != before and self.complete_mae is not None:
+            self.use(self.complete_mae)
         self.health.reset()
 
     def distrust_lengths(self, evidence: Evidence, offset: Array | None = None) -> None:
@@ -258,7 +250,7 @@ class Estimator:
             MusculoskeletalError: If there is no network, if the posture is not valid, or if no
                 posture is stated for a robot whose tensions are unknown.
         """
-        self.calibration = CheckedCalibration(self.robot, self.mae, posture)
+        self.calibration = LengthCalibration(self.robot, self.mae, posture)
         self.distrust_lengths(Evidence.CALIBRATING)
         self.health.residual.forget_reading()
         self.output = self.load = None
@@ -351,7 +343,7 @@ class Estimator:
         """Take a message of muscle_states: estimate the state, and check for faults.
 
         Args:
-            message: The message, or a `MuscleReading`.
+            message: The message, or its rows (`muscle_reading`).
             time: Time of the message [s].
             now: Time on the steady clock [s].
             delay: How late the message is, compared with the fastest one [s].
@@ -411,7 +403,7 @@ class Estimator:
             sent_apart = max(sample.sent_at - before.sent_at, 0.0)
         self.joint_stream.pass_time(min(elapsed, LONGEST_STEP))
         temperature = np.where(self.body.used, sample.temperature, np.nan)
-        self.heat.step(sample.motor_tension, temperature, elapsed)
+        self.health.heat.step(sample.motor_tension, temperature, elapsed)
         if self.mae is None:
             return None
         self.stepped_at = now
@@ -446,29 +438,30 @@ class Estimator:
                 return None
             guess = newest
             sample = sample.shifted(self.body.offsets.offset - before.offset)
-        estimate = self.state.step(sample.bone_tension, sample.length_read - guess.offset)
+        assert self.mae is not None
+        of_sample = estimate(self.mae, sample.bone_tension, sample.length_read - guess.offset)
         if self.suspects.verification is not None:
-            self._verify(sample, estimate, dt, now)
+            self._verify(sample, of_sample, dt, now)
         readings = self._fresh_readings(now)
         self.measured = self._measured_theta(readings)
         self._unchecked += dt
         self._unchecked_sent += sent_apart
         detected, contact = False, None
         if sample.jumped or not 0.0 < self._unchecked_sent < SPACING:
-            detected, contact = self._check(sample, estimate, readings, now)
+            detected, contact = self._check(sample, of_sample, readings, now)
         self.output = Output(
-            sample, estimate.state, estimate.covariance, estimate.anomaly, detected, contact
+            sample, of_sample.state, of_sample.covariance, of_sample.anomaly, detected, contact
         )
         return self.output
 
     def _check(
-        self, sample: MuscleSample, estimate: Estimate, readings: Array, now: float
+        self, sample: MuscleSample, of_sample: Estimate, readings: Array, now: float
     ) -> tuple[bool, Contact | None]:
         """Check the health of the body, and estimate the external load.
 
         Args:
             sample: The readings.
-            estimate: The network's estimate.
+            of_sample: The network's estimate.
             readings: Fresh readings of the joint sensors [rad], (D,); NaN where there are none.
             now: Time on the steady clock [s].
 
@@ -480,16 +473,16 @@ class Estimator:
         known = self.body.offsets.known
         demand = self._commands.demand(self.robot, sample.length, now)
         command = self._commands.length(now)
-        observation = Observation(sample, estimate, demand, dt, known, self.measured, command)
+        observation = Observation(sample, of_sample, demand, dt, known, self.measured, command)
         detected = self._handle(self.health.step(observation), now)
         self.load = None
         if known and self.robot.tension_source.is_known:
             pull = sample.bone_tension * self.body.used
-            self.load = self.contact.step(estimate.state.theta, pull, sent_apart)
+            self.load = self.contact.step(of_sample.state.theta, pull, sent_apart)
             if self.suspects.finding is None:
                 torque = self.load.torque
                 self.healthy_torque.step(torque, self.contact.velocity, sent_apart)
-                self.mounting.step(estimate.state.theta, pull, torque, dt)
+                self.mounting.step(of_sample.state.theta, pull, torque, dt)
         if detected:
             self.joint_check.drop_newest()
         elif known and self.suspects.finding is None:
@@ -571,7 +564,7 @@ class Estimator:
     @property
     def _repair_check(self) -> RepairCheck | None:
         """A check of the newest readings; None before the first and without a network."""
-        sample, mae, body = self.sample, self.state.complete_mae, self.body
+        sample, mae, body = self.sample, self.complete_mae, self.body
         if sample is None or mae is None:
             return None
         limit = LARGEST_LEARNED if self.health.residual.is_calibrated else LARGEST_YOUNG
@@ -629,13 +622,14 @@ class Estimator:
         self.health.reset()
 
     def _calibrate(
-        self, calibration: CheckedCalibration, sample: MuscleSample, dt: float, now: float
+        self, calibration: LengthCalibration, sample: MuscleSample, dt: float, now: float
     ) -> LengthOffsets | None:
         """Continue the length calibration, and return the newest estimate of the offsets.
 
         The result is None before the first estimate.
         """
-        evidence = calibration.step(sample, dt, self._measured_theta(self._fresh_readings(now)))
+        theta = self._measured_theta(self._fresh_readings(now))
+        evidence = calibration.step(sample.motor_tension, sample.length_read, dt, theta)
         if evidence is not None:
             self._note(evidence, found=calibration.offsets)
         if evidence is Evidence.CALIBRATED:

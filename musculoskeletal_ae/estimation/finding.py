@@ -11,7 +11,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.conditions import ConditionKind, Revokes
-from musculoskeletal_ae.estimation.state_estimator import Estimate, estimate_of
+from musculoskeletal_ae.estimation.estimate import Estimate, estimate
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
@@ -108,9 +108,8 @@ def observe(
         usable=usable,
         newest=np.array([length, motor_tension, unknown]),
     )
-    state = mae.estimate(bone_tension, length) if state is None else state
-    estimate = estimate_of(mae, state, bone_tension, length)
-    return Observation(sample, estimate, demand, dt, command=command)
+    estimated = estimate(mae, bone_tension, length, state)
+    return Observation(sample, estimated, demand, dt, command=command)
 
 
 class Detector:

@@ -79,7 +79,7 @@ TO_SIGMA = 1.48  # multiply a median of absolute deviations by this to get the s
 GROSS = 0.8
 
 
-class _Message(NamedTuple):
+class _CountedMessage(NamedTuple):
     """The readings of one message that counts for the judgement."""
 
     time: float  # [s]
@@ -111,7 +111,7 @@ class JointSensorCheck:
         self._mae: Mae | None = None
         self.trust = JointTrust.full(robot.joint_count)
         #: messages in order of time; the last NEWEST of them are judged by the earlier ones
-        self._messages: deque[_Message] = deque(maxlen=EARLIER + NEWEST)
+        self._messages: deque[_CountedMessage] = deque(maxlen=EARLIER + NEWEST)
         #: θ − θ̂ [rad] (D,) and l − l_net(θ̂, T_end) [m] (M,) of each message with the network in use
         self._compared: deque[tuple[Array, Array]] = deque(maxlen=EARLIER + NEWEST)
         self._since = 0.0  # time since the last message that counted [s]
@@ -204,7 +204,7 @@ class JointSensorCheck:
         self._since, self._counted_at = 0.0, estimate
         length = np.where(sample.usable, sample.length, np.nan)
         tension = np.nan_to_num(sample.bone_tension)
-        self._messages.append(_Message(now, theta.copy(), tension, length))
+        self._messages.append(_CountedMessage(now, theta.copy(), tension, length))
         self._compared.append((theta - estimate, length - self._mae.lengths(estimate, tension)))
         if len(self._messages) >= WINDOWS[0][0]:
             self._judge()
@@ -258,9 +258,7 @@ class JointSensorCheck:
         A network that has learned little makes large errors in new postures. Without tensions, a
         load changes the estimates as false joint sensors would.
         """
-        statistics = None if self._mae is None else self._mae.anomaly
-        has_learned = statistics is not None and statistics.calibrated
-        return has_learned and self._has_tensions
+        return self._mae is not None and self._mae.is_calibrated and self._has_tensions
 
     def _limits(self, usual: _Usual) -> Iterator[tuple[int, Array]]:
         """Yield the length of each window and the limits of the median of |x| [rad], (D,)."""

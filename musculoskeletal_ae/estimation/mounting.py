@@ -119,7 +119,7 @@ class MountingCheck:
     def use(self, mae: Mae) -> None:
         """Use another network; without statistics of the learned arm, nothing is checked."""
         self._mae = mae
-        self._is_learned = mae.anomaly is not None and mae.anomaly.calibrated
+        self._is_learned = mae.is_calibrated
 
     def reset(self) -> None:
         """Reset the check: discard all evidence, for example after a reset by the user."""

@@ -5,7 +5,7 @@ A muscle must not be used again while one of these problems is present:
 
     the length has just jumped      its new level is not accepted yet
     a reading is NaN                the sensor is faulty (`MuscleSample.missing`)
-    T < slack_share · T_ref         the tendon is slack although the command demands tension T_ref
+    T < SLACK_SHARE · T_ref         the tendon is slack although the command demands tension T_ref
     |l − l'| > limit                the length does not fit the posture
 
 l' is the length that the network computes at the posture that joint sensors measure or, without
@@ -25,7 +25,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.limits import LIMITS, slack_tension
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 #: Refuse a repaired muscle if |l − l'| exceeds this [m], with a calibrated network or with any
@@ -55,7 +55,7 @@ class RepairCheck(NamedTuple):
             return f'{name}: a sensor reports NaN instead of a number; repair it'
         bias = float(robot.tension.bias[muscle])
         demanded = 0.0 if demand is None else float(demand[muscle])
-        if demanded >= bias and tension < LIMITS.slack_share * demanded:
+        if demanded >= bias and tension < slack_tension(demanded):
             return f'{name} has no tension although the command demands tension; repair it'
         error = self._length_error(muscle)
         may_be_slack = self._is_slack(muscle) and error > 0.0
@@ -80,8 +80,8 @@ class RepairCheck(NamedTuple):
         return is_settled and abs(self._length_error(muscle)) > self.limit
 
     def _is_slack(self, muscle: int) -> bool:
-        bias = float(self.robot.tension.bias[muscle])
-        return float(self.sample.motor_tension[muscle]) < LIMITS.slack_share * bias
+        lowest = slack_tension(self.robot.tension.bias[muscle])
+        return bool(self.sample.motor_tension[muscle] < lowest)
 
     def _length_error(self, muscle: int) -> float:
         """Return by how much the length of a muscle deviates from the posture (l − l') [m]."""

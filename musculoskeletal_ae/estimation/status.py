@@ -28,7 +28,7 @@ def report(core: Estimator, now: float) -> Report:
     The value `verification` is an identifier for programs, and `last outcome` is one of
     `verification.Outcome`.
     """
-    mae, present = core.state.mae, conditions(core, now)
+    mae, present = core.mae, conditions(core, now)
     if mae is None:
         return Report('', {}, present)
     values = {
@@ -54,9 +54,9 @@ def conditions(core: Estimator, now: float) -> tuple[Condition, ...]:
         present.append(ConditionKind.READINGS_REJECTED.condition(reason))
     if core.mounting.tilt is not None:
         present.append(ConditionKind.OTHER_MOUNTING.condition(core.mounting.tilt.text))
-    if core.unsuitable_because:
-        present.append(ConditionKind.UNSUITABLE_NETWORK.condition(core.unsuitable_because))
-    if core.state.mae is None:
+    if weakness := core.networks.unsuitable_because:
+        present.append(ConditionKind.UNSUITABLE_NETWORK.condition(weakness))
+    if core.mae is None:
         present.append(ConditionKind.NO_CHECKPOINT.condition(steps=[Step.PROVIDE_CHECKPOINT]))
     return tuple(present)
 
@@ -74,7 +74,7 @@ def _finding(core: Estimator) -> Iterator[Condition]:
 
 
 def _changed_modules(core: Estimator) -> Iterator[Condition]:
-    for muscle, change in core.heat.changed.items():
+    for muscle, change in core.health.heat.changed.items():
         name = core.robot.muscles[muscle]
         yield ConditionKind.MODULE_CHANGED.condition(f'the module of {name} {change}', [name])
 
@@ -174,7 +174,7 @@ def _residuals(core: Estimator) -> dict[str, str]:
     residual, output = core.health.residual, core.output
     if output is None or residual.reading is None:
         return {}
-    suspect = next(iter(core.heat.changed), residual.reading.suspect)
+    suspect = next(iter(core.health.heat.changed), residual.reading.suspect)
     if core.suspects.finding is not None:
         suspect = core.suspects.finding.muscle
     values = {

@@ -52,7 +52,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.limits import slack_tension
 
 #: count the suspect as being wound in once its length command has decreased by more than this [m]
 WINDING_CHANGE = 0.001
@@ -122,24 +122,15 @@ class VerificationVerdict(NamedTuple):
         return f'{text} of {self.evidence}' if self.evidence else text
 
 
-class _Reading(NamedTuple):
-    """Readings of the suspect, its command, and the length expected from the other muscles."""
+class _Moment(NamedTuple):
+    """What was read of the suspect at one moment, and what follows from it."""
 
     tension: float  # T [N]
     length: float  # measured length l [m]
     command: float  # length command l_target [m]
     likely: float  # length l' that the other muscles indicate [m]
-
-
-class _Row(NamedTuple):
-    """Readings of the suspect at one moment while it was wound in."""
-
-    tension: float  # T [N]
-    length: float  # measured length l [m]
-    demand: float  # tension T_ref that a healthy muscle would have [N]
-    excess: float  # measured length minus the one that the other muscles indicate [m]
-    command: float  # length command l_target [m]
-    stretch: float  # stretch x of the series elastic element [m]
+    demand: float = math.nan  # tension T_ref that a healthy muscle would have [N]
+    stretch: float = math.nan  # stretch x of the series elastic element [m]
 
 
 class ModuleLaw:
@@ -149,7 +140,7 @@ class ModuleLaw:
         """Describe a module with a tension bias [N] and a control stiffness [N/m]."""
         self.bias, self._stiffness = bias, stiffness
 
-    def stretch(self, row: _Reading) -> float:
+    def stretch(self, row: _Moment) -> float:
         """Return the length that the other muscles indicate minus the measured length [m].
 
         The verdict on modules under muscle stiffness control does not use the result. For
@@ -157,7 +148,7 @@ class ModuleLaw:
         """
         return row.likely - row.length
 
-    def demand(self, row: _Reading, is_reference: bool) -> float:  # noqa: ARG002
+    def demand(self, row: _Moment, is_reference: bool) -> float:  # noqa: ARG002
         """Return the tension that the command demands of the suspect's module [N].
 
         Args:
@@ -184,7 +175,7 @@ class PositionLaw(ModuleLaw):
         #: stretch of a healthy tendon with tension [m]
         self.stretched = STRETCHED * elongation(bias)
 
-    def stretch(self, row: _Reading) -> float:
+    def stretch(self, row: _Moment) -> float:
         """Return the stretch of the suspect's series elastic element [m].
 
         It is the length that the other muscles indicate, minus the measured length, plus the
@@ -192,7 +183,7 @@ class PositionLaw(ModuleLaw):
         """
         return row.likely - row.length + self._elongation(row.tension)
 
-    def demand(self, row: _Reading, is_reference: bool) -> float:
+    def demand(self, row: _Moment, is_reference: bool) -> float:
         """Return the tension that a healthy muscle would have at the present stretch [N].
 
         Args:
@@ -202,7 +193,7 @@ class PositionLaw(ModuleLaw):
         """
         stretch = self.stretch(row)
         if is_reference:  # for a slack tendon, x_0 − L_e(T_0) is unknown and assumed to be 0
-            is_slack = row.tension < LIMITS.slack_share * self.bias
+            is_slack = row.tension < slack_tension(self.bias)
             self._reference = 0.0 if is_slack else stretch - self._elongation(row.tension)
         wanted, low, high = stretch - self._reference, 0.0, HIGHEST_TENSION
         for _ in range(HALVINGS):
@@ -227,7 +218,7 @@ class Verification:
         self._time = 0.0
         self._highest_command = -math.inf
         self._before = bias, bias  # T and T_ref before the suspect was wound in [N]
-        self._rows: list[_Row] = []
+        self._rows: list[_Moment] = []  # while the suspect was wound in
         self._watched = 0.0  # duration of winding in so far [s]
 
     def step(
@@ -249,15 +240,14 @@ class Verification:
         demand = math.inf
         if command is not None:
             is_reference = command >= self._highest_command
-            reading = _Reading(tension, length, command, likely)
-            demand, stretch = self._law.demand(reading, is_reference), self._law.stretch(reading)
+            row = _Moment(tension, length, command, likely)
+            demand = self._law.demand(row, is_reference)
             if is_reference:
                 self._highest_command = command
                 self._before = tension, demand
             if command < self._highest_command - WINDING_CHANGE:
                 self._watched += dt
-                excess = length - likely
-                self._rows.append(_Row(tension, length, demand, excess, command, stretch))
+                self._rows.append(row._replace(demand=demand, stretch=self._law.stretch(row)))
         if self._watched >= CLASSIFICATION_TIME and isinstance(self._law, PositionLaw):
             return self._judge_position(self._law)
         if self._watched >= CLASSIFICATION_TIME:
@@ -270,11 +260,12 @@ class Verification:
         return VerificationVerdict(Outcome.NOT_WOUND_IN)
 
     def _judge(self) -> VerificationVerdict:
-        tension, length, demand, excess, *_ = np.array(self._rows).T
+        tension, length, _, likely, demand, _ = np.array(self._rows).T
+        excess = length - likely
         first_quarter = slice(max(len(tension) // 4, 1))
         last_quarter = slice(-max(len(tension) // 4, 1), None)
         reached, wanted, beside = map(_late_median, (tension, demand, excess))
-        is_slack = reached < LIMITS.slack_share * self._bias
+        is_slack = reached < slack_tension(self._bias)
         follows_the_winch = excess[0] - excess[-1] > RUPTURE_CHANGE
         if np.ptp(length) < FROZEN:
             return VerificationVerdict(Outcome.LENGTH_SENSOR_FROZEN)
@@ -298,8 +289,10 @@ class Verification:
 
     def _judge_position(self, law: PositionLaw) -> VerificationVerdict | None:
         rows = self._rows[len(self._rows) // 2 :]
-        tension, length, demand, excess, command, stretch = np.median(rows[-10:], axis=0)
-        is_slack = tension < LIMITS.slack_share * self._bias
+        newest = np.array(rows[-10:])
+        tension, length, command, _, demand, stretch = np.median(newest, axis=0)
+        excess = np.median(newest[:, 1] - newest[:, 3])
+        is_slack = tension < slack_tension(self._bias)
         is_stretched = stretch > law.stretched
         may_wait = self._watched < LONGEST_WINDING and self._time < LONGEST
         if is_slack and not is_stretched and may_wait:

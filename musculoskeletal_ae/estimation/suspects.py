@@ -40,7 +40,7 @@ muscles. While a muscle is being verified, it cannot be restored.
 
 from collections.abc import Iterable
 
-from musculoskeletal_ae.conditions import Reaction
+from musculoskeletal_ae.conditions import FindingReaction
 from musculoskeletal_ae.estimation.finding import Finding
 from musculoskeletal_ae.estimation.settings import ISOLATE, EstimatorSettings
 from musculoskeletal_ae.estimation.suspect_verification import (
@@ -59,7 +59,7 @@ WITHIN = 60.0  # count a suspect that was verified as healthy for this long [s]
 
 
 #: isolate without a verification after these reactions: there is no doubt which muscle is faulty
-AT_ONCE = Reaction.ISOLATE_AT_ONCE, Reaction.ISOLATE_ONLY
+AT_ONCE = FindingReaction.ISOLATE_AT_ONCE, FindingReaction.ISOLATE_ONLY
 
 
 class SuspectHandling:
@@ -127,7 +127,7 @@ class SuspectHandling:
             self.last_verdict = muscle, VerificationVerdict(Outcome(finding.kind.identifier))
             self.faults[muscle] = self.last_verdict[1]
             return (*isolated, muscle)
-        if finding.kind.reaction is Reaction.ISOLATE_ONLY:
+        if finding.kind.reaction is FindingReaction.ISOLATE_ONLY:
             return isolated
         if self.explains(finding):
             return isolated
@@ -138,7 +138,7 @@ class SuspectHandling:
             return isolated
         self.finding, self.suspect = finding, muscle
         recent = [time for time in self._acquitted if now - time < WITHIN]
-        may_isolate = isolates and finding.kind.reaction is Reaction.ISOLATE
+        may_isolate = isolates and finding.kind.reaction is FindingReaction.ISOLATE
         if not may_isolate or len(recent) >= ACQUITTALS:
             return isolated
         self.verification = Verification(muscle, self._law(muscle))

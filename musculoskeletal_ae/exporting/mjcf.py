@@ -170,7 +170,7 @@ def loads_in_mjx(model: Any) -> str:
     return 'can load the model'
 
 
-def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> ExportReport:
+def export(robot: Robot, mae: Mae, out: Path) -> ExportReport:
     """Export a learned body as `model.xml` and `report.txt` into a new or empty directory.
 
     Raises:
@@ -181,13 +181,13 @@ def export(robot: Robot, mae: Mae, out: Path, seed: int = 0) -> ExportReport:
         return MusculoskeletalError(f'{file}: {problem}')
 
     with new_directory(out, refuse):
-        return _write(robot, mae, out, seed)
+        return _write(robot, mae, out)
 
 
-def _write(robot: Robot, mae: Mae, out: Path, seed: int) -> ExportReport:
+def _write(robot: Robot, mae: Mae, out: Path) -> ExportReport:
     robot = robot.with_elasticity(mae.elasticity)
     body = CalibratedBody(robot)
-    fit_to_network(body, mae, seed, with_remainder=False)
+    fit_to_network(body, mae, with_remainder=False)
     learned = learned_routes(robot, body, mae)
     moved = Robot(replace(robot.description, routes=learned.routes))
     moved = moved.with_elasticity(mae.elasticity)

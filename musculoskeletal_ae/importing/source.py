@@ -203,14 +203,14 @@ class Source:
 
     def reduce_range(self, joint: str, low: float, high: float) -> None:
         """Reduce the limits of a joint [rad or m] to the part that its muscles can hold."""
-        before = ', '.join(f'{end:.4g}' for end in self.span(joint))
+        before = ' to '.join(f'{end:.4g}' for end in self.span(joint))
         q = self.model.joints[self.model.getJointId(joint)].idx_q
         for limits, end in (('lowerPositionLimit', low), ('upperPositionLimit', high)):
             ends = getattr(self.model, limits)
             ends[q] = end
             setattr(self.model, limits, ends)
         text = (
-            f'limits of joint {joint}: robot.urdf has [{low:.4g}, {high:.4g}] instead of [{before}]'
+            f'limits of joint {joint}: robot.urdf has {low:.4g} to {high:.4g} instead of {before}'
         )
         reason = 'no muscle can hold the joint, or bring it back, outside the new limits'
         self.note('chosen', f'{text}, because {reason}')

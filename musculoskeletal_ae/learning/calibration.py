@@ -191,12 +191,7 @@ def uncalibrated(mae: Mae) -> Mae:
 
 def is_learned(mae: Mae) -> bool:
     """Return whether a network has learned from an arm, not only from its geometric model."""
-    return mae.covariance is not None or is_calibrated(mae)
-
-
-def is_calibrated(mae: Mae) -> bool:
-    """Return whether a network's statistics come from enough messages and samples of the arm."""
-    return mae.anomaly is not None and mae.anomaly.calibrated
+    return mae.covariance is not None or mae.is_calibrated
 
 
 def calibrate(mae: Mae, healthy: Healthy, samples: int) -> AnomalyStatistics | None:

@@ -145,7 +145,7 @@ class SampleCollector:
 
         Args:
             time: Time of reception [s].
-            message: The message, or a `MuscleReading`.
+            message: The message, or its rows (`muscle_reading`).
             delay: How late the message is (`Arrival.delay`) [s].
 
         Returns:

@@ -31,7 +31,7 @@ from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.body_model.joint_stops import LARGEST_OFFSET
 from musculoskeletal_ae.conditions import Condition
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
+from musculoskeletal_ae.learning.calibration import Reservoir, uncalibrated
 from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR, SampleCollector
 from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.learning.joint_history import JointHistory
@@ -163,7 +163,7 @@ class Learner:
         """Take a message of muscle_states, and learn from it.
 
         Args:
-            message: The message, or a `MuscleReading`.
+            message: The message, or its rows (`muscle_reading`).
             time: Time of reception [s].
             delay: How late the message is (`Arrival.delay`) [s].
 
@@ -271,7 +271,7 @@ class Learner:
             self._forget(muscle)
             self.collector.reset()
         mae = self.keeper.mae
-        if not self.scheduler.statistics_hold and mae is not None and is_calibrated(mae):
+        if not self.scheduler.statistics_hold and mae is not None and mae.is_calibrated:
             self.keeper.use(uncalibrated(mae))
         self.keeper.store()
 

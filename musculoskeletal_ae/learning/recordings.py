@@ -18,8 +18,6 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.bags.storage import LONGEST_PAUSE
 from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
-from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.collector import SampleCollector
 from musculoskeletal_ae.learning.learner import Learner
@@ -156,15 +154,16 @@ def learn(
 ) -> str:
     """Learn from a recording, message by message, as on a running arm.
 
-    This function plays the part of the estimator node: it validates the networks, and an estimator
-    decides when learning has to stop. `progress` is called with the recorded seconds since its last
-    call.
+    An estimator plays the part of its node: it validates the networks, and decides when learning
+    has to stop. `progress` is called with the recorded seconds since its last call.
 
     Returns:
         A warning if learning stopped before the end of the recording, or ''.
     """
     estimator = Estimator(learner.robot, learner.trainer.preset.name)
-    validator = CheckpointValidator(learner.robot)
+    networks = estimator.networks
+    networks.accepted = learner.note_accepted
+    networks.rejected = lambda mae, reason: learner.note_rejected(mae.version, reason)
     newest, stop = None, ''
     learner.reset()
     learner.use_body(learner.body.with_anomaly(Anomaly.NONE))
@@ -174,10 +173,10 @@ def learn(
         if isolated != estimator.body.isolated:
             learner.use_body(learner.body.with_isolated(isolated))
             estimator.isolate(isolated)
-            validator.isolated = isolated
-            validator.forget()
+            networks.follow(estimator.body, at)
+            networks.forget()
         if learner.mae is not newest:
-            _decide(validator, estimator, learner, at)
+            _decide(estimator, learner.mae, at)
             newest = learner.mae
         reading = muscle_reading(learner.robot, length=length, tension=tension)
         learner.joints(at, theta)
@@ -185,13 +184,11 @@ def learn(
             output = estimator.take(reading, at, at)
             assert output is not None
             sample = output.sample
-            validator.message(sample.tension_read, sample.length, sample.sliding, at, theta)
+            networks.message(sample.tension_read, sample.length, sample.sliding, at, theta)
         finding = estimator.suspects.finding
         if finding is not None and not stop:
             learner.use_body(learner.body.with_anomaly(Anomaly.FOUND, finding.muscle))
-            if (before := validator.anomaly(True, at)) is not None:
-                learner.note_accepted(estimator.use(before))
-                learner.note_rejected(newest.version, 'an anomaly was detected soon after')
+            networks.follow(estimator.body, at)
             stop = (
                 f'learning stopped {at:.1f} s after the start: an anomaly begins there '
                 f'({learner.robot.muscles[finding.muscle]}: {finding.kind.identifier})'
@@ -202,27 +199,15 @@ def learn(
         if progress is not None:
             progress(float(without_pauses(dt)))
     if learner.mae is not newest:
-        _decide(validator, estimator, learner, at)
+        _decide(estimator, learner.mae, at)
     return stop
 
 
-def _decide(
-    validator: CheckpointValidator, estimator: Estimator, learner: Learner, now: float
-) -> None:
-    """Decide on the learner's newest network, tell the learner, and use the network if accepted."""
-    mae = learner.mae
-    if validator.is_in_use(mae):
-        return
-    try:
-        validator.check(mae)
-    except GateError as error:
-        learner.note_rejected(mae.version, str(error))
-        if estimator.mae is None:
-            estimator.use(mae)
-    else:
-        mae = estimator.use(mae)
-        validator.take(mae, now)
-        learner.note_accepted(mae)
+def _decide(estimator: Estimator, mae: Mae, now: float) -> None:
+    """Let the estimator decide on a network; without any, it uses even one that is rejected."""
+    estimator.networks.decide(mae, now)
+    if estimator.mae is None:
+        estimator.use(mae)
 
 
 def errors(mae: Mae, recording: Pairs, at_rest: bool = False) -> Array:

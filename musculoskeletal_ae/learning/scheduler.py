@@ -7,7 +7,7 @@ An update begins when there are new data and enough samples, and the last update
 
 import math
 
-from musculoskeletal_ae.learning.calibration import Reservoir, is_calibrated, uncalibrated
+from musculoskeletal_ae.learning.calibration import Reservoir, uncalibrated
 from musculoskeletal_ae.learning.job import Job, Update
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae.mae import Mae
@@ -77,7 +77,7 @@ class UpdateScheduler:
         self.last_update = update
         self.updates += 1
         mae = uncalibrated(update.mae) if self._has_changed or update.changed else update.mae
-        self.statistics_hold |= is_calibrated(mae)
+        self.statistics_hold |= mae.is_calibrated
         return mae
 
 

@@ -25,14 +25,9 @@ LONGEST_GAP = 0.3  # count readings after a longer gap as another motion [s]
 
 
 class SlowMoments:
-    """Turns the readings of a moving arm into samples, with the interface of `RestDetector`.
-
-    Attributes:
-        speeds: Speed of each sample so far [rad/s].
-    """
+    """Turns the readings of a moving arm into samples, with the interface of `RestDetector`."""
 
     def __init__(self) -> None:
-        self.speeds: list[float] = []
         self.reset()
 
     def reset(self) -> None:
@@ -57,9 +52,8 @@ class SlowMoments:
             self._end_moment()
         if self._time < PERIOD or self._slowest is None:
             return None
-        speed, sample = self._slowest
+        _, sample = self._slowest
         self._time, self._slowest, self._readings = 0.0, None, []
-        self.speeds.append(speed)
         return sample
 
     def _end_moment(self) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from musculoskeletal_ae.conditions import Condition, ConditionKind
-from musculoskeletal_ae.learning.calibration import is_calibrated, is_learned
+from musculoskeletal_ae.learning.calibration import is_learned
 from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import Report
@@ -91,7 +91,7 @@ def _update_values(robot: Robot, update: Update) -> dict[str, str]:
         'error at newest samples': robot.units.errors_text(update.errors) or 'nan rad',
         'loss': f'{update.loss:.4f}',
         'update': f'{update.seconds:.2f} s on {update.device}',
-        'anomaly calibrated': str(is_calibrated(update.mae)),
+        'anomaly calibrated': str(update.mae.is_calibrated),
     }
     if update.unchanged:
         values['network unchanged'] = update.unchanged

@@ -30,7 +30,7 @@ from musculoskeletal_ae.body_model.body_fit import (
 )
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.covariance import MANY_MESSAGES, observed_theta
-from musculoskeletal_ae.body_model.fit import Fit
+from musculoskeletal_ae.body_model.fit import FittedBody
 from musculoskeletal_ae.body_model.synthetic import TrainingData, synthetic_samples
 from musculoskeletal_ae.learning.job import Job, Update
 from musculoskeletal_ae.learning.network_trainer import BATCH, NetworkTrainer
@@ -113,7 +113,7 @@ class BodyUpdater(Updater):
         """
         return read and replace(read, theta=read.theta - self.body.zero)
 
-    def _mix_in_real(self, data: TrainingData, observed: Observations, fit: Fit) -> None:
+    def _mix_in_real(self, data: TrainingData, observed: Observations, fit: FittedBody) -> None:
         """Replace some training samples by rest samples that fit the body."""
         trusted = np.flatnonzero((fit.weight > LEAST_WEIGHT).all(axis=1))
         self._put(data, observed[trusted], slice(int(REAL_SHARE * len(data.entered))))

@@ -20,7 +20,7 @@ from musculoskeletal_ae.body_model.covariance import (
     estimate_covariance,
     observed_theta,
 )
-from musculoskeletal_ae.body_model.fit import Fit
+from musculoskeletal_ae.body_model.fit import FittedBody
 from musculoskeletal_ae.learning.calibration import recalibrated, uncalibrated
 from musculoskeletal_ae.learning.job import Job, Update
 from musculoskeletal_ae.mae.mae import Mae
@@ -62,7 +62,7 @@ class Updater(ABC):
     def _learn(self, job: Job) -> Update: ...
 
     def _published(
-        self, network: Network, preset: str, steps: int, job: Job, fit: Fit | None = None
+        self, network: Network, preset: str, steps: int, job: Job, fit: FittedBody | None = None
     ) -> Mae:
         """Return the trained network as an `Mae` with its statistics and its training history."""
         origin, samples = self._origin, len(job.observed)

@@ -463,6 +463,11 @@ class Mae:
         """Tendon friction μ of each muscle (M,); 0 until it has been learned."""
         return np.zeros(len(self.muscles)) if self.touch is None else self.touch.friction
 
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether the statistics come from enough messages and samples of the healthy arm."""
+        return self.anomaly is not None and self.anomaly.calibrated
+
     def without(self, isolated: Iterable[int]) -> Mae:
         """Return the same network with exactly these muscles isolated.
 

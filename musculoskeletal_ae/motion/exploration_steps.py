@@ -169,6 +169,6 @@ def holdable_postures(
             return held
     raise RobotDescriptionError(
         f'{robot.description.directory}: only {len(held)} of {TRIES} random postures are holdable '
-        f'with tensions in [{shown(robot.tension.bias)}, {shown(robot.tension.limit)}] N; '
+        f'with tensions from {shown(robot.tension.bias)} to {shown(robot.tension.limit)} N; '
         'run check_robot, which suggests changes'
     )

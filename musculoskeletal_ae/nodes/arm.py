@@ -32,7 +32,7 @@ from musculoskeletal_ae.ros.messages import (
 )
 from musculoskeletal_ae.ros.second_publishers import COMMANDS, MOTOR_COMMAND
 from musculoskeletal_ae.signals.motor_interface import STATES
-from musculoskeletal_ae.signals.muscle_readings import reading_rows
+from musculoskeletal_ae.signals.muscle_readings import muscle_reading
 
 MARKER_RATE = 10.0  # publish markers at this rate [Hz]
 NAME_HEIGHT = 0.018  # draw the muscles' names at this height [m]
@@ -174,7 +174,7 @@ class ArmNode(Shell):
 
         Args:
             theta: θ [rad], (D,).
-            values: The readings of the muscle modules, as for `reading_rows`; among them `length`
+            values: The readings of the muscle modules, as for `muscle_reading`; among them `length`
                 and `tension`.
         """
         stamp, motors, joints = self.get_clock().now().to_msg(), self._motors, self._joints
@@ -187,5 +187,5 @@ class ArmNode(Shell):
         if joints is not None and joints is not motors and is_heard(joints):
             joints.publish(posture_message(self.robot.units, theta, stamp))
         if self._muscles is not None and is_heard(self._muscles):
-            rows = reading_rows(self.robot, **values)
+            rows = muscle_reading(self.robot, **values)
             self._muscles.publish(array_message(rows, 'quantity', 'muscle'))

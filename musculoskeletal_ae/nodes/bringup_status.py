@@ -42,7 +42,7 @@ WAITING_INTERVAL = 5.0  # wait at least this long between two lines before the f
 LAST_REPORT_WAIT = 5.0
 
 
-class BringupStatus(Shell):
+class BringupStatusNode(Shell):
     """Prints the estimation error, the anomaly measure A, and counts of samples and checkpoints."""
 
     # The node is not watched for progress, because printing blocks while a terminal is paused.

@@ -26,7 +26,7 @@ from musculoskeletal_ae.bags.topics import topics_with
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.command import LENGTH, TENSION
-from musculoskeletal_ae.control.controller import Controller as Core
+from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.method_choice import check_settings
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.control.stop_memory import BEFORE, StopMemory
@@ -59,7 +59,7 @@ from musculoskeletal_ae.signals.limits import LIMITS
 OVERDUE = 1.5  # compute a command after this number of periods without an estimate
 
 
-class Controller(Shell):
+class ControllerNode(Shell):
     """Passes messages, parameters and services to the core controller; publishes its commands."""
 
     # While several nodes publish muscle_states, the arm is stopped. Their messages are still
@@ -72,7 +72,7 @@ class Controller(Shell):
             kind: self.create_publisher(Float64MultiArray, f'muscle_{kind}_command', RELIABLE)
             for kind in (LENGTH, TENSION)
         }
-        self.core = Core(self.robot, self._settings(), self.parameter('seed'), self.awake)
+        self.core = Controller(self.robot, self._settings(), self.parameter('seed'), self.awake)
         self.memory = StopMemory(self.state_directory())
         if self.memory.found is not None:
             self.core.stop(self.memory.found.kind, BEFORE)

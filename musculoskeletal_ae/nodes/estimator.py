@@ -25,8 +25,7 @@ from std_srvs.srv import Trigger
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation.body_memory import BodyMemory
-from musculoskeletal_ae.estimation.estimator import Estimator as Core
-from musculoskeletal_ae.estimation.estimator import Output
+from musculoskeletal_ae.estimation.estimator import Estimator, Output
 from musculoskeletal_ae.estimation.lengths.length_calibration import stated_theta
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
 from musculoskeletal_ae.estimation.settings import EstimatorSettings
@@ -55,7 +54,7 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample, RejectionErro
 OWN_TOPICS = [topic for topic, author in AUTHORS.items() if author == 'the estimator']
 
 
-class Estimator(Shell):
+class EstimatorNode(Shell):
     """Passes messages, parameters and services to the core estimator; publishes its results."""
 
     def __init__(self, **options: Any) -> None:
@@ -64,8 +63,9 @@ class Estimator(Shell):
         found = self.memory.found
         # The time distinguishes the body states of this estimator from those of an earlier one.
         generation = max(time.time_ns() // 1_000_000, 0 if found is None else found.generation + 1)
-        self.core = Core(self.robot, self.parameter('preset'), generation)
-        self.candidates = Candidates(self, self._use)
+        self.core = Estimator(self.robot, self.parameter('preset'), generation)
+        self.candidates = Candidates(self, self.core.networks)
+        self.core.networks.accepted = self._accepted
         self._advertise()
         self.sources.watch(*OWN_TOPICS)
         self.published_trust: JointTrust | None = None  # None if none was published yet
@@ -76,15 +76,15 @@ class Estimator(Shell):
             self.needed.expect_rate('muscle_states', self.rate)
         self.posture: tuple[float, ...] = ()  # value of the parameter zero_posture
         self.muscles_to_isolate: tuple[int, ...] = ()  # value of the parameter isolate_muscles
-        self.follow_parameter('zero_posture', self._on_posture)
+        self.parameters.follow('zero_posture', self._on_posture)
         if self.parameter('zero_at_start'):
             self.core.distrust_lengths(Evidence.NOT_CALIBRATED)
-        elif found is not None and found.offset is not None:
-            self.core.distrust_lengths(Evidence.RESTARTED, found.offset)
-        self.follow_parameter('isolate_muscles', self._on_isolate_muscles)
+        elif found is not None and not found.offsets.known:
+            self.core.distrust_lengths(Evidence.RESTARTED, found.offsets.offset)
+        self.parameters.follow('isolate_muscles', self._on_isolate_muscles)
         self.core.isolate([*self.muscles_to_isolate, *(() if found is None else found.isolated)])
-        self.candidates.follow()
-        self.follow_parameter(
+        self.candidates.subscribe()
+        self.parameters.follow(
             'on_anomaly', lambda value: self.core.configure(EstimatorSettings(on_anomaly=value))
         )
         self.follow_muscle_messages(self._on_muscles)
@@ -118,12 +118,11 @@ class Estimator(Shell):
 
     # -- parameters and services ----------------------------------------------------------------
 
-    def _use(self, mae: Mae, unsuitable_because: str) -> Mae:
-        mae = self.core.use(mae, unsuitable_because)
+    def _accepted(self, mae: Mae) -> None:
+        self.candidates.publish(mae)
         if Evidence.NOT_CALIBRATED in self.core.trust.evidence:  # it waits for the first network
             self.core.calibrate_lengths(self.posture)
             self._publish_body()
-        return mae
 
     def _on_posture(self, posture: tuple[float, ...]) -> None:
         stated_theta(self.robot, posture)  # raises if the posture is not legal
@@ -156,7 +155,7 @@ class Estimator(Shell):
         isolated = self.core.body.isolated
         restored = self.muscles_to_isolate or isolated  # all muscles if the parameter names none
         self.core.restore(restored)
-        self.candidates.validator.declare_repaired(restored, time.monotonic())
+        self.core.networks.declare_repaired(restored, time.monotonic())
         self._publish_body()
         return self._isolated
 
@@ -176,7 +175,7 @@ class Estimator(Shell):
         finding = self.core.suspects.finding
         self.core.reset()
         if finding is not None:
-            self.candidates.validator.declare_repaired(finding.muscles, time.monotonic())
+            self.core.networks.declare_repaired(finding.muscles, time.monotonic())
         self._publish_body()
         self._report()
         if finding is None:
@@ -225,7 +224,7 @@ class Estimator(Shell):
         if self.frames is not None and self.tf_source == 'estimate':
             self.frames.publish(state.theta)
         if self.core.body.offsets.known:
-            self.candidates.validator.message(
+            self.core.networks.message(
                 sample.tension_read, sample.length, sample.sliding, now, self.core.measured
             )
         self.joints.publish(posture_message(self.robot.units, state.theta, stamp))
@@ -258,17 +257,14 @@ class Estimator(Shell):
             return
         self.body = body
         self.bodies.publish(array_message(body.rows, 'quantity', 'muscle'))
-        self.candidates.validator.isolated = body.isolated
-        if body.offsets != before.offsets:
-            self.candidates.validator.forget()
         if suspects.last_verdict is not self.logged_verdict:
             self.logged_verdict = suspects.last_verdict
             self.get_logger().warning(suspects.last_verification)
+        if body.has_anomaly and not before.has_anomaly:
+            text = f'anomaly detected: {self.core.cause}; {self.core.advice}'
+            self.get_logger().warning(text)
+        self.candidates.follow(body)
         if body.has_anomaly != before.has_anomaly:
-            if body.has_anomaly:
-                text = f'anomaly detected: {self.core.cause}; {self.core.advice}'
-                self.get_logger().warning(text)
-            self.candidates.on_anomaly(body.has_anomaly)
             self._report()  # at once, because the report names the suspect
 
     def conditions(self) -> Iterable[Condition]:
@@ -286,7 +282,7 @@ class Estimator(Shell):
         rows[-1] = self.robot.units.to_position(trust.deviation)
         self.trust.publish(array_message(rows, 'quantity', 'joint'))
         if before is not None:
-            self.candidates.validator.forget()  # the readings so far may be wrong
+            self.core.networks.forget()  # the readings so far may be wrong
             names = ', '.join(self.robot.joints[joint] for joint in trust.unused)
             self.get_logger().warning(f'joint sensors that are not used: {names or "none"}')
             self._report()

@@ -31,7 +31,7 @@ from musculoskeletal_ae.ros.messages import RELIABLE, serve
 PACE_TIME = 5.0  # average the real-time factor over this time [s]
 
 
-class HardwareEmulator(ArmNode):
+class HardwareEmulatorNode(ArmNode):
     """Passes commands and faults to the emulated arm; publishes its measurements."""
 
     def __init__(self, **options: Any) -> None:
@@ -48,8 +48,8 @@ class HardwareEmulator(ArmNode):
         self.arm.step(0.01)
         self.pose_due = self.remainder = 0.0
         self.reading = self.arm.sense()
-        self.follow_parameter('payload', self.arm.set_payload)
-        self.follow_parameter('faults', self.arm.set_faults)
+        self.parameters.follow('payload', self.arm.set_payload)
+        self.parameters.follow('faults', self.arm.set_faults)
         with naming_parameter('sensors'):
             self.sensors = read_sensors(self.parameter('sensors'), self.robot)
         self.advertise('', self.sensors.joints, description=True)

@@ -20,7 +20,7 @@ from std_srvs.srv import SetBool, Trigger
 from musculoskeletal_ae.arrival import SPACING
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
-from musculoskeletal_ae.learning import learner
+from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.trainer import TrainerProcess
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -39,7 +39,7 @@ LEAST_PERIOD = 0.01  # pair joint angles at most as narrowly as if messages had 
 JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
 
 
-class Learner(Shell):
+class LearnerNode(Shell):
     """Passes messages, parameters and services to the core learner; publishes its networks."""
 
     is_time_critical = False
@@ -48,7 +48,7 @@ class Learner(Shell):
         super().__init__('learner', **options)
         value = self.parameter
         self.taken_at = -math.inf  # time of the last message that was learned [s]
-        self.core = learner.Learner(
+        self.core = Learner(
             self.robot,
             preset=value('preset'),
             seed=value('seed'),

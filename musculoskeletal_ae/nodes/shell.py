@@ -309,15 +309,6 @@ class Shell(Node):
         place = Path(home) / 'musculoskeletal_ae' / self.robot.description.directory.name
         return place.joinpath(*self.get_namespace().strip('/').split('/'))
 
-    def follow_parameter(
-        self,
-        name: str,
-        setter: Callable[[Any], object],
-        prepare: Callable[[Any], object] | None = None,
-    ) -> None:
-        """Call `setter` now and whenever the parameter is set; see `NodeParameters.follow`."""
-        self.parameters.follow(name, setter, prepare)
-
     # -- checkpoints ----------------------------------------------------------------------------
 
     def follow_accepted_checkpoints(
@@ -359,7 +350,7 @@ class Shell(Node):
 
         self.accepted = self.checkpoint_queue(ACCEPTED, handle, unfit)
         self.needed.add(ACCEPTED)
-        self.follow_parameter('checkpoint', use_file, self.load_checkpoint)
+        self.parameters.follow('checkpoint', use_file, self.load_checkpoint)
         self.listen(UInt8MultiArray, ACCEPTED, self.accepted.propose, LATCHED)
 
     def load_checkpoint(self, path: str) -> Mae | None:

@@ -33,7 +33,7 @@ MOST_RATE = 100.0  # beside a robot, simulate at most this often, because nothin
 TEMPERATURE = 25.0  # report this temperature of all modules [°C]
 
 
-class Sim(ArmNode):
+class SimNode(ArmNode):
     """Passes commands and wrenches to the simulation of the learned body; publishes its states."""
 
     def __init__(self, **options: Any) -> None:

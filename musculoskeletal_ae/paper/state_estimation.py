@@ -4,7 +4,7 @@
     (θ_est, T_est, l_est) = f_decode(f_encode,2(T, l))
     A = ‖T_est − T‖₂ + ‖l_est − l‖₂                                                          (4)
 
-Both presets share the estimate (`estimation/state_estimator.py`). The paper does not state the
+Both presets share the estimate (`estimation/estimate.py`). The paper does not state the
 following, which we chose: A is in scaled units, its threshold comes from the checkpoint, and a
 finding needs five consecutive messages.
 """

@@ -324,7 +324,7 @@ def _check_joints(
         lower, upper = (limit[index] for limit in limits)
         if not -math.inf < lower < upper < math.inf:
             least, most = distinct(lower, upper)
-            limits_text = f'joint {name!r} has limits [{least}, {most}] in robot.urdf'
+            limits_text = f'joint {name!r} has the limits {least} to {most} in robot.urdf'
             expected = 'expected finite lower < upper in its <limit>'
             raise fail(f'$.joints[{i}]: {limits_text}; {expected}')
 

@@ -43,9 +43,9 @@ class JointUnit(NamedTuple):
         return f'{theta * self.radian:{form}} {self.position}'
 
     def range_text(self, low: float, high: float, form: str = '.2f') -> str:
-        """Return a range of positions with its unit, such as '[0.00, 0.05] m', for θ [rad]."""
+        """Return a range of positions with its unit, such as '0.00 to 0.05 m', for θ [rad]."""
         low, high = low * self.radian, high * self.radian
-        return f'[{low:{form}}, {high:{form}}] {self.position}'
+        return f'{low:{form}} to {high:{form}} {self.position}'
 
     def torque_text(self, torque: float, form: str = '.2f') -> str:
         """Return a joint torque, or the force on a prismatic joint, for a torque in [N·m]."""

@@ -47,7 +47,7 @@ def run(name: str) -> int:
         kinds = []
         for node in COMBINED.get(name, (name,)):
             module = import_module(f'musculoskeletal_ae.nodes.{node}')
-            kinds.append(getattr(module, node.title().replace('_', '')))
+            kinds.append(getattr(module, f'{node.title().replace("_", "")}Node'))
         with STOP.reacting(Reaction.REMEMBER):
             _run(kinds)
     except MusculoskeletalError as error:

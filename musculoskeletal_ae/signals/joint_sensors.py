@@ -31,8 +31,8 @@ LEAST_MOTION = 0.05  # judge a joint only if the range of its θ is at least thi
 #: and both emulator models, a_j of joints that moved enough is between 0.4 and 1.9.
 LEAST_SCALE = 0.3
 BEYOND = 0.3  # let a correct θ exceed the joint limits by at most this [rad]
-#: Another unit, order or sign of θ (`_hypotheses`) is assumed if it reduces the misfit of l to less
-#: than this fraction.
+#: Another unit, order or sign of θ (`_possible_faults`) is assumed if it reduces the misfit of l to
+#: less than this fraction.
 BETTER = 0.8
 MOST_SAMPLES = 600  # use at most this many messages, evenly distributed
 LEAST_SAMPLES = 20  # judge sensors only by at least this many messages
@@ -106,17 +106,18 @@ def judge(
     used = np.ones(robot.muscle_count, dtype=bool) if used is None else used
     segments = np.zeros(len(theta), dtype=int) if segments is None else segments
     lengths = _Lengths(robot, length[rows], tension[rows], used, segments[rows])
-    measured = _Hypothesis(None, theta[rows])
-    best, signs = measured, lengths.signs(measured.theta)
-    least = BETTER * lengths.misfit(best.theta * signs.sign)
-    for other in _hypotheses(lengths, theta[rows]):
-        others = lengths.signs(other.theta)
-        if (misfit := lengths.misfit(other.theta * others.sign)) < least:
-            best, signs, least = other, others, misfit
-    faults = [] if best.fault is None else [best.fault]
+    best: JointFault | None = None  # the fault that explains the lengths best; None for no fault
+    signs = lengths.signs(theta[rows])
+    least = BETTER * lengths.misfit(theta[rows] * signs.sign)
+    for fault in _possible_faults(lengths, theta[rows]):
+        true = corrected(theta[rows], [fault], robot.units)
+        others = lengths.signs(true)
+        if (misfit := lengths.misfit(true * others.sign)) < least:
+            best, signs, least = fault, others, misfit
+    faults = [] if best is None else [best]
     reversed_joints = set(np.flatnonzero(signs.sign < 0.0).tolist())
-    if best.fault is not None and best.fault.kind == SIGN:
-        reversed_joints ^= set(best.fault.joints)
+    if best is not None and best.kind == SIGN:
+        reversed_joints ^= set(best.joints)
         faults = []
     if reversed_joints:
         faults.append(JointFault(SIGN, tuple(sorted(reversed_joints))))
@@ -190,13 +191,6 @@ def stuck_sensors(
             if is_moving or abs(np.median(away)) > STUCK_OFFSET:
                 faults.append(JointFault(STUCK, (j,), float(time[begin]), float(time[end])))
     return faults
-
-
-class _Hypothesis(NamedTuple):
-    """An assumption about a fault of the joint sensors, and the angles that follow from it."""
-
-    fault: JointFault | None  # the fault that is assumed; None if the angles are taken as they are
-    theta: Array  # θ [rad], (N, D), corrected for this fault
 
 
 class _Signs(NamedTuple):
@@ -299,8 +293,8 @@ def _solve(products: Array, right: Array) -> Array:
     return solution
 
 
-def _hypotheses(lengths: _Lengths, theta: Array) -> Iterator[_Hypothesis]:
-    """Yield the faults of joint sensors that could explain the measured θ (N, D).
+def _possible_faults(lengths: _Lengths, theta: Array) -> list[JointFault]:
+    """Return the faults of joint sensors that could explain the measured θ (N, D).
 
     The faults are wrong signs, degrees instead of radians, and two exchanged joints.
     """
@@ -314,12 +308,11 @@ def _hypotheses(lengths: _Lengths, theta: Array) -> Iterator[_Hypothesis]:
         degrees = sorted({*far} & {*turning}), turning
         faults += [JointFault(DEGREES, tuple(joints)) for joints in degrees if joints]
     pairs = list(combinations(np.flatnonzero(lengths.moved(theta)).tolist(), 2))
-    if pairs:  # yield only the best exchange, because the caller's search for signs takes time
+    if pairs:  # state only the best exchange, because the caller's search for signs takes time
         exchanges = [JointFault(ORDER, pair) for pair in pairs]
         misfits = [lengths.misfit(corrected(theta, [fault], robot.units)) for fault in exchanges]
         faults.append(exchanges[int(np.argmin(misfits))])
-    for fault in faults:
-        yield _Hypothesis(fault, corrected(theta, [fault], robot.units))
+    return faults
 
 
 def _repeats(time: Array, values: Array) -> Iterator[tuple[int, int]]:

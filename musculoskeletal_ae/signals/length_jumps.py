@@ -30,7 +30,7 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.arrival import longer_pause
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
-from musculoskeletal_ae.signals.limits import LENGTH_JUMPED, LIMITS
+from musculoskeletal_ae.signals.limits import LENGTH_JUMPED, LIMITS, slack_tension
 
 #: count a change of more than this fraction of the legal change as a possible part of a jump
 LARGE = 0.5
@@ -100,7 +100,7 @@ class PresumedRupture:
     """
 
     def __init__(self, robot: Robot) -> None:
-        self._slack = LIMITS.slack_share * robot.description.tension.bias
+        self._slack = slack_tension(robot.description.tension.bias)
         #: for which muscles a rupture is presumed, (M,)
         self._presumed: Bools = np.zeros(robot.muscle_count, dtype=bool)
         #: time at which each of these muscles began to pull again [s], (M,); ∞ if it does not pull

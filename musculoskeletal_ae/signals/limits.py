@@ -8,7 +8,7 @@ range, and tensions reached 343 N.
 """
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
+
+Tension = TypeVar('Tension', float, Array)
 
 
 class Limits(NamedTuple):
@@ -48,7 +50,6 @@ class Limits(NamedTuple):
     length_margin: float = 0.1
     #: distance by which a slack tendon can be shorter than `length_margin` permits [m]
     slack_length_margin: float = 1.0
-    slack_share: float = 0.2  # tension below which a tendon is slack, as a fraction of T_bias
     # Between two messages, a length changes by at most `step + speed · dt`. dt is the time between
     # the messages, limited to `longest_step`. A length that has jumped is accepted after it has
     # stayed at the new level for `settled`.
@@ -63,10 +64,17 @@ class Limits(NamedTuple):
 
 
 LIMITS = Limits()
+#: tension below which a tendon is slack, as a fraction of T_bias or of the demanded tension
+SLACK_SHARE = 0.2
 POSTURES = 500  # search this many random postures for the extremes of `length_range`
 
 #: reason under which messages with a jump of a length are counted
 LENGTH_JUMPED = 'length jumped'
+
+
+def slack_tension(of: Tension) -> Tension:
+    """Return the tensions below which tendons are slack [N], for T_bias or demanded tensions."""
+    return SLACK_SHARE * of
 
 
 def reading_range(robot: Robot) -> tuple[Array, Array]:

@@ -22,7 +22,7 @@ from musculoskeletal_ae.arrival import is_later, nanoseconds
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.message_reading import joint_names, read_array
 from musculoskeletal_ae.robot.motors import ARRAY, JOINT_STATE, NO_MOTORS, Motors
-from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, MuscleReading, Row
+from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Row
 
 STATES = 'muscle_states'
 
@@ -70,7 +70,7 @@ class MotorInterface:
         self._stamp = 0  # the last stamp [ns]; 0 before the first
 
     def reading(self, message: Any) -> Any:
-        """Return a message of `state_topic` in the format of muscle_states.
+        """Return the rows of muscle_states that a message of `state_topic` states, (Q, M).
 
         Messages of muscle_states are returned unchanged.
 
@@ -98,7 +98,7 @@ class MotorInterface:
             if len(message.effort):
                 effort = np.array(message.effort, dtype=float)[self._places]
                 rows[Row.TENSION] = self._tension_per_effort * (effort - self._effort_zero)
-        return MuscleReading(rows.ravel())
+        return rows
 
     def command(self, length: Array) -> Array:
         """Return the motor positions that command lengths, in the order of the motor commands.

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a muscle module reports: one row for each quantity, in the order of `QUANTITIES`.
 
-A message of `muscle_states` has these rows, with one column for each muscle. To add a quantity, add
-its entry to `QUANTITIES`. Messages may then have its row; its values are checked, and
-`MuscleSample.newest` contains them. What else a quantity needs if the emulator reports it, or if a
-part of the package uses it, is in doc/explanation/architecture.md ("How to add …").
+A message of `muscle_states` has these rows, with one column for each muscle. Readings that did not
+arrive as a message are passed on as an array of these rows (`muscle_reading`).
+
+To add a quantity, add its entry to `QUANTITIES`. Messages may then have its row; its values are
+checked, and `MuscleSample.newest` contains them. What else a quantity needs if the emulator reports
+it, or if a part of the package uses it, is in doc/explanation/architecture.md ("How to add …").
 """
 
 from __future__ import annotations
@@ -82,22 +84,8 @@ def possible_readings(robot: Robot) -> tuple[Array, Array]:
     return possible[0], possible[1]
 
 
-class ReadingLayout(NamedTuple):
-    """The layout of a `MuscleReading`: no named dimensions and no offset."""
-
-    dim: tuple[()] = ()
-    data_offset: int = 0
-
-
-class MuscleReading(NamedTuple):
-    """One reading of all muscle modules, with the fields of a `muscle_states` message."""
-
-    data: Array  # (Q·M,): one row of M values for each of the Q quantities
-    layout: ReadingLayout = ReadingLayout()
-
-
-def reading_rows(robot: Robot, **values: Array) -> Array:
-    """Return the rows of a message of `muscle_states`, (Q, M).
+def muscle_reading(robot: Robot, **values: Array) -> Array:
+    """Return a reading of all muscle modules: the rows of a message of `muscle_states`, (Q, M).
 
     Args:
         robot: The robot; if its modules report motor currents, tensions are converted to currents.
@@ -110,8 +98,3 @@ def reading_rows(robot: Robot, **values: Array) -> Array:
             rows[row] = values[quantity.name]
     rows[Row.TENSION] = robot.tension_source.to_message(rows[Row.TENSION])
     return rows
-
-
-def muscle_reading(robot: Robot, **values: Array) -> MuscleReading:
-    """Return a reading that was not received as a message; arguments as of `reading_rows`."""
-    return MuscleReading(reading_rows(robot, **values).ravel())

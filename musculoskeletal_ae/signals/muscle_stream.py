@@ -114,22 +114,6 @@ class MuscleSample:
         return replace(self, length=self.length - offset, newest=newest)
 
 
-class MedianFilter:
-    """Computes the median of each value over the last messages, to remove outliers."""
-
-    def __init__(self, window: int) -> None:
-        self._last: deque[Array] = deque(maxlen=window)  # readings, (Q, M) each
-
-    def step(self, states: Array) -> Array:
-        """Return the median of the last messages, of which `states` (Q, M) is the newest."""
-        self._last.append(states)
-        return states if len(self._last) == 1 else median_of_rows(np.array(self._last))
-
-    def reset(self) -> None:
-        """Discard all messages."""
-        self._last.clear()
-
-
 class MuscleStream:
     """Turns the messages of one arm's muscle modules into samples.
 
@@ -152,8 +136,8 @@ class MuscleStream:
         self.use_transmission(Transmission(np.zeros(robot.muscle_count)))
         self._levels = LevelCheck(robot)
         self._temperatures = TemperatureCheck(robot.muscle_count)
-        self._median = MedianFilter(window)
-        #: readings of the last messages, accepted or not, (Q, M) each
+        #: readings of the last messages that were accepted, and of all last messages, (Q, M) each
+        self._accepted: deque[Array] = deque(maxlen=window)
         self._received: deque[Array] = deque(maxlen=window)
         self._implausible = Persistence()
         self.jumps = LengthJumps(robot)
@@ -163,7 +147,7 @@ class MuscleStream:
         """Discard earlier messages, for example after a jump of the clock."""
         self.jumps.reset()
         self._direction = FrictionDirection()
-        self._median.reset()
+        self._accepted.clear()
         self._received.clear()
         self._time = math.inf  # reception of the last sample [s]
         self._sample_delay = 0.0  # delay of the last sample [s]
@@ -202,7 +186,7 @@ class MuscleStream:
     def take(
         self, message: Any, time: float, now: float | None = None, delay: float = 0.0
     ) -> MuscleSample:
-        """Check and convert a message, or a `MuscleReading`.
+        """Check and convert a message, or its rows (`muscle_reading`).
 
         Args:
             message: The message.
@@ -246,7 +230,8 @@ class MuscleStream:
         if time < self._time or pause > LIMITS.pause:
             self._direction.reset()
         self._time, self._sample_delay = time, delay
-        read = self._median.step(states)
+        self._accepted.append(states)
+        read = states if len(self._accepted) == 1 else median_of_rows(np.array(self._accepted))
         length, tension = read[Row.LENGTH] - offsets.offset, read[Row.TENSION]
         sliding = self._direction.step(length)
         newest[Row.TENSION] = self._transmission.motor(newest[Row.TENSION], sliding)

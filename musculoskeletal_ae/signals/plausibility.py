@@ -10,7 +10,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.limits import LIMITS, slack_tension
 from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Row, possible_readings
 
 
@@ -21,7 +21,7 @@ class LevelCheck:
         self._robot = robot
         #: lowest and highest possible value of each quantity, (Q, M)
         self._low, self._high = possible_readings(robot)
-        self._slack = LIMITS.slack_share * robot.description.tension.bias
+        self._slack = slack_tension(robot.description.tension.bias)
 
     def plausible_pull(self, states: Array, offset: Array) -> Array:
         """Return the plausible lengths [m] and tensions [N] of a message, together (2, M).

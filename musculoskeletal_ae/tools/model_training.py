@@ -70,14 +70,16 @@ def train(args: Namespace) -> None:
     off = trained.mae.estimate(states.tension, states.length).theta - states.theta
     print(
         f'error on the geometric model: {robot.units.error_text(off, ".3f")} (mean over unseen '
-        'states, from T and l)'
+        'states, from T and l)',
+        file=sys.stderr,
+        flush=True,
     )
     has_slides = bool(robot.units.slides.any())
     rack = f'; {1e3 * RACK:g} mm of a prismatic joint count as 1 rad' * has_slides
-    print(table(planned, f'{HELD_OUT_STATES} unseen states, T in [0, {shown(limit)}] N{rack}'))
+    print(table(planned, f'{HELD_OUT_STATES} unseen states, T from 0 to {shown(limit)} N{rack}'))
     if (most > limit).any():
         overload = pair_errors(trained.mae, random_states(robot, HELD_OUT_STATES, rng, most, limit))
-        print(table(overload, f'overload: T in [{shown(limit)}, {shown(most)}] N'))
+        print(table(overload, f'overload: T from {shown(limit)} to {shown(most)} N'))
     print(joint_table(robot, planned))
     print(f'checkpoint: {args.out}')
     save_plot(args.plot, lambda: plot(robot, trained, planned))
@@ -143,7 +145,7 @@ def plot(robot: Robot, trained: Trained, errors: list[PairError]) -> Any:
     curve.grid(alpha=0.3)
     text.axis('off')
     limit = robot.tension.limit
-    states = f'{HELD_OUT_STATES} unseen states, T in [0, {shown(limit)}] N'
+    states = f'{HELD_OUT_STATES} unseen states, T from 0 to {shown(limit)} N'
     text.set_title(f'Mean norm of the error, {states}')
     cells = [[f'{e.norm:.4f} {e.unit}' for e in errors if e.mask is mask] for mask in ENTERED]
     grid = text.table(

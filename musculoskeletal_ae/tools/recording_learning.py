@@ -66,7 +66,7 @@ LARGEST_ZERO = 0.03
 MOST_IMPOSSIBLE = 0.5
 
 
-class Source(NamedTuple):
+class TableSource(NamedTuple):
     """A recording or a part of one, to learn from or to measure the error on."""
 
     name: str
@@ -146,15 +146,15 @@ def train(args: Namespace) -> None:
     _warn(warnings)
 
 
-def _bag_sources(robot: Robot, args: Namespace) -> list[Source]:
+def _bag_sources(robot: Robot, args: Namespace) -> list[TableSource]:
     return [
-        Source(str(path), Table.of_pairs(read(path, robot, args.from_namespace)), is_held_out)
+        TableSource(str(path), Table.of_pairs(read(path, robot, args.from_namespace)), is_held_out)
         for paths, is_held_out in ((args.from_bag, False), (args.hold_out, True))
         for path in paths
     ]
 
 
-def _csv_sources(robot: Robot, args: Namespace) -> list[Source]:
+def _csv_sources(robot: Robot, args: Namespace) -> list[TableSource]:
     """Read the CSV files, hold a part of them out, and bring their lengths to the zeros of θ = 0.
 
     Raises:
@@ -175,14 +175,14 @@ def _csv_sources(robot: Robot, args: Namespace) -> list[Source]:
                 )
                 _warn([f'{path}: {text}'])
             if is_held_out or args.hold_out:
-                sources.append(Source(str(path), table, is_held_out))
+                sources.append(TableSource(str(path), table, is_held_out))
                 continue
             try:
                 learned, held_out = table.split()
             except TableError as error:
                 raise TableError(f'{path}: {error}') from error
-            sources.append(Source(f'{path}, {len(learned)} rows', learned, False))
-            sources.append(Source(f'{path}, {len(held_out)} rows', held_out, True))
+            sources.append(TableSource(f'{path}, {len(learned)} rows', learned, False))
+            sources.append(TableSource(f'{path}, {len(held_out)} rows', held_out, True))
     if len({source.table.at_rest for source in sources}) > 1:
         raise TableError(
             'some files have times and others do not; learn from them separately, with '
@@ -202,7 +202,7 @@ def _table_text(table: Table, columns: tuple[Column, ...]) -> str:
     return f'{len(table)} {what}; ' + ', '.join(f'{kind.value} in {unit}' for kind, unit in units)
 
 
-def _zeros(robot: Robot, sources: list[Source], estimate: bool) -> Array:
+def _zeros(robot: Robot, sources: list[TableSource], estimate: bool) -> Array:
     """Return the length zeros [m] (M,) of the tables that are learned, or 0.
 
     Raises:
@@ -229,7 +229,7 @@ def _zeros(robot: Robot, sources: list[Source], estimate: bool) -> Array:
     return np.zeros(robot.muscle_count)
 
 
-def _check_range(robot: Robot, source: Source) -> None:
+def _check_range(robot: Robot, source: TableSource) -> None:
     """Check whether most values of a joint or muscle are possible; otherwise raise a TableError."""
     rows = source.table.rows
     margin = LIMITS.joint_outside * (robot.upper - robot.lower)
@@ -255,7 +255,7 @@ def _check_range(robot: Robot, source: Source) -> None:
         )
 
 
-def _warnings(robot: Robot, sources: list[Source], is_csv: bool) -> Iterator[str]:
+def _warnings(robot: Robot, sources: list[TableSource], is_csv: bool) -> Iterator[str]:
     """Yield warnings about joint sensors and, in CSV files, about the columns of muscles."""
     for source in sources:
         rows = source.table.rows
@@ -301,7 +301,7 @@ def _initial_network(robot: Robot, args: Namespace) -> Mae:
     return mae
 
 
-def _learns_from_motion(robot: Robot, sources: list[Source], preset: str) -> bool:
+def _learns_from_motion(robot: Robot, sources: list[TableSource], preset: str) -> bool:
     """Return whether to learn from slow moments of a motion, because there are too few rests.
 
     Raises:
@@ -331,7 +331,7 @@ def _learns_from_motion(robot: Robot, sources: list[Source], preset: str) -> boo
     )
 
 
-def _count(robot: Robot, sources: list[Source], enough: int, *, from_motion: bool) -> int:
+def _count(robot: Robot, sources: list[TableSource], enough: int, *, from_motion: bool) -> int:
     """Count how many postures would be learned, up to `enough`."""
     count = 0
     learned = [source for source in sources if not source.is_held_out]
@@ -346,7 +346,7 @@ def _count(robot: Robot, sources: list[Source], enough: int, *, from_motion: boo
     return count
 
 
-def _learn_and_show(learner: Learner, source: Source) -> str:
+def _learn_and_show(learner: Learner, source: TableSource) -> str:
     """Learn from a recording and show the progress; return a warning, or ''."""
     total = work(source.table)
 
@@ -428,7 +428,7 @@ def repetition(robot: Robot, theta: Array, learned: Array) -> str:
     )
 
 
-def _anomalies(robot: Robot, source: Source, mae: Mae, preset: str) -> Iterator[str]:
+def _anomalies(robot: Robot, source: TableSource, mae: Mae, preset: str) -> Iterator[str]:
     """Yield a warning for each segment of a recording that has an anomaly (`anomaly_in`)."""
     if source.table.at_rest:  # the detectors need successive readings
         return

@@ -22,8 +22,8 @@ from bags import bag_samples as samples
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.message_reading import read_array
-from musculoskeletal_ae.nodes.controller import Controller
-from musculoskeletal_ae.nodes.learner import Learner
+from musculoskeletal_ae.nodes.controller import ControllerNode
+from musculoskeletal_ae.nodes.learner import LearnerNode
 from musculoskeletal_ae.ros.messages import SENSOR
 from musculoskeletal_ae.ros_tools import record as record_tool
 from musculoskeletal_ae.ros_tools import replay as replay_tool
@@ -315,7 +315,7 @@ def test_a_replay_begins_when_the_nodes_run_that_it_waits_for(tool, graph, tmp_p
 def test_a_replay_beside_nodes_of_another_robot_says_so(tool, graph, tmp_path):
     content = stream(500)
     samples.write_ours(tmp_path / 'bag', content, 'none', finish=True)
-    graph.host(Learner, robot='arm26', state_directory='')
+    graph.host(LearnerNode, robot='arm26', state_directory='')
     replay = tool('replay', tmp_path / 'bag', *ros(graph))
     graph.wait(lambda: replay.process.poll() is not None, 'the end of the replay')
     output = replay.output()
@@ -405,7 +405,7 @@ def test_a_demonstration_is_replayed_as_one_trajectory(tool, graph, tmp_path):
 
 @pytest.mark.parametrize('takes', [pytest.param(True, marks=pytest.mark.thorough), False])
 def test_the_result_of_a_replayed_demonstration_is_reported(tool, graph, tmp_path, takes):
-    controller = graph.host(Controller, robot='arm26')
+    controller = graph.host(ControllerNode, robot='arm26')
     names = controller.robot.joints
     if takes:
         controller.core.trajectory = lambda *_: None

@@ -28,7 +28,7 @@ def found_later(tmp_path, muscles=MUSCLES):
 def test_the_next_estimator_finds_the_body_by_the_names_of_the_muscles(memory, tmp_path):
     memory.note(FOUND)
     found = found_later(tmp_path, ['triceps', 'brachialis', 'biceps'])
-    assert_array_equal(found.offset, [-0.08, 0.0, 0.05])
+    assert_array_equal(found.offsets.offset, [-0.08, 0.0, 0.05])
     assert found.isolated == (0,)
     assert found.generation == 12
 
@@ -40,13 +40,16 @@ def test_a_healthy_body_with_absolute_sensors_leaves_no_file(memory, tmp_path):
 
 def test_absolute_sensors_keep_offsets_that_are_known_to_be_zero(memory, tmp_path):
     memory.note(replace(HEALTHY, isolated=(0,), generation=1))
-    assert found_later(tmp_path) == (None, (0,), 1)
+    found = found_later(tmp_path)
+    assert (found.offsets.known, found.isolated, found.generation) == (True, (0,), 1)
     trust = np.array([Trust.REVOKED, Trust.KNOWN])
     revoked = replace(HEALTHY, offsets=replace(HEALTHY.offsets, trust=trust), generation=2)
     memory.note(revoked)
-    assert_array_equal(found_later(tmp_path).offset, np.zeros(2))
+    assert_array_equal(found_later(tmp_path).offsets.offset, np.zeros(2))
+    assert not found_later(tmp_path).offsets.known
     memory.note(replace(HEALTHY, generation=3))  # joint sensors agree with the lengths again
-    assert found_later(tmp_path) == (None, (), 3)
+    found = found_later(tmp_path)
+    assert (found.offsets.known, found.isolated, found.generation) == (True, (), 3)
 
 
 def test_provisional_offsets_of_a_calibration_are_not_saved_but_isolated_muscles_are(
@@ -59,14 +62,15 @@ def test_provisional_offsets_of_a_calibration_are_not_saved_but_isolated_muscles
     assert found_later(tmp_path).generation == 13
     memory.note(BodyState(provisional, (0, 1), generation=15))
     found = found_later(tmp_path)
-    assert_array_equal(found.offset, np.zeros(2))
+    assert_array_equal(found.offsets.offset, np.zeros(2))
+    assert not found.offsets.known
     assert found.isolated == (0, 1)
 
 
 def test_a_file_of_an_earlier_version_names_no_isolated_muscles(tmp_path):
     (tmp_path / FILE).write_text('{"generation": 5, "offset": {"biceps": 0.05}}')
     found = BodyMemory(tmp_path, MUSCLES).found
-    assert_array_equal(found.offset, [0.05, 0.0])
+    assert_array_equal(found.offsets.offset, [0.05, 0.0])
     assert (found.isolated, found.generation) == ((), 5)
 
 
@@ -76,7 +80,8 @@ def test_a_file_of_an_earlier_version_names_no_isolated_muscles(tmp_path):
 def test_a_damaged_file_still_says_that_the_offsets_are_unknown(tmp_path, content):
     (tmp_path / FILE).write_text(content)
     found = BodyMemory(tmp_path, MUSCLES).found
-    assert_array_equal(found.offset, np.zeros(2))
+    assert_array_equal(found.offsets.offset, np.zeros(2))
+    assert not found.offsets.known
 
 
 def test_a_body_that_cannot_be_saved_is_reported_and_changes_nothing_else(tmp_path):

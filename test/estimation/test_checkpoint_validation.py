@@ -28,6 +28,7 @@ from musculoskeletal_ae.learning.calibration import Healthy, calibrate
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import Anomaly, BodyState
 
 ROBOT = Robot.load('arm26')
 STILL = np.zeros(ROBOT.muscle_count)  # direction of sliding of tendons that have not slid
@@ -251,10 +252,10 @@ def test_a_network_that_moves_the_posture_by_as_much_as_learning_does_is_accepte
 
 
 def test_joint_sensors_decide_how_far_a_network_may_move_the_posture(trained):
-    gate, mae = CheckpointValidator(ROBOT), trained['default']
+    mae = trained['default']
     learned = replace(_turned(mae, 0.6), covariance=np.eye(ROBOT.joint_count))
     for measures in (True, False):
-        gate.start()
+        gate = CheckpointValidator(ROBOT)
         gate.take(learned, 0.0)
         send_messages_of_the_model(gate, measures)
         compared = gate.agreement(mae)[0]
@@ -266,17 +267,44 @@ def test_joint_sensors_decide_how_far_a_network_may_move_the_posture(trained):
 def test_a_chosen_network_that_fits_worse_is_used_and_called_so(trained, measures):
     gate, mae = CheckpointValidator(ROBOT), trained['default']
     learned = replace(mae, covariance=np.eye(ROBOT.joint_count))
-    assert gate.weakness(_turned(mae, 0.2)) == ''
-    gate.take(learned, 0.0)
-    assert gate.weakness(_turned(mae, 0.2)) == ''  # nothing is known yet
+
+    def choose(network):
+        gate.take(learned, 0.0)
+        gate.choose(network, 1.0)
+        return gate.unsuitable_because
+
+    assert choose(_turned(mae, 0.2)) == ''  # nothing is known yet
     send_messages_of_the_model(gate, measures)
-    assert gate.weakness(replace(learned, version=9)) == ''
     weight, bias = mae.decoder[-1]
     off = replace(mae, decoder=(*mae.decoder[:-1], (weight, bias + 0.3 * np.eye(len(bias))[-1])))
     other = _turned(mae, 0.2) if measures else off  # without sensors, a wrong length tells
-    gate.check(other, is_chosen=True)
-    text = gate.weakness(other)
-    assert ('from its sensor' if measures else 'explains the length of') in text
+    assert ('from its sensor' if measures else 'explains the length of') in choose(other)
+    assert choose(replace(learned, version=9)) == ''
+
+
+def test_decisions_are_told_and_an_anomaly_rejects_the_network_accepted_shortly_before(trained):
+    used = []
+    gate = CheckpointValidator(ROBOT, lambda mae: used.append(mae.version) or mae)
+    told = []
+    gate.accepted = lambda mae: told.append(('accepted', mae.version))
+    gate.rejected = lambda mae, reason: told.append(('rejected', mae.version, reason))
+    first, healthy = trained['default'], BodyState.healthy(ROBOT.muscle_count)
+    gate.follow(healthy, 0.0)
+    gate.decide(replace(first, version=1), 0.0)
+    gate.decide(replace(first, version=1), 1.0)  # it is in use already
+    gate.decide(replace(first, version=2), 20.0)
+    gate.decide(replace(_turned(first, 3.0), version=3), 21.0)
+    proven = gate.follow(healthy.with_anomaly(Anomaly.FOUND, 0), 22.0)
+    assert proven.version == 1
+    assert used == [1, 2, 1]
+    assert [each[:2] for each in told] == [
+        ('accepted', 1),
+        ('accepted', 2),
+        ('rejected', 3),
+        ('accepted', 1),
+        ('rejected', 2),
+    ]
+    assert 'soon after' in told[-1][2]
 
 
 def test_a_network_without_a_calibrated_detector_takes_over_with_that_in_use(trained):

@@ -125,10 +125,11 @@ def test_exchanged_muscles_are_named_without_joint_sensors(robot, mae, moment):
 
 def test_length_offsets_are_found_from_a_stated_posture_if_the_arm_stands(robot, mae, moment):
     theta, *standing = moment(3.0)
-    moved = run(LengthCalibration(robot, mae, theta), moment, 5.0, sees=False, begin=3.0)
+    posture = tuple(theta.tolist())
+    moved = run(LengthCalibration(robot, mae, posture), moment, 5.0, sees=False, begin=3.0)
     assert not moved.is_done and 'call estimator/zero again' in moved.progress
     calibration = run(
-        LengthCalibration(robot, mae, theta), lambda _: (theta, *standing), 2.0, sees=False
+        LengthCalibration(robot, mae, posture), lambda _: (theta, *standing), 2.0, sees=False
     )
     assert calibration.is_done
     np.testing.assert_allclose(calibration.offsets.offset, OFFSET, atol=1e-3)
@@ -197,7 +198,7 @@ def test_the_readings_of_an_isolated_muscle_do_not_disturb_the_length_calibratio
 
 def test_an_isolated_muscle_gets_an_uncertain_length_offset(robot, mae, moment):
     theta, *standing = moment(3.0)
-    calibration = LengthCalibration(robot, mae.without((3,)), theta)
+    calibration = LengthCalibration(robot, mae.without((3,)), tuple(theta.tolist()))
     calibration = run(calibration, lambda _: (theta, *standing), 2.0, sees=False)
     assert calibration.is_done
     off = np.abs(calibration.offsets.offset - OFFSET)

@@ -18,7 +18,7 @@ TENSION = np.full(ARM.muscle_count, 30.0)
 def findings(theta, length_error, joint_error):
     """Return what the detector reports in 4 s in which an arm stands in a posture."""
     mae = ExactMae(ARM)
-    mae.isolated, mae.anomaly = (), SimpleNamespace(calibrated=True)
+    mae.isolated, mae.is_calibrated = (), True
     detector, rng = LengthDisagreement(ARM), np.random.default_rng(0)
     detector.use(mae)
     length = mae.lengths(theta, TENSION) + length_error + rng.normal(0.0, 0.002, len(TENSION))

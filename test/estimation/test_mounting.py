@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Another mounting than that of robot.urdf is found, and payloads, pushes and errors are none."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -22,7 +20,7 @@ class Exploring:
     def __init__(self, gravity, payload=0.0, push=0.0, seed=0):
         self.gravity, self.payload, self.push = gravity, payload, push
         self.mae, self.rng = ExactMae(ARM), np.random.default_rng(seed)
-        self.mae.anomaly = SimpleNamespace(calibrated=True)
+        self.mae.is_calibrated = True
         self.model = pin.Model(ARM.kinematics.model)
         self.model.gravity.linear = gravity
         self.dt = 1.0  # time between two messages [s]

@@ -10,8 +10,8 @@ import pytest
 from graph import PATIENCE
 from std_msgs.msg import Float32MultiArray, Float64MultiArray
 
-from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
+from musculoskeletal_ae.nodes.estimator import EstimatorNode
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros_tools import check_driver
 
@@ -31,7 +31,7 @@ def check_here(graph, *options):
 
 
 def start_driver(graph, **parameters):
-    graph.host(HardwareEmulator, robot='arm26', rate=RATE, **parameters)
+    graph.host(HardwareEmulatorNode, robot='arm26', rate=RATE, **parameters)
     graph.listen(Float64MultiArray, 'muscle_states')
     graph.next('muscle_states')
 
@@ -147,7 +147,7 @@ def test_check_driver_stops_moving_when_a_controller_starts(graph, capsys):
 
 
 def test_nodes_report_the_topics_that_they_wait_for(graph, capfd):
-    graph.host(Estimator, robot='arm26')
+    graph.host(EstimatorNode, robot='arm26')
     logged = ''
 
     def waits():

@@ -10,7 +10,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.nodes.parameters import check_names
 
 
@@ -21,7 +21,7 @@ def test_both_nodes_of_one_process_move_the_arm_and_end_by_one_signal(graph, tra
         (JointState, 'estimated_joint_states'),
     ):
         graph.listen(kind, topic)
-    graph.host(HardwareEmulator, robot='arm26')
+    graph.host(HardwareEmulatorNode, robot='arm26')
     process = graph.start(
         'combined', robot='arm26', checkpoint=trained_file, explore=True, max_age=10.0
     )

@@ -11,7 +11,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.controller import ControllerNode
 from musculoskeletal_ae.nodes.stop_recording import FILE
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.ros.messages import LATCHED
@@ -163,7 +163,7 @@ def test_an_unfit_checkpoint_file_is_refused_and_the_arm_goes_on(moving):
 
 
 def test_an_unfit_accepted_checkpoint_stops_the_controller(graph, trained_file):
-    controller = graph.host(Controller, robot='arm26', checkpoint=trained_file)
+    controller = graph.host(ControllerNode, robot='arm26', checkpoint=trained_file)
     before, supervisor = controller.core.mae, controller.core.supervisor
     graph.send_network(b'not a checkpoint', 'accepted_checkpoint')
     graph.wait(lambda: supervisor.is_latched, 'the stop')

@@ -13,7 +13,7 @@ from graph import Process
 from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.driver.listening import Listening
-from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.controller import ControllerNode
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros.messages import array_message, joint_message
 
@@ -49,7 +49,7 @@ def test_the_driver_template_follows_the_last_command_and_ends_silently(graph):
 
 
 def test_methods_with_tension_commands_are_refused_without_a_driver_for_them(graph):
-    core = graph.host(Controller, robot='arm26').core
+    core = graph.host(ControllerNode, robot='arm26').core
     graph.listen(Float64MultiArray, 'muscle_length_command')
     graph.wait(
         lambda: not graph.set_parameter('controller', 'method', 'float')[0],

@@ -16,15 +16,15 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
+from musculoskeletal_ae.nodes.estimator import EstimatorNode
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros.messages import array_message
 
 
 @pytest.fixture
 def estimator(graph, trained_file):
-    graph.estimator = graph.host(Estimator, robot='arm26', checkpoint=trained_file)
+    graph.estimator = graph.host(EstimatorNode, robot='arm26', checkpoint=trained_file)
     graph.listen(JointState, 'estimated_joint_states')
     graph.listen(JointState, 'vision_joint_states')
     graph.listen(Float64MultiArray, 'estimated_muscle_states')
@@ -216,7 +216,7 @@ def picture(robot, theta):
 
 def test_a_marker_gives_no_angles_of_joints_that_do_not_move_it(graph):
     robot = Robot.load('musashi_upper_body')
-    graph.host(Estimator, robot='musashi_upper_body')
+    graph.host(EstimatorNode, robot='musashi_upper_body')
     observed = graph.listen(JointState, 'vision_joint_states')
     graph.publisher(PoseStamped, 'marker_pose').publish(picture(robot, 0.5 * robot.lower))
     graph.wait(lambda: observed, 'the joint angles')
@@ -253,7 +253,7 @@ def test_a_marker_pose_becomes_joint_angles_with_the_stamp_of_the_picture(estima
 )
 def test_a_wrong_parameter_is_refused_by_name(graph, parameters, error, expected):
     with pytest.raises(error, match=expected):
-        graph.host(Estimator, **{'robot': 'arm26', **parameters})
+        graph.host(EstimatorNode, **{'robot': 'arm26', **parameters})
 
 
 def test_the_covariance_of_the_network_is_published(graph, arm26, trained_file, tmp_path):
@@ -261,9 +261,9 @@ def test_the_covariance_of_the_network_is_published(graph, arm26, trained_file, 
     mae = replace(checkpoint.load(trained_file, arm26), covariance=covariance)
     file = tmp_path / 'sure.safetensors'
     checkpoint.save(mae, file)
-    node = graph.host(Estimator, robot='arm26', checkpoint=str(file))
+    node = graph.host(EstimatorNode, robot='arm26', checkpoint=str(file))
     reported = graph.listen(Float64MultiArray, 'estimated_joint_covariance')
-    graph.host(HardwareEmulator, robot='arm26')
+    graph.host(HardwareEmulatorNode, robot='arm26')
     message = graph.wait(lambda: reported and reported[-1], 'the covariance')
     np.testing.assert_array_equal(np.reshape(message.data, (2, 2)), covariance)
     assert '0.020' in node.report().values['joint uncertainty']
@@ -290,7 +290,7 @@ def test_silence_of_the_driver_is_an_error_also_for_a_node_that_has_just_started
 
 
 def test_messages_that_keep_coming_too_slowly_are_a_warning(graph, trained_file, healthy):
-    node = graph.host(Estimator, robot='arm26', checkpoint=trained_file, rate=1000.0)
+    node = graph.host(EstimatorNode, robot='arm26', checkpoint=trained_file, rate=1000.0)
     muscles = graph.publisher(Float64MultiArray, 'muscle_states')
     reports = graph.listen(DiagnosticArray, '/diagnostics')
 

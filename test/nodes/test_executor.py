@@ -14,7 +14,7 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.bringup_status import BringupStatus
+from musculoskeletal_ae.nodes.bringup_status import BringupStatusNode
 from musculoskeletal_ae.ros import executor
 
 
@@ -56,7 +56,7 @@ def test_under_every_executor_a_node_counts_exceptions_goes_on_and_ends_with_sta
 
 
 def test_an_exception_of_a_node_s_callback_is_counted_by_topic(graph):
-    node = graph.host(BringupStatus, robot='arm26')
+    node = graph.host(BringupStatusNode, robot='arm26')
 
     def fails(message):
         raise ValueError(message.data)

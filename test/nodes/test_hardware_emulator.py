@@ -13,7 +13,7 @@ from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.message_reading import read_muscle_states
-from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.ros.messages import LATCHED, array_message
 
@@ -25,7 +25,7 @@ def arm(graph):
     graph.listen(String, 'robot_description', LATCHED)
     graph.listen(MarkerArray, 'hardware_emulator/markers')
     graph.listen(PoseStamped, 'marker_pose')
-    graph.emulator = graph.host(HardwareEmulator, robot='arm26', seed=1)
+    graph.emulator = graph.host(HardwareEmulatorNode, robot='arm26', seed=1)
     graph.next('muscle_states')
     graph.next('joint_states')
     return graph
@@ -119,7 +119,7 @@ def test_a_marker_pose_is_published_on_request(graph, arm26):
     for kind, topic in ((JointState, 'joint_states'), (PoseStamped, 'marker_pose')):
         graph.listen(kind, topic)
     arm = graph
-    arm.host(HardwareEmulator, robot='arm26', sensors=['joints', 'marker:30'])
+    arm.host(HardwareEmulatorNode, robot='arm26', sensors=['joints', 'marker:30'])
     pose = arm.next('marker_pose', 3)
     assert pose.header.frame_id == arm26.root_link
     theta = np.array(arm.received['joint_states'][-1].position)
@@ -181,7 +181,7 @@ def test_faults_are_switched_at_run_time(arm, arm26):
 
 def test_without_joint_sensors_there_are_no_joint_states(graph):
     graph.listen(Float64MultiArray, 'muscle_states')
-    graph.host(HardwareEmulator, robot='arm26', sensors=[''])
+    graph.host(HardwareEmulatorNode, robot='arm26', sensors=[''])
     graph.next('muscle_states', 10)
     assert graph.node.count_publishers('joint_states') == 0
 
@@ -190,7 +190,7 @@ def test_the_foreign_emulator_has_the_same_topics(graph, arm26):
     graph.listen(Float64MultiArray, 'muscle_states')
     graph.listen(JointState, 'joint_states')
     graph.listen(MarkerArray, 'hardware_emulator/markers')
-    graph.emulator = graph.host(HardwareEmulator, robot='arm26', reality='foreign')
+    graph.emulator = graph.host(HardwareEmulatorNode, robot='arm26', reality='foreign')
     start = rows(graph, arm26)[0]
     drive(graph, start - 0.02, lambda: rows(graph, arm26)[1].max() > 60.0, 'tension')
     assert tuple(graph.next('joint_states').name) == arm26.joints
@@ -200,20 +200,20 @@ def test_the_foreign_emulator_has_the_same_topics(graph, arm26):
 
 
 def test_an_accelerometer_is_published_on_request(graph):
-    graph.host(HardwareEmulator, robot='arm26', sensors=['imu:hand'], frame_prefix='left/')
+    graph.host(HardwareEmulatorNode, robot='arm26', sensors=['imu:hand'], frame_prefix='left/')
     read = graph.listen(Imu, 'imu')
     message = graph.wait(lambda: read and read[-1], 'the accelerometer')
     assert message.header.frame_id == 'left/hand'
     held = message.linear_acceleration
     assert abs(np.linalg.norm([held.x, held.y, held.z]) - 9.81) < 0.5
     with pytest.raises(MusculoskeletalError, match=r'parameter sensors: .*forearm'):
-        graph.host(HardwareEmulator, robot='arm26', sensors=['imu:knee'])
+        graph.host(HardwareEmulatorNode, robot='arm26', sensors=['imu:knee'])
 
 
 def test_the_sensor_of_a_prismatic_joint_is_published_in_metres(graph, tmp_path):
     write_robot(tmp_path / 'slider', slider=True)
     graph.listen(JointState, 'joint_states')
-    graph.host(HardwareEmulator, robot=str(tmp_path / 'slider'), seed=1)
+    graph.host(HardwareEmulatorNode, robot=str(tmp_path / 'slider'), seed=1)
     joints = graph.next('joint_states')
     assert joints.name[-1] == 'wrist'
     assert -0.01 < joints.position[-1] < 0.06

@@ -9,7 +9,7 @@ from controlled_arm import ControlledArm
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.nodes.estimator import Estimator
+from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.signals.body_state import Anomaly
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -0.9])
@@ -105,7 +105,7 @@ def test_muscles_are_isolated_by_service_and_unknown_names_are_refused(arm, trai
 def test_a_restarted_estimator_remembers_isolated_muscles(graph, arm26, trained):
     bodies = graph.follow_body()
     names = list(arm26.muscles[1:3])
-    estimator = graph.host(Estimator, robot='arm26', isolate_muscles=names)
+    estimator = graph.host(EstimatorNode, robot='arm26', isolate_muscles=names)
     graph.send_network(checkpoint.to_bytes(replace(trained['default'], version=5)))
     graph.wait(lambda: estimator.checkpoint_version == 5, 'the network')
     assert graph.set_parameter('estimator', 'isolate_muscles', names[:1])[0]
@@ -113,7 +113,7 @@ def test_a_restarted_estimator_remembers_isolated_muscles(graph, arm26, trained)
     graph.wait(lambda: bodies and bodies[-1].isolated == (2,), 'the restored muscle')
     before = bodies[-1]
     graph.end(estimator)
-    restarted = graph.host(Estimator, robot='arm26')
+    restarted = graph.host(EstimatorNode, robot='arm26')
     graph.wait(lambda: bodies[-1].generation > before.generation, 'its first body state')
     assert bodies[-1].isolated == (2,)
     # The learner's network may name other muscles, but only the estimator decides.
@@ -128,7 +128,7 @@ def test_the_estimator_isolates_no_muscle_because_a_network_lacks_it(graph, trai
     file = str(tmp_path / 'without.safetensors')
     checkpoint.save(trained['default'].without((4,)), file)
     bodies = graph.follow_body()
-    graph.host(Estimator, robot='arm26', checkpoint=file)
+    graph.host(EstimatorNode, robot='arm26', checkpoint=file)
     graph.wait(lambda: bodies, 'the body state')
     assert bodies[-1].isolated == ()
 
@@ -141,7 +141,7 @@ def test_a_stop_outlasts_a_restart_of_the_estimator_and_no_suspect_is_used_again
     graph.wait(lambda: arm.state().values['mode'] == 'verifying', 'the verification')
     graph.end(arm.estimator)
     count = len(bodies)
-    arm.estimator = graph.host(Estimator, robot='arm26', checkpoint=arm.checkpoint)
+    arm.estimator = graph.host(EstimatorNode, robot='arm26', checkpoint=arm.checkpoint)
     graph.wait(lambda: len(bodies) > count, 'the body state of the new estimator')
     assert (bodies[-1].isolated, bodies[-1].anomaly) == ((3,), Anomaly.NONE)
     graph.wait(lambda: arm.state().values['mode'] == 'stopped', 'the end of the verification')

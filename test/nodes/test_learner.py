@@ -23,10 +23,10 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.state import NETWORK, NEWEST
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.nodes.controller import Controller
-from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
-from musculoskeletal_ae.nodes.learner import Learner
+from musculoskeletal_ae.nodes.controller import ControllerNode
+from musculoskeletal_ae.nodes.estimator import EstimatorNode
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
+from musculoskeletal_ae.nodes.learner import LearnerNode
 from musculoskeletal_ae.ros.messages import LATCHED, array_message
 from musculoskeletal_ae.ros.running import NICENESS
 from musculoskeletal_ae.signals.body_state import Anomaly, BodyState
@@ -84,7 +84,7 @@ class HostedLearner:
 
     def __init__(self, graph, robot, **parameters):
         self.graph = graph
-        self.node = graph.host(Learner, robot='arm26', **parameters)
+        self.node = graph.host(LearnerNode, robot='arm26', **parameters)
         graph.listen(UInt8MultiArray, 'mae_checkpoint', LATCHED)
         self.arm = Arm(graph, robot)
         self.node.now = lambda: self.arm.time
@@ -413,10 +413,10 @@ def test_a_killed_learner_resumes_from_its_saved_state_and_ctrl_c_ends_it_with_i
 @pytest.mark.usefixtures('here')
 def test_learning_works_with_a_marker_instead_of_joint_sensors(graph, arm26, trained_file):
     common = {'robot': 'arm26', 'checkpoint': trained_file}
-    graph.host(HardwareEmulator, robot='arm26', sensors=['marker:30'])
-    graph.host(Estimator, **common)
-    graph.host(Controller, **common, explore=True, max_age=10.0)
-    learner = graph.host(Learner, **common, state_directory='', joint_source='marker')
+    graph.host(HardwareEmulatorNode, robot='arm26', sensors=['marker:30'])
+    graph.host(EstimatorNode, **common)
+    graph.host(ControllerNode, **common, explore=True, max_age=10.0)
+    learner = graph.host(LearnerNode, **common, state_directory='', joint_source='marker')
     observed = graph.listen(JointState, 'vision_joint_states')
     graph.wait(lambda: observed, 'joint angles from the marker')
     assert tuple(observed[-1].name) == arm26.joints

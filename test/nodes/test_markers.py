@@ -15,8 +15,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.arm import Frames
-from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
+from musculoskeletal_ae.nodes.estimator import EstimatorNode
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.ros_tools import render
 
@@ -27,8 +27,8 @@ def test_markers_of_estimate_and_hardware_differ_and_have_names_and_prefixed_fra
     graph, arm26, trained_file
 ):
     options = {'robot': 'arm26', 'frame_prefix': 'left/'}
-    graph.host(Estimator, **options, checkpoint=trained_file, mirror_muscles=True)
-    graph.host(HardwareEmulator, **options)
+    graph.host(EstimatorNode, **options, checkpoint=trained_file, mirror_muscles=True)
+    graph.host(HardwareEmulatorNode, **options)
     arms = ('estimated', 'hardware_emulator')
     for arm in arms:
         graph.listen(MarkerArray, f'{arm}/markers')
@@ -70,7 +70,7 @@ def test_render_draws_the_emulated_arm_or_without_an_emulator_the_estimate(
 
     graph.node.create_timer(0.1, publish)
     if emulated:
-        graph.host(HardwareEmulator, robot='arm26')
+        graph.host(HardwareEmulatorNode, robot='arm26')
     out = tmp_path / 'arm.png'
     with graph.spinning():
         status = render.main(

@@ -12,12 +12,12 @@ from rclpy.parameter import Parameter as RosParameter
 from robots import write_robot
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.controller import Controller
-from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
-from musculoskeletal_ae.nodes.learner import Learner
+from musculoskeletal_ae.nodes.controller import ControllerNode
+from musculoskeletal_ae.nodes.estimator import EstimatorNode
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
+from musculoskeletal_ae.nodes.learner import LearnerNode
 from musculoskeletal_ae.nodes.parameters import PARAMETERS, yaml_text
-from musculoskeletal_ae.nodes.sim import Sim
+from musculoskeletal_ae.nodes.sim import SimNode
 from musculoskeletal_ae.parameters import Parameter
 
 FILE = Path(__file__).resolve().parents[2] / 'config' / 'nodes.yaml'
@@ -75,7 +75,9 @@ def test_every_number_has_a_range_in_which_its_default_is(node):
             assert all(low <= number <= high for number in numbers), name
 
 
-@pytest.mark.parametrize('kind', [Controller, Estimator, HardwareEmulator, Learner, Sim])
+@pytest.mark.parametrize(
+    'kind', [ControllerNode, EstimatorNode, HardwareEmulatorNode, LearnerNode, SimNode]
+)
 def test_every_parameter_that_is_settable_is_followed(graph, kind):
     node = graph.host(kind, robot='arm26')
     settable = {name for name, p in PARAMETERS[node.get_name()].items() if p.settable}
@@ -86,9 +88,9 @@ def test_every_parameter_that_is_settable_is_followed(graph, kind):
 @pytest.mark.parametrize(
     ('kind', 'name', 'value'),
     [
-        (Controller, 'joint_stiffness', [-1.0, -1.0]),
-        (Controller, 'max_age', float('nan')),
-        (HardwareEmulator, 'faults', ['melt']),
+        (ControllerNode, 'joint_stiffness', [-1.0, -1.0]),
+        (ControllerNode, 'max_age', float('nan')),
+        (HardwareEmulatorNode, 'faults', ['melt']),
     ],
 )
 def test_a_value_that_is_not_legal_is_refused_at_the_start(graph, kind, name, value):
@@ -97,7 +99,7 @@ def test_a_value_that_is_not_legal_is_refused_at_the_start(graph, kind, name, va
 
 
 @pytest.mark.parametrize(
-    ('kind', 'name'), [(HardwareEmulator, 'faults'), (Controller, 'joint_stiffness')]
+    ('kind', 'name'), [(HardwareEmulatorNode, 'faults'), (ControllerNode, 'joint_stiffness')]
 )
 def test_an_empty_list_at_the_start_is_an_empty_list(graph, kind, name, tmp_path):
     file = tmp_path / 'nodes.yaml'
@@ -112,28 +114,28 @@ def test_an_empty_list_at_the_start_is_an_empty_list(graph, kind, name, tmp_path
 
 def test_an_arm_of_one_joint_may_stand_at_0_to_find_its_zeros(graph, tmp_path):
     robot = str(write_robot(tmp_path, joints=['swing']))
-    assert graph.host(Estimator, robot=robot).posture == ()
+    assert graph.host(EstimatorNode, robot=robot).posture == ()
     graph.end(graph.hosted[0])
-    assert graph.host(Estimator, robot=robot, zero_posture=[0.0]).posture == (0.0,)
+    assert graph.host(EstimatorNode, robot=robot, zero_posture=[0.0]).posture == (0.0,)
 
 
 @pytest.mark.parametrize(
     ('kind', 'parameters', 'kept'),
     [
         (
-            Estimator,
+            EstimatorNode,
             {'zero_posture': [0.0, -1.0], 'isolate_muscles': ['tail']},
             lambda node: node.posture,
         ),
         # Setting `checkpoint` would replace the network in use, which may have learned much.
         (
-            Estimator,
+            EstimatorNode,
             {'checkpoint': '', 'isolate_muscles': ['tail']},
             lambda node: id(node.core.mae),
         ),
         # Setting `method` would end the exploration.
         (
-            Controller,
+            ControllerNode,
             {'method': 'float', 'joint_stiffness': [1.0]},
             lambda node: node.core.supervisor.explores,
         ),
@@ -144,7 +146,7 @@ def test_of_parameters_set_together_none_is_taken_if_one_is_refused(
 ):
     required = {'checkpoint': trained_file} if 'checkpoint' in parameters else {}
     node = graph.host(
-        kind, robot='arm26', **required, **{'explore': True} if kind is Controller else {}
+        kind, robot='arm26', **required, **{'explore': True} if kind is ControllerNode else {}
     )
     before = kept(node)
     one, other = (

@@ -10,7 +10,7 @@ from controlled_arm import ControlledArm
 from graph import Process
 from std_srvs.srv import Trigger
 
-from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.controller import ControllerNode
 
 PAGE = Path(__file__).parents[2] / 'doc' / 'howto' / 'command_from_python.md'
 PROGRAMS = re.findall(r'```python\n(.*?)```', PAGE.read_text('utf-8'), re.S)
@@ -102,7 +102,7 @@ def test_the_second_program_breaks_and_repairs_a_muscle_and_the_arm_explores_on(
 
 def test_the_other_programs_call_services_and_set_parameters(graph, tmp_path):
     _, _, call, set_parameter = PROGRAMS
-    controller = graph.host(Controller, robot='arm26')
+    controller = graph.host(ControllerNode, robot='arm26')
     printed = run(graph, tmp_path, call, 'controller/explore', expected_status=1)
     assert 'controller/explore needs a value' in printed
     printed = run(graph, tmp_path, call, 'controller/stop').splitlines()

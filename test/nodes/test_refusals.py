@@ -10,12 +10,12 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from musculoskeletal_ae import reception
-from musculoskeletal_ae.nodes.controller import Controller
+from musculoskeletal_ae.nodes.controller import ControllerNode
 
 
 def test_a_refused_command_is_shown_for_some_seconds_with_its_reason(graph, monkeypatch):
     monkeypatch.setattr(reception, 'SHOWN', 3.0)
-    graph.host(Controller, robot='arm26')
+    graph.host(ControllerNode, robot='arm26')
     graph.listen(DiagnosticArray, '/diagnostics')
     beyond = JointTrajectoryPoint(positions=[-99.0], time_from_start=Duration(sec=1))
     unknown = JointState(name=['elbo'], position=[0.1])
@@ -40,7 +40,7 @@ def test_a_refused_command_is_shown_for_some_seconds_with_its_reason(graph, monk
 
 
 def test_a_publisher_whose_quality_of_service_does_not_fit_is_reported(graph):
-    graph.host(Controller, robot='arm26')
+    graph.host(ControllerNode, robot='arm26')
     graph.listen(DiagnosticArray, '/diagnostics')
     unreliable = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
     graph.node.create_publisher(JointState, 'target_joint_states', unreliable)

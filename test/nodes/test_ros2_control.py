@@ -18,10 +18,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.controller import Controller
-from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
-from musculoskeletal_ae.nodes.sim import Sim
+from musculoskeletal_ae.nodes.controller import ControllerNode
+from musculoskeletal_ae.nodes.estimator import EstimatorNode
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
+from musculoskeletal_ae.nodes.sim import SimNode
 from musculoskeletal_ae.robot.directories import find_robot
 
 EXAMPLE = Path(__file__).parents[2] / 'examples' / 'ros2_control'
@@ -87,7 +87,7 @@ def test_the_fake_robot_passes_check_driver_and_is_estimated_and_moved_by_the_no
     assert set(faults) <= {'latency', 'rate'} and (status == 0 or faults), output
     assert commands and len(commands[0].data) == len(MOTORS)
 
-    estimator = host(Estimator, checkpoint=trained_file)
+    estimator = host(EstimatorNode, checkpoint=trained_file)
     estimates = graph.listen(JointState, 'estimated_joint_states')
     graph.wait(lambda: estimates, 'an estimate')
     measured = [joint_values(graph)[joint] for joint in arm26.joints]
@@ -95,7 +95,7 @@ def test_the_fake_robot_passes_check_driver_and_is_estimated_and_moved_by_the_no
     assert not estimator.rejected
 
     # On a loaded machine messages arrive late. A large max_age avoids pauses.
-    controller = host(Controller, checkpoint=trained_file, max_age=10.0)
+    controller = host(ControllerNode, checkpoint=trained_file, max_age=10.0)
     commands.clear()
     lengths = graph.listen(Float64MultiArray, 'muscle_length_command')
     before = joint_values(graph, 'effort')
@@ -116,7 +116,7 @@ def test_the_fake_robot_passes_check_driver_and_is_estimated_and_moved_by_the_no
 
 
 def test_a_second_publisher_of_the_motors_is_named(graph, host):
-    estimator = host(Estimator)
+    estimator = host(EstimatorNode)
     graph.publisher(JointState, STATES)
     stranger = Node('stranger', context=graph.context, namespace=graph.namespace)
     stranger.create_publisher(JointState, STATES, 10)
@@ -127,7 +127,7 @@ def test_a_second_publisher_of_the_motors_is_named(graph, host):
 
 
 def test_the_emulator_plays_the_same_robot(graph, host, arm26):
-    emulator = host(HardwareEmulator)
+    emulator = host(HardwareEmulatorNode)
     graph.listen(JointState, STATES)
     position = joint_values(graph)
     assert {*MOTORS, *arm26.joints} == position.keys()
@@ -146,9 +146,9 @@ def test_the_emulator_plays_the_same_robot(graph, host, arm26):
 
 
 def test_our_nodes_command_the_emulator_by_its_motors(graph, host, trained_file):
-    emulator = host(HardwareEmulator)
-    host(Estimator, checkpoint=trained_file)
-    host(Controller, checkpoint=trained_file, max_age=10.0, explore=True)
+    emulator = host(HardwareEmulatorNode)
+    host(EstimatorNode, checkpoint=trained_file)
+    host(ControllerNode, checkpoint=trained_file, max_age=10.0, explore=True)
     graph.wait(lambda: not emulator.arm.safe, 'a command to the motors')
     assert not emulator.rejected
 
@@ -156,7 +156,7 @@ def test_our_nodes_command_the_emulator_by_its_motors(graph, host, trained_file)
 def test_the_simulator_takes_the_place_of_the_robot_with_the_same_messages(
     graph, host, trained_file, arm26
 ):
-    sim = host(Sim, checkpoint=trained_file, as_robot=True)
+    sim = host(SimNode, checkpoint=trained_file, as_robot=True)
     graph.listen(JointState, STATES)
     assert {*MOTORS, *arm26.joints} == joint_values(graph).keys()
     commands = graph.publisher(Float64MultiArray, COMMANDS)
@@ -171,7 +171,7 @@ def test_the_simulator_takes_the_place_of_the_robot_with_the_same_messages(
 
 
 def test_what_is_wrong_with_the_messages_is_counted_with_the_reason(graph, host, trained_file):
-    estimator = host(Estimator, checkpoint=trained_file)
+    estimator = host(EstimatorNode, checkpoint=trained_file)
     graph.listen(DiagnosticArray, '/diagnostics')
     states = graph.publisher(JointState, STATES)
     message = JointState(name=MOTORS, position=[0.0] * 6, effort=[0.5] * 6)
@@ -199,7 +199,7 @@ def test_what_is_wrong_with_the_messages_is_counted_with_the_reason(graph, host,
 
 
 def test_a_second_publisher_of_motor_commands_stops_the_arm(graph, host, trained_file):
-    controller = host(Controller, checkpoint=trained_file)
+    controller = host(ControllerNode, checkpoint=trained_file)
     graph.node.create_publisher(Float64MultiArray, COMMANDS, 10)
     graph.wait(
         lambda: COMMANDS in controller.core.watchdog.second_publisher,
@@ -208,7 +208,7 @@ def test_a_second_publisher_of_motor_commands_stops_the_arm(graph, host, trained
 
 
 def test_a_topic_of_joints_and_motors_is_named_once_if_two_nodes_publish_it(graph, host):
-    node = host(Estimator)
+    node = host(EstimatorNode)
     for name in ('first', 'second'):
         other = graph.host(partial(Node, name))
         other.create_publisher(JointState, STATES, 10)
@@ -217,7 +217,7 @@ def test_a_topic_of_joints_and_motors_is_named_once_if_two_nodes_publish_it(grap
 
 
 def test_methods_that_command_tensions_are_refused(host):
-    controller = host(Controller)
+    controller = host(ControllerNode)
     for method in ('tension', 'float'):
         result = controller.set_parameters([Parameter('method', value=method)])[0]
         assert not result.successful and f'{COMMANDS} follow lengths only' in result.reason
@@ -226,4 +226,4 @@ def test_methods_that_command_tensions_are_refused(host):
 @pytest.mark.parametrize('name', ['motor_names', 'spool_radius', 'motor_state_topic'])
 def test_a_parameter_file_that_still_connects_motors_ends_a_node_with_the_new_place(graph, name):
     with pytest.raises(MusculoskeletalError, match=f'{name}.*motors.yaml in the robot directory'):
-        graph.host(Estimator, robot='arm26', **{name: 'value'})
+        graph.host(EstimatorNode, robot='arm26', **{name: 'value'})

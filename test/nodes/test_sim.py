@@ -17,9 +17,9 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.message_reading import read_muscle_states
 from musculoskeletal_ae.motion.methods import first_command
-from musculoskeletal_ae.nodes.controller import Controller
-from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.sim import Sim
+from musculoskeletal_ae.nodes.controller import ControllerNode
+from musculoskeletal_ae.nodes.estimator import EstimatorNode
+from musculoskeletal_ae.nodes.sim import SimNode
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros.messages import LATCHED, array_message
 from musculoskeletal_ae.simulation.simulation import Simulation
@@ -30,7 +30,7 @@ def arm(graph, trained_file):
     graph.listen(JointState, 'sim/joint_states')
     graph.listen(Float64MultiArray, 'sim/muscle_states')
     graph.listen(DiagnosticArray, '/diagnostics')
-    graph.simulator = graph.host(Sim, robot='arm26', checkpoint=trained_file)
+    graph.simulator = graph.host(SimNode, robot='arm26', checkpoint=trained_file)
     graph.next('sim/muscle_states')
     return graph
 
@@ -93,7 +93,7 @@ def test_the_simulator_follows_the_command_of_the_hardware(arm, arm26, mae, core
 
 def test_beside_a_fast_robot_the_simulator_publishes_at_100_hz(graph, trained_file):
     states = graph.listen(JointState, 'sim/joint_states')
-    graph.host(Sim, robot='arm26', checkpoint=trained_file, rate=1000.0)
+    graph.host(SimNode, robot='arm26', checkpoint=trained_file, rate=1000.0)
     graph.next('sim/joint_states', 50)
     stamps = [message.header.stamp for message in states]
     times = [stamp.sec + 1e-9 * stamp.nanosec for stamp in stamps]
@@ -156,7 +156,7 @@ def test_an_unreachable_command_is_reported_and_bad_commands_change_nothing(arm,
 
 def test_the_simulator_waits_for_a_checkpoint_and_refuses_unfit_ones(graph, mae, trained_file):
     graph.listen(JointState, 'sim/joint_states')
-    sim = graph.host(Sim, robot='arm26')
+    sim = graph.host(SimNode, robot='arm26')
     graph.wait(lambda: 'no network' in sim.report().message, 'the report')
     assert not graph.received['sim/joint_states']
     graph.send_network(b'not a network', 'accepted_checkpoint')
@@ -180,10 +180,10 @@ def test_the_simulator_as_robot_closes_the_loop_with_estimator_and_controller(
     graph.listen(Float64MultiArray, 'muscle_states')
     graph.listen(String, 'robot_description', LATCHED)
     common = {'robot': 'arm26', 'checkpoint': trained_file}
-    graph.host(Sim, **common, as_robot=True)
-    graph.host(Estimator, **common)
+    graph.host(SimNode, **common, as_robot=True)
+    graph.host(EstimatorNode, **common)
     # On a loaded machine messages arrive late. A large max_age avoids stops.
-    graph.host(Controller, **common, first_duration=1.0, max_age=10.0)
+    graph.host(ControllerNode, **common, first_duration=1.0, max_age=10.0)
     graph.next('muscle_states')
     graph.wait(lambda: graph.received['robot_description'], 'the description')
     assert graph.received['robot_description'][0].data == arm26.description.urdf
@@ -198,7 +198,7 @@ def test_the_simulator_as_robot_closes_the_loop_with_estimator_and_controller(
 
 
 def test_the_simulator_as_robot_uses_neither_length_offsets_nor_isolation(graph, trained_file):
-    shell = graph.host(Sim, robot='arm26', checkpoint=trained_file, as_robot=True, rate=2.0)
+    shell = graph.host(SimNode, robot='arm26', checkpoint=trained_file, as_robot=True, rate=2.0)
     assert shell.longest_step == 1.0  # two periods of the rate of 2 Hz [s]
     topics = {subscription.topic_name for subscription in shell.subscriptions}
     assert f'{graph.namespace}/muscle_length_command' in topics
@@ -207,11 +207,11 @@ def test_the_simulator_as_robot_uses_neither_length_offsets_nor_isolation(graph,
 
 def test_preset_paper_runs_and_an_unknown_one_is_refused(graph, arm26, trained_file):
     graph.listen(JointState, 'sim/joint_states')
-    graph.host(Sim, robot='arm26', checkpoint=trained_file, preset='paper')
+    graph.host(SimNode, robot='arm26', checkpoint=trained_file, preset='paper')
     theta = np.array(graph.next('sim/joint_states', 20).position)
     assert np.all((theta >= arm26.lower) & (theta <= arm26.upper))
     with pytest.raises(MusculoskeletalError, match=r'parameter preset: .*default, paper'):
-        graph.host(Sim, robot='arm26', preset='magic')
+        graph.host(SimNode, robot='arm26', preset='magic')
 
 
 def test_a_prismatic_joint_is_fixed_and_published_in_metres(graph, tmp_path):
@@ -219,7 +219,7 @@ def test_a_prismatic_joint_is_fixed_and_published_in_metres(graph, tmp_path):
     file = tmp_path / 'mae.safetensors'
     checkpoint.save(initial_mae(robot, steps=300).mae, file)
     graph.listen(JointState, 'sim/joint_states')
-    graph.host(Sim, robot=str(tmp_path / 'slider'), checkpoint=str(file))
+    graph.host(SimNode, robot=str(tmp_path / 'slider'), checkpoint=str(file))
     fixed = JointState(name=['wrist'], position=[0.03])
     publisher = graph.publisher(JointState, 'sim/fixed_joint_states')
 

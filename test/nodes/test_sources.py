@@ -14,8 +14,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import Trigger
 
-from musculoskeletal_ae.nodes.controller import Controller
-from musculoskeletal_ae.nodes.estimator import Estimator
+from musculoskeletal_ae.nodes.controller import ControllerNode
+from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.ros.diagnostics import NODE_SILENCE
 from musculoskeletal_ae.ros.messages import LATCHED, array_message, joint_message
 from musculoskeletal_ae.ros.second_publishers import (
@@ -83,7 +83,7 @@ def test_a_second_node_of_the_same_name_is_noticed_by_its_reports():
 
 
 def test_a_repeated_estimate_grows_old(graph, arm26, trained_file):
-    controller = graph.host(Controller, robot='arm26', checkpoint=trained_file)
+    controller = graph.host(ControllerNode, robot='arm26', checkpoint=trained_file)
     joints = graph.publisher(JointState, 'estimated_joint_states')
     repeated = joint_message(arm26.joints, np.zeros(2), graph.node.get_clock().now().to_msg())
 
@@ -155,8 +155,8 @@ def test_messages_in_the_name_of_the_estimator_stop_the_arm_and_change_nothing(
 
 
 def test_a_second_clock_stops_the_nodes_that_use_it(graph):
-    follower = graph.host(Controller, robot='arm26', use_sim_time=True)
-    other = graph.host(Estimator, robot='arm26')
+    follower = graph.host(ControllerNode, robot='arm26', use_sim_time=True)
+    other = graph.host(EstimatorNode, robot='arm26')
     stranger = Node('stranger', context=graph.context, namespace=graph.namespace)
     for node in (graph.node, stranger):
         node.create_publisher(Clock, '/clock', 10)

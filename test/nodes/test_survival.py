@@ -21,22 +21,22 @@ from type_description_interfaces.srv import GetTypeDescription
 
 from musculoskeletal_ae.conditions import CONDITIONS
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
-from musculoskeletal_ae.nodes.bringup_status import BringupStatus
-from musculoskeletal_ae.nodes.controller import Controller
-from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
-from musculoskeletal_ae.nodes.learner import Learner
+from musculoskeletal_ae.nodes.bringup_status import BringupStatusNode
+from musculoskeletal_ae.nodes.controller import ControllerNode
+from musculoskeletal_ae.nodes.estimator import EstimatorNode
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
+from musculoskeletal_ae.nodes.learner import LearnerNode
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
-from musculoskeletal_ae.nodes.sim import Sim
+from musculoskeletal_ae.nodes.sim import SimNode
 
 #: services of each node, besides those of rclpy
 NODES = {
-    HardwareEmulator: ['hardware_emulator/reset'],
-    Estimator: ['estimator/reset'],
-    Controller: ['controller/stop', 'controller/reset'],
-    Sim: [],
-    Learner: ['learner/save'],
-    BringupStatus: [],
+    HardwareEmulatorNode: ['hardware_emulator/reset'],
+    EstimatorNode: ['estimator/reset'],
+    ControllerNode: ['controller/stop', 'controller/reset'],
+    SimNode: [],
+    LearnerNode: ['learner/save'],
+    BringupStatusNode: [],
 }
 NAMES = ['', ' ', '.', '/', 'ö' * 300, '\x1b[2J', 'a\nb', '*' * 3000]
 TYPES = [*range(11), 99, 255]
@@ -83,10 +83,10 @@ class Caller:
 @pytest.mark.parametrize('kind', NODES)
 def test_no_request_or_clock_ends_a_node(graph, kind):
     graph.listen(DiagnosticArray, '/diagnostics', 100)
-    own = {'state_directory': ''} if kind is Learner else {}
+    own = {'state_directory': ''} if kind is LearnerNode else {}
     hosted = graph.host(kind, robot='arm26', use_sim_time=True, **own)
     # `running` lowers the priority of nodes on which no command depends.
-    assert hosted.is_time_critical is (kind not in (Learner, Sim))
+    assert hosted.is_time_critical is (kind not in (LearnerNode, SimNode))
     node = hosted.get_name()
     call = Caller(graph, node)
     names = [*PARAMETERS[node], 'use_sim_time', 'start_type_description_service', *NAMES]
@@ -109,8 +109,8 @@ def test_no_request_or_clock_ends_a_node(graph, kind):
         call(GetTypeDescription, 'get_type_description', type_name=text, type_hash=text)
     for service in NODES[kind]:
         assert graph.call(Trigger, service).message.isprintable()
-    if kind in (Controller, Learner):
-        name = {Controller: 'controller/explore', Learner: 'learner/enable'}[kind]
+    if kind in (ControllerNode, LearnerNode):
+        name = {ControllerNode: 'controller/explore', LearnerNode: 'learner/enable'}[kind]
         for data in (True, False):
             graph.call(SetBool, name, SetBool.Request(data=data))
     graph.set_parameter(node, 'use_sim_time', True)
@@ -135,7 +135,7 @@ SHOUTED = r'[{"identifier": "a", "level": "error", "text": "\u001b[2J\u009b1m"}]
 
 
 def test_escape_sequences_in_messages_do_not_reach_the_terminal(graph, capsys):
-    status = graph.host(BringupStatus, robot='arm26')
+    status = graph.host(BringupStatusNode, robot='arm26')
     shouting = [
         DiagnosticStatus(
             name=f'{graph.namespace}/{name}: state',
@@ -159,12 +159,12 @@ def test_escape_sequences_in_messages_do_not_reach_the_terminal(graph, capsys):
     )
     assert str(MessageError('wrong', '\x1b[2J\ud800')).isprintable()
     with pytest.raises(MusculoskeletalError) as refusal:
-        graph.host(Controller, robot='arm26\x1b[2J')
+        graph.host(ControllerNode, robot='arm26\x1b[2J')
     assert str(refusal.value).isprintable()
 
 
 def test_the_status_line_waits_for_a_slow_start_for_a_limited_time(graph):
-    status = graph.host(BringupStatus, robot='arm26', duration=1e6, patience=0.01)
+    status = graph.host(BringupStatusNode, robot='arm26', duration=1e6, patience=0.01)
     status.anomalies.append(0.0)
     status._print()  # `patience` is over, but the system has come up: the status is printed
     status.begun -= 1e3

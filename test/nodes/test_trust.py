@@ -18,12 +18,13 @@ from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.estimation.network_validation import validator
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.nodes.controller import Controller
-from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
-from musculoskeletal_ae.nodes.learner import Learner
-from musculoskeletal_ae.nodes.sim import Sim
+from musculoskeletal_ae.nodes.controller import ControllerNode
+from musculoskeletal_ae.nodes.estimator import EstimatorNode
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
+from musculoskeletal_ae.nodes.learner import LearnerNode
+from musculoskeletal_ae.nodes.sim import SimNode
 from musculoskeletal_ae.ros.messages import LATCHED, array_message, joint_message
+from musculoskeletal_ae.signals.body_state import Anomaly
 
 HERE = np.array([-0.5, -1.2])
 REFUSED = 'mae_checkpoint: does not explain the arm'
@@ -39,7 +40,7 @@ def arm(graph, arm26, trained_file):
 
 def test_a_bad_network_is_rejected_for_all_nodes_and_the_arm_goes_on(arm, trained, trained_file):
     bad = replace(ATTACKS['weights × 1.5'](trained['default']), version=66)
-    sim = arm.graph.host(Sim, robot='arm26', checkpoint=trained_file)
+    sim = arm.graph.host(SimNode, robot='arm26', checkpoint=trained_file)
     decisions = arm.graph.listen(KeyValue, 'rejected_checkpoint', LATCHED)
     arm.graph.send_network(checkpoint.to_bytes(bad))
     arm.graph.wait(lambda: arm.estimator.rejected[REFUSED] and decisions, 'the rejection')
@@ -57,7 +58,9 @@ def test_a_bad_network_is_rejected_for_all_nodes_and_the_arm_goes_on(arm, traine
 def test_a_file_with_a_bad_network_is_refused_with_figure_and_limit(
     arm, trained, trained_file, tmp_path
 ):
-    learner = arm.graph.host(Learner, robot='arm26', checkpoint=trained_file, state_directory='')
+    learner = arm.graph.host(
+        LearnerNode, robot='arm26', checkpoint=trained_file, state_directory=''
+    )
     bad = tmp_path / 'bad.safetensors'
     checkpoint.save(ATTACKS['noise of 100 %'](trained['default']), bad)
     for node in ('estimator', 'learner'):
@@ -89,15 +92,15 @@ def test_of_networks_received_during_a_validation_all_nodes_use_the_last_without
 def test_an_anomaly_rejects_a_network_that_is_being_validated(arm, trained):
     estimator = arm.estimator
     decisions = arm.graph.listen(KeyValue, 'rejected_checkpoint', LATCHED)
-    first, candidates = estimator.core.state.complete_mae, estimator.candidates
+    first, candidates = estimator.core.complete_mae, estimator.candidates
     arm.graph.send_network(checkpoint.to_bytes(replace(trained['paper'], version=67)))
     arm.graph.wait(lambda: candidates.queue.is_busy, 'the validation')
-    candidates.on_anomaly(True)
+    candidates.follow(estimator.core.body.with_anomaly(Anomaly.FOUND, 0))
     arm.graph.wait(lambda: decisions, 'the decision')
     assert decisions[-1].key == '67'
     assert 'anomaly' in decisions[-1].value
     assert not candidates.queue.is_busy
-    assert estimator.core.state.complete_mae is first
+    assert estimator.core.complete_mae is first
 
 
 def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_nodes(
@@ -121,7 +124,8 @@ def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_n
 
     arm.graph.wait(is_used, 'the new network')
     decisions = arm.graph.listen(KeyValue, 'rejected_checkpoint', LATCHED)
-    arm.estimator.candidates.on_anomaly(True)
+    body = arm.estimator.core.body
+    arm.estimator.candidates.follow(body.with_anomaly(Anomaly.FOUND, 0))
     arm.graph.wait(
         lambda: decisions and 'soon after' in decisions[-1].value, 'the rejection of the new one'
     )
@@ -130,7 +134,7 @@ def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_n
 
 
 def test_an_impossible_body_state_is_refused(graph, trained_file):
-    controller = graph.host(Controller, robot='arm26', checkpoint=trained_file)
+    controller = graph.host(ControllerNode, robot='arm26', checkpoint=trained_file)
     rows = np.zeros((6, 6))
     rows[0] = 1e17
     latched = graph.publisher(Float64MultiArray, 'body_state', LATCHED)
@@ -193,7 +197,7 @@ def test_with_use_sim_time_a_trajectory_follows_the_clock(graph, arm26, trained_
     pace = 0.3  # simulated seconds per second
     sent = graph.listen(Float64MultiArray, 'muscle_length_command', 1000)
     node = graph.host(
-        Controller,
+        ControllerNode,
         robot='arm26',
         checkpoint=trained_file,
         first_duration=1.0,
@@ -232,10 +236,10 @@ def test_with_use_sim_time_a_trajectory_follows_the_clock(graph, arm26, trained_
 def test_a_muscle_ruptured_before_the_start_is_detected(graph, trained_file):
     # With this muscle ruptured, the estimate is so wrong that the controller does not start.
     muscle = 'deltoid_anterior'
-    hardware = graph.host(HardwareEmulator, robot='arm26', seed=0, faults=[f'rupture:{muscle}'])
+    hardware = graph.host(HardwareEmulatorNode, robot='arm26', seed=0, faults=[f'rupture:{muscle}'])
     hardware.arm.step(3.0)
     bodies = graph.follow_body()
-    estimator = graph.host(Estimator, robot='arm26', checkpoint=trained_file)
-    graph.host(Controller, robot='arm26', checkpoint=trained_file, explore=True, max_age=10.0)
+    estimator = graph.host(EstimatorNode, robot='arm26', checkpoint=trained_file)
+    graph.host(ControllerNode, robot='arm26', checkpoint=trained_file, explore=True, max_age=10.0)
     graph.wait(lambda: bodies and bodies[-1].has_anomaly, 'the detection')
     assert estimator.core.cause.startswith(muscle)

@@ -7,10 +7,10 @@ from graph import DEADLINE
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.estimation.lengths import length_calibration
-from musculoskeletal_ae.nodes.controller import Controller
-from musculoskeletal_ae.nodes.estimator import Estimator
-from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulator
-from musculoskeletal_ae.nodes.learner import Learner
+from musculoskeletal_ae.nodes.controller import ControllerNode
+from musculoskeletal_ae.nodes.estimator import EstimatorNode
+from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
+from musculoskeletal_ae.nodes.learner import LearnerNode
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets, Trust
 
 
@@ -20,12 +20,12 @@ def test_length_offsets_are_found_and_reach_every_node_until_the_estimator_resta
 ):
     monkeypatch.setattr(length_calibration, 'ENOUGH_WITH_ANGLES', 2.0)
     common = {'robot': 'arm26', 'checkpoint': trained_file}
-    hardware = graph.host(HardwareEmulator, robot='arm26', seed=1, faults=['unzeroed'])
+    hardware = graph.host(HardwareEmulatorNode, robot='arm26', seed=1, faults=['unzeroed'])
     hardware.arm.step(10.0)
-    node = graph.host(Estimator, **common)
+    node = graph.host(EstimatorNode, **common)
     # On a loaded machine messages arrive late. A large max_age avoids stops.
-    controller = graph.host(Controller, **common, max_age=10.0)
-    learner = graph.host(Learner, robot='arm26', state_directory=str(tmp_path))
+    controller = graph.host(ControllerNode, **common, max_age=10.0)
+    learner = graph.host(LearnerNode, robot='arm26', state_directory=str(tmp_path))
     if stands:
         graph.set_parameter('estimator', 'zero_posture', hardware.arm.theta.tolist())
     assert graph.call(Trigger, 'estimator/zero').success
@@ -48,7 +48,7 @@ def test_length_offsets_are_found_and_reach_every_node_until_the_estimator_resta
     assert not node.core.cause
     found = node.body.offsets.offset
     graph.end(node)
-    restarted = graph.host(Estimator, **common)
+    restarted = graph.host(EstimatorNode, **common)
     others = [controller, learner]
     graph.wait(lambda: not any(n.body.offsets.known for n in others), 'the loss of the offsets')
     for other in (restarted, *others):
@@ -58,7 +58,7 @@ def test_length_offsets_are_found_and_reach_every_node_until_the_estimator_resta
 
 
 def test_every_decision_of_the_estimator_is_used_once_and_as_it_states(graph, trained_file):
-    controller = graph.host(Controller, robot='arm26', checkpoint=trained_file)
+    controller = graph.host(ControllerNode, robot='arm26', checkpoint=trained_file)
     uses, use = [], controller.core.use_body
 
     def noted(body):
@@ -89,8 +89,8 @@ def test_every_decision_of_the_estimator_is_used_once_and_as_it_states(graph, tr
 
 def test_zero_at_start_begins_the_length_calibration_for_every_node(graph, trained_file):
     common = {'robot': 'arm26', 'checkpoint': trained_file}
-    controller = graph.host(Controller, **common)
-    estimator = graph.host(Estimator, **common, zero_at_start=True)
+    controller = graph.host(ControllerNode, **common)
+    estimator = graph.host(EstimatorNode, **common, zero_at_start=True)
     graph.wait(
         lambda: not controller.body.offsets.known,
         'the controller to receive unknown length offsets',

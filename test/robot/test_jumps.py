@@ -43,10 +43,12 @@ def test_check_robot_warns_of_a_muscle_whose_length_jumps(tmp_path):
 def test_the_choices_that_a_jumping_length_leaves_are_named(tmp_path):
     robot = behind_a_drum(tmp_path, DRUM_ENDS['jumps'])
     jumps_at, limit, choices = jump_choices(robot)
-    jump = 'the length of muscle straightener jumps by up to 173 mm for bend in [-1.57, -1.57] rad'
+    jump = (
+        'the length of muscle straightener jumps by up to 173 mm for bend from -1.57 to -1.57 rad'
+    )
     assert jumps_at == f'length jump: {jump}'
     assert '(--without straightener), or accept' in choices
-    pattern = r'limiting (\w+) to \[(.*), (.*)\] rad excludes this jump'
+    pattern = r'limiting (\w+) to the range (.*) to (.*) rad excludes this jump'
     joint, low, high = re.search(pattern, limit).groups()
     j = robot.joints.index(joint)
     robot.lower[j], robot.upper[j] = float(low), float(high)

@@ -78,7 +78,7 @@ class ObservedMotors(Motors):
         super().__init__(period=1.0, **options)
         self.core, self.now = Estimator(ROBOT), 0.0
         self.core.use(mae)
-        self.heat = self.core.heat
+        self.heat = self.core.health.heat
         #: whether readings go to the thermal model alone, without the estimator, which is slower;
         #: this suffices while the model learns the constants of the modules
         self.is_learning = True
@@ -186,7 +186,8 @@ def test_a_module_whose_heat_changes_is_an_anomaly_of_that_muscle_only(trained, 
     motors.run_until_changed()
     assert set(motors.heat.changed) == {2}
     assert motors.core.cause.startswith(f'{ROBOT.muscles[2]}: its module ')
-    motors.core.heat.accept(3)  # accepting another module does not clear the report of module 2
+    # Accepting another module does not clear the report of module 2.
+    motors.core.health.heat.accept(3)
     assert set(motors.heat.changed) == {2}
     motors.core.reset()  # after a reset, the present state of all modules counts as healthy
     motors.run(60)

@@ -12,7 +12,7 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.limits import slack_tension
 
 FROZEN_TIME = 1.0  # suspect a sensor whose reading has stayed the same for this long [s]
 #: conclude that a sensor has noise near T_bias if its reading changes in the share NOISY of the
@@ -59,7 +59,7 @@ class FrozenSensor(Detector):
         is_same = readings == self._last if self._last is not None else np.zeros_like(readings)
         if not robot.tension_source.is_known:  # an unknown tension does not count as frozen
             is_same[1] = 0.0
-        slack = LIMITS.slack_share * robot.tension.bias
+        slack = slack_tension(robot.tension.bias)
         is_near_bias = np.abs(tension - robot.tension.bias) <= slack
         # Messages with the present value are counted only when the reading changes again. Otherwise
         # a frozen sensor would look like one that never had noise.
@@ -69,11 +69,9 @@ class FrozenSensor(Detector):
         self._near_bias = np.array([same, changed, (now + is_near_bias) * ~has_changed])
         self._last = readings
         self._unchanged_time = (self._unchanged_time + observation.dt) * is_same
-        is_calibrated = mae is not None and mae.anomaly is not None and mae.anomaly.calibrated
-        if self._unchanged_time.max() < FROZEN_TIME or not is_calibrated:
+        if self._unchanged_time.max() < FROZEN_TIME or mae is None or not mae.is_calibrated:
             self._stop_observing()
             return None
-        assert mae is not None
         # Slack tendons are left to `slack_tendon.py`. A constant tension of T_bias is no fault of a
         # simple module that always reports exactly T_bias.
         by_length, by_tension = self._unchanged_time

@@ -33,7 +33,7 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.limits import slack_tension
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 SPACING = 0.1  # compute g at this interval [s]
@@ -207,9 +207,8 @@ class LengthDisagreement(Detector):
             The difference of each length [m], (M,), and the limits of these differences.
         """
         assert self._mae is not None
-        statistics = self._mae.anomaly
-        has_learned = statistics is not None and statistics.calibrated
-        limits = (CHANGE_LEARNED, GAP_LEARNED) if has_learned else (CHANGE_YOUNG, GAP_YOUNG)
+        is_learned = self._mae.is_calibrated
+        limits = (CHANGE_LEARNED, GAP_LEARNED) if is_learned else (CHANGE_YOUNG, GAP_YOUNG)
         single, together = (np.where(self._has_usual, *pair) for pair in zip(*limits, strict=True))
         return gap - self._usual, Largest(single, together)
 
@@ -261,7 +260,7 @@ class LengthDisagreement(Detector):
             change: Difference of each length from what is usual [m], (M,).
             largest: The limits of these differences.
         """
-        slack_tension = LIMITS.slack_share * self._robot.tension.bias[muscle]
-        is_slack = sample.motor_tension[muscle] < slack_tension
+        lowest = slack_tension(self._robot.tension.bias[muscle])
+        is_slack = sample.motor_tension[muscle] < lowest
         others_agree = self._others_agree(muscle, change, largest)
         return bool(is_slack and change[muscle] < 0.0 and others_agree)

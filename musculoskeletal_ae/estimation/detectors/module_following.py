@@ -39,7 +39,7 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.limits import slack_tension
 
 FAULTY = 1.0  # report a module after this time of evidence [s]
 SMOOTHING = 0.1  # smooth differences and speeds with this time constant [s]
@@ -131,7 +131,7 @@ class ModuleFollowing(Detector):
         excess = away - limit * correcting / CORRECTING
         allowed = ALLOWED * limit + ALLOWED_SHARE * demand
         # Slack tendons, which even a slow winch may take up, are left to `slack_tendon.py`.
-        is_slack = observation.sample.motor_tension < LIMITS.slack_share * demand
+        is_slack = observation.sample.motor_tension < slack_tension(demand)
         growth: Array = (excess - allowed - SURE * observation.sample.tension_spread) / (
             CLEAR * limit
         )

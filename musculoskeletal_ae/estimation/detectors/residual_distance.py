@@ -38,7 +38,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, residuals
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.limits import slack_tension
 
 DISTANCE = 'distance'  # name of the threshold of d in a checkpoint
 NORM = 'norm'  # name of the threshold of A in a checkpoint
@@ -128,7 +128,7 @@ class ResidualDistance(Detector):
             share = centred / self._spread
         square = share * share
         score = square[:muscle_count] + square[muscle_count:]
-        is_slack = self._robot.used & (tension < LIMITS.slack_share * self._robot.tension.bias)
+        is_slack = self._robot.used & (tension < slack_tension(self._robot.tension.bias))
         slack_count = int(np.count_nonzero(is_slack))
         waits = False
         if slack_count:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detects a muscle that has no tension although tension is commanded: it is ruptured or slack.
 
-    T < slack_share · T_ref for DEAD_TIME, and the tendon is not being wound in
+    T < SLACK_SHARE · T_ref for DEAD_TIME, and the tendon is not being wound in
 
 T is the measured and T_ref the demanded tension. The rule needs no statistics, because a healthy
 module maintains at least T_bias. A slow winch takes time to wind in slack. The detector waits while
@@ -13,7 +13,7 @@ A position-controlled module maintains no tension, so a healthy tendon is slack 
 commanded. Such a module is reported if its tendon is stretched, but has no tension:
 
     T < T_slack for DEAD_TIME, and d − d̄ > SIGMAS · σ,   d = l(θ, T_slack) − l
-    T_slack = slack_share · T_bias
+    T_slack = SLACK_SHARE · T_bias
 
 d is the stretch: the length that the network computes for a barely taut tendon, minus the measured
 length l. The joint angles θ are estimated from the tendons that are not slack. d contains errors of
@@ -35,7 +35,7 @@ from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.estimation.lengths.length_errors import LengthErrors, Prediction
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import LIMITS, share_outside
+from musculoskeletal_ae.signals.limits import LIMITS, share_outside, slack_tension
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 #: report a tendon without tension if its stretch exceeds the expected one by this many standard
@@ -91,7 +91,7 @@ class SlackTendon(Detector):
             self.is_winding_in[:] = False
             return None
         bias = self._robot.tension.bias
-        is_slack = (tension < LIMITS.slack_share * demand) & (demand >= bias) & self._robot.used
+        is_slack = (tension < slack_tension(demand)) & (demand >= bias) & self._robot.used
         if not (np.count_nonzero(is_slack) or np.count_nonzero(self._slack_time)):
             self.is_winding_in[:] = False
             return None
@@ -129,7 +129,7 @@ class SlackTendon(Detector):
             return observation.demand
         bias, theta = self._robot.tension.bias, observation.estimate.state.theta
         is_implausible = share_outside(self._robot, theta).max() > LIMITS.estimate_outside
-        is_slack = observation.sample.motor_tension < LIMITS.slack_share * bias
+        is_slack = observation.sample.motor_tension < slack_tension(bias)
         if not is_implausible or is_slack[self._robot.used].all():
             return None
         return np.full(len(is_slack), bias)
@@ -193,8 +193,7 @@ class StretchedTendon(SlackTendon):
     @property
     def _slack_tension(self) -> Array:
         """Tension below which each tendon counts as slack [N], (M,)."""
-        tension: Array = LIMITS.slack_share * self._complete_robot.tension.bias
-        return tension
+        return slack_tension(self._complete_robot.tension.bias)
 
     def _is_stretched(self, sample: MuscleSample, is_slack: Bools, start: Array) -> Bools:
         """Return which slack tendons are so short that a healthy tendon would have tension, (M,).

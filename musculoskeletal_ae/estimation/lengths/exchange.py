@@ -31,7 +31,7 @@ from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import anomaly, residuals
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.limits import LIMITS
+from musculoskeletal_ae.signals.limits import slack_tension
 from musculoskeletal_ae.signals.muscle_readings import Row
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement, decide, single_faults
 
@@ -189,10 +189,10 @@ class ExchangeCheck:
     def _judge(self, observation: Observation) -> WiringJudgement | None:
         """Judge which wiring restores the usual A; return None if that cannot be judged."""
         mae, sample = self._mae, observation.sample
-        if mae is None or mae.anomaly is None or not mae.anomaly.calibrated:
+        if mae is None or not mae.is_calibrated:
             return None
         used = ~np.isin(np.arange(self._robot.muscle_count), mae.isolated)
-        slack = sample.motor_tension < LIMITS.slack_share * self._robot.description.tension.bias
+        slack = sample.motor_tension < slack_tension(self._robot.description.tension.bias)
         if len(self._messages) < ENOUGH or (slack & used).any():
             return None  # no exchange explains a tendon without tension
         offset = _offset(observation)

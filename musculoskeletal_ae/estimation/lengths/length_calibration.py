@@ -9,10 +9,14 @@ Offsets cannot correct readings in a wrong order, or lengths with a wrong sign. 
 often lead to plausible but false offsets. Before offsets of a moving arm are accepted, the wiring
 is therefore judged (`signals/wiring.py`), and a wrong one is refused with the names of the muscles.
 A standing arm does not show the wiring.
+
+If an arm stands still, some offsets explain its readings even if it does not stand in the stated
+posture. They count as known only if the joint sensors, where there are any, measure that posture.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Generator
 
 import numpy as np
@@ -20,6 +24,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.lengths.length_fit import FARTHEST, Fit, LengthFit
 from musculoskeletal_ae.estimation.lengths.length_moments import MomentCollector, Moments
+from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.remedy import Step, sentence
@@ -51,6 +56,13 @@ OTHER_WAY = (
     'provide joint sensors; or set zero_posture, hold the arm there, and call estimator/zero'
 )
 CORRELATED = 10.0  # count this many successive moments as one independent moment
+SHIFTED = 0.02  # use another estimate if it differs by more than this from the one in use [m]
+#: Reject a stated posture if a joint sensor differs by more than this [rad]. A larger difference is
+#: due to a wrong posture or a faulty sensor.
+STATED_ERROR = 0.2
+#: compare the stated posture with the median of this number of measured postures, at least and at
+#: most
+LEAST, MOST = 10, 100
 BEYOND_STOP = 0.01  # let a stated joint angle exceed a limit by this share of the joint's range
 #: multiply a median absolute deviation by this to get the standard deviation
 MAD_TO_DEVIATION = 1.48
@@ -60,41 +72,66 @@ class LengthCalibration:
     """Collects readings and fits the offsets, with a small amount of work at every message.
 
     Attributes:
-        posture: Joint angles in which the arm stands [rad], (D,), or None if it moves gently.
-        offsets: The newest estimate of the offsets, which may still be unreliable; None before the
-            first estimate.
+        posture: The stated posture, as the constructor gets it.
         wiring: What the newest fit tells about the order and the signs of the columns; None before
             they have been judged.
     """
 
-    def __init__(self, robot: Robot, mae: Mae, posture: Array | None = None) -> None:
+    def __init__(self, robot: Robot, mae: Mae | None, posture: tuple[float, ...] = ()) -> None:
         """Start a calibration.
 
         Args:
             robot: The nominal body.
             mae: The network; its isolated muscles are ignored.
-            posture: θ [rad] (D,) if the arm stands in a stated posture, else None.
+            posture: Positions of the joints at which the arm stands [rad or m], (D,); () if it
+                moves gently.
+
+        Raises:
+            MusculoskeletalError: If there is no network, if the posture is not valid, or if no
+                posture is stated for a robot whose tensions are unknown.
         """
-        self._robot, self._mae, self.posture = robot, mae, posture
+        if mae is None:
+            raise MusculoskeletalError(
+                'a length calibration requires a checkpoint; set the parameter `checkpoint`, or '
+                'start the learner'
+            )
+        self.posture, self._stated = posture, stated_theta(robot, posture)
+        if not posture and not robot.tension_source.is_known:
+            raise MusculoskeletalError(
+                'without tensions (tension_source: none), lengths can be calibrated only in a '
+                'known posture; hold the arm still and set the parameter zero_posture'
+            )
+        self._robot, self._mae = robot, mae
         self._fit = LengthFit(robot, mae)
-        self._collector = MomentCollector(self._fit.used, robot.joint_count, posture)
+        self._collector = MomentCollector(self._fit.used, robot.joint_count, self._stated)
         self._since = 0.0  # time since the last fit began [s]
         self._work: Generator[None, None, None] | None = None  # the running fit
         self._best: Fit | None = None
         self._has_angles = False  # whether joint angles are measured most of the time
-        self._problem = ''  # reason why the last fit is not reliable
-        self.offsets: LengthOffsets | None = None
+        self._problem = ''  # why the last fit is not reliable, or the stated posture is wrong
+        self._estimate: LengthOffsets | None = None  # the newest one, which may be unreliable
+        self._used: Array | None = None  # offsets in use [m], (M,); None before the first estimate
+        #: θ measured last while the arm stands [rad], (D,) each
+        self._measured: deque[Array] = deque(maxlen=MOST)
         self.wiring: WiringJudgement | None = None
 
     @property
     def is_standing(self) -> bool:
         """Whether the arm stands in a stated posture."""
-        return self.posture is not None
+        return self._stated is not None
 
     @property
     def is_done(self) -> bool:
         """Whether the offsets are known."""
-        return self.offsets is not None and self.offsets.known
+        return self._estimate is not None and self._estimate.known and not self._problem
+
+    @property
+    def offsets(self) -> LengthOffsets | None:
+        """The newest estimate of the offsets; None before the first.
+
+        While the arm stands in a stated posture, there is none until the offsets are known.
+        """
+        return None if self.is_standing and not self.is_done else self._estimate
 
     @property
     def time(self) -> float:
@@ -123,22 +160,68 @@ class LengthCalibration:
         return self._problem
 
     @property
+    def overtime(self) -> float:
+        """Time for which the arm has moved or stood longer than required [s]."""
+        return self.time - self.enough
+
+    @property
     def remedy(self) -> tuple[Step, ...]:
         """What a user must do before the lengths can be calibrated; () if the wiring is right."""
         return CORRECT_DRIVER if self.wiring is not None and self.wiring.is_faulty else ()
 
-    def step(self, tension: Array, length: Array, dt: float, theta: Array | None = None) -> None:
-        """Record the readings of one message, and continue or begin a fit if one is due.
+    def step(
+        self, tension: Array, length: Array, dt: float, theta: Array | None = None
+    ) -> Evidence | None:
+        """Continue the calibration by the readings of one message.
 
         Args:
             tension: Tensions [N], (M,).
             length: Muscle lengths as read, with their unknown offsets [m], (M,).
             dt: Time since the previous message [s].
             theta: Measured joint angles [rad], (D,), or None without joint sensors.
+
+        Returns:
+            CALIBRATING if `offsets` are to be used from now on, CALIBRATED if they also count as
+            known, which ends the calibration, or None.
         """
         has_failed = self.is_standing and (self._problem or self._collector.has_moved_away)
-        if self.is_done or has_failed:
-            return
+        if has_failed:
+            return None
+        if not self.is_done:
+            if self.is_standing and theta is not None:
+                self._measured.append(theta)
+            self._continue(tension, length, dt, theta)
+        if self.is_done and (problem := self._posture_problem()):
+            self._problem = problem
+        if (offsets := self.offsets) is None:
+            return None
+        if self.is_done:
+            return Evidence.CALIBRATED
+        # Use the first estimate, and any other only after a substantial change.
+        if self._used is None or np.abs(offsets.offset - self._used).max() > SHIFTED:
+            self._used = offsets.offset
+            return Evidence.CALIBRATING
+        return None
+
+    def _posture_problem(self) -> str:
+        """Return why the arm does not stand in the stated posture, as a text for users, or ''."""
+        if self._stated is None or len(self._measured) < LEAST:
+            return ''
+        measured = np.median(self._measured, axis=0)
+        difference = np.abs(measured - self._stated)
+        j = int(difference.argmax())
+        if difference[j] <= STATED_ERROR:
+            return ''
+        text = self._robot.units[j].position_text
+        return (
+            f'zero_posture states {text(self._stated[j])} for {self._robot.joints[j]}, but '
+            f'its sensor measures {text(measured[j])} (legal: a difference of at most '
+            f'{text(STATED_ERROR, "g")}); correct zero_posture or the sensor, and call '
+            'estimator/zero again'
+        )
+
+    def _continue(self, tension: Array, length: Array, dt: float, theta: Array | None) -> None:
+        """Record the readings of a message, and continue or begin a fit if one is due."""
         self._collector.step(tension, length, dt, theta)
         self._since += dt
         if self._work is not None:
@@ -198,7 +281,7 @@ class LengthCalibration:
                 independent = max(1.0, len(fit.theta) / CORRELATED)
                 deviation = MAD_TO_DEVIATION * residual / np.sqrt(independent)
                 deviation[~used] = LARGEST_RESIDUAL
-        self.offsets = LengthOffsets(offset, deviation)
+        self._estimate = LengthOffsets(offset, deviation)
 
     def _problem_of(self, fit: Fit, residual: Array) -> str:
         """Return why a fit is not reliable, as a text for users, or '' if it is reliable.
@@ -248,6 +331,6 @@ def stated_theta(robot: Robot, posture: tuple[float, ...]) -> Array | None:
     low, high = robot.lower - beyond, robot.upper + beyond
     if theta.shape == low.shape and ((theta >= low) & (theta <= high)).all():
         return theta
-    limits = zip(units, units.to_position(robot.lower), units.to_position(robot.upper))
-    legal = ', '.join(f'{low:.6g} to {high:.6g} {unit.position}' for unit, low, high in limits)
+    limits = zip(units, robot.lower, robot.upper)
+    legal = ', '.join(unit.range_text(low, high, '.6g') for unit, low, high in limits)
     raise MusculoskeletalError(f'zero_posture is {list(posture)}; legal: an empty list, or {legal}')

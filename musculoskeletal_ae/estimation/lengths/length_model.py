@@ -159,7 +159,7 @@ class LengthModel:
         return value, by_theta / self.noise[:, None], by_constants / self.noise[:, None]
 
 
-class Point(NamedTuple):
+class LengthPoint(NamedTuple):
     """Values of the unknowns, and the residuals at these values."""
 
     #: length offset, friction and tension offset of each muscle, then friction of each joint,
@@ -182,30 +182,30 @@ class MomentFit:
         self._by_theta: Array  # ∂residual/∂θ, (K, M + 2D, D)
         self._by_constants: Array  # ∂residual/∂constants, (K, M + 2D, 3M + D)
 
-    def point(self, constants: Array, theta: Array) -> Point:
+    def point(self, constants: Array, theta: Array) -> LengthPoint:
         """Return these values of the unknowns with their residuals."""
         (value,) = self._model.residuals(constants, theta, self._moments, self._turning)
-        return Point(constants, theta, value)
+        return LengthPoint(constants, theta, value)
 
-    def weigh(self, point: Point) -> None:
+    def weigh(self, point: LengthPoint) -> None:
         """Compute the robust weights of lengths and torques; those of the limits are 1."""
         self._weight = student(point.residual)
         self._weight[:, -point.theta.shape[1] :] = 1.0
 
-    def cost(self, point: Point) -> float:
+    def cost(self, point: LengthPoint) -> float:
         """Return the cost of a point with the present weights."""
         return float((self._weight * point.residual**2).sum()) + self._by_prior(point)
 
-    def log_cost(self, point: Point) -> float:
+    def log_cost(self, point: LengthPoint) -> float:
         """Return −2 times the logarithm of the posterior at a point, up to a constant."""
         noisy, outside = np.split(point.residual, [-point.theta.shape[1]], axis=1)
         return student_cost(noisy) + float(np.square(outside).sum()) + self._by_prior(point)
 
-    def _by_prior(self, point: Point) -> float:
+    def _by_prior(self, point: LengthPoint) -> float:
         deviation = point.constants - self._model.prior_mean
         return float(self._precision @ deviation**2)
 
-    def equations(self, point: Point) -> Equations:
+    def equations(self, point: LengthPoint) -> Equations:
         """Return the normal equations at a point."""
         _, self._by_theta, self._by_constants = self._model.residuals(
             point.constants, point.theta, self._moments, self._turning, derivatives=True
@@ -217,7 +217,7 @@ class MomentFit:
         common = tall.T @ weighted.reshape(tall.shape) + np.diag(self._precision)
         return Equations(by_theta + SMALL * np.eye(by_theta.shape[-1]), mixed, common)
 
-    def right_sides(self, point: Point) -> RightSides:
+    def right_sides(self, point: LengthPoint) -> RightSides:
         """Return the right sides of the normal equations."""
         weighted = self._weight * point.residual
         by_prior = self._precision * (self._model.prior_mean - point.constants)
@@ -226,7 +226,7 @@ class MomentFit:
             by_prior - np.tensordot(weighted, self._by_constants, 2),
         )
 
-    def moved(self, point: Point, step: SolvedStep) -> Point:
+    def moved(self, point: LengthPoint, step: SolvedStep) -> LengthPoint:
         """Return the unknowns after a step of the solver, with their residuals."""
         turned = np.clip(step.samples, -self._largest_step, self._largest_step)
         return self.point(point.constants + step.common, point.theta + turned)

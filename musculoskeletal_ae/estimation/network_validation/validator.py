@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoint validation: tests whether a candidate network is accurate enough to be used.
+"""Checkpoint validation: decides which network the estimator uses.
+
+    candidate of the learner ─► checks ─► accepted, or rejected with a reason
+    network of a user        ─► checks ─► accepted, with what it does worse; or refused
+    an anomaly begins        ─► a proven network again; the doubtful one is rejected
 
 Four checks compare a candidate with the geometric model, the arm and the network in use:
 
@@ -12,7 +16,7 @@ Four checks compare a candidate with the geometric model, the arm and the networ
 
 The first network is only subject to the first and the last check, because its error on a body that
 differs from its model cannot be predicted. A network that a user has chosen is not subject to
-the third check; where it is clearly worse than the network in use, `weakness` says so.
+the third check; where it is clearly worse than the network in use, `unsuitable_because` says so.
 
 All limits leave a margin to the values of healthy networks: initial and learned networks of both
 presets, on arm26 and musashi_left_arm, with both emulator models. `python -m bench gate` prints
@@ -28,7 +32,7 @@ except for the oldest network. The newest of the remaining networks is used agai
 """
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
 
 import numpy as np
@@ -40,9 +44,10 @@ from musculoskeletal_ae.estimation.network_validation import detector, message_e
 from musculoskeletal_ae.estimation.network_validation.agreement import Agreement, AgreementCheck
 from musculoskeletal_ae.estimation.network_validation.postures import PostureCheck
 from musculoskeletal_ae.estimation.network_validation.recent_messages import RecentMessages
-from musculoskeletal_ae.exceptions import GateError
+from musculoskeletal_ae.exceptions import CheckpointError, GateError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 
 PROOF = 10.0  # count a network as proven after this time in use without an anomaly [s]
 MOST_USED = 20  # keep at most this many networks for a rollback
@@ -50,21 +55,36 @@ RELEARNING_TIME = 600.0  # expect that a muscle may be relearned for this long a
 
 
 class CheckpointValidator:
-    """Accepts or rejects candidates, and chooses the network for a rollback.
+    """Decides which network is used, by checks of candidates and by anomalies.
 
     All times `now` are readings of one steady clock [s].
 
     Attributes:
         isolated: Indices of the isolated muscles, which are ignored.
+        is_anomaly: Whether an anomaly is present.
         postures: The check on the geometric model.
+        unsuitable_because: Why the network in use, which a user has chosen, fits this arm worse
+            than the one before; '' if it does not.
+        accepted: Called with each network that is used from now on.
+        rejected: Called with each network that is not used, or no longer, and with the reason.
     """
 
-    def __init__(self, robot: Robot) -> None:
-        self._robot = robot
+    def __init__(self, robot: Robot, use: Callable[[Mae], Mae] = lambda mae: mae) -> None:
+        """Start without a network.
+
+        Args:
+            robot: The nominal body.
+            use: Puts a network to use, and returns it with what has been measured for it.
+        """
+        self._robot, self._use = robot, use
+        self.unsuitable_because = ''
+        self.accepted: Callable[[Mae], object] = lambda _: None
+        self.rejected: Callable[[Mae, str], object] = lambda _, __: None
+        self._offsets: LengthOffsets | None = None  # length offsets of the messages
         self.postures = PostureCheck(robot)
         self._messages = RecentMessages(robot.joint_count)
         self._used: list[tuple[float, Mae]] = []  # networks, and the times at which they took over
-        self._is_anomaly = False
+        self.is_anomaly = False
         self._repaired_at: dict[int, float] = {}  # time of each muscle's last repair [s]
         self.isolated: tuple[int, ...] = ()
 
@@ -72,6 +92,78 @@ class CheckpointValidator:
     def mae(self) -> Mae | None:
         """The network in use; None before the first."""
         return self._used[-1][1] if self._used else None
+
+    # -- decisions ------------------------------------------------------------------------------
+
+    def decide(self, mae: Mae, now: float) -> None:
+        """Use a candidate of the learner, or reject it; `propose` does the same in steps."""
+        if self.is_in_use(mae):
+            return
+        try:
+            self.check(mae)
+            self._accept(self.with_detector(mae, now), now)
+        except CheckpointError as error:
+            self.rejected(mae, str(error))
+
+    def propose(self, mae: Mae, clock: Callable[[], float]) -> Iterator[None]:
+        """Decide in steps of some milliseconds, between which a node can do other work.
+
+        Args:
+            mae: The candidate. Nothing is decided if it is the network in use.
+            clock: Returns the time on the steady clock [s].
+
+        Raises:
+            CheckpointError: If the candidate is rejected.
+        """
+        if self.is_in_use(mae):
+            return
+        try:
+            yield from self.trial(mae)
+            now = clock()
+            self._accept(self.with_detector(mae, now), now)
+        except CheckpointError as error:
+            self.rejected(mae, str(error))
+            raise
+
+    def choose(self, mae: Mae, now: float) -> None:
+        """Use a network that a user has chosen, and find out whether it fits this arm worse.
+
+        Raises:
+            CheckpointError: If it is refused.
+        """
+        self.check(mae, is_chosen=True)
+        self._accept(mae, now, unsuitable_because=self._weakness(mae))
+
+    def follow(self, body: BodyState, now: float) -> Mae | None:
+        """Follow a change of the body state.
+
+        Other length offsets make the messages useless. If an anomaly begins, a network that was
+        accepted shortly before may be its cause; it is replaced by a proven one, and rejected.
+
+        Returns:
+            The proven network that is used again; None if the network in use does not change.
+        """
+        self.isolated = body.isolated
+        if body.offsets != self._offsets:
+            self._offsets = body.offsets
+            self.forget()
+        doubtful = self.mae
+        proven = self.anomaly(body.has_anomaly, now)
+        if proven is None or doubtful is None:
+            return None
+        self.unsuitable_because = ''
+        self.accepted(self._use(proven))
+        self.rejected(doubtful, 'an anomaly was detected soon after it was accepted')
+        return proven
+
+    def _accept(self, mae: Mae, now: float, unsuitable_because: str = '') -> None:
+        try:
+            mae = self._use(mae)
+        except (np.linalg.LinAlgError, FloatingPointError) as error:
+            raise CheckpointError(f'the network cannot be evaluated ({error})') from error
+        self.unsuitable_because = unsuitable_because
+        self.take(mae, now)
+        self.accepted(mae)
 
     def is_in_use(self, mae: Mae) -> bool:
         """Return whether a network is the one in use, which needs no further decision.
@@ -84,6 +176,27 @@ class CheckpointValidator:
             and mae.version == in_use.version
             and np.array_equal(mae.encoder[0][0], in_use.encoder[0][0])
         )
+
+    def _weakness(self, mae: Mae) -> str:
+        """Say in what a network is clearly worse on recent messages than a learned one in use.
+
+        Joint sensors tell, or else the lengths that each network computes at its own estimate.
+
+        Returns:
+            The quantity, its error and that of the network in use; '' if it is not clearly worse,
+            or if nothing is known about it.
+        """
+        if self.mae is None or self.mae.covariance is None or not self._messages.are_enough:
+            return ''
+        in_use = self.mae.without(self.isolated)
+        mae = mae.without(self.isolated)
+        check = AgreementCheck(self._robot, self.postures, self._messages, in_use, self.isolated)
+        if (text := check.worse_angle(mae)) is not None:
+            return text
+        errors, before = self.message_errors(mae), self.message_errors(in_use)
+        return message_errors.worse_length(errors, before, self._robot.muscles)
+
+    # -- messages, networks and repairs ---------------------------------------------------------
 
     def message(
         self,
@@ -102,16 +215,13 @@ class CheckpointValidator:
             now: Time of the measurement [s].
             theta: Joint angles from joint sensors [rad], (D,), or None if there are none.
         """
-        self._messages.note(tension, length, sliding, now, theta, is_healthy=not self._is_anomaly)
-
-    def start(self) -> None:
-        """Start without networks and messages, so that the next network counts as the first one."""
-        self._used.clear()
-        self.forget()
+        self._messages.note(tension, length, sliding, now, theta, is_healthy=not self.is_anomaly)
 
     def forget(self) -> None:
         """Forget the messages, for example when the length offsets change."""
         self._messages.clear()
+
+    # -- checks ---------------------------------------------------------------------------------
 
     def check(self, mae: Mae, is_chosen: bool = False) -> None:
         """Check a network in a single call; `trial` does the same in steps.
@@ -170,9 +280,9 @@ class CheckpointValidator:
         Returns:
             The network that is used again, or None if the network in use does not change.
         """
-        if detected == self._is_anomaly:
+        if detected == self.is_anomaly:
             return None
-        self._is_anomaly = detected
+        self.is_anomaly = detected
         if not detected:
             self._messages.clear()  # they may describe the arm as it was before a repair
             return None
@@ -197,25 +307,6 @@ class CheckpointValidator:
         check = AgreementCheck(self._robot, self.postures, self._messages, in_use, self.isolated)
         return check.comparisons(mae)
 
-    def weakness(self, mae: Mae) -> str:
-        """State what a network does clearly worse, on recent messages, than a learned one in use.
-
-        Joint sensors decide, or else the lengths that each network computes at its own estimate.
-
-        Returns:
-            The quantity, its error and that of the network in use; '' if it is not clearly worse,
-            or if nothing is known about it.
-        """
-        if self.mae is None or self.mae.covariance is None or not self._messages.are_enough:
-            return ''
-        in_use = self.mae.without(self.isolated)
-        mae = mae.without(self.isolated)
-        check = AgreementCheck(self._robot, self.postures, self._messages, in_use, self.isolated)
-        if (text := check.worse_angle(mae)) is not None:
-            return text
-        errors, before = self.message_errors(mae), self.message_errors(in_use)
-        return message_errors.worse_length(errors, before, self._robot.muscles)
-
     def detector_measures(self, mae: Mae) -> Iterator[float]:
         """Yield ratios of a network's anomaly statistic to its threshold on recent messages.
 
@@ -231,10 +322,11 @@ class CheckpointValidator:
         If `mae` has no calibrated detector of its own, the copy that is returned has the detector
         of the network in use.
         """
-        statistics = None if self.mae is None else self.mae.anomaly
-        has_own = mae.anomaly is not None and mae.anomaly.calibrated
-        if has_own or statistics is None or not statistics.calibrated:
+        in_use = self.mae
+        if mae.is_calibrated or in_use is None or not in_use.is_calibrated:
             return mae
+        statistics = in_use.anomaly
+        assert statistics is not None
         repaired = [m for m, at in self._repaired_at.items() if 0.0 <= now - at < RELEARNING_TIME]
         statistics = statistics.ignoring(repaired)
         return detector.with_detector_of(statistics, mae, self._messages, self.isolated)

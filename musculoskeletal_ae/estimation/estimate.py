@@ -10,7 +10,6 @@ restores tensions and lengths. e is the residual and A the anomaly score, both i
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 from musculoskeletal_ae.arrays import Array
@@ -38,43 +37,16 @@ class Estimate:
     covariance: Array | None
 
 
-class StateEstimator:
-    """Estimates the state from the muscles that are not isolated.
-
-    Attributes:
-        mae: The network in use, without the isolated muscles; None before the first.
-        complete_mae: The same network as it was received.
-    """
-
-    def __init__(self) -> None:
-        self.mae: Mae | None = None
-        self.complete_mae: Mae | None = None
-
-    def use(self, mae: Mae, isolated: Iterable[int]) -> None:
-        """Use another network, and isolate these muscles (indices) in it."""
-        self.complete_mae, self.mae = mae, mae.without(isolated)
-
-    def step(self, bone_tension: Array, length: Array) -> Estimate:
-        """Return the estimate for one sample; `use` must have been called before.
-
-        Args:
-            bone_tension: Bone-side tensions [N], (M,).
-            length: Muscle lengths [m], (M,).
-        """
-        assert self.mae is not None
-        state = self.mae.estimate(bone_tension, length)
-        return estimate_of(self.mae, state, bone_tension, length)
-
-
-def estimate_of(mae: Mae, state: State, bone_tension: Array, length: Array) -> Estimate:
-    """Return a state that a network restored, with its residual, anomaly score and covariance.
+def estimate(mae: Mae, bone_tension: Array, length: Array, state: State | None = None) -> Estimate:
+    """Return the estimate of a network for one sample.
 
     Args:
-        mae: The network.
-        state: The state that it restored from the readings.
-        bone_tension: Bone-side tensions from the readings [N], (M,).
-        length: Muscle lengths from the readings [m], (M,).
+        mae: The network; its isolated muscles are ignored.
+        bone_tension: Bone-side tensions [N], (M,).
+        length: Muscle lengths [m], (M,).
+        state: The state that the network restores from them; None to compute it here.
     """
+    state = mae.estimate(bone_tension, length) if state is None else state
     error = residuals(state, bone_tension, length, mae.isolated)
     tension_error, length_error = error[: len(length)], error[len(length) :]
     anomaly = math.sqrt(tension_error @ tension_error) + math.sqrt(length_error @ length_error)
