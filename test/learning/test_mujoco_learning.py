@@ -60,7 +60,7 @@ def test_a_model_that_its_muscles_cannot_hold_is_refused_before_any_training(tmp
     assert main(options) == 1
     streams = capsys.readouterr()
     assert '0 of 150 random postures can be held: training is pointless' in streams.out
-    assert 'cannot hold it' in streams.err
+    assert 'the muscles cannot hold the arm' in streams.err
 
 
 @pytest.mark.parametrize(
