@@ -88,7 +88,7 @@ of "messages alone" in the next table.
 
 ## At the wire
 
-The table was measured by `bench wire`. Terms in it:
+The table was measured by `python -m bench wire`, which you can run on your own computer. Terms in it:
 
 - *latency*: time from the publishing of `muscle_states` to that of the next command
 - *late*: commands that came after more than two periods
