@@ -47,8 +47,9 @@ BEFORE_CORE = {
     f'simulation step, time per arm in a batch of {timings.MANY}': 6.7,
 }  # fmt: skip
 TORCH_BEFORE = 118.0  # time of the first row of BEFORE_CORE in eager torch on that machine [µs]
-#: results of that version by rate [Hz]: latency as median / 99th percentile / maximum [ms], and CPU
-#: time of all nodes [% of a core]. The learner ran at 100 and 200 Hz, but not at 500 Hz.
+#: results of the first version that was measured, by rate [Hz]: latency as median / 99th percentile
+#: / maximum [ms], and CPU time of all nodes [% of a core]. The learner ran at 100 and 200 Hz, but
+#: not at 500 Hz.
 BEFORE_WIRE = {100.0: ('3.4 / 9.4 / 19', 138), 200.0: ('2.4 / 8.6 / 17', 172),
                500.0: ('0.6 / 6.1 / 12', 166)}  # fmt: skip
 BEFORE_MEMORY = {'hardware_emulator': 271, 'estimator': 140, 'sim': 146, 'controller': 145,
@@ -88,7 +89,7 @@ of "messages alone" in the next table.
 
 ## At the wire
 
-The table was measured by `python -m bench wire`, which you can run on your own computer. Terms in it:
+The table was measured by `python -m bench wire`; run it on your own computer. Terms in it:
 
 - *latency*: time from the publishing of `muscle_states` to that of the next command
 - *late*: commands that came after more than two periods
@@ -164,8 +165,8 @@ def wire_table(measured: dict[tuple[str, float, str], Wire]) -> str:
         cost = known[1], f'{sum(result.cpu.values()):.0f}'
         cells.append((robot, f'{rate:.0f}', kind, known[0], latency, *lost, *cost))
     head = (
-        'robot | rate [Hz] | nodes | before: 50 % / 99 % / largest [ms] | now [ms] | late [%] | '
-        'missed [%] | CPU before [%] | now [%]'
+        'robot | rate [Hz] | nodes | latency before: 50 % / 99 % / largest [ms] | '
+        'latency now [ms] | late [%] | missed [%] | CPU before [%] | CPU now [%]'
     )
     return rows(head, cells)
 

@@ -187,7 +187,7 @@ def control_rows(robot: Robot, mae: Mae, eager: Network) -> list[Row]:
             lambda: eager_proposed_paper(robot, eager, theta, torque, tension),
         ),
         Row(
-            'one step of method stiffness',
+            'one step of the control method `stiffness`',
             lambda: stiffness_command(robot, mae, theta, torque, np.full(joints, 20.0), limit),
         ),
     ]

@@ -175,7 +175,7 @@ class Parser(argparse.ArgumentParser):
         text = 'muscles to leave out'
         self.add_argument('--without', type=names, default=[], metavar='NAME,…', help=text)
         self.add_argument('--base', metavar='LINK', help='root link of the chain to keep')
-        text = 'end effector: a link, a site, or LINK_tip, the far end of a drawn link; '
+        text = 'end effector: a link, a site, or LINK_tip, the far end of a link with a shape; '
         text += 'joints outside the chain to it are held fixed'
         self.add_argument('--end', metavar='NAME', help=text)
 

@@ -109,7 +109,7 @@ class Step(Enum):
     EXPLORE = 'explore', 'call controller/explore true to explore again', 3
     EXPLORE_GENTLY = (
         'explore_gently',
-        'call controller/explore true to explore gently until the offsets are known',
+        'call controller/explore true: the arm explores gently until its length offsets are known',
         3,
     )
     CHANGE_TARGET = (

@@ -40,7 +40,7 @@ class Series(NamedTuple):
     """The valid messages of a topic."""
 
     time: Array  # since the bag's start [s], (N,)
-    values: Array  # (N, …)
+    values: Array  # values of the N messages, one row for each
 
 
 class Pairs(NamedTuple):

@@ -154,8 +154,8 @@ class Stops:
         #: limit [rad] at whose stop each joint is, NaN for joints that are not at a stop, (N, D)
         self._at = np.full(model.by_sensor.shape, np.nan)
 
-    def lean(self, own: Array, score: Array) -> Bools:
-        """Detect which joints are at their stops.
+    def are_free(self, own: Array, score: Array) -> Bools:
+        """Return which joints are free of their stops, so that their torques must balance.
 
         Args:
             own: θ [rad], (N, D).
@@ -163,8 +163,7 @@ class Stops:
                 torque pushes the joint towards its upper limit.
 
         Returns:
-            A mask (N, D) of the joints whose torque balance the fit can use. A joint at its stop is
-            not among them, because the stop exerts an unknown torque.
+            A mask (N, D). It is false for a joint at its stop, which exerts an unknown torque.
         """
         # A joint with a sensor stays at its stop until the torque pulls it away. The score of a
         # joint without a sensor has to exceed LEAST_PUSH at every call. Otherwise a stop that was

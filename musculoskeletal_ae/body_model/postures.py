@@ -198,7 +198,7 @@ class GroupFit:
         )
         usual_torque = 1.5 * np.median(np.abs(residuals.torque), axis=0)
         usual_torque = np.maximum(usual_torque, LEAST_TORQUE * residuals.load + SMALL)
-        is_free = self.stops.lean(own, residuals.torque / usual_torque)
+        is_free = self.stops.are_free(own, residuals.torque / usual_torque)
         sigma = np.maximum(usual_torque, TORQUE_NOISE * residuals.load)
         y = self.prior.angle_precision
         self._weights = Weights(

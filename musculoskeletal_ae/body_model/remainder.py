@@ -50,9 +50,10 @@ if TYPE_CHECKING:
 UNITS = np.array([0.002, 0.5, 1.0, 1.0, 1.0, 0.001])
 #: expect these unknowns of the evidence before the samples (prior means)
 USUAL = np.array([-1.5, 0.5, 1.0, 2.0, 1.0, -2.0])
-#: expect the unknowns of the evidence to deviate from USUAL by this (prior standard deviations)
+#: prior standard deviations of the hyperparameters about USUAL; the search for the largest evidence
+#: is drawn towards USUAL by them
 SPREAD = np.array([2.0, 0.4, 1.0, 1.0, 1.0, 1.5])
-#: search each unknown of the evidence within these limits
+#: search each hyperparameter within these limits
 BOUNDS = ((-8.0, 4.0), (-1.5, 3.0), (0.0, 4.0), (-1.5, 4.0), (0.0, 3.5), (-2.5, 3.0))
 #: start a search from these values: a trusted body, a wrong body, and a rough remainder
 STARTS = (
@@ -67,7 +68,7 @@ ROUNDS = 25  # end a search that starts from STARTS after this many iterations
 FEW_ROUNDS = 4  # end a search that continues from the last result after this many iterations
 JUDGING = 150  # compute the evidence from at most this many samples
 LEAST_SAMPLES = 5  # learn a remainder only from at least this many samples
-UNKNOWN = 1.0  # assume this variance of a length that a sample does not describe [m²]
+UNKNOWN = 1.0  # assume this variance of a length that a sample lacks [m²]
 JITTER = 1e-10  # add this variance to keep covariances positive definite [m²]
 
 

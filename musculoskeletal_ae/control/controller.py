@@ -195,7 +195,7 @@ class Controller:
         self.holding = HoldingCheck(robot)
         self.sent_at = 0.0  # time of the last publication [s]; set by the caller
         self._estimate_problem = Persistence()
-        self._jumped_at = math.inf  # time of the last jump of lengths [s]
+        self._jumped_at = math.inf  # time of the last jump of lengths [s]; ∞ before the first one
         #: number of messages after which the filtered muscle states are newer than the last pause
         self._awaited_samples = 0
         if self.settings.method == 'float':

@@ -83,7 +83,7 @@ class Settings(CheckedSettings):
     )
     temperature_limit: float = settable(
         85.0,
-        'winding temperature to which muscle tensions are limited; 20 °C above it the arm stops',
+        'highest winding temperature, which limits the tensions; 20 °C above it the arm stops',
         '°C',
         40.0,
         200.0,

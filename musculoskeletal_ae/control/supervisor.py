@@ -49,8 +49,8 @@ class Event(Enum):
     CLEARED = 'no cause for 0.2 s'
     RELEASED = 'hold_time is over and the arm is released'
     SUSPECT = 'the estimator verifies a suspect muscle'
-    NOT_VERIFIED = 'the estimator has stopped or verifies nothing, or another cause needs a reset'
-    VERIFIED = 'verification ended the anomaly, and no cause needs a reset'
+    NOT_VERIFIED = 'the estimator has ended or verifies no muscle, or another cause needs a reset'
+    VERIFIED = 'the verification has ended the anomaly, and no cause needs a reset'
     NOTHING_PRESENT = 'no cause is present'
     RESET = 'controller/reset without a cause present'
 

@@ -253,8 +253,8 @@ class Winding(MotionTest):
         excess = tension - demand
         pulls = excess > self._tolerance
         needed = 0.5 * np.where(pulls, excess, -np.inf)
-        # The module evaluates the law with its own l, or with the l that is published for the other
-        # muscle.
+        # A module computes its tension from its own length, or, if two muscles are exchanged, from
+        # the length that is published for the other one.
         own: Array = self._robot.stiffness[:, None] * (length[:, None] - self._sent[None, :])
         published = (demand - self._bias)[None, :]
         explained: Bools = np.maximum(own, published) > needed[:, None]

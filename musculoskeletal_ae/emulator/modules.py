@@ -248,7 +248,7 @@ class Arm(ABC):
         self._current_zero = rng.normal(0.0, CURRENT_ZERO, count)
         share = DRIVE_FRICTION * rng.uniform(0.5, 1.5, count)
         self._drive_friction: Array = share * robot.description.tension.limit
-        self._mount = self.faults.mount  # turn of the base that the simulation uses
+        self._mount = self.faults.mount  # present turn of the base
         self._wrench = np.zeros(6)
         self._friction_factor = 1.0  # present friction, as a multiple of the individual's own
         self._command = Command(

@@ -88,7 +88,7 @@ class SuspectHandling:
 
     @property
     def anomaly(self) -> Anomaly:
-        """What has become of the newest latched finding."""
+        """State of the newest finding: none, found, being verified, or ended."""
         if self.suspect is None:
             return Anomaly.NONE
         if self.finding is None:

@@ -39,7 +39,7 @@ class ContactLoop(ClosedLoop):
     """A closed loop whose arm is pushed."""
 
     def contact(self, exploring: bool = False) -> Contact:
-        """Advance by one message, and return the contact estimate of this message."""
+        """Simulate until the next message, and return the contact that is estimated from it."""
         _ = self.explore() if exploring else self.step()
         assert self.estimator.output is not None and self.estimator.output.contact is not None
         return self.estimator.output.contact

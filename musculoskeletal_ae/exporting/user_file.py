@@ -23,7 +23,7 @@ INCLUDE = re.compile(r'<include\b[^>]*?\bfile\s*=\s*["\']([^"\']*)["\'][^>]*>')
 COMPILER = re.compile(r'<compiler\b[^>]*>')
 ATTRIBUTE = r'\b{name}\s*=\s*(["\'])(.*?)\1'
 FOLDERS = 'meshdir', 'texturedir', 'assetdir'
-SAME = 1e-6  # count a site's position as that of the compiled model up to this difference [m]
+SAME = 1e-6  # regard a site as unchanged if it has moved by no more than this [m]
 
 
 class UserFile:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lengths of passive tendons as polynomials of the joint angles (`robot/passive_tendons.py`).
 
-The source's own engine computes the lengths. The polynomial has the lowest degree at which it
-agrees with them to ACCURACY. If no degree does, it is the best polynomial with at most MOST_TERMS
-terms.
+The physics engine of the imported format (MuJoCo, for example) computes the lengths. The polynomial
+has the lowest degree at which it agrees with them to ACCURACY. If no degree does, it is the best
+polynomial with at most MOST_TERMS terms.
 """
 
 from itertools import combinations_with_replacement

@@ -148,7 +148,7 @@ class TrainerProcess(Trainer):
 
     @property
     def ready(self) -> bool:
-        """Whether a process is running and idle."""
+        """Whether the training process has started and waits for a job."""
         return self._process is not None and self._job is None
 
     def submit(self, job: Job) -> None:

@@ -69,7 +69,7 @@ class BringupStatusNode(Shell):
         self.ended_report = math.inf  # arrival of that report, as `Situation.heard_at` counts [s]
         #: the last line that was printed before the first estimate, and whether it stated the load
         self.waiting = '', False
-        self.waiting_since = -math.inf  # when that line was printed [s]
+        self.waiting_at = -math.inf  # time at which the line 'waiting for …' was printed last [s]
         self.printed_hint = ''
         self.follow_posture('joint_states', self._on_measured_posture, some=True)
         self.follow_posture('estimated_joint_states', self._on_estimate)
@@ -91,7 +91,7 @@ class BringupStatusNode(Shell):
             self.errors.append(theta - measured)
 
     def conditions(self) -> Iterable[Condition]:
-        """Yield the conditions of the whole arm, so that the level is that of the worst node."""
+        """Yield the conditions of all nodes; the level of the arm is that of its worst node."""
         yield from super().conditions()
         yield from (each.condition for each in self.situation.conditions())
 
@@ -184,10 +184,10 @@ class BringupStatusNode(Shell):
         line = ': '.join(filter(None, ['waiting for the first estimate', reason]))
         # The load itself changes all the time, which is no reason to print the line again.
         is_new = bool(waits := self._why_replay_waits()) and waits not in self.waiting[0]
-        is_due = is_new or now - self.waiting_since >= WAITING_INTERVAL
+        is_due = is_new or now - self.waiting_at >= WAITING_INTERVAL
         note = overload_note() if is_settled else ''
         if (line, bool(note)) != self.waiting and is_due:
-            self.waiting, self.waiting_since = (line, bool(note)), now
+            self.waiting, self.waiting_at = (line, bool(note)), now
             print(printable('; '.join(filter(None, [line, note]))), flush=True)
 
     def _print_line(self, running_time: float) -> None:

@@ -78,7 +78,7 @@ def proposed(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array
 def control_loss(
     robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array
 ) -> tuple[Term, ...]:
-    """Return the three terms of L_control (9)."""
+    """Return the three terms of the control loss L_control, equation (9) of the paper."""
     joints, muscles = robot.joint_count, robot.muscle_count
     jacobian = muscle_jacobian(mae, theta, tension)
     jacobian[list(robot.isolated)] = 0.0

@@ -312,7 +312,7 @@ class StiffnessControl(Actuation):
         return demand
 
     def tension_per_length(self, tension: Array) -> Array:  # noqa: ARG002
-        """Return the control stiffness of each module [N/m], (M,), which is constant."""
+        """Return the gain K of each module [N/m], (M,), which does not depend on the tension."""
         return self._stiffness
 
     def length_for(self, length: Array, tension: Array, wanted: Array) -> Array:  # noqa: ARG002

@@ -233,8 +233,8 @@ def parse(arguments: list[str]) -> Namespace:
     compression_help = 'compression of the chunks of the mcap file'
     add('--compression', choices=COMPRESSIONS, default='zstd', help=compression_help)
     recover_help = (
-        'copy all readable messages of a damaged bag, for example of a killed recorder, to a '
-        'complete bag in DIR (default: BAG_recovered)'
+        'copy all readable messages of a damaged bag (for example, one whose recorder was killed) '
+        'to a new bag in DIR (default: BAG_recovered)'
     )
     add('--recover', type=Path, metavar='BAG', help=recover_help)
     options = parser.parse_args(arguments)

@@ -223,9 +223,9 @@ def _check(rows: Array) -> None:
             return ', '.join(f'{each:d}' for each in kind)
 
         legal = (
-            f'offsets within ±{MOST_OFFSET:g} m, standard deviations >= 0, a trust of '
-            f'{values(Trust)}, 1 for isolated muscles and 0 for others, an anomaly of '
-            f'{values(Anomaly)} that is 0 for all muscles but one and not {Anomaly.VERIFYING:d} '
-            'for a muscle in use, and the same whole number >= 0 as the generation of all muscles'
+            f'offset within ±{MOST_OFFSET:g} m; standard deviation >= 0; trust {values(Trust)}; '
+            f'isolated 0 or 1; anomaly {values(Anomaly)}, other than 0 for at most one muscle, and '
+            f'{Anomaly.VERIFYING:d} only for an isolated one; generation a whole number >= 0, the '
+            'same for all muscles'
         )
         raise MessageError('impossible body state', f'expected {legal}, got {rows.tolist()}')

@@ -27,7 +27,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 HELD = 60.0  # plan no tension that heats a winding too much when it is held for this time [s]
 MOMENT = 5.0  # command no tension that heats a winding too much when it is held for this time [s]
-EVERY = 1.0  # update at this interval [s]
+EVERY = 1.0  # compute the winding temperatures again after this time [s]
 LONGEST = 10.0  # let one update cover at most this time [s]
 #: Attribute a larger change of a housing's temperature between two updates to the sensor or to
 #: another source of heat [°C], because the motor cannot cause it.

@@ -223,8 +223,8 @@ class _Lengths:
     def misfit(self, theta: Array) -> float:
         """Return the root mean square of measured minus modelled lengths [m] at θ (N, D).
 
-        The mean of the differences in each segment is subtracted first. The result is ∞ if θ is
-        beyond the joint limits.
+        The mean difference of each uninterrupted stretch of the recording is subtracted first. The
+        result is ∞ if any θ is beyond a joint limit.
         """
         robot = self.robot
         beyond = np.maximum(theta - robot.upper, robot.lower - theta)

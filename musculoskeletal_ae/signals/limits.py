@@ -54,7 +54,7 @@ class Limits(NamedTuple):
     # the messages, limited to `longest_step`. A length that has jumped is accepted after it has
     # stayed at the new level for `settled`.
     step: float = 0.02  # constant part of the largest change of a length [m]
-    speed: float = 1.0  # largest speed of a length [m/s]
+    speed: float = 1.0  # largest plausible speed of a muscle length [m/s]
     longest_step: float = 0.05  # upper limit of dt in this formula [s]
     settled: float = 1.0  # time after which a new level of a length is accepted [s]
     #: time after which implausible messages are a fault instead of a glitch [s]

@@ -23,7 +23,7 @@ from musculoskeletal_ae.signals.limits import LIMITS, longest_lengths, reading_r
 
 
 class Presence(Enum):
-    """Which values of a quantity a message may lack."""
+    """Whether a message must have a quantity for all muscles, for some of them, or not at all."""
 
     REQUIRED = 'each value is a finite number'
     MEASURED_OR_NAN = 'a value that is not measured is NaN'

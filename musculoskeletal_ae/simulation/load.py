@@ -45,7 +45,7 @@ class LoadTree(NamedTuple):
     first: Array
     second: Array
     axis: Array  # axis of each joint in its own frame, (J, 3)
-    mass: Array  # mass of each joint's body [kg], (J,)
+    mass: Array  # mass of the body that each of the J joints moves [kg], (J,)
     carried: Array  # total mass that each joint carries [kg], (J,)
     centre: Array  # centre of mass of each body in its joint's frame [m], (J, 3)
     gravity: Array  # acceleration of gravity [m/s²], (3,)

@@ -50,7 +50,7 @@ class Table:
 
     @classmethod
     def of_pairs(cls, pairs: Pairs) -> Table:
-        """Return the readings of a bag as a table."""
+        """Return a table with one row for each pair of a joint and a muscle message of a bag."""
         return cls(pairs, False, np.zeros(len(pairs.time), dtype=int))
 
     @classmethod

@@ -33,7 +33,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_seeds(None, 'seeds of the emulated individuals (default: 0,1,2,3,4; quick: 0)')
     parser.add_reality()
     parser.add_minutes('duration of the exploration (default: 10; quick: 2)', None)
-    parser.add_quick('a short version of each experiment, in a minute')
+    parser.add_quick('run a short version of each experiment, in about a minute for all of them')
     parser.add_out('DIR', 'results and report', Path('experiments'))
     cores = len(os.sched_getaffinity(0))
     parser.add_argument('--jobs', type=whole(1, 256), default=cores, help='number of processes')

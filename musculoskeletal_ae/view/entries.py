@@ -23,7 +23,8 @@ class Entries:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._changes: dict[Key, deque[float]] = {}  # times of the last changes [s]
-        self._values: dict[Key, float] = {}  # values that have not been taken
+        #: values that a visitor has entered and that `take` has not returned yet
+        self._values: dict[Key, float] = {}
 
     def change(self, key: Key, value: float, now: float) -> None:
         """Record that a visitor has changed a value at the time `now` [s]."""

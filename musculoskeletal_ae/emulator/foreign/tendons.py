@@ -273,7 +273,7 @@ def tendons_step(arm: Handle, kind: int, absolute: Array, control: Array) -> Non
 
 @njit(cache=True)
 def guides_step(arm: Handle, duration: float) -> None:
-    """Update the bends of the tendons, and let route points yield to their load.
+    """Compute the angles by which tendons bend at their guides, and how far these guides give way.
 
     Args:
         arm: Handle to the GuideParts, which are changed in place.

@@ -158,10 +158,11 @@ class ResidualDistance(Detector):
         return Finding(suspect, ConditionKind.RESIDUAL_DISTANCE, evidence, tuple(others))
 
     def unfamiliarity(self, theta: Array) -> float:
-        """Return how far a posture is from the nearest one in which the network was calibrated.
+        """Return how far a posture is from the nearest one in which the detector was calibrated.
 
-        Above 1, the posture is unfamiliar. A distance of a quarter of every joint's range (root sum
-        square over the joints) counts as 1. Without calibrated postures, the result is 0.
+        The result is 1 if every joint differs by a quarter of its range; in between, the root sum
+        square over the joints decides. Above 1, the posture is unfamiliar. Without calibrated
+        postures, the result is 0.
 
         Args:
             theta: Joint angles [rad], (D,).
