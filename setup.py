@@ -20,7 +20,7 @@ TOOLS = [
 #: what only the page and only the experiments need: extras of `pip install .[view,experiments]`
 EXTRAS = {
     'view': ['viser', 'websockets', 'trimesh', 'Jinja2'],
-    'experiments': ['matplotlib', 'mujoco', 'Jinja2', 'cma'],
+    'experiments': ['matplotlib', 'mujoco', 'Jinja2', 'cma', 'joblib'],
 }
 BUILD = ['colcon-common-extensions', 'setuptools']  # with which the scripts build a ROS package
 

@@ -20,6 +20,7 @@ network. With the learned network, the bench measures:
 Tensions are the true ones of the emulated arm, whatever its sensors measure.
 """
 
+from collections import defaultdict
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments import online_learning
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_TIME, ClosedLoop
 from musculoskeletal_ae.experiments.resilience import IsolatingLoop
+from musculoskeletal_ae.experiments.workers import workers
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.exploration_steps import TRIES, holdable_postures
@@ -224,6 +226,7 @@ def main(argv: list[str]) -> int:
     add('--seconds', type=positive, default=EXPLORED, help='time of exploration [s]')
     add('--held', type=positive, default=HELD, help='time for each target [s]')
     parser.add_initial()
+    parser.add_workers()
     options = parser.parse_args(argv)
     if wrong := set(options.modules) - set(KINDS):
         raise MusculoskeletalError(
@@ -233,14 +236,23 @@ def main(argv: list[str]) -> int:
     robot = Robot.load(options.robot)
     initial = initial_network(robot, options.initial)
     print(HEAD)
-    for reality in options.realities:
-        rows: dict[str, list[Result]] = {kind: [] for kind in options.modules}
-        for seed in options.seeds:
-            for kind, results in rows.items():
-                results.append(measure(robot, kind, initial, reality, seed, share, options.held))
-                print(line(reality, str(seed), kind, results[-1]), flush=True)
-        for kind, results in rows.items():
-            mean = Result(*np.nanmean(results, axis=0))
-            highest = max(result.highest for result in results)
-            print(line(reality, 'mean', kind, mean._replace(highest=highest)), flush=True)
+    cases = [
+        (reality, seed, kind)
+        for reality in options.realities
+        for seed in options.seeds
+        for kind in options.modules
+    ]
+    rows = defaultdict[tuple[str, str], list[Result]](list)
+    calls = [
+        (robot, kind, initial, reality, seed, share, options.held) for reality, seed, kind in cases
+    ]
+    with workers(options.jobs, options.scheduler) as processes:
+        results = processes.in_order(measure, calls)
+        for (reality, seed, kind), result in zip(cases, results, strict=True):
+            rows[reality, kind].append(result)
+            print(line(reality, str(seed), kind, result), flush=True)
+    for (reality, kind), every in rows.items():
+        mean = Result(*np.nanmean(every, axis=0))
+        highest = max(result.highest for result in every)
+        print(line(reality, 'mean', kind, mean._replace(highest=highest)), flush=True)
     return 0

@@ -26,7 +26,6 @@ from collections import defaultdict
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from bench.learned_arm import initial_network
 from musculoskeletal_ae.arrays import Array
@@ -40,6 +39,7 @@ from musculoskeletal_ae.experiments.recording import (
     end_tensions,
     record,
 )
+from musculoskeletal_ae.experiments.workers import workers
 from musculoskeletal_ae.learning.collector import NONE, SENSOR
 from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.learner import Learner
@@ -113,6 +113,27 @@ def learned(robot: Robot, driver: Mae, exploring: Recording, seed: int, source: 
     return mae
 
 
+def measure(
+    robot: Robot,
+    driver: Mae,
+    reality: str,
+    seed: int,
+    exploration: str,
+    minutes: float,
+    scale: float,
+) -> dict[str, Honesty]:
+    """Let an individual learn; return how honest its covariance is, by source of joint angles."""
+    steps = Exploration(robot, EXPLORATION_STREAM + seed, exploration)
+    exploring = record(make_arm(robot, seed, reality), driver, steps, 60.0 * minutes)
+    held_out = record(make_arm(robot, seed, reality), driver, HELD_OUT_STREAM, HELD_OUT)
+    results = {}
+    for source in VIEWS:
+        mae = learned(robot, driver, exploring, seed, source)
+        assert mae.covariance is not None  # the method of preset default computes it
+        results[source] = honesty(scale * mae.covariance, errors(mae, held_out))
+    return results
+
+
 def main(argv: list[str]) -> None:
     """Print a line for each individual, and a line of means for each emulator model."""
     parser = Parser('covariance', (__doc__ or '').partition('\n')[0])
@@ -129,26 +150,24 @@ def main(argv: list[str]) -> None:
         '--scale', type=number(0.01, 100.0), default=1.0, help='factor of each covariance'
     )
     parser.add_initial()
+    parser.add_workers()
     args = parser.parse_args(argv)
-    torch.set_num_threads(1)
 
     robot = Robot.load(args.robot)
     rows = defaultdict[tuple[str, str], list[Honesty]](list)
     driver = initial_network(robot, args.initial)
     print('with joint sensors; without joint sensors')
-    for reality in args.realities:
-        for seed in args.seeds:
-            steps = Exploration(robot, EXPLORATION_STREAM + seed, args.exploration)
-            exploring = record(make_arm(robot, seed, reality), driver, steps, 60.0 * args.minutes)
-            held_out = record(make_arm(robot, seed, reality), driver, HELD_OUT_STREAM, HELD_OUT)
-            texts = []
-            for source in VIEWS:
-                mae = learned(robot, driver, exploring, seed, source)
-                assert mae.covariance is not None  # the method of preset default computes it
-                row = honesty(args.scale * mae.covariance, errors(mae, held_out))
+    cases = [(reality, seed) for reality in args.realities for seed in args.seeds]
+    with workers(args.jobs, args.scheduler) as processes:
+        calls = [
+            (robot, driver, *case, args.exploration, args.minutes, args.scale) for case in cases
+        ]
+        for (reality, seed), results in zip(cases, processes.in_order(measure, calls), strict=True):
+            for source, row in results.items():
                 rows[reality, source].append(row)
-                texts.append(row.text())
+            texts = [row.text() for row in results.values()]
             print(f'{reality} {seed}: {"; ".join(texts)}', flush=True)
+    for reality in args.realities:
         texts = [summary(rows[reality, source]) for source in VIEWS]
         goal = 'goal: 0.93 to 0.97 inside, NEES 1'
         print(f'{reality}, mean: {"; ".join(texts)} ({goal})', flush=True)

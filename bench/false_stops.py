@@ -20,12 +20,11 @@ stop. The exit status is 1 if there was one.
 
 from typing import NamedTuple
 
-import torch
-
 from bench.lab import CORES, SAMPLE_TIME, Lab
 from bench.learned_arm import initial_network
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import KIN, make_arm
+from musculoskeletal_ae.experiments.workers import workers
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser, number, positive
 from musculoskeletal_ae.robot.robot import Robot
@@ -93,6 +92,13 @@ class BusyLoop(Lab):
         )  # fmt: skip
 
 
+def watch(
+    robot: Robot, reality: str, seed: int, initial: Mae, load: float, seconds: float
+) -> Result:
+    """Let the individual of a seed explore; return what happened (see `BusyLoop`)."""
+    return BusyLoop(make_arm(robot, seed, reality), initial, seed, load).watch(seconds)
+
+
 def main(argv: list[str]) -> int:
     """Print the table; exit status 1 if a healthy arm stopped."""
     parser = Parser('false_stops', (__doc__ or '').partition('\n')[0])
@@ -112,17 +118,19 @@ def main(argv: list[str]) -> int:
     )
     parser.add_initial()
     parser.add_quick('a minute of each arm')
+    parser.add_workers()
     options = parser.parse_args(argv)
-    torch.set_num_threads(1)
     robot = Robot.load(options.robot)
     initial = initial_network(robot, options.initial)
     seconds = 60.0 if options.quick else 3600.0 * options.hours
     print(HEAD)
     problems = 0
-    for seed in options.seeds:
-        arm = make_arm(robot, seed, options.reality)
-        result = BusyLoop(arm, initial, seed, options.load).watch(seconds)
-        problems += bool(result.problem)
-        print(result.line(seed), flush=True)
+    calls = [
+        (robot, options.reality, seed, initial, options.load, seconds) for seed in options.seeds
+    ]
+    with workers(options.jobs, options.scheduler) as processes:
+        for seed, result in zip(options.seeds, processes.in_order(watch, calls), strict=True):
+            problems += bool(result.problem)
+            print(result.line(seed), flush=True)
     print(f'{problems} false findings and stops')
     return int(problems > 0)

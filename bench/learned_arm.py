@@ -56,6 +56,7 @@ def initial_network(robot: Robot, file: Path | None) -> Mae:
 
 def initial(robot: Robot, folder: Path) -> Mae:
     """Return the network of the geometric model, from the cache in `folder` if it is there."""
+    folder.mkdir(parents=True, exist_ok=True)
     file = folder / 'initial.safetensors'
     if not file.exists():
         checkpoint.save(initial_mae(robot).mae, file)
@@ -69,7 +70,6 @@ def learned_arm(
 
     If the cache in `folder` has the individual, it is read from there.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     name = f'{seed}' if reality == KIN else f'{reality}_{seed}'
     driver, file = initial(robot, folder), folder / f'learned_{name}.safetensors'
     messages = folder / f'exploring_{name}.npz'

@@ -59,6 +59,7 @@ from bench.mishap_kinds import MISHAPS, NAMES, SELF, SOFTWARE, Case, Mishap
 from bench.statements import Statement, statements, troubles
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.experiments.workers import workers
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
@@ -727,6 +728,7 @@ def main(argv: list[str]) -> int:
     )
     parser.add_out('DIR', 'folder of the results', Path('bench_mishaps'))
     parser.add_quick('the first 11 mishaps of individual 0, emulator model kin')
+    parser.add_workers()
     options = parser.parse_args(argv)
     if options.list:
         print('\n'.join(mishap.name for mishap in MISHAPS))
@@ -753,9 +755,17 @@ def main(argv: list[str]) -> int:
         run_graph(folder, seeds, options.kinds, options.again)
         print(graph_table(results(folder)))
         return 0
-    for reality in realities:
-        for seed in seeds:
-            run_seed(robot, folder, seed, reality, kinds, options.again)
+    folder = folder.resolve()
+    for reality in realities:  # train these networks once, and not for each individual
+        other_network(robot, initial(robot, folder), reality, folder)
+    calls = [
+        (robot, folder, seed, reality, kinds, options.again)
+        for reality in realities
+        for seed in seeds
+    ]
+    with workers(options.jobs, options.scheduler) as processes:
+        for _ in processes.in_order(run_seed, calls):
+            pass
     mine = [
         each
         for each in results(folder)

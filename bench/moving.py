@@ -13,9 +13,11 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.emulator.reality import make_arm
+from musculoskeletal_ae.experiments.workers import workers
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.recordings import errors, learn
 from musculoskeletal_ae.mae.initial_training import initial_mae
+from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -57,6 +59,21 @@ def record(
     return Pairs(PERIOD * np.arange(len(rows), dtype=float), theta, length, tension, unknown)
 
 
+def measure(robot: Robot, mae: Mae, reality: str, seed: int, seconds: float) -> list[str]:
+    """Return the errors of one individual as lines of text."""
+    held_out = record(robot, reality, seed, 60.0, 1.0, 1.0, order=9)
+    before = robot.units.error_text(errors(mae, held_out))
+    lines = [f'{reality} {seed}: initial network {before}']
+    for name, motion, rest in (('without a rest', 2.0, 0.0), ('with rests', 1.0, 1.0)):
+        recording = record(robot, reality, seed, seconds, motion, rest, order=0)
+        learner = Learner(robot, mae, from_motion=not rest)
+        stop = learn(learner, recording)
+        after = robot.units.error_text(errors(learner.mae, held_out))
+        count = f'{len(learner.samples)} samples'
+        lines.append(f'{reality} {seed}: {name} {after} ({count}) {stop}')
+    return lines
+
+
 def main(argv: list[str]) -> int:
     """Print the errors for each individual."""
     parser = Parser('moving', 'Learns emulated recordings with and without rests.')
@@ -64,18 +81,12 @@ def main(argv: list[str]) -> int:
     parser.add_reality()
     parser.add_seeds((0, 1))
     parser.add_argument('--seconds', type=float, default=150.0, help='duration of a recording [s]')
+    parser.add_workers()
     args = parser.parse_args(argv)
     robot = Robot.load(args.robot)
     mae = initial_mae(robot).mae
-    for seed in args.seeds:
-        held_out = record(robot, args.reality, seed, 60.0, 1.0, 1.0, order=9)
-        before = robot.units.error_text(errors(mae, held_out))
-        print(f'{args.reality} {seed}: initial network {before}', flush=True)
-        for name, motion, rest in (('without a rest', 2.0, 0.0), ('with rests', 1.0, 1.0)):
-            recording = record(robot, args.reality, seed, args.seconds, motion, rest, order=0)
-            learner = Learner(robot, mae, from_motion=not rest)
-            stop = learn(learner, recording)
-            after = robot.units.error_text(errors(learner.mae, held_out))
-            count = f'{len(learner.samples)} samples'
-            print(f'{args.reality} {seed}: {name} {after} ({count}) {stop}', flush=True)
+    calls = [(robot, mae, args.reality, seed, args.seconds) for seed in args.seeds]
+    with workers(args.jobs, args.scheduler) as processes:
+        for lines in processes.in_order(measure, calls):
+            print(*lines, sep='\n', flush=True)
     return 0

@@ -18,7 +18,7 @@ Exit status 1 if a tension was above `ALLOWED` times its limit for longer than `
 healthy arm stopped.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -39,6 +39,7 @@ from musculoskeletal_ae.experiments.recording import (
     estimation_error,
     record,
 )
+from musculoskeletal_ae.experiments.workers import workers
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.exploration_steps import TRIES, holdable_postures
@@ -150,6 +151,34 @@ def line(seed: int, what: str, excess: Excess, stops: int, rest: str = '') -> st
     )
 
 
+def measure(
+    robot: Robot,
+    reality: str,
+    initial: Mae,
+    seed: int,
+    methods: Sequence[str],
+    share: float,
+    seconds: float,
+) -> list[tuple[str, Excess, int, tuple[int, float] | None]]:
+    """Let an individual explore, and move to targets by each method.
+
+    Returns:
+        What the arm did, the excess of its tensions, the number of its stops, and if it explored,
+        the number of samples and the error after learning [rad].
+    """
+    held_out = record(make_arm(robot, seed, reality), initial, HELD_OUT_STREAM, share * HELD_OUT)
+    results = list[tuple[str, Excess, int, tuple[int, float] | None]]()
+    if seconds * share >= SAMPLE_TIME:
+        arm = make_arm(robot, seed, reality)
+        excess, stops, samples, error = explore(arm, initial, seed, share * seconds, held_out)
+        results.append(('exploring', excess, stops, (samples, error)))
+    for method in methods:
+        arm = make_arm(robot, seed, reality)
+        count = max(1, round(share * TARGETS))
+        results.append((method, *go(arm, initial, seed, method, count), None))
+    return results
+
+
 def main(argv: list[str]) -> int:
     """Measure every individual, and print the table."""
     parser = Parser('tension', (__doc__ or '').partition('\n')[0])
@@ -166,6 +195,7 @@ def main(argv: list[str]) -> int:
         '--seconds', type=positive, default=EXPLORED, help='time of exploration [s]'
     )
     parser.add_initial()
+    parser.add_workers()
     options = parser.parse_args(argv)
     share = 0.25 if options.quick else 1.0
     robot = Robot.load(options.robot)
@@ -177,26 +207,20 @@ def main(argv: list[str]) -> int:
         )
     print(HEAD)
     failures, worst, rows = 0, Excess(0.0, 0.0, 0.0, 0.0), []
-    for seed in options.seeds:
-        held_out = record(
-            make_arm(robot, seed, options.reality), initial, HELD_OUT_STREAM, share * HELD_OUT
-        )
-        results = []
-        if options.seconds * share >= SAMPLE_TIME:
-            arm = make_arm(robot, seed, options.reality)
-            excess, stops, samples, error = explore(
-                arm, initial, seed, share * options.seconds, held_out
-            )
-            rows.append((samples, error))
-            results.append(('exploring', excess, stops, f' {samples:>7} {error:>7.3f}'))
-        for method in methods:
-            arm = make_arm(robot, seed, options.reality)
-            count = max(1, round(share * TARGETS))
-            results.append((method, *go(arm, initial, seed, method, count), ''))
-        for what, excess, stops, rest in results:
-            print(line(seed, what, excess, stops, rest), flush=True)
-            failures += (excess.longest > LONGEST) + stops
-            worst = Excess(*np.maximum(worst, excess))
+    calls = [
+        (robot, options.reality, initial, seed, methods, share, options.seconds)
+        for seed in options.seeds
+    ]
+    with workers(options.jobs, options.scheduler) as processes:
+        for seed, results in zip(options.seeds, processes.in_order(measure, calls), strict=True):
+            for what, excess, stops, learned in results:
+                rest = ''
+                if learned is not None:
+                    rows.append(learned)
+                    rest = f' {learned[0]:>7} {learned[1]:>7.3f}'
+                print(line(seed, what, excess, stops, rest), flush=True)
+                failures += (excess.longest > LONGEST) + stops
+                worst = Excess(*np.maximum(worst, excess))
     means = np.mean(rows, axis=0) if rows else (np.nan, np.nan)
     print(line(-1, 'worst, mean', worst, failures, f' {means[0]:>7.0f} {means[1]:>7.3f}'))
     return int(failures > 0)

@@ -24,9 +24,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
-from bench.learned_arm import learned_arm
+from bench.learned_arm import initial, learned_arm
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import Controller
@@ -36,6 +35,7 @@ from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
 from musculoskeletal_ae.estimation.estimator import Estimator, Output
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME
+from musculoskeletal_ae.experiments.workers import workers
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.remedy import Step
@@ -206,30 +206,40 @@ def run(robot: Robot, mae: Mae, arm: Arm, seed: int, case: Case) -> dict[str, An
     return {'outcome': outcome, 'before': before, 'after': after, 'said': said}
 
 
+def measure(robot: Robot, folder: Path, seed: int, reality: str) -> list[tuple[str, str]]:
+    """Try all cases on one individual; return a line of text and the outcome of each."""
+    results, mae = [], learned_arm(robot, seed, folder, MINUTES, reality).mae
+    for case in cases(robot, seed):
+        got = run(robot, mae, make_arm(robot, seed, reality), seed, case)
+        how = 'sensors' if case.has_sensors else 'none'
+        muscles = robot.names(case.wiring.faulty) or '-'
+        (error, anomaly), (last_error, last_anomaly) = got['before'], got['after']
+        text = (
+            f'{seed} {reality:7s} {how:7s} {case.what:8s} {muscles}: {got["outcome"]}; '
+            f'{error:.3f} → {last_error:.3f} rad, A {anomaly:.3f} → {last_anomaly:.3f}; '
+            f'{got["said"]}'
+        )
+        results.append((text, f'{case.what}, {how}: {got["outcome"]}'))
+    return results
+
+
 def main(argv: list[str]) -> int:
     """Print the outcomes; return the exit status, 0 unless false offsets were accepted, else 1."""
     parser = Parser('wiring', 'Exchanges muscles, or reverses a sign, in a live driver.')
     parser.add_robot()
     parser.add_seeds((0, 1, 2, 3, 4))
     parser.add_folder('folder that keeps the learned networks', Path('bench_wiring'))
+    parser.add_workers()
     args = parser.parse_args(argv)
-    torch.set_num_threads(1)
     robot, outcomes = Robot.load(args.robot), Counter[str]()
-    for seed in args.seeds:
-        for reality in (KIN, FOREIGN):
-            mae = learned_arm(robot, seed, args.folder, MINUTES, reality).mae
-            for case in cases(robot, seed):
-                got = run(robot, mae, make_arm(robot, seed, reality), seed, case)
-                how = 'sensors' if case.has_sensors else 'none'
-                outcomes[f'{case.what}, {how}: {got["outcome"]}'] += 1
-                muscles = robot.names(case.wiring.faulty) or '-'
-                (error, anomaly), (last_error, last_anomaly) = got['before'], got['after']
-                print(
-                    f'{seed} {reality:7s} {how:7s} {case.what:8s} {muscles}: {got["outcome"]}; '
-                    f'{error:.3f} → {last_error:.3f} rad, A {anomaly:.3f} → {last_anomaly:.3f}; '
-                    f'{got["said"]}',
-                    flush=True,
-                )
+    folder = args.folder.resolve()
+    initial(robot, folder)
+    calls = [(robot, folder, seed, reality) for seed in args.seeds for reality in (KIN, FOREIGN)]
+    with workers(args.jobs, args.scheduler) as processes:
+        for results in processes.in_order(measure, calls):
+            for text, outcome in results:
+                print(text, flush=True)
+                outcomes[outcome] += 1
     for text, count in sorted(outcomes.items()):
         print(f'{count:4d} × {text}')
     return int(any('FALSE' in text or 'REFUSED' in text for text in outcomes))

@@ -20,9 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from bench.learned_arm import learned_arm
+from bench.learned_arm import initial, learned_arm
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
@@ -36,6 +35,7 @@ from musculoskeletal_ae.experiments.recording import (
     mean_error,
     record,
 )
+from musculoskeletal_ae.experiments.workers import workers
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
@@ -146,6 +146,25 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
     }
 
 
+def measure(robot: Robot, folder: Path, seed: int) -> dict[str, dict[str, Any]]:
+    """Return the results of one individual, with and without joint sensors."""
+    learned = learned_arm(robot, seed, folder, MINUTES)
+    held_out = record(EmulatedArm(robot, seed), learned.driver, HELD_OUT_STREAM, HELD_OUT)
+    return {how: zeroed(robot, learned.mae, seed, how, held_out) for how in GOALS}
+
+
+def line(seed: int, how: str, got: dict[str, Any], good: bool) -> str:
+    """Return one result as a line for people."""
+    return (
+        f'individual {seed}, {how:8s} error {got["before_rad"]:.4f} → {got["after_rad"]:.4f} rad '
+        f'(× {got["ratio"]:.2f}) after {got["seconds"]:.0f} s; largest error of an offset '
+        f'{1e3 * got["worst_zero_m"]:.1f} mm; {got["alarms"]} alarms during calibration and '
+        f'{got["alarms_after"]} after it; at most {1e3 * got["fastest_m_s"]:.0f} mm/s and '
+        f'{got["highest_n"]:.0f} N; mean range of the joints {got["range_rad"]:.2f} rad; '
+        f'{"meets" if good else "misses"} the goal {got["stopped"]}'
+    )
+
+
 def main(argv: list[str]) -> int:
     """Print the results; return the exit status, 0 if every individual meets the goals, else 1."""
     parser = Parser('zeroing', 'Tests length calibration after power-on.')
@@ -153,29 +172,20 @@ def main(argv: list[str]) -> int:
     parser.add_seeds((0, 1, 2, 3, 4))
     parser.add_folder('folder that keeps the learned networks', Path('bench_zeroing'))
     parser.add_out('FILE', 'JSON file for the results', is_optional=True)
+    parser.add_workers()
     args = parser.parse_args(argv)
-    torch.set_num_threads(1)
     robot, numbers, passed = Robot.load(args.robot), dict[str, Any](), True
-    for seed in args.seeds:
-        learned = learned_arm(robot, seed, args.folder, MINUTES)
-        arm = EmulatedArm(robot, seed)
-        held_out = record(arm, learned.driver, HELD_OUT_STREAM, HELD_OUT)
-        for how, (seconds, ratio) in GOALS.items():
-            got = numbers[f'{how} {seed}'] = zeroed(robot, learned.mae, seed, how, held_out)
-            good = got['found'] and got['seconds'] <= seconds and got['ratio'] <= ratio
-            good &= not (got['alarms'] + got['alarms_after'] or got['stopped'])
-            passed &= good
-            print(
-                f'individual {seed}, {how:8s} error {got["before_rad"]:.4f} → '
-                f'{got["after_rad"]:.4f} rad (× {got["ratio"]:.2f}) after '
-                f'{got["seconds"]:.0f} s; largest error of an offset '
-                f'{1e3 * got["worst_zero_m"]:.1f} mm; {got["alarms"]} alarms during calibration '
-                f'and {got["alarms_after"]} after it; at most {1e3 * got["fastest_m_s"]:.0f} mm/s '
-                f'and {got["highest_n"]:.0f} N; mean range of the joints '
-                f'{got["range_rad"]:.2f} rad; {"meets" if good else "misses"} the goal',
-                got['stopped'],
-                flush=True,
-            )
-            if args.out:
-                args.out.write_text(json.dumps(numbers, indent=1) + '\n')
+    folder = args.folder.resolve()
+    initial(robot, folder)
+    calls = [(robot, folder, seed) for seed in args.seeds]
+    with workers(args.jobs, args.scheduler) as processes:
+        for seed, results in zip(args.seeds, processes.in_order(measure, calls), strict=True):
+            for how, (seconds, ratio) in GOALS.items():
+                got = numbers[f'{how} {seed}'] = results[how]
+                good = got['found'] and got['seconds'] <= seconds and got['ratio'] <= ratio
+                good &= not (got['alarms'] + got['alarms_after'] or got['stopped'])
+                passed &= good
+                print(line(seed, how, got, good), flush=True)
+                if args.out:
+                    args.out.write_text(json.dumps(numbers, indent=1) + '\n')
     return 0 if passed else 1

@@ -10,6 +10,7 @@ prints one line and ends with status 1.
 import argparse
 import errno
 import math
+import os
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -140,6 +141,14 @@ class Parser(argparse.ArgumentParser):
     def add_quick(self, text: str) -> None:
         """Add `--quick`; the text says what the tool then skips."""
         self.add_argument('--quick', action='store_true', help=text)
+
+    def add_workers(self) -> None:
+        """Add `--jobs` and `--scheduler`, which say where independent parts of the work run."""
+        cores = len(os.sched_getaffinity(0))
+        text = 'number of processes on this machine'
+        self.add_argument('--jobs', type=whole(1, 256), default=cores, help=text)
+        text = 'scheduler of a Dask cluster to use instead, such as tcp://192.168.0.2:8786'
+        self.add_argument('--scheduler', metavar='ADDRESS', help=text)
 
     def add_out(
         self,

@@ -5,11 +5,10 @@ import json
 import tempfile
 import time
 from argparse import Namespace
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-
-from tqdm import tqdm
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.paper_page import update_page
@@ -21,12 +20,11 @@ from musculoskeletal_ae.experiments.results import (
     write,
     write_report,
 )
-from musculoskeletal_ae.experiments.runner import run
+from musculoskeletal_ae.experiments.runner import Outcome, run, stages
 from musculoskeletal_ae.experiments.study import Study
-from musculoskeletal_ae.progress_bar import is_bar_visible
+from musculoskeletal_ae.experiments.workers import workers
+from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
-
-BAR = '{l_bar}{bar}| {elapsed} < {remaining}'
 
 
 def measure(args: Namespace) -> None:
@@ -45,25 +43,30 @@ def measure(args: Namespace) -> None:
         study = Study(
             robot, args.preset, args.seeds, args.minutes, args.quick, folder, args.reality
         )
-        with tqdm(total=1.0, disable=not is_bar_visible(), bar_format=BAR) as bar:
+        seconds = defaultdict[str, float](float)
+        total = sum(part.weight for parts in stages(study, names) for part in parts)
+        bar = ProgressBar('experiments', total)
+        with workers(args.jobs, args.scheduler) as processes, bar:
 
-            def report(share: float, running: str) -> None:
-                bar.n = share
-                bar.set_description_str(running)
+            def report(outcome: Outcome) -> None:
+                seconds[outcome.part.name] += outcome.seconds
+                bar.add(outcome.part.weight)
 
             try:
-                parts = run(study, names, args.jobs, report)
+                results = run(study, names, processes, report)
             except KeyboardInterrupt as stop:
                 kept = 'use --keep DIR next time to keep the parts that were measured'
                 if args.keep:
                     kept = f'--keep {args.keep} has the parts that were measured'
                 raise KeyboardInterrupt(f'nothing was written to {args.out}; {kept}') from stop
-        files = [*write(study, parts, args.out), write_report(args.out)]
+        files = [*write(study, results, args.out), write_report(args.out)]
     if args.readme:
         files += update_readme(args.readme, args.out)
     if args.page:
         files += update_page(args.page, args.out)
     print(*files, f'finished after {time.perf_counter() - start:.0f} s', sep='\n')
+    hours = [f'{name} {spent / 3600.0:.3f}' for name, spent in seconds.items() if spent]
+    print(f'core-hours of this run: {", ".join(hours) or "none"}')
     measured = read(args.out)
     if failed := failures({name: measured[name] for name in names}):
         problem = f'some experiments failed: {"; ".join(failed)}'
@@ -82,7 +85,8 @@ def _work_folder(args: Namespace) -> Iterator[Path]:
         with tempfile.TemporaryDirectory(prefix='experiment_') as folder:
             yield Path(folder)
         return
-    args.keep.mkdir(parents=True, exist_ok=True)
+    folder = args.keep.resolve()  # workers may have another working directory
+    folder.mkdir(parents=True, exist_ok=True)
     options = {
         key: str(getattr(args, key)) for key in ('robot', 'preset', 'minutes', 'quick', 'reality')
     }
@@ -97,4 +101,4 @@ def _work_folder(args: Namespace) -> Iterator[Path]:
     elif any(args.keep.iterdir()):
         raise MusculoskeletalError(f'--keep {args.keep}: expected an empty or new folder')
     file.write_text(json.dumps(options), encoding='utf-8')
-    yield args.keep
+    yield folder

@@ -1,42 +1,88 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The list of experiments, and their execution in parallel processes.
+"""The list of experiments, and their execution in three stages.
 
     train both presets → for each individual: record, learn → its other experiments
 
 A part of the work is one experiment on one individual, or the initial training of one preset. The
-experiments of an individual start as soon as its network is trained. Every part has its own random
-seeds, so the results do not depend on the number of processes. If a part fails, only the parts that
-need its results are skipped. If a worker process is killed, for example for lack of memory, all
-parts that were running start again, one at a time. A part during which a worker is killed a second
-time fails.
+parts of a stage run in parallel on workers. The next stage begins when all of them have ended.
+Every part has its own random seeds, so the results do not depend on the workers. If a part fails,
+only the parts that need its results are left out.
+
+Parts exchange files only, in a folder that all workers share. A part's result is in a file as soon
+as the part ends, so an interrupted run can be continued.
 """
 
-import multiprocessing
 import os
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+import socket
+import time
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
-from typing import Any
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import NamedTuple
+from uuid import uuid4
 
+from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments import NAMES, kept, online_learning
 from musculoskeletal_ae.experiments.study import Measured, Study, round_numbers
+from musculoskeletal_ae.experiments.workers import WorkerKilledError, Workers
 from musculoskeletal_ae.presets.registry import PRESETS
-from musculoskeletal_ae.process_signals import STOP, Reaction, interrupts_blocked
 
 EXPERIMENTS = {
     name: import_module(f'musculoskeletal_ae.experiments.{name}').EXPERIMENT for name in NAMES
 }
 LEARNING = 'online_learning'
-POLL = 0.5  # report after at most this time [s]
-Part = tuple[str, int]  # an experiment and a seed, or a preset to train and -1
+RUN = 'run'  # file with the identifier of the run, by which a worker recognises the folder
 
-# Threads of the numeric libraries would compete with the processes for the cores.
-SINGLE = {f'{library}_NUM_THREADS': '1' for library in ('OMP', 'OPENBLAS', 'MKL', 'NUMBA')}
+
+class Part(NamedTuple):
+    """One experiment on one individual, or the initial training of one preset."""
+
+    name: str  # name of the experiment or of the preset
+    seed: int | None = None  # seed of the individual; None for the training
+
+    @property
+    def stem(self) -> str:
+        """Name of the part's files, without suffix."""
+        return f'{self.name}_{"initial" if self.seed is None else self.seed}'
+
+    @property
+    def weight(self) -> float:
+        """Relative duration."""
+        return 1.0 if self.seed is None else EXPERIMENTS[self.name].weight
+
+    @property
+    def needs(self) -> tuple['Part', ...]:
+        """The parts whose results this part needs."""
+        if self.seed is None:
+            return ()
+        if self.name == LEARNING:
+            return tuple(map(Part, PRESETS))
+        return (Part(LEARNING, self.seed),)
+
+
+class Outcome(NamedTuple):
+    """What the run learns when a part ends."""
+
+    part: Part
+    failure: str = ''  # '' if the result is in the folder of the run
+    seconds: float = 0.0  # processor time [s]; 0 if the part was not measured in this run
+
+
+def stages(study: Study, names: Sequence[str]) -> tuple[list[Part], ...]:
+    """Return the parts of a run, in stages: each needs results of the stages before it only."""
+    others = set(names) - {LEARNING}
+    # Start the longest experiments first, so that none of them runs alone at the end.
+    longest_first = sorted(others, key=lambda name: EXPERIMENTS[name].weight, reverse=True)
+    return (
+        [Part(preset) for preset in PRESETS],
+        [Part(LEARNING, seed) for seed in study.seeds],
+        [Part(name, seed) for name in longest_first for seed in study.seeds],
+    )
 
 
 def run(
-    study: Study, names: Sequence[str], jobs: int, report: Callable[[float, str], None]
+    study: Study, names: Sequence[str], workers: Workers, report: Callable[[Outcome], None]
 ) -> dict[str, dict[int, Measured | str]]:
     """Measure experiments on all individuals; return results by experiment and seed.
 
@@ -45,193 +91,91 @@ def run(
     Args:
         study: Options of the run.
         names: Names of the experiments.
-        jobs: Number of processes.
-        report: Function that is called regularly with the completed share of the work and the
-            names of the running parts.
+        workers: Where the parts run.
+        report: Function that is called whenever a part has ended.
+
+    Raises:
+        MusculoskeletalError: If a worker does not see the folder of the study.
     """
-    os.environ.update(SINGLE | dict(os.environ))
-    schedule, workers = _Schedule(study, names), _Workers(study, jobs)
+    identifier, failures = uuid4().hex, dict[Part, str]()
+    (study.folder / RUN).write_text(identifier, encoding='utf-8')
+    for parts in stages(study, names):
+        to_measure = list[Part]()
+        for part in parts:
+            lack = next((failures[needed] for needed in part.needs if needed in failures), '')
+            if lack:
+                failures[part] = lack
+            if lack or _result_file(study, part).is_file():
+                report(Outcome(part, lack))
+            else:
+                to_measure.append(part)
+        calls = [(study, part, identifier) for part in to_measure]
+        for index, outcome in workers.as_they_end(_measure, calls):
+            if isinstance(outcome, WorkerKilledError):
+                outcome = _failed(to_measure[index], outcome)
+            if outcome.failure:
+                failures[outcome.part] = outcome.failure
+            report(outcome)
+    return {
+        name: {seed: _result(study, Part(name, seed), failures) for seed in study.seeds}
+        for name in names
+    }
+
+
+def _measure(study: Study, part: Part, identifier: str) -> Outcome:
+    """Measure a part, and put its result into the folder of the study; runs on a worker."""
+    _check_folder(study.folder, identifier)
+    begun = time.process_time()
     try:
-        while schedule.waiting or workers.is_busy:
-            workers.start_from(schedule.waiting)
-            for part, future in workers.ended():
-                if error := future.exception():
-                    schedule.on_failure(part, error)
-                else:
-                    schedule.on_result(part, future.result())
-            report(schedule.completed, ', '.join(sorted({name for name, _ in workers.parts})))
-    except BaseException:
-        workers.abort()
-        raise
-    workers.close()
-    return {name: {seed: rows[seed] for seed in study.seeds} for name, rows in schedule.results()}
+        study.remember(part.stem, lambda: _value(study, part))
+    except Exception as error:  # noqa: BLE001 - whatever ends a part, the others continue
+        return _failed(part, error)
+    return Outcome(part, seconds=time.process_time() - begun)
 
 
-class _Schedule:
-    """The parts that may begin, and the results of the parts that have ended.
-
-    Attributes:
-        waiting: Parts that may begin, in this order.
-    """
-
-    def __init__(self, study: Study, names: Sequence[str]) -> None:
-        self._study, self._names = study, names
-        experiments = {name: experiment.weight for name, experiment in EXPERIMENTS.items()}
-        self._weights = dict.fromkeys(PRESETS, 1.0) | experiments
-        of_individual = sum(experiments[name] for name in {LEARNING, *names})
-        self._total = len(PRESETS) + len(study.seeds) * of_individual
-        self._done = 0.0
-        # Start the longest experiments first, so that none of them runs alone at the end.
-        others = set(names) - {LEARNING}
-        self._others = sorted(others, key=experiments.__getitem__, reverse=True)
-        self._untrained = set(PRESETS)
-        self._measured: dict[str, dict[int, Measured | str]] = {name: {} for name in names}
-        self.waiting: list[Part] = [(preset, -1) for preset in PRESETS]
-
-    @property
-    def completed(self) -> float:
-        """Completed share of the work."""
-        return self._done / self._total
-
-    def results(self) -> Iterable[tuple[str, dict[int, Measured | str]]]:
-        """Return the results, or error messages, of each experiment by seed."""
-        return self._measured.items()
-
-    def on_result(self, part: Part, result: Any) -> None:
-        """Store the result of a part, and append the parts that need it to `waiting`."""
-        name, seed = part
-        self._done += self._weights[name]
-        if name in self._measured:
-            self._measured[name][seed] = result
-        if name == LEARNING:
-            self.waiting += [(other, seed) for other in self._others]
-        elif name in PRESETS:
-            self._untrained.remove(name)
-            if not self._untrained:
-                self.waiting += [(LEARNING, each) for each in self._study.seeds]
-
-    def on_failure(self, part: Part, error: BaseException) -> None:
-        """Store the error message as the result of a part and of all parts that need it."""
-        name, seed = part
-        self._done += self._weights[name]
-        lost = self._names if name in (LEARNING, *PRESETS) else (name,)
-        seeds = self._study.seeds if name in PRESETS else (seed,)
-        for each in lost:
-            message = f'{type(error).__name__} in {name}: {error}'
-            self._measured[each] |= dict.fromkeys(seeds, message)
+def _failed(part: Part, error: Exception) -> Outcome:
+    return Outcome(part, f'{type(error).__name__} in {part.name}: {error}')
 
 
-class _Workers:
-    """Processes that run parts; a killed process is replaced, and its parts run again."""
-
-    def __init__(self, study: Study, jobs: int) -> None:
-        self._study, self._jobs = study, jobs
-        self._pool = _pool(jobs)
-        self._is_broken = False
-        self._running = dict[Future[Any], Part]()
-        #: parts that were running when a process was killed; they run again, one at a time
-        self._suspects: list[Part] = []
-
-    @property
-    def is_busy(self) -> bool:
-        """Whether a part is running or has to run again."""
-        return bool(self._running or self._suspects)
-
-    @property
-    def parts(self) -> Iterable[Part]:
-        """The parts that are running."""
-        return self._running.values()
-
-    def start_from(self, waiting: list[Part]) -> None:
-        """Start as many parts as may run now, and remove them from `waiting`."""
-        if self._is_broken and not self._running:
-            self._pool.shutdown()
-            self._pool, self._is_broken = _pool(self._jobs), False
-        if self._suspects and not self._running:
-            self._begin(self._suspects[0])
-        while waiting and not (self._suspects or self._is_broken) and self._is_free:
-            self._begin(waiting.pop(0))
-
-    @property
-    def _is_free(self) -> bool:
-        return len(self._running) < self._jobs
-
-    def _begin(self, part: Part) -> None:
-        name, seed = part
-        task: tuple[Any, ...] = _measure, name, self._study, seed
-        if name in PRESETS:
-            task = _train, online_learning.train_initial, self._study, name
-        try:
-            # This may start a worker and the fork server. A worker whose start is interrupted could
-            # not be ended, and would print a traceback.
-            with interrupts_blocked(), STOP.reacting(Reaction.REMEMBER):
-                future = self._pool.submit(*task)
-        except BrokenProcessPool as error:  # the pool broke after the last check
-            future = Future()
-            future.set_exception(error)
-        self._running[future] = part
-        STOP.raise_if_received()
-
-    def ended(self) -> list[tuple[Part, Future[Any]]]:
-        """Wait until a part ends, but at most POLL [s]; return the ended parts and their futures.
-
-        Parts that were running for the first time when a process was killed are not returned,
-        because they run again.
-        """
-        ended = list[tuple[Part, Future[Any]]]()
-        for future in wait(self._running, POLL, FIRST_COMPLETED).done:
-            part, was_killed = self._running.pop(future), _was_killed(future)
-            self._is_broken |= was_killed
-            if part in self._suspects:
-                self._suspects.remove(part)
-            elif was_killed:
-                self._suspects.append(part)
-                continue
-            ended.append((part, future))
-        return ended
-
-    def abort(self) -> None:
-        """End all processes immediately, without waiting for running parts."""
-        # End the processes before the pool. Otherwise, a process that is just starting would print
-        # a traceback.
-        for child in multiprocessing.active_children():
-            child.terminate()
-        self._pool.shutdown(wait=False, cancel_futures=True)
-
-    def close(self) -> None:
-        """End the processes after the last part has ended."""
-        self._pool.shutdown()
+def _check_folder(folder: Path, identifier: str) -> None:
+    """Raise a MusculoskeletalError unless the folder is that of the run, and can be written to."""
+    try:
+        found = (folder / RUN).read_text('utf-8')
+        problem = '' if found == identifier else 'it is another folder, or another run uses it'
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        problem = str(error)
+    if problem:
+        raise MusculoskeletalError(
+            f'process {os.getpid()} on {socket.gethostname()} cannot use {folder}, the folder of '
+            f'this run: {problem}; let --keep name a folder to which all workers can write under '
+            'the same path, for example on NFS'
+        )
 
 
-def _was_killed(future: Future[Any]) -> bool:
-    return isinstance(future.exception(), BrokenProcessPool)
+def _value(study: Study, part: Part) -> Measured | None:
+    if part.seed is None:
+        online_learning.train_initial(study, part.name)
+        return None
+    measured = EXPERIMENTS[part.name].measure(study, part.seed)
+    return measured._replace(numbers=round_numbers(measured.numbers))
 
 
-def _pool(jobs: int) -> ProcessPoolExecutor:
-    # The fork server imports slow modules once, for all workers.
-    context = multiprocessing.get_context('forkserver')
-    context.set_forkserver_preload([__name__, 'torch'])
-    return ProcessPoolExecutor(jobs, context, _start)
-
-
-def _train(train: Callable[[Study, str], None], study: Study, preset: str) -> None:
-    study.remember(f'{preset}_initial', lambda: train(study, preset))
-
-
-def _measure(name: str, study: Study, seed: int) -> Measured:
-    def measure() -> Measured:
-        measured = EXPERIMENTS[name].measure(study, seed)
-        return measured._replace(numbers=round_numbers(measured.numbers))
-
-    part = f'{name}_{seed}'
-    result = study.remember(part, measure)
-    numbers, traces = (getattr(result, key, None) for key in Measured._fields)
-    if not isinstance(numbers, dict) or not isinstance(traces, dict):
-        raise kept.unusable(study.folder / part, 'expected numbers and traces')
+def _result(study: Study, part: Part, failures: Mapping[Part, str]) -> Measured | str:
+    """Return the result of a part from the folder of the study, or why there is none."""
+    if part in failures:
+        return failures[part]
+    file = _result_file(study, part)
+    try:
+        result = kept.read(file)
+        numbers, traces = (getattr(result, key, None) for key in Measured._fields)
+        if not isinstance(numbers, dict) or not isinstance(traces, dict):
+            raise kept.unusable(file, 'expected numbers and traces')
+    except MusculoskeletalError as error:
+        return _failed(part, error).failure
     return Measured(numbers, traces)
 
 
-def _start() -> None:
-    import torch
-
-    torch.set_num_threads(1)
+def _result_file(study: Study, part: Part) -> Path:
+    return study.folder / f'{part.stem}.npz'

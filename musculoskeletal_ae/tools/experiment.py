@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """`experiment`: the paper's experiments on emulated arms, with numbers, plots and a report."""
 
-import os
 from argparse import ArgumentTypeError
 from pathlib import Path
 
 from musculoskeletal_ae.experiments import NAMES, PAPER
-from musculoskeletal_ae.options import Parser, exit_status, whole
+from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.process_signals import import_heavy
 
 # With --quick, explore for two minutes: enough to calibrate the detector, so that every result has
@@ -35,11 +34,11 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_minutes('duration of the exploration (default: 10; quick: 2)', None)
     parser.add_quick('run a short version of each experiment, in about a minute for all of them')
     parser.add_out('DIR', 'results and report', Path('experiments'))
-    cores = len(os.sched_getaffinity(0))
-    parser.add_argument('--jobs', type=whole(1, 256), default=cores, help='number of processes')
+    parser.add_workers()
     text = (
         'folder that keeps networks, recordings and measured parts; a later run with the same '
-        'options measures only the parts that are missing (use only folders of your own runs)'
+        'options measures only the parts that are missing (use only folders of your own runs); '
+        '--scheduler needs a folder that all workers share'
     )
     parser.add_argument('--keep', type=Path, metavar='DIR', help=text)
     text = 'also write the results table between the markers of this page'
@@ -47,6 +46,8 @@ def main(argv: list[str] | None = None) -> int:
     text = 'also write the page FILE.md that shows the paper beside ours, and its pictures'
     parser.add_argument('--page', type=Path, metavar='FILE.md', help=text)
     args = parser.parse_args(argv)
+    if args.scheduler and not args.keep:
+        parser.error('--scheduler: also name --keep DIR, a folder that all workers share')
     args.seeds = args.seeds or (QUICK_SEEDS if args.quick else SEEDS)
     args.minutes = args.minutes or (QUICK_MINUTES if args.quick else MINUTES)
     return exit_status(

@@ -2,11 +2,7 @@
 """result.json combines several individuals, even if the experiment failed on some of them."""
 
 import json
-import os
-import re
 import shutil
-import signal
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -165,12 +161,11 @@ def learns(_study, _seed):
 def test_a_failed_part_is_reported_everywhere_and_the_others_continue(
     monkeypatch, tmp_path, capsys, learning, measuring, told
 ):
-    monkeypatch.setattr(runner, 'ProcessPoolExecutor', lambda *_: ThreadPoolExecutor(2))
     monkeypatch.setattr(online_learning, 'train_initial', lambda *_: None)
     for name, measure in ('online_learning', learning), ('body_change', measuring):
         faked = runner.EXPERIMENTS[name]._replace(measure=measure, plots=())
         monkeypatch.setitem(runner.EXPERIMENTS, name, faked)
-    command = f'body_change --robot arm26 --seeds 0,1 --out {tmp_path}'
+    command = f'body_change --robot arm26 --seeds 0,1 --jobs 1 --out {tmp_path}'
     assert experiment.main(command.split()) == 1
     assert f'body_change of individual 1: {told}' in capsys.readouterr().err
     content = json.loads((tmp_path / 'body_change' / 'result.json').read_text('utf-8'))
@@ -180,67 +175,12 @@ def test_a_failed_part_is_reported_everywhere_and_the_others_continue(
     assert f'Failed: body_change of individual 1: {told}' in readme_table(read(tmp_path))
 
 
-def is_killed(name, study, seed):
-    """Kill the process that measures individual 0.
-
-    At the first attempt, this happens while another process is measuring individual 1.
-    """
-    if name == 'body_change':
-        begun = study.folder / f'{seed}'
-        first = not begun.exists()
-        begun.touch()
-        if first:  # opening both ends of a FIFO makes the two workers wait for each other
-            (study.folder / 'fifo').open('rw'[seed]).close()
-        if seed == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-        if first:
-            signal.pause()
-    return Measured({'error_rad': 0.5}, {})
-
-
-def test_after_the_kill_of_a_worker_only_a_part_whose_worker_is_killed_again_fails(
-    arm26, tmp_path, monkeypatch
-):
-    os.mkfifo(tmp_path / 'fifo')
-    monkeypatch.setattr(online_learning, 'train_initial', learns)
-    monkeypatch.setattr(runner, '_measure', is_killed)
-    study = Study(arm26, 'default', (0, 1), 1.0, True, tmp_path)
-    names = 'online_learning', 'body_change', 'sensors'
-    measured = runner.run(study, names, 2, lambda *_: None)
-    assert measured['body_change'].pop(0).startswith('BrokenProcessPool in body_change')
-    assert all(isinstance(each, Measured) for rows in measured.values() for each in rows.values())
-
-
-def reached_by_ctrl_c(_name, _study, _seed):
-    """Return how many of two processes would receive SIGINT: this one and its parent.
-
-    The parent is the fork server of the experiments. A process that blocks SIGINT does not count.
-    """
-    reached = 0
-    for process in (os.getpid(), os.getppid()):
-        status = Path(f'/proc/{process}/status').read_text('utf-8')
-        (blocked,) = re.findall(r'^SigBlk:\s*(\w+)$', status, re.M)
-        reached += not int(blocked, 16) >> (signal.SIGINT - 1) & 1
-    return Measured({'reached': reached}, {})
-
-
-def test_ctrl_c_in_a_terminal_reaches_no_worker_whose_traceback_it_would_print(
-    arm26, tmp_path, monkeypatch
-):
-    monkeypatch.setattr(online_learning, 'train_initial', learns)
-    monkeypatch.setattr(runner, '_measure', reached_by_ctrl_c)
-    study = Study(arm26, 'default', (0,), 1.0, True, tmp_path)
-    measured = runner.run(study, ['online_learning'], 1, lambda *_: None)
-    assert measured['online_learning'][0].numbers == {'reached': 0}
-
-
 def test_if_initial_training_fails_every_part_reports_it(monkeypatch, tmp_path, capsys):
     def train(_study, _preset):
         raise InfeasibleError('no tension at all')
 
-    monkeypatch.setattr(runner, 'ProcessPoolExecutor', lambda *_: ThreadPoolExecutor(1))
     monkeypatch.setattr(online_learning, 'train_initial', train)
-    assert experiment.main(f'all --robot arm26 --seeds 0,1 --out {tmp_path}'.split()) == 1
+    assert experiment.main(f'all --robot arm26 --seeds 0,1 --jobs 1 --out {tmp_path}'.split()) == 1
     assert (
         f'{[*runner.EXPERIMENTS][-1]} of individual 1: InfeasibleError in'
         in capsys.readouterr().err
