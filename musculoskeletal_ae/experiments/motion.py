@@ -9,13 +9,14 @@ commands. Three other methods receive the same postures as targets and approach 
 time: `proposed` by a trajectory of its own, `first` and `second` by ramps of the lengths. `tension`
 receives the desired posture in every message. The controller may use the full speed of the emulated
 winches. A trajectory that is too fast for the winches is slowed, and errors refer to the slowed
-trajectory. Afterwards, the hand moves along circles of 10 cm diameter at 0.1 m/s, for which
-`target_pose` receives 50 poses a second. A planar arm draws the circles in its plane. Then forces
-of 10 to 50 N in random directions push the hand: for 1.5 s while the arm rests, and for 1 s while
-it explores. At rest, a joint stop may carry a part of the force. In method `float`, the arm is
-first left alone, and then guided with 15 to 20 N. If the controller stops on a trajectory, the
-experiment fails for this individual. If it stops in another method, the numbers of this method are
-missing. If no circle is reachable, the error on circles is missing.
+trajectory. Then `proposed` moves the arm to 20 such postures in turn, with 8 s for each.
+Afterwards, the hand moves along circles of 10 cm diameter at 0.1 m/s, for which `target_pose`
+receives 50 poses a second. A planar arm draws the circles in its plane. Then forces of 10 to 50 N
+in random directions push the hand: for 1.5 s while the arm rests, and for 1 s while it explores. At
+rest, a joint stop may carry a part of the force. In method `float`, the arm is first left alone,
+and then guided with 15 to 20 N. If the controller stops on a trajectory, the experiment fails for
+this individual. If it stops in another method, the numbers of this method are missing. If no circle
+is reachable, the error on circles is missing.
 
 - tracking: mean of ‖θ_desired − θ_true‖ over the motion
 - settled: the same distance 0.5 s after the end of the motion
@@ -23,6 +24,8 @@ missing. If no circle is reachable, the error on circles is missing.
 - tension: mean ‖T‖ relative to the least T ≥ T_bias that moves the true body along the same path
 - attainable: the same ratio if the least T also overcomes winch drag and friction
 - settle: time from a target of `proposed` until the arm stays within 0.05 rad of it
+- distance: ‖θ_target − θ_true‖ 8 s after a target of `proposed`. Further than 0.06 rad, the target
+  counts as missed; further than 0.4 rad, the motion counts as stuck.
 - wrench_error: |‖F_est‖ − ‖F‖| / ‖F‖ in the last half second of a push
 - false contacts: contacts that are detected in one hour of exploration (shared by the individuals)
   without external forces
@@ -83,8 +86,12 @@ EVERY = 2  # send a pose with every second message
 NEAR = 0.002  # count a pose as reachable if the hand comes this close [m]
 #: maps a time [s] to the desired pose of the hand
 Place = Callable[[float], pin.SE3]
+TARGETS = 20  # approach this many targets with `proposed`
+ARRIVING = 8.0  # read the distance from a target after this time [s]
 SETTLING_TIME = 4.0  # wait at most this long for the arm to settle [s]
 WITHIN = 0.05  # count the arm as settled within this distance from the target [rad]
+MISSED = 0.06  # count a target as missed if the arm ends further away than this [rad]
+STUCK = 0.4  # count a motion as stuck if the arm ends further away than this [rad]
 LAP = 2.0 * np.pi * RADIUS / SPEED  # duration of a circle [s]
 
 
@@ -165,21 +172,37 @@ def follow(
     )
 
 
-def settling(loop: ClosedLoop, goal: Array) -> float:
-    """Send a target; return the time [s] until the arm stays within a distance WITHIN of it.
+class Approach(NamedTuple):
+    """How the arm approached one target."""
 
-    The arm is simulated for SETTLING_TIME, which is also the result if the arm does not settle.
+    settling: float  # time until it stayed within WITHIN of it, at most SETTLING_TIME [s]
+    distance: float  # ‖θ_target − θ‖ after ARRIVING [rad]
 
-    Args:
-        loop: The arm and its controller.
-        goal: The target [rad], (D,).
-    """
-    last = 0
+
+def approach(loop: ClosedLoop, goal: Array, duration: float) -> Approach:
+    """Send a target θ [rad] (D,), and observe the arm for `duration` [s]."""
     loop.target(goal)
-    for n in range(round(SETTLING_TIME / SAMPLE_TIME)):
+    distances = list[float]()
+    for _ in range(round(duration / SAMPLE_TIME)):
         loop.step()
-        last = n + 1 if np.linalg.norm(loop.arm.theta - goal) > WITHIN else last
-    return SAMPLE_TIME * last
+        distances.append(float(np.linalg.norm(loop.arm.theta - goal)))
+    beyond = np.array(distances[: round(SETTLING_TIME / SAMPLE_TIME)]) > WITHIN
+    settled_at = beyond.nonzero()[0].max(initial=-1) + 1
+    return Approach(SAMPLE_TIME * float(settled_at), distances[-1])
+
+
+def arrivals(loop: ClosedLoop, goals: Array, duration: float) -> dict[str, float]:
+    """Approach targets θ [rad], (N, D), one after the other, for `duration` [s] each."""
+    approaches = [approach(loop, goal, duration) for goal in goals]
+    distances = np.array([each.distance for each in approaches])
+    return {
+        'settle_s': float(np.mean([each.settling for each in approaches])),
+        'distance_rad': float(distances.mean()),
+        'distance_median_rad': float(np.median(distances)),
+        'approaches': len(distances),
+        'missed': int((distances > MISSED).sum()),
+        'stuck': int((distances > STUCK).sum()),
+    }
 
 
 def bounds(arm: Arm, motion: Setpoint) -> Array:
@@ -268,8 +291,10 @@ def measure(study: Study, seed: int) -> Measured:
     count = study.number(MOTIONS)
     arm = study.arm(seed)
     postures = robot.random_postures(TRIES, rng)
-    held = holdable_postures(robot, postures, count + 1, arm.individual.muscle_jacobian)
-    postures = np.array([theta for theta, _ in held])
+    number = study.number(TARGETS) + 1
+    held = holdable_postures(robot, postures, number, arm.individual.muscle_jacobian)
+    targets = np.array([theta for theta, _ in held])
+    postures = targets[: count + 1]
     numbers: dict[str, Any] = {'methods': {}}
     traces: dict[str, Any] = {}
     for method in QUICK_METHODS if study.quick else METHODS:
@@ -297,8 +322,8 @@ def measure(study: Study, seed: int) -> Measured:
     if 'attainable_ratio_1s' in ours:
         both = ours['attainable_ratio_1s'] + ours['attainable_ratio_2s']
         numbers['tension_ratio_attainable'] = 0.5 * both
-    loop = loop_at(study.arm(seed), mae, postures[0], OURS, 1.0)
-    numbers['settle_s'] = float(np.mean([settling(loop, goal) for goal in postures[1:]]))
+    loop = loop_at(study.arm(seed), mae, targets[0], OURS, 1.0)
+    numbers |= arrivals(loop, targets[1:], study.seconds(ARRIVING))
     found = circles(robot, mae, rng, study.number(CIRCLES))
     laps = [circle(loop, *each) for each in found]
     errors = [np.linalg.norm(true - desired, axis=1).mean() for desired, true in laps]

@@ -35,7 +35,8 @@ Results = Mapping[str, Mapping[str, Any]]
 #: and the durations that the individuals share
 ALARMS = ('false_contacts', 'false_alarms', 'false_alarms_beside_cuts')
 ISOLATIONS = ('wrong_isolations', 'acquittals')
-TOTALS = (*ALARMS, *ISOLATIONS, 'healthy_s', 'healthy_touch_s', 'counted_cuts')
+MOTIONS = ('approaches', 'missed', 'stuck')
+TOTALS = (*ALARMS, *ISOLATIONS, *MOTIONS, 'healthy_s', 'healthy_touch_s', 'counted_cuts')
 BEGIN, END = '<!-- results -->', '<!-- /results -->'  # markers around the results table
 KEPT = Path('doc/results')
 TEMPLATE = 'report.html.jinja'  # a file in the folder of this module

@@ -56,12 +56,13 @@ def exertion_slowness(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float
         τ(s) = τ_hold(θ) + (τ(θ, θ̇, θ̈) − τ_hold(θ))/s²
         T_low(s) = (T_bias + K_stiff λ max(dl/dt, 0)/s)/loss
 
-    The factor s is the smallest of `SLOWER` for which the missing torque, throughout the motion,
-    is at most `reach.NOTABLE` above that of a very slow motion. If no factor suffices, s is
-    the largest of `SLOWER`. If the muscle modules provide no tensions, s is 1. An arm without
-    isolated muscles may use all tensions up to T_limit. For an arm with isolated muscles, the
-    factors are those of `SLOWER_ISOLATED`, and the highest tension is that of `reach.Limits`, which
-    keeps a reserve. `loss` is defined there, too.
+    The factor s is the smallest of `SLOWER` for which the largest missing torque of the motion is
+    at most `reach.NOTABLE` above that of a very slow motion. If a motion lacks torque at one
+    instant however slow it is, it is therefore not slowed because of a smaller lack at another
+    instant. If no factor suffices, s is the largest of `SLOWER`. If the muscle modules provide no
+    tensions, s is 1. An arm without isolated muscles may use all tensions up to T_limit. For an arm
+    with isolated muscles, the factors are those of `SLOWER_ISOLATED`, and the highest tension is
+    that of `reach.ReachLimits`, which keeps a reserve. `loss` is defined there, too.
 
     Args:
         robot: The robot; isolated muscles have no tension.
@@ -80,12 +81,16 @@ def exertion_slowness(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float
     marks = np.arange(0.0, travelled[-1], spacing)
     moments = trajectory.sample(time[np.unique(np.searchsorted(travelled, marks)) + 1])
     jacobians = mae.muscle_jacobian(moments.theta, np.tile(bias, (len(moments.theta), 1)))
+    lacking = [  # the instants at which the muscles lack torque if the motion is not slowed
+        (jacobian, at)
+        for at, jacobian in zip(map(Setpoint._make, zip(*moments)), jacobians)
+        if limits.missing_in_motion(jacobian, at, lag, factors[0]) > reach.NOTABLE
+    ]
+    very_slow = [limits.missing_in_motion(*moment, lag, np.inf) for moment in lacking]
+    legal = max(very_slow, default=0.0) + reach.NOTABLE
     number = 0
-    for at, jacobian in zip(map(Setpoint._make, zip(*moments)), jacobians):
-        if limits.missing_in_motion(jacobian, at, lag, factors[number]) <= reach.NOTABLE:
-            continue
-        legal = limits.missing_in_motion(jacobian, at, lag, np.inf) + reach.NOTABLE
-        while limits.missing_in_motion(jacobian, at, lag, factors[number]) > legal:
+    for moment in lacking:
+        while limits.missing_in_motion(*moment, lag, factors[number]) > legal:
             number += 1
             if number == len(factors) - 1:
                 return factors[number]

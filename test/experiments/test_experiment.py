@@ -29,7 +29,7 @@ KEYS = {
     'body_change': 'angle_change_mm paper_angle_change_mm nonlinearity_true',
     'layers': 'layers trainings',
     'motion': 'track_1s_rad track_2s_rad settled_rad tension_ratio hand_circle_m '
-    'wrench_error false_contacts',
+    'wrench_error false_contacts settle_s distance_rad approaches missed stuck',
     'resilience': 'healthy_rad one_isolated_rad two_isolated_rad proposed_one_isolated_rad '
     'right_isolations_share wrong_isolations dead_sensor_rad',
     'robustness': 'kin foreign ablation_rad',

@@ -5,6 +5,8 @@ Some tests use an emulated arm.
 """
 
 import re
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -25,9 +27,11 @@ from musculoskeletal_ae.motion import hand as hand_motion
 from musculoskeletal_ae.motion.feedback import CORRECTION
 from musculoskeletal_ae.motion.hand import HAND_SPEED, Hand
 from musculoskeletal_ae.motion.methods import StiffnessModel
-from musculoskeletal_ae.motion.slowness import SHARE, slowness
+from musculoskeletal_ae.motion.reach import NOTABLE, ReachLimits
+from musculoskeletal_ae.motion.slowness import SHARE, exertion_slowness, slowness
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.motion.winches import Winches
+from musculoskeletal_ae.robot.robot import Robot
 
 STILL = np.zeros((1, 2))
 PEAK_SPEED = 1.875  # ratio of peak to mean speed of a quintic from rest to rest
@@ -373,6 +377,32 @@ def test_an_isolated_muscle_does_not_slow_a_trajectory():
     before = slowness(robot, bench.mae, trajectory, Settings())
     reduced = robot.without([fastest])
     assert 1.0 < slowness(reduced, bench.mae, trajectory, Settings()) < 0.99 * before
+
+
+def test_a_motion_that_lacks_torque_at_any_speed_is_slowed_only_as_far_as_that_helps():
+    stated = Robot.load('musashi_left_arm').description
+    weak = replace(stated.tension, limit=np.full_like(stated.tension.limit, 90.0))
+    robot = Robot(replace(stated, tension=weak))
+    mae, lag, slowed = ExactMae(robot), 0.02, []
+    limits = ReachLimits(robot, mae, used=1.0)
+
+    def lack(motion, slower):
+        """Return the largest missing torque of a slowed motion [N·m]."""
+        instants = map(Setpoint._make, zip(*motion.sample(np.linspace(0.0, motion.duration, 60))))
+        return max(
+            limits.missing_in_motion(
+                mae.muscle_jacobian(at.theta, robot.tension.bias), at, lag, slower
+            )
+            for at in instants
+        )
+
+    for start, goal in pairwise(robot.random_postures(30, np.random.default_rng(0))):
+        motion = Trajectory.to(Setpoint.resting(start), goal[None], 1.0)
+        at_any_speed = lack(motion, np.inf)
+        if at_any_speed > 1.0:
+            slowed.append(exertion_slowness(robot, mae, motion, lag))
+            assert lack(motion, slowed[-1]) < at_any_speed + 2.0 * NOTABLE
+    assert slowed and max(slowed) < 3.0
 
 
 def test_slowing_a_slow_trajectory_changes_nothing():
