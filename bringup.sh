@@ -363,7 +363,6 @@ import_mujoco() {
   launch import_robot "$mujoco" --out "$robot" "${chain[@]}" > >(tee -p "$logs/import.log") 2>&1
   wait_for import_robot || exit 1
   reality=$robot/model.xml
-  own_clock=true
 }
 
 # --- The system ----------------------------------------------------------------------------------
@@ -389,10 +388,13 @@ fi
 
 quoted() { printf "'%s'" "${1//\'/\'\'}"; } # as YAML, the format of ROS parameters
 
-# Whether the emulated arm publishes /clock, because it may be too slow for real time. This is unknown
-# for a MuJoCo model.
-own_clock=false
 [ -z "$mujoco" ] || import_mujoco
+# MuJoCo may be too slow for real time. The emulator of a MuJoCo model therefore publishes /clock.
+own_clock=false
+if [[ ! $reality =~ ^(kin|foreign)$ ]]; then
+  own_clock=true
+  say 'nodes follow simulated time (/clock), which runs slower if MuJoCo is too slow for real time'
+fi
 [ -n "$checkpoint" ] || train_once
 
 # Each process writes one log, to which `start` redirects its output; rcl would write a second one.

@@ -38,12 +38,15 @@ The columns of a row are
 - the speed of the emulated arm on one core, as a multiple of real time, and
 - the duration of the initial training on one core [s].
 
+If the bench is interrupted, the same command continues it: finished rows are read from --out.
+
 With --nodes, the bench measures the running system instead, for the first individual of --seeds:
 emulator, estimator, sim, controller and learner exchange messages at 100 Hz while the arm explores.
 The columns are the CPU time of each node [% of a core], and the share of messages of the emulator
 that arrived: below 100 %, the emulator is slower than real time, or the machine is busy.
 """
 
+import shutil
 import time
 from argparse import Namespace
 from collections.abc import Callable, Iterator
@@ -96,6 +99,7 @@ LEAST_TORQUE = 1e-6  # count the muscles as too weak for a motion if more torque
 HOLDING = 5.0  # hold a posture for this time [s]
 ARM_POSTURES = 300
 RATE = 100.0  # rate of muscle_states with --nodes [Hz]
+TRAINED = 'trained'  # the part of a run that contains the first networks
 LISTS = 'joints', 'muscles', 'without'
 MuscleJacobian = Callable[[Array], Array]
 
@@ -229,9 +233,11 @@ def table_row(
     cells.append(f'{learned_error(study.preset, held_out, study, seed):.4f}')
     cells += rupture_cells(study, seed)
     cells += [attempt(error, study, seed) for error in (tracking_error, holding_error)]
-    out = study.folder / f'model_{seed}'
+    out, again = study.folder / f'model_{seed}', study.folder / f'exported_{seed}'
+    for unfinished in (out, again):
+        shutil.rmtree(unfinished, ignore_errors=True)
     export_into(robot, study.network(seed), file, out)
-    exported = import_robot(out / file.name, study.folder / f'exported_{seed}', **chain).robot
+    exported = import_robot(out / file.name, again, **chain).robot
     theta = robot.random_postures(ARM_POSTURES, np.random.default_rng(0x309))
     differences = route_errors(exported, study.network(seed), theta)
     arm_size = np.sqrt((robot.routes.muscle_jacobian(theta) ** 2).sum(axis=2).mean(axis=0))
@@ -290,9 +296,13 @@ def nodes_row(name: str, file: Path, chain: dict[str, Any], args: Namespace) -> 
 def model_rows(
     name: str, file: Path, chain: dict[str, Any], args: Namespace
 ) -> Iterator[list[str]]:
-    """Import a model, train, and yield the row of each individual."""
+    """Import a model, train, and yield the row of each individual.
+
+    Networks and rows of an interrupted run with the same --out are read from its files.
+    """
     folder = args.out / name
-    folder.mkdir(parents=True)
+    directory = folder / 'robot'
+    folder.mkdir(parents=True, exist_ok=True)
     begun = time.perf_counter()
     share = 1.0
 
@@ -304,18 +314,27 @@ def model_rows(
             seconds = time.perf_counter() - begun
             raise MusculoskeletalError(f'after {seconds:.1f} s: {" ".join(found.lines())}')
 
-    robot: Robot = import_robot(file, folder / 'robot', check, **chain).robot
+    def measure_training() -> dict[str, float]:
+        start = time.process_time()
+        online_learning.train_initial(study, study.preset)
+        training, first = time.process_time() - start, time.perf_counter() - begun
+        online_learning.train_initial(study, PAPER_PRESET)
+        return {'share': share, 'training': training, 'first': first}
+
+    if (folder / f'{TRAINED}.npz').is_file():
+        robot = Robot.load(directory)
+    else:
+        shutil.rmtree(directory, ignore_errors=True)
+        robot = import_robot(file, directory, check, **chain).robot
     study = Individuals(
         robot, 'default', args.seeds, args.minutes, quick=args.quick, folder=folder,
-        reality=str(folder / 'robot' / 'model.xml'),
+        reality=str(directory / 'model.xml'),
     )  # fmt: skip
-    start = time.process_time()
-    online_learning.train_initial(study, study.preset)
-    training, first = time.process_time() - start, time.perf_counter() - begun
-    online_learning.train_initial(study, PAPER_PRESET)
+    trained = study.remember(TRAINED, measure_training)
     for seed in args.seeds:
-        cells = table_row(study, name, seed, training, file, chain)
-        yield [*cells[:4], f'{100 * share:.0f} %', f'{first:.0f}', *cells[4:]]
+        row = partial(table_row, study, name, seed, trained['training'], file, chain)
+        cells = study.remember(f'row_{seed}', row)
+        yield [*cells[:4], f'{100 * trained["share"]:.0f} %', f'{trained["first"]:.0f}', *cells[4:]]
 
 
 def main(argv: list[str]) -> None:
@@ -327,7 +346,7 @@ def main(argv: list[str]) -> None:
         'example arm=myoarm.xml:joints=elbow_flexion,pro_sup'
     )
     parser.add_argument('models', nargs='+', type=parse, metavar='NAME=FILE…', help=text)
-    parser.add_out('DIR', 'a new directory')
+    parser.add_out('DIR', 'a directory; the same one continues an interrupted run')
     parser.add_argument('--seeds', type=seeds, default=(0, 1, 2), help='seeds of the individuals')
     parser.add_minutes('duration of the exploration', 10.0)
     parser.add_quick('short initial training and held-out motion, to try things out')

@@ -8,9 +8,11 @@
 
 MSC is muscle stiffness control with the stiffness K. Except for heat, l and T are the length and
 tension that the module's own sensors read. `muscles.yaml` says whether the modules follow MSC or
-positions (`actuation`). A position-controlled module holds its length while it gets no commands,
-and pays out while its tension exceeds T_max. c₁, c₂ and c_a are the temperatures of winding,
-housing and surroundings, with the heat capacities C and the thermal resistances R.
+positions (`actuation`). A module that follows MSC winds in a slack tendon with up to TAKE_UP_SPEED,
+even if T_bias is so small that the gain alone would be slower. A position-controlled module holds
+its length while it gets no commands, and pays out while its tension exceeds T_max. c₁, c₂ and c_a
+are the temperatures of winding, housing and surroundings, with the heat capacities C and the
+thermal resistances R.
 """
 
 import math
@@ -38,6 +40,9 @@ SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 #: let a module in the safe state approach T_bias at this rate [N/s]
 RELEASE_RATE = 100.0
 MOTOR_GAIN = 0.004  # wind in at this speed for each newton of missing tension [m/s/N]
+#: Wind in a slack tendon at this speed [m/s], which falls to 0 at half of T_bias. Weak muscles need
+#: it: MOTOR_GAIN alone would wind in at 2 mm/s with a T_bias of 0.5 N.
+TAKE_UP_SPEED = 0.03
 POSITION_LAG = 0.02  # let a position-controlled module follow with this time constant [s]
 # Heat. Each motor is sized for its muscle: constant T_limit heats the average module to 85 °C at
 # the housing and 105 °C in the winding.
@@ -169,6 +174,8 @@ def wind(
         desired = previous + min(change, max(-change, bias - previous))
     muscle.reference[m] = min(modules.tension_max[m], desired)
     speed = -MOTOR_GAIN * (muscle.reference[m] - tension)
+    if bias > 0.0:
+        speed = min(speed, -TAKE_UP_SPEED * (1.0 - 2.0 * tension / bias))
     if muscle.ruptured[m] > 0.0:
         speed = -SPEED_LIMIT
     return _turn(modules, muscle, m, min(most, max(-most, speed)))

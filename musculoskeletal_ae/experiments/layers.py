@@ -99,7 +99,7 @@ def _trained(study: Study, seed: int, hidden: tuple[int, ...], training: int) ->
 
 def _learn(study: Study, seed: int, hidden: tuple[int, ...], training: int) -> dict[str, Any]:
     robot, preset = study.robot, PaperPreset(hidden)
-    steps = QUICK_STEPS if study.quick else preset.initial_steps(robot.groups)
+    steps = QUICK_STEPS if study.quick else preset.initial_steps(robot)
     network = preset.train_initial(robot, training, steps, None)
     initial = completed(robot, network, PAPER_PRESET, training).mae
     test = preset.training_states(robot, TEST_STATES, np.random.default_rng([0, 2]))

@@ -130,10 +130,13 @@ def teach_and_evaluate(
 
 def explore(loop: ClosedLoop, learner: Learner, duration: float) -> Iterator[tuple[Array, ...]]:
     """Explore for `duration` [s] with the learner's latest network; yield each message."""
+    accepted = loop.mae
     for _ in range(round(duration / SAMPLE_TIME)):
-        if learner.mae is not loop.mae:
+        if learner.mae is not accepted:
             loop.use(learner.mae)
             learner.note_accepted(loop.mae)
+            # The learner now keeps the network with the residual torque that the estimator added.
+            accepted = learner.mae
         yield loop.explore()
 
 

@@ -22,12 +22,12 @@ from safetensors.numpy import save as save_tensors
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.files import read_bytes, write_whole
-from musculoskeletal_ae.mae.mae import Layer, Mae
+from musculoskeletal_ae.mae.mae import Layer, Mae, latent_places, read_blocks
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
 from musculoskeletal_ae.mae.units import UNITS, ActivationName
 from musculoskeletal_ae.presets.names import PRESET_NAMES
 from musculoskeletal_ae.report import distinct
-from musculoskeletal_ae.robot.groups import Group
+from musculoskeletal_ae.robot.groups import Group, union
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.schema import Strict, convert
@@ -62,7 +62,8 @@ Units = Annotated[int, Meta(ge=1, le=4096)]
 Threshold = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 #: copy these entries of the metadata to and from the attributes of `Mae` with the same name
 SHARED = (
-    'joints', 'muscles', 'groups', 'isolated', 'activation', 'preset', 'version', 'training',
+    'joints', 'muscles', 'groups', 'bases', 'isolated', 'activation', 'preset', 'version',
+    'training',
 )  # fmt: skip
 
 
@@ -89,6 +90,8 @@ class Metadata(Strict, frozen=True):
     uncertain: bool  # whether the covariance of the estimates is included
     drive: bool = False  # whether γ, b and F of motor currents are included
     elastic: bool = False  # whether learned springs of the joints are included
+    #: index of the base of each group's block, or of the block itself; () if none has a base
+    bases: Annotated[tuple[Count, ...], Meta(max_length=1000)] = ()
 
     def __post_init__(self) -> None:
         """Check the rules that types cannot express."""
@@ -107,11 +110,17 @@ class Metadata(Strict, frozen=True):
         if len(known) < len(self.isolated) or not known <= {*muscles}:
             indices = f'indices of muscles, 0 to {len(muscles) - 1}, each at most once'
             raise ValueError(f'isolated {self.isolated}; legal: {indices}')
+        bases, count = self.bases_by_group(), len(self.groups)
+        are_bases = len(bases) == count and max(bases) < count
+        if not are_bases or any(bases[base] != base for base in bases):
+            expected = f'for each of {count} groups the index of its base, which is its own base'
+            raise ValueError(f'bases {self.bases}; legal: {expected}')
         # Encoder and decoder have equally many hidden layers; the latent layer is between them.
         depth, rest = divmod(len(self.layer_sizes), len(self.groups))
-        for group, sizes in zip(self.groups, self.sizes_by_group(), strict=True):
-            d, m = len(group.joints), len(group.muscles)
-            ends = d + 2 * m + 3, d + m, d + 2 * m
+        for g, sizes in enumerate(self.sizes_by_group()):
+            d, m = map(len, self.groups[g])
+            read = union([self.groups[r] for r in read_blocks(bases)[g]])
+            ends = len(read.joints) + 2 * len(read.muscles) + 3, d + m, d + 2 * m
             is_symmetric = rest == 0 and depth % 2 == 1
             if not is_symmetric or (sizes[0], sizes[depth // 2], sizes[-1]) != ends:
                 expected = '{}, …, {}, …, {}'.format(*ends)
@@ -122,14 +131,21 @@ class Metadata(Strict, frozen=True):
         depth = len(self.layer_sizes) // len(self.groups)
         return [self.layer_sizes[g * depth :][:depth] for g in range(len(self.groups))]
 
+    def bases_by_group(self) -> tuple[int, ...]:
+        """Return the index of the base of each group's block."""
+        return self.bases or tuple(range(len(self.groups)))
+
     def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the name and shape of every tensor that belongs to this metadata."""
         values = len(self.joints) + 2 * len(self.muscles)
         shapes: dict[str, tuple[int, ...]] = {'mean': (values,), 'std': (values,)}
+        latents = latent_places(self.groups, self.bases_by_group())
         for g, sizes in enumerate(self.sizes_by_group()):
             depth = len(sizes) // 2
             for i, (into, out) in enumerate(pairwise(sizes)):
                 stack = 'encoder' if i < depth else 'decoder'
+                if i == depth:  # the decoder also reads the part of z of its base
+                    into = len(latents[g])
                 layer = g * depth + i % depth
                 shapes[f'{stack}.{layer}.weight'] = out, into
                 shapes[f'{stack}.{layer}.bias'] = (out,)

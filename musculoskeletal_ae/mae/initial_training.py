@@ -40,7 +40,7 @@ def initial_mae(
         steps: Number of mini-batches; None for the preset's number.
     """
     chosen = preset_named(preset)
-    steps = chosen.initial_steps(robot.groups) if steps is None else steps
+    steps = chosen.initial_steps(robot) if steps is None else steps
     trained = chosen.train_initial(robot, seed, steps, progress)
     return completed(robot, trained, preset, seed)
 

@@ -45,7 +45,7 @@ from musculoskeletal_ae.mae.units import (
     scale_vector,
     visible,
 )
-from musculoskeletal_ae.robot.groups import Group
+from musculoskeletal_ae.robot.groups import Group, union
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.signals.friction import Transmission
 
@@ -60,11 +60,20 @@ LENGTH_SPREAD = 0.003
 
 
 class BlockDiagonal:
-    """A weight (in, out) that consists of blocks, each with its own inputs and outputs."""
+    """A weight (in, out) that consists of blocks, each with its own outputs.
+
+    Blocks may share inputs.
+    """
 
     __array_ufunc__ = None  # makes numpy call __rmatmul__ for x @ weight
 
-    def __init__(self, blocks: Sequence[Singles], into: Ints | None, out: Ints | None) -> None:
+    def __init__(
+        self,
+        blocks: Sequence[Singles],
+        into: Ints | None,
+        out: Ints | None,
+        starts: Ints | None = None,
+    ) -> None:
         """Combine blocks.
 
         Args:
@@ -73,10 +82,12 @@ class BlockDiagonal:
                 already has this order.
             out: Indices that bring the outputs of the blocks, one block after another, into the
                 order of the result; None if the result has the order of the blocks.
+            starts: If given, sum the outputs, once they are in the order `out`, from each of these
+                places to the next. The transposed weight of blocks that share inputs needs it.
         """
         ends = np.cumsum([0, *map(len, blocks)]).tolist()
         self._blocks = [*zip(map(slice, ends, ends[1:]), blocks)]
-        self._into, self._out = into, out
+        self._into, self._out, self._starts = into, out, starts
 
     def __rmatmul__(self, x: Singles) -> Singles:
         """Return x @ weight, shape (..., out), for x (..., in)."""
@@ -85,13 +96,22 @@ class BlockDiagonal:
         parts = [product(x[..., into], block) for into, block in self._blocks]
         result: Singles = np.concatenate(parts, axis=-1)
         # `take` keeps rows contiguous in memory, like a matrix product; [..., out] would not.
-        return result if self._out is None else result.take(self._out, axis=-1)
+        if self._out is not None:
+            result = result.take(self._out, axis=-1)
+        if self._starts is not None:
+            result = np.add.reduceat(result, self._starts, axis=-1)
+        return result
 
     @cached_property
     def T(self) -> BlockDiagonal:
         """The transposed weight."""
-        into, out = (None if p is None else p.argsort() for p in (self._out, self._into))
-        return BlockDiagonal([block.T for _, block in self._blocks], into, out)
+        into, out = (
+            None if p is None else p.argsort(kind='stable') for p in (self._out, self._into)
+        )
+        starts = None
+        if self._into is not None and len(np.unique(self._into)) < len(self._into):
+            starts = np.unique(np.sort(self._into), return_index=True)[1]
+        return BlockDiagonal([block.T for _, block in self._blocks], into, out, starts)
 
 
 def product(x: Singles, weight: Singles | BlockDiagonal) -> Singles:
@@ -283,6 +303,9 @@ class Mae:
     elasticity: JointElasticity | None = None  # springs of the joints; None if not learned
     #: groups of joints and muscles, each with a block of the network; () for one block
     groups: tuple[Group, ...] = ()
+    #: index of the block whose inputs and part of z each block uses as well, such as that of the
+    #: wrist for a finger; its own index if it uses no other; () if none does
+    bases: tuple[int, ...] = ()
     isolated: tuple[int, ...] = ()  # indices of isolated muscles in T and l
     _enter: dict[Mask, Stack] = field(init=False, repr=False)
     _leave: Stack = field(init=False, repr=False)
@@ -301,20 +324,23 @@ class Mae:
         scale = scale_vector(joints, muscles)
         activation = ACTIVATIONS[self.activation]
         groups = self.groups or (Group.whole(joints, muscles),)
+        bases = self.bases or tuple(range(len(groups)))
         enter: dict[Mask, list[Stack]] = {mask: [] for mask in Mask}
         leave, leave_length, leave_scaled = list[Stack](), list[Stack](), list[Stack]()
         columns = [group.columns(joints, muscles) for group in groups]
+        read_groups = [union([groups[r] for r in read]) for read in read_blocks(bases)]
+        read_columns = [group.columns(joints, muscles) for group in read_groups]
         depth = len(encoder) // len(groups)
-        for g, own in enumerate(columns):
+        for g, (own, seen) in enumerate(zip(columns, read_columns, strict=True)):
             layers, sizes = slice(g * depth, (g + 1) * depth), tuple(map(len, groups[g]))
             (first, first_bias), *rest = encoder[layers]
             after = tuple(_transposed(*layer) for layer in rest)
             for mask, stacks in enter.items():
-                selected = visible(mask, *sizes)
-                weight = first[:, : len(own)][:, selected] / std[own][selected]
-                constant = first[:, len(own) :] @ np.array(mask.value, dtype=float)
-                bias = first_bias + constant - weight @ mean[own][selected]
-                layer = _transposed(weight * scale[own][selected], bias)
+                selected = visible(mask, *map(len, read_groups[g]))
+                weight = first[:, : len(seen)][:, selected] / std[seen][selected]
+                constant = first[:, len(seen) :] @ np.array(mask.value, dtype=float)
+                bias = first_bias + constant - weight @ mean[seen][selected]
+                layer = _transposed(weight * scale[seen][selected], bias)
                 stacks.append(_stack((layer, *after), activation))
             *rest, (last, last_bias) = decoder[layers]
             before = tuple(_transposed(*layer) for layer in rest)
@@ -327,14 +353,18 @@ class Mae:
                 (leave_scaled, (weight, bias)),
             ):
                 stacks.append(_stack((*before, _transposed(*final)), activation))
-        all_columns = np.concatenate(columns)
-        out = np.argsort(all_columns)
+        inputs = np.concatenate(read_columns)
+        out = np.argsort(np.concatenate(columns))
         out_length = np.argsort(np.concatenate([group.muscles for group in groups]))
 
         def entered(mask: Mask) -> Ints:
             selected = visible(mask, joints, muscles)
-            places: Ints = (np.cumsum(selected) - 1)[all_columns[selected[all_columns]]]
+            places: Ints = (np.cumsum(selected) - 1)[inputs[selected[inputs]]]
             return places
+
+        into = None
+        if bases != tuple(range(len(groups))):
+            into = np.concatenate(latent_places(groups, bases))
 
         vars(self).update(  # a frozen dataclass refuses assignments to its attributes
             mean=mean,
@@ -342,10 +372,11 @@ class Mae:
             encoder=encoder,
             decoder=decoder,
             groups=groups,
+            bases=bases,
             _enter={mask: side_by_side(stacks, entered(mask)) for mask, stacks in enter.items()},
-            _leave=side_by_side(leave, out=out),
-            _leave_length=side_by_side(leave_length, out=out_length),
-            decode_scaled=side_by_side(leave_scaled, out=out),
+            _leave=side_by_side(leave, into, out),
+            _leave_length=side_by_side(leave_length, into, out_length),
+            decode_scaled=side_by_side(leave_scaled, into, out),
         )
 
     @property
@@ -525,22 +556,48 @@ class Mae:
         if len(self.groups) == 1:
             return length, slopes
         result = np.zeros((*x.shape[:-1], len(self.muscles), len(self.joints)))
-        for joints, muscles in self.groups:
+        for (_, muscles), joints in zip(self.groups, self._read_joints, strict=True):
             rows, columns = np.ix_(muscles, joints)
             result[..., rows, columns] = slopes[..., muscles, : len(joints)]
         return length, result
 
     @cached_property
     def _directions(self) -> Array:
-        """Directions of (θ, T), each of which moves one joint of every group, (K, D+M).
+        """Directions of (θ, T), each of which moves at most one joint of every block, (K, D+M).
 
-        Groups do not affect each other, so K is the number of joints of the largest group.
+        Blocks that do not read each other do not affect each other, so K is the largest number of
+        joints that a block reads.
         """
-        largest = max(len(group.joints) for group in self.groups)
+        largest = max(map(len, self._read_joints))
         directions = np.zeros((largest, len(self.joints) + len(self.muscles)))
-        for group in self.groups:
-            directions[np.arange(len(group.joints)), group.joints] = 1.0
+        for joints in self._read_joints:
+            directions[np.arange(len(joints)), joints] = 1.0
         return directions
+
+    @cached_property
+    def _read_joints(self) -> list[tuple[int, ...]]:
+        """The joints that each block reads, those of its base first.
+
+        A base has no other base, so a joint has the same place in each of these lists.
+        """
+        return [
+            union([self.groups[r] for r in reversed(read)]).joints
+            for read in read_blocks(self.bases)
+        ]
+
+
+def read_blocks(bases: Sequence[int]) -> list[tuple[int, ...]]:
+    """Return the indices of the blocks that each block reads: its own, and that of its base."""
+    return [(g,) if base == g else (g, base) for g, base in enumerate(bases)]
+
+
+def latent_places(groups: Sequence[Group], bases: Sequence[int]) -> list[Ints]:
+    """Return for each block the places in z of the parts that its decoder reads, its own first."""
+    ends = np.cumsum([0, *(sum(map(len, group)) for group in groups)])
+    return [
+        np.concatenate([np.arange(ends[r], ends[r + 1]) for r in read])
+        for read in read_blocks(bases)
+    ]
 
 
 def _frozen(array: Array) -> Array:

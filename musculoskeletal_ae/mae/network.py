@@ -7,7 +7,7 @@
 the entries of the third are zero at the input of the first layer.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
@@ -17,9 +17,9 @@ import torch
 from torch import Tensor, nn
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.mae.mae import Layer, Mae
+from musculoskeletal_ae.mae.mae import Layer, Mae, latent_places, read_blocks
 from musculoskeletal_ae.mae.units import ActivationName, Mask, scale_vector, visible
-from musculoskeletal_ae.robot.groups import Group
+from musculoskeletal_ae.robot.groups import Group, union
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {'tanh': nn.Tanh, 'silu': nn.SiLU}
 
@@ -60,7 +60,9 @@ class Network(nn.Module):
 
     Its layers have D+2M+3, *hidden, D+M, *reversed hidden and D+2M units. The inputs are (θ, T, l)
     and the three entries of the mask. With several groups, each group has a separate block of
-    layers, with the group's own D, M and hidden layers.
+    layers, with the group's own D, M and hidden layers. A block may have another block as its base,
+    as a finger has the wrist. It then has the inputs of both, and its decoder reads both parts of
+    z.
     """
 
     mean: Tensor
@@ -75,6 +77,7 @@ class Network(nn.Module):
         mean: Array,
         std: Array,
         blocks: Mapping[Group, tuple[int, ...]] | None = None,
+        bases: Sequence[int] = (),
     ) -> None:
         """Initialise the weights with torch's random generator.
 
@@ -86,23 +89,29 @@ class Network(nn.Module):
             std: Standard deviation by which scaled (θ, T, l) are standardised, (D+2M,).
             blocks: Sizes of the hidden layers in each group's block; by default, the network is
                 one block with the hidden layers of `layers`.
+            bases: Index of each block's base, or of the block itself if it has none; () if no block
+                has a base.
         """
         super().__init__()
         self.joints, self.muscles, self.activation = joints, muscles, layers.activation
         blocks = blocks or {Group.whole(joints, muscles): layers.hidden}
-        self.groups = tuple(blocks)
-        values, start, encoders, decoders = joints + 2 * muscles, 0, [], []
-        own, latents = [group.columns(joints, muscles) for group in blocks], []
-        for columns, (group, hidden) in zip(own, blocks.items(), strict=True):
-            latents.append(np.arange(start, start := start + sum(map(len, group))))
-            sizes = len(columns) + 3, *hidden, len(latents[-1]), *reversed(hidden), len(columns)
-            encoders.append(self._stack(sizes[: len(hidden) + 2]))
-            decoders.append(self._stack(sizes[len(hidden) + 1 :]))
-        inputs = [np.append(columns, values + np.arange(3)) for columns in own]
-        self.encoder, self.decoder = (
-            Blocks(encoders, inputs, latents),
-            Blocks(decoders, latents, own),
-        )
+        self.groups, self.bases = tuple(blocks), tuple(bases) or tuple(range(len(blocks)))
+        values, encoders, decoders = joints + 2 * muscles, [], []
+        own = [group.columns(joints, muscles) for group in self.groups]
+        latents = latent_places(self.groups, range(len(blocks)))
+        read_latents = latent_places(self.groups, self.bases)
+        inputs = [
+            np.append(
+                union([self.groups[r] for r in read]).columns(joints, muscles),
+                values + np.arange(3),
+            )
+            for read in read_blocks(self.bases)
+        ]
+        for g, hidden in enumerate(blocks.values()):
+            encoders.append(self._stack((len(inputs[g]), *hidden, len(latents[g]))))
+            decoders.append(self._stack((len(read_latents[g]), *reversed(hidden), len(own[g]))))
+        self.encoder = Blocks(encoders, inputs, latents)
+        self.decoder = Blocks(decoders, read_latents, own)
         self.register_buffer('mean', torch.tensor(mean, dtype=torch.float32))
         self.register_buffer('std', torch.tensor(std, dtype=torch.float32))
         # One row for each mask: a 1 for each selected entry, then the three mask inputs.
@@ -155,6 +164,7 @@ def to_mae(
         std=array(network.std),
         training=training,
         groups=network.groups,
+        bases=network.bases,
     )
 
 
@@ -164,7 +174,8 @@ def from_mae(mae: Mae) -> Network:
     depth = len(hidden) // len(mae.groups)
     blocks = {g: tuple(hidden[i * depth :][: depth - 1]) for i, g in enumerate(mae.groups)}
     layers = Layers(blocks[mae.groups[0]], mae.activation)
-    network = Network(len(mae.joints), len(mae.muscles), layers, mae.mean, mae.std, blocks)
+    sizes = len(mae.joints), len(mae.muscles)
+    network = Network(*sizes, layers, mae.mean, mae.std, blocks, mae.bases)
     with torch.no_grad():
         for layers, arrays in ((network.encoder, mae.encoder), (network.decoder, mae.decoder)):
             for layer, (weight, bias) in zip(_linear(layers), arrays, strict=True):

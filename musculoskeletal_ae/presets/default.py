@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.mae.units import State
     from musculoskeletal_ae.motion.exploration_steps import ExplorationStep
     from musculoskeletal_ae.motion.methods import LengthMethod
-    from musculoskeletal_ae.robot.groups import Group
     from musculoskeletal_ae.robot.robot import Robot
     from musculoskeletal_ae.simulation.simulated_body import SimulatedBody
 
@@ -33,11 +32,11 @@ class DefaultPreset:
     simulates_on_devices = True
     methods_without_tension: tuple[str, ...] = 'geometric', 'first', 'proposed'
 
-    def initial_steps(self, groups: Iterable[Group]) -> int:
-        """Return a number of mini-batches that grows with D + M of the largest group."""
-        from musculoskeletal_ae.mae.default_training import default_steps
+    def initial_steps(self, robot: Robot) -> int:
+        """Return a number of mini-batches that grows with D + M of the largest block."""
+        from musculoskeletal_ae.mae.default_training import default_steps, divided
 
-        return default_steps(groups)
+        return default_steps(divided(robot)[0])
 
     def training_states(self, robot: Robot, count: int, rng: np.random.Generator) -> State:
         """Return random states, some of which exceed the tension limit."""

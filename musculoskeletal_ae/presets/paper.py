@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.mae.units import State
     from musculoskeletal_ae.motion.exploration_steps import ExplorationStep
     from musculoskeletal_ae.motion.methods import LengthMethod
-    from musculoskeletal_ae.robot.groups import Group
     from musculoskeletal_ae.robot.robot import Robot
     from musculoskeletal_ae.simulation.simulated_body import SimulatedBody
 
@@ -40,7 +39,7 @@ class PaperPreset:
     def __init__(self, hidden: tuple[int, ...] = HIDDEN) -> None:
         self._hidden = hidden
 
-    def initial_steps(self, groups: Iterable[Group]) -> int:  # noqa: ARG002
+    def initial_steps(self, robot: Robot) -> int:  # noqa: ARG002
         """Return the same number of mini-batches for any body (§III-B)."""
         return INITIAL_STEPS
 

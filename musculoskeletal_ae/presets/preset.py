@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.mae.units import State
     from musculoskeletal_ae.motion.exploration_steps import ExplorationStep
     from musculoskeletal_ae.motion.methods import LengthMethod
-    from musculoskeletal_ae.robot.groups import Group
     from musculoskeletal_ae.robot.robot import Robot
     from musculoskeletal_ae.simulation.simulated_body import SimulatedBody
 
@@ -43,8 +42,8 @@ class Preset(Protocol):
 
     # -- network and initial training -----------------------------------------------------------
 
-    def initial_steps(self, groups: Iterable[Group]) -> int:
-        """Return the number of mini-batches of initial training for a body with these groups."""
+    def initial_steps(self, robot: Robot) -> int:
+        """Return the number of mini-batches of initial training for a robot."""
 
     def training_states(self, robot: Robot, count: int, rng: np.random.Generator) -> State:
         """Return `count` random states of the geometric model, drawn as for initial training."""

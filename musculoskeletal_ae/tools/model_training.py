@@ -87,7 +87,7 @@ def train(args: Namespace) -> None:
 
 def train_on_model(robot: Robot, args: Namespace) -> Trained:
     """Train a network on the geometric model, and show the progress."""
-    steps = PRESETS[args.preset].initial_steps(robot.groups) // (10 if args.quick else 1)
+    steps = PRESETS[args.preset].initial_steps(robot) // (10 if args.quick else 1)
     newest = 0.0  # loss of the newest mini-batch
     with ProgressBar('training', steps, lambda: f'loss {newest:.4f}', is_even=True) as bar:
         bar.announce(f': drawing states of the geometric model, {steps} mini-batches follow')

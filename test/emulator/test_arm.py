@@ -140,6 +140,19 @@ def test_a_ruptured_muscle_has_no_tension_and_winds_in_at_the_speed_limit(robot,
     assert arm.sense().tension[1] > 0.5 * robot.tension.bias[1]
 
 
+def test_a_weak_muscle_takes_up_slack(tmp_path, reality):
+    weak = {'bias': 0.5, 'limit': 50.0, 'max': 75.0}
+    robot = Robot.load(write_robot(tmp_path / 'arm', tension=weak))
+    arm = make_arm(robot, 2, reality)
+    command = to_mid_range(robot, 5.0)
+    drive(arm, command, 2.0)
+    before = arm.sense().length[1]
+    arm._muscle.length[1] += 0.02
+    drive(arm, command, 1.5)
+    assert arm.sense().tension[1] > 0.0
+    assert arm.sense().length[1] - before < 0.01
+
+
 def test_a_length_offset_shifts_the_controlled_posture(robot, nominal):
     arm = nominal()
     command = to_mid_range(robot, 80.0)

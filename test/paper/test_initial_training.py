@@ -21,7 +21,7 @@ def test_the_network_has_the_printed_layers():
 def test_100_batches_and_30_epochs_make_3000_mini_batches_for_any_body():
     assert constants.INITIAL_SAMPLES // constants.INITIAL_BATCH == 100
     for name in ('arm26', 'musashi_upper_body'):
-        assert preset_named('paper').initial_steps(Robot.load(name).groups) == 30 * 100
+        assert preset_named('paper').initial_steps(Robot.load(name)) == 30 * 100
 
 
 def test_the_samples_are_states_of_the_geometric_model():
