@@ -83,7 +83,7 @@ def test_an_arm_that_does_not_explore_is_shown_with_its_mode():
 
 
 def test_the_hint_is_printed_once(graph, capsys):
-    node = graph.host(bringup_status.BringupStatus, robot='arm26')
+    node = graph.host(bringup_status.BringupStatusNode, robot='arm26')
     node.situation.diagnosed(diagnostics(f'{graph.namespace}/learner', samples='0'))
     for _ in range(2):
         node.anomalies.append(0.5)
@@ -107,7 +107,7 @@ def measure(node, ago=0.0):
 
 
 def test_silent_joint_sensors_are_shown_as_missing(graph, capsys):
-    node = graph.host(bringup_status.BringupStatus, robot='arm26')
+    node = graph.host(bringup_status.BringupStatusNode, robot='arm26')
     node.anomalies.append(0.5)
     measure(node)
     node._on_estimate(np.ones(2))
@@ -122,7 +122,7 @@ def test_silent_joint_sensors_are_shown_as_missing(graph, capsys):
 def test_before_the_first_estimate_a_line_says_why_there_is_none(graph, capsys, monkeypatch, load):
     load(0.0)
     monkeypatch.setattr(bringup_status, 'WAITING_INTERVAL', 0.0)
-    node = graph.host(bringup_status.BringupStatus, robot='arm26')
+    node = graph.host(bringup_status.BringupStatusNode, robot='arm26')
     node._print()
     assert capsys.readouterr().out == 'waiting for the first estimate\n'
     rejected = {'last_rejected': 'muscle_states: wrong length: 15 values; expected 18'}
@@ -143,7 +143,7 @@ def test_before_the_first_estimate_a_line_says_why_there_is_none(graph, capsys, 
 
 def test_what_a_replay_waits_for_is_printed_as_soon_as_it_changes(graph, capsys, load):
     load(0.0)
-    node = graph.host(bringup_status.BringupStatus, robot='arm26', end_with_replay=True)
+    node = graph.host(bringup_status.BringupStatusNode, robot='arm26', end_with_replay=True)
     node._print()
     missing = ('estimator and learner', 'learner')
     for nodes in missing:
@@ -159,7 +159,7 @@ def test_what_a_replay_waits_for_is_printed_as_soon_as_it_changes(graph, capsys,
 
 
 def test_at_the_end_of_a_recording_the_last_values_are_shown(graph, capsys):
-    node = graph.host(bringup_status.BringupStatus, robot='arm26', end_with_replay=True)
+    node = graph.host(bringup_status.BringupStatusNode, robot='arm26', end_with_replay=True)
     node.situation.diagnosed(diagnostics(f'{graph.namespace}/learner', samples='9'))
     node.anomalies.append(0.5)
     measure(node)
@@ -177,7 +177,7 @@ def test_at_the_end_of_a_recording_the_last_values_are_shown(graph, capsys):
 
 @pytest.mark.parametrize('had_estimates', [True, False])
 def test_the_end_of_a_recording_without_estimates_is_an_error(graph, had_estimates):
-    node = graph.host(bringup_status.BringupStatus, robot='arm26', end_with_replay=True)
+    node = graph.host(bringup_status.BringupStatusNode, robot='arm26', end_with_replay=True)
     if had_estimates:
         node.anomalies.append(0.5)
     node._print()
@@ -193,7 +193,7 @@ def test_the_end_of_a_recording_without_estimates_is_an_error(graph, had_estimat
 
 @pytest.mark.parametrize('lost', ['', 'learner'])
 def test_at_the_end_of_a_recording_the_samples_and_losses_are_printed(graph, capsys, lost):
-    node = graph.host(bringup_status.BringupStatus, robot='arm26', end_with_replay=True)
+    node = graph.host(bringup_status.BringupStatusNode, robot='arm26', end_with_replay=True)
     learner = f'{graph.namespace}/learner'
     node.anomalies.append(0.5)
     node.situation.diagnosed(diagnostics(learner, samples='9'))
@@ -377,7 +377,7 @@ def test_every_kind_has_a_text_and_every_stop_ends_with_a_reset():
 
 
 def test_a_joint_sensor_without_a_number_is_counted_and_the_others_are_used(graph):
-    node = graph.host(bringup_status.BringupStatus, robot='arm26')
+    node = graph.host(bringup_status.BringupStatusNode, robot='arm26')
     graph.listen(DiagnosticArray, '/diagnostics')
     publisher = graph.publisher(JointState, 'joint_states')
     first, second = node.robot.joints
