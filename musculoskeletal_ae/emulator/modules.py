@@ -8,11 +8,11 @@
 
 MSC is muscle stiffness control with the stiffness K. Except for heat, l and T are the length and
 tension that the module's own sensors read. `muscles.yaml` says whether the modules follow MSC or
-positions (`actuation`). A module that follows MSC winds in a slack tendon with up to TAKE_UP_SPEED,
-even if T_bias is so small that the gain alone would be slower. A position-controlled module holds
-its length while it gets no commands, and pays out while its tension exceeds T_max. c₁, c₂ and c_a
-are the temperatures of winding, housing and surroundings, with the heat capacities C and the
-thermal resistances R.
+positions (`actuation`). A module that follows a length by MSC winds in a slack tendon with up to
+TAKE_UP_SPEED, even if T_bias is so small that the gain alone would be slower. A position-controlled
+module holds its length while it gets no commands, and pays out while its tension exceeds T_max. c₁,
+c₂ and c_a are the temperatures of winding, housing and surroundings, with the heat capacities C and
+the thermal resistances R.
 """
 
 import math
@@ -174,7 +174,7 @@ def wind(
         desired = previous + min(change, max(-change, bias - previous))
     muscle.reference[m] = min(modules.tension_max[m], desired)
     speed = -MOTOR_GAIN * (muscle.reference[m] - tension)
-    if bias > 0.0:
+    if kind == FOLLOW_LENGTH and bias > 0.0:
         speed = min(speed, -TAKE_UP_SPEED * (1.0 - 2.0 * tension / bias))
     if muscle.ruptured[m] > 0.0:
         speed = -SPEED_LIMIT

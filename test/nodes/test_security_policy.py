@@ -33,7 +33,7 @@ def of_actions(node: str, *parts: str) -> set[str]:
 @pytest.mark.parametrize('name', NODES)
 def test_a_node_uses_exactly_the_rights_of_the_policy(graph, name, tmp_path):
     module = importlib.import_module(f'musculoskeletal_ae.nodes.{name}')
-    kind = getattr(module, ''.join(word.title() for word in name.split('_')))
+    kind = getattr(module, ''.join(word.title() for word in name.split('_')) + 'Node')
     extra = {
         'learner': {'state_directory': str(tmp_path)},
         'estimator': {'mirror_muscles': True},

@@ -71,14 +71,14 @@ def test_body_states_are_equal_if_all_their_values_are(change):
 def test_impossible_rows_are_refused_with_the_legal_values(row, value):
     rows = BODY.rows.copy()
     rows[row, 1] = value
-    with pytest.raises(MessageError, match='impossible body state: expected offsets within'):
+    with pytest.raises(MessageError, match='impossible body state: expected offset within'):
         BodyState.of_rows(rows)
 
 
 def test_one_finding_names_one_muscle():
     rows = BODY.rows.copy()
     rows[4, 0] = Anomaly.FOUND
-    with pytest.raises(MessageError, match='0 for all muscles but one'):
+    with pytest.raises(MessageError, match='other than 0 for at most one muscle'):
         BodyState.of_rows(rows)
 
 
