@@ -174,7 +174,7 @@ def wind(
         desired = previous + min(change, max(-change, bias - previous))
     muscle.reference[m] = min(modules.tension_max[m], desired)
     speed = -MOTOR_GAIN * (muscle.reference[m] - tension)
-    if kind == FOLLOW_LENGTH and bias > 0.0:
+    if kind == FOLLOW_LENGTH and tension < 0.5 * bias:
         speed = min(speed, -TAKE_UP_SPEED * (1.0 - 2.0 * tension / bias))
     if muscle.ruptured[m] > 0.0:
         speed = -SPEED_LIMIT
