@@ -35,7 +35,7 @@ from musculoskeletal_ae.experiments.resilience import IsolatingLoop
 from musculoskeletal_ae.experiments.workers import workers
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.motion.exploration_steps import TRIES, holdable_postures
+from musculoskeletal_ae.motion.explored_postures import TRIES, holdable_postures
 from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot

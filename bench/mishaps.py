@@ -63,7 +63,7 @@ from musculoskeletal_ae.experiments.workers import workers
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.motion.exploration_steps import holdable_postures
+from musculoskeletal_ae.motion.explored_postures import holdable_postures
 from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.robot.robot import Robot

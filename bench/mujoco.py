@@ -80,7 +80,7 @@ from musculoskeletal_ae.exporting.mjcf import export_into
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.motion import reach, slowness
-from musculoskeletal_ae.motion.exploration_steps import holdable_postures
+from musculoskeletal_ae.motion.explored_postures import holdable_postures
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.options import Parser, number, seeds
 from musculoskeletal_ae.presets.names import PAPER_PRESET

@@ -17,7 +17,7 @@ from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion import methods
-from musculoskeletal_ae.motion.exploration_steps import TRIES, holdable_postures
+from musculoskeletal_ae.motion.explored_postures import TRIES, holdable_postures
 from musculoskeletal_ae.motion.methods import stiffness_command
 from musculoskeletal_ae.paper.control import proposed as proposed_as_printed
 from musculoskeletal_ae.robot.robot import Robot

@@ -12,7 +12,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.design.checks import COUNTED_ARM_SHARE, LEAST_COUNTED_ARM
-from musculoskeletal_ae.motion.exploration_steps import supported_postures
+from musculoskeletal_ae.motion.explored_postures import supported_postures
 from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension

@@ -8,8 +8,8 @@ The sequence after the rupture of a tendon, with `on_anomaly: isolate`:
     keep T_bias, otherwise as soon as the tendon should carry load. The finding is latched: the
     estimator publishes a body state with an anomaly, and the controller stops the arm.
  3. Isolation. The suspect is isolated immediately: estimation and control continue without it.
- 4. Verification. The controller winds the suspect in by a few millimetres. `verification.py`
-    classifies its response: ruptured, jammed, sensor fault, or healthy.
+ 4. Verification. The controller winds the suspect in by a few millimetres.
+    `suspect_verification.py` classifies its response: ruptured, jammed, sensor fault, or healthy.
  5. Resuming. A faulty muscle stays isolated, a healthy one is restored. Either way the anomaly is
     over, and the controller resumes after a verification (`control/supervisor.py`).
 

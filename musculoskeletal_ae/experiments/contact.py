@@ -12,7 +12,7 @@ from musculoskeletal_ae.estimation.contact import Contact
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, columns
 from musculoskeletal_ae.experiments.study import Measured, Plot, Rows, Study
-from musculoskeletal_ae.motion.exploration_steps import TRIES, holdable_postures
+from musculoskeletal_ae.motion.explored_postures import TRIES, holdable_postures
 from musculoskeletal_ae.robot.robot import Robot
 
 CONTACT_STREAM = 7000

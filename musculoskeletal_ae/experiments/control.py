@@ -39,7 +39,7 @@ from musculoskeletal_ae.experiments.study import (
     first_individual,
 )
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.motion.exploration_steps import TRIES, holdable_postures
+from musculoskeletal_ae.motion.explored_postures import TRIES, holdable_postures
 from musculoskeletal_ae.motion.methods import proposed
 from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.robot.tension import holding_tension

@@ -57,7 +57,7 @@ from musculoskeletal_ae.experiments.study import (
     first_individual,
 )
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.motion.exploration_steps import TRIES, holdable_postures
+from musculoskeletal_ae.motion.explored_postures import TRIES, holdable_postures
 from musculoskeletal_ae.motion.hand import POSITION
 from musculoskeletal_ae.motion.ramps import RAMP_SHARE
 from musculoskeletal_ae.motion.reach import lacking

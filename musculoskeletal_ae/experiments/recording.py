@@ -20,7 +20,7 @@ from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.exploration import Exploration
-from musculoskeletal_ae.motion.exploration_steps import ExplorationStep
+from musculoskeletal_ae.motion.explored_postures import ExplorationStep
 from musculoskeletal_ae.motion.methods import first_command
 from musculoskeletal_ae.motion.ramps import RAMP_SHARE
 from musculoskeletal_ae.presets.names import PAPER_PRESET

@@ -39,7 +39,7 @@ from musculoskeletal_ae.experiments.detection import grasp_and_release
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, make_error_function
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.motion.exploration_steps import TRIES
+from musculoskeletal_ae.motion.explored_postures import TRIES
 from musculoskeletal_ae.motion.progress import FALLEN
 from musculoskeletal_ae.robot.tension import holding_tension
 

@@ -18,8 +18,8 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.arrival import Arrival
+from musculoskeletal_ae.learning.anomaly_margin import AnomalyMargin
 from musculoskeletal_ae.learning.calibration import Reservoir
-from musculoskeletal_ae.learning.margin import AnomalyMargin
 from musculoskeletal_ae.learning.rest import REST_TIME, RestDetector
 from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
 from musculoskeletal_ae.learning.slow_moments import SlowMoments

@@ -14,7 +14,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.activities import ActivityControl, Inputs
 from musculoskeletal_ae.control.command import Command
-from musculoskeletal_ae.motion.exploration_steps import ExplorationStep
+from musculoskeletal_ae.motion.explored_postures import ExplorationStep
 from musculoskeletal_ae.motion.ramps import Goal, LengthRamps
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot

@@ -16,7 +16,7 @@ from collections.abc import Callable
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.motion.exploration_steps import ExplorationStep, explored_posture
+from musculoskeletal_ae.motion.explored_postures import ExplorationStep, explored_posture
 from musculoskeletal_ae.paper.constants import DURATIONS
 from musculoskeletal_ae.robot.robot import Robot
 

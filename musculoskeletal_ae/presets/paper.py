@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.mae.mae import Mae
     from musculoskeletal_ae.mae.training import Progress, TrainedNetwork
     from musculoskeletal_ae.mae.units import State
-    from musculoskeletal_ae.motion.exploration_steps import ExplorationStep
+    from musculoskeletal_ae.motion.explored_postures import ExplorationStep
     from musculoskeletal_ae.motion.methods import LengthMethod
     from musculoskeletal_ae.robot.robot import Robot
     from musculoskeletal_ae.simulation.simulated_body import SimulatedBody

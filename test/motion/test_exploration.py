@@ -10,7 +10,7 @@ from robots import read_muscles, write_muscles, write_robot
 from musculoskeletal_ae.emulator.kin.individual import Individual
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.motion.exploration import Exploration
-from musculoskeletal_ae.motion.exploration_steps import explored_posture, holdable_postures
+from musculoskeletal_ae.motion.explored_postures import explored_posture, holdable_postures
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension

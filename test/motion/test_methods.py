@@ -19,7 +19,7 @@ from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.motion import methods
-from musculoskeletal_ae.motion.exploration_steps import holdable_postures
+from musculoskeletal_ae.motion.explored_postures import holdable_postures
 from musculoskeletal_ae.motion.methods import first_command
 from musculoskeletal_ae.paper import control as paper
 from musculoskeletal_ae.paper.latent_descent import Loss, descend
