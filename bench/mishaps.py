@@ -473,19 +473,19 @@ def results(folder: Path) -> list[dict[str, Any]]:
     return list(newest.values())
 
 
-def run_seed(
-    robot: Robot, folder: Path, seed: int, reality: str, kinds: Sequence[str], again: bool
-) -> None:
-    """Run the mishaps of one individual that have no result yet."""
-    file = folder / f'{reality}_{seed}.jsonl'
+def without_result(folder: Path, seed: int, reality: str, kinds: Sequence[str]) -> list[str]:
+    """Return the names of those mishaps of an individual that have no result in the folder yet."""
     done = {
         each['mishap']
         for each in results(folder)
-        if (each['seed'], each['reality']) == (seed, reality) and not again
+        if (each['seed'], each['reality']) == (seed, reality)
     }
-    to_do = [name for name in kinds if name not in done]
-    if not to_do:
-        return
+    return [name for name in kinds if name not in done]
+
+
+def run_seed(robot: Robot, folder: Path, seed: int, reality: str, to_do: Sequence[str]) -> None:
+    """Run mishaps of one individual, and append their results to its file."""
+    file = folder / f'{reality}_{seed}.jsonl'
     first = initial(robot, folder)
     mishap_kinds.OTHER_NETWORK[:] = [other_network(robot, first, reality, folder)]
     begun = time.process_time()
@@ -756,13 +756,15 @@ def main(argv: list[str]) -> int:
         print(graph_table(results(folder)))
         return 0
     folder = folder.resolve()
-    for reality in realities:  # train these networks once, and not for each individual
+    calls = list[tuple[Robot, Path, int, str, Sequence[str]]]()
+    for reality in realities:
+        for seed in seeds:
+            names_left = without_result(folder, seed, reality, kinds)
+            to_do = kinds if options.again else names_left
+            if to_do:
+                calls.append((robot, folder, seed, reality, to_do))
+    for reality in {call[3] for call in calls}:  # train once, and not for each individual
         other_network(robot, initial(robot, folder), reality, folder)
-    calls = [
-        (robot, folder, seed, reality, kinds, options.again)
-        for reality in realities
-        for seed in seeds
-    ]
     with workers(options.jobs, options.scheduler) as processes:
         for _ in processes.in_order(run_seed, calls):
             pass

@@ -33,7 +33,7 @@ from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.exporting.mjcf import export
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.initial_training import initial_mae
-from musculoskeletal_ae.mae.mae import Mae, read_blocks
+from musculoskeletal_ae.mae.mae import Mae, read_groups
 from musculoskeletal_ae.mae.network import Network, TorchLengths, from_mae
 from musculoskeletal_ae.mae.training import random_states
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, visible
@@ -42,7 +42,6 @@ from musculoskeletal_ae.motion.methods import first_command, stiffness_command
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.paper import control as paper
 from musculoskeletal_ae.paper.constants import CONTROL_WEIGHTS, TORQUE_UNITS
-from musculoskeletal_ae.robot.groups import union
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.signals.muscle_readings import muscle_reading
@@ -83,6 +82,7 @@ def products(mae: Mae, mask: Mask | None, lengths: bool = False) -> int:
 
     Without a mask, the encoder is not used. With `lengths`, the decoder computes only l.
     """
+    groups_read = read_groups(mae.groups, mae.bases)
     depth, total = len(mae.encoder) // len(mae.groups), sum(w.size for w, _ in mae.decoder)
     for g, group in enumerate(mae.groups):
         muscles = len(group.muscles)
@@ -90,8 +90,7 @@ def products(mae: Mae, mask: Mask | None, lengths: bool = False) -> int:
         total -= last.shape[1] * (len(last) - muscles) if lengths else 0
         if mask is not None:
             first, *rest = (weight for weight, _ in mae.encoder[g * depth : (g + 1) * depth])
-            read = union([mae.groups[r] for r in read_blocks(mae.bases)[g]])
-            visible_count = int(visible(mask, *map(len, read)).sum())
+            visible_count = int(visible(mask, *map(len, groups_read[g])).sum())
             total += len(first) * visible_count + sum(weight.size for weight in rest)
     return total
 

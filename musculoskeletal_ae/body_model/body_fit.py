@@ -23,9 +23,10 @@ PROBES = 200  # average the length of each muscle over this many postures
 #: with residuals of the same sign
 LEAST_NEWEST = 4
 LEAST_BEFORE = 8  # report it only if at least this many samples came before those
-#: a sample contradicts the body only if its residual is at least this large [m]
+#: count a sample as contradicting the body only if its residual is at least this large [m]
 LEAST_CHANGE = 0.004
-#: a sample contradicts the body only if its residual has at least this many standard deviations
+#: count a sample as contradicting the body only if its residual has at least this many standard
+#: deviations
 OUTLIER = 6.0
 
 

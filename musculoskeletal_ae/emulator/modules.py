@@ -385,7 +385,7 @@ class Arm(ABC):
 
     @abstractmethod
     def set_payload(self, mass: float) -> None:
-        """Set the mass [kg] in the hand, a ball of 5 cm radius at the end effector."""
+        """Set the payload: a ball of this mass [kg] and 5 cm radius at the end effector."""
 
     @property
     @abstractmethod

@@ -439,56 +439,56 @@ class Estimator:
             guess = newest
             sample = sample.shifted(self.body.offsets.offset - before.offset)
         assert self.mae is not None
-        of_sample = estimate(self.mae, sample.bone_tension, sample.length_read - guess.offset)
+        estimated = estimate(self.mae, sample.bone_tension, sample.length_read - guess.offset)
         if self.suspects.verification is not None:
-            self._verify(sample, of_sample, dt, now)
+            self._verify(sample, estimated, dt, now)
         readings = self._fresh_readings(now)
         self.measured = self._measured_theta(readings)
         self._unchecked += dt
         self._unchecked_sent += sent_apart
         detected, contact = False, None
         if sample.jumped or not 0.0 < self._unchecked_sent < SPACING:
-            detected, contact = self._check(sample, of_sample, readings, now)
+            detected, contact = self._check(sample, estimated, readings, now), self.load
         self.output = Output(
-            sample, of_sample.state, of_sample.covariance, of_sample.anomaly, detected, contact
+            sample, estimated.state, estimated.covariance, estimated.anomaly, detected, contact
         )
         return self.output
 
     def _check(
-        self, sample: MuscleSample, of_sample: Estimate, readings: Array, now: float
-    ) -> tuple[bool, Contact | None]:
-        """Check the health of the body, and estimate the external load.
+        self, sample: MuscleSample, estimated: Estimate, readings: Array, now: float
+    ) -> bool:
+        """Check the health of the body, and estimate its external load (`load`).
 
         Args:
             sample: The readings.
-            of_sample: The network's estimate.
+            estimated: The network's estimate.
             readings: Fresh readings of the joint sensors [rad], (D,); NaN where there are none.
             now: Time on the steady clock [s].
 
         Returns:
-            Whether a finding has been latched, and the external load as in `Output`.
+            Whether a finding has been latched.
         """
         dt, sent_apart = min(self._unchecked, LONGEST_STEP), self._unchecked_sent
         self._unchecked = self._unchecked_sent = 0.0
         known = self.body.offsets.known
         demand = self._commands.demand(self.robot, sample.length, now)
         command = self._commands.length(now)
-        observation = Observation(sample, of_sample, demand, dt, known, self.measured, command)
+        observation = Observation(sample, estimated, demand, dt, known, self.measured, command)
         detected = self._handle(self.health.step(observation), now)
         self.load = None
         if known and self.robot.tension_source.is_known:
             pull = sample.bone_tension * self.body.used
-            self.load = self.contact.step(of_sample.state.theta, pull, sent_apart)
+            self.load = self.contact.step(estimated.state.theta, pull, sent_apart)
             if self.suspects.finding is None:
                 torque = self.load.torque
                 self.healthy_torque.step(torque, self.contact.velocity, sent_apart)
-                self.mounting.step(of_sample.state.theta, pull, torque, dt)
+                self.mounting.step(estimated.state.theta, pull, torque, dt)
         if detected:
             self.joint_check.drop_newest()
         elif known and self.suspects.finding is None:
             load = 0.0 if self.load is None else self.load.distance
             self.joint_check.step(observation, readings, now, load)
-        return detected, self.load
+        return detected
 
     # -- findings, verification and calibration -------------------------------------------------
 

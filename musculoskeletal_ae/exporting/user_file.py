@@ -81,7 +81,7 @@ class UserFile:
         return sites
 
     def places(self, links: dict[str, str]) -> dict[Place, str]:
-        """Return the names of the movable sites by where they are.
+        """Return the name of each movable site, by its link and its position there.
 
         Args:
             links: Name of the link of each body, by the name of the body.

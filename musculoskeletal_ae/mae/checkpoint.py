@@ -22,12 +22,12 @@ from safetensors.numpy import save as save_tensors
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.files import read_bytes, write_whole
-from musculoskeletal_ae.mae.mae import Layer, Mae, latent_places, read_blocks
+from musculoskeletal_ae.mae.mae import Layer, Mae, complete_bases, latent_places, read_groups
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
 from musculoskeletal_ae.mae.units import UNITS, ActivationName
 from musculoskeletal_ae.presets.names import PRESET_NAMES
 from musculoskeletal_ae.report import distinct
-from musculoskeletal_ae.robot.groups import Group, union
+from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.schema import Strict, convert
@@ -117,9 +117,9 @@ class Metadata(Strict, frozen=True):
             raise ValueError(f'bases {self.bases}; legal: {expected}')
         # Encoder and decoder have equally many hidden layers; the latent layer is between them.
         depth, rest = divmod(len(self.layer_sizes), len(self.groups))
-        for g, sizes in enumerate(self.sizes_by_group()):
-            d, m = map(len, self.groups[g])
-            read = union([self.groups[r] for r in read_blocks(bases)[g]])
+        groups_read = read_groups(self.groups, bases)
+        for group, read, sizes in zip(self.groups, groups_read, self.sizes_by_group(), strict=True):
+            d, m = map(len, group)
             ends = len(read.joints) + 2 * len(read.muscles) + 3, d + m, d + 2 * m
             is_symmetric = rest == 0 and depth % 2 == 1
             if not is_symmetric or (sizes[0], sizes[depth // 2], sizes[-1]) != ends:
@@ -133,7 +133,7 @@ class Metadata(Strict, frozen=True):
 
     def bases_by_group(self) -> tuple[int, ...]:
         """Return the index of the base of each group's block."""
-        return self.bases or tuple(range(len(self.groups)))
+        return complete_bases(self.bases, len(self.groups))
 
     def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the name and shape of every tensor that belongs to this metadata."""

@@ -324,23 +324,23 @@ class Mae:
         scale = scale_vector(joints, muscles)
         activation = ACTIVATIONS[self.activation]
         groups = self.groups or (Group.whole(joints, muscles),)
-        bases = self.bases or tuple(range(len(groups)))
+        bases = complete_bases(self.bases, len(groups))
         enter: dict[Mask, list[Stack]] = {mask: [] for mask in Mask}
         leave, leave_length, leave_scaled = list[Stack](), list[Stack](), list[Stack]()
         columns = [group.columns(joints, muscles) for group in groups]
-        read_groups = [union([groups[r] for r in read]) for read in read_blocks(bases)]
-        read_columns = [group.columns(joints, muscles) for group in read_groups]
+        groups_read = read_groups(groups, bases)
+        read_columns = [group.columns(joints, muscles) for group in groups_read]
         depth = len(encoder) // len(groups)
-        for g, (own, seen) in enumerate(zip(columns, read_columns, strict=True)):
+        for g, (own, read) in enumerate(zip(columns, read_columns, strict=True)):
             layers, sizes = slice(g * depth, (g + 1) * depth), tuple(map(len, groups[g]))
             (first, first_bias), *rest = encoder[layers]
             after = tuple(_transposed(*layer) for layer in rest)
             for mask, stacks in enter.items():
-                selected = visible(mask, *map(len, read_groups[g]))
-                weight = first[:, : len(seen)][:, selected] / std[seen][selected]
-                constant = first[:, len(seen) :] @ np.array(mask.value, dtype=float)
-                bias = first_bias + constant - weight @ mean[seen][selected]
-                layer = _transposed(weight * scale[seen][selected], bias)
+                selected = visible(mask, *map(len, groups_read[g]))
+                weight = first[:, : len(read)][:, selected] / std[read][selected]
+                constant = first[:, len(read) :] @ np.array(mask.value, dtype=float)
+                bias = first_bias + constant - weight @ mean[read][selected]
+                layer = _transposed(weight * scale[read][selected], bias)
                 stacks.append(_stack((layer, *after), activation))
             *rest, (last, last_bias) = decoder[layers]
             before = tuple(_transposed(*layer) for layer in rest)
@@ -584,6 +584,16 @@ class Mae:
             union([self.groups[r] for r in reversed(read)]).joints
             for read in read_blocks(self.bases)
         ]
+
+
+def complete_bases(bases: Sequence[int], count: int) -> tuple[int, ...]:
+    """Return the index of the base of each of `count` blocks; () means that no block has one."""
+    return tuple(bases) or tuple(range(count))
+
+
+def read_groups(groups: Sequence[Group], bases: Sequence[int]) -> list[Group]:
+    """Return the joints and muscles that each block reads: its own, then those of its base."""
+    return [union([groups[r] for r in read]) for read in read_blocks(bases)]
 
 
 def read_blocks(bases: Sequence[int]) -> list[tuple[int, ...]]:

@@ -17,9 +17,9 @@ import torch
 from torch import Tensor, nn
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.mae.mae import Layer, Mae, latent_places, read_blocks
+from musculoskeletal_ae.mae.mae import Layer, Mae, complete_bases, latent_places, read_groups
 from musculoskeletal_ae.mae.units import ActivationName, Mask, scale_vector, visible
-from musculoskeletal_ae.robot.groups import Group, union
+from musculoskeletal_ae.robot.groups import Group
 
 ACTIVATIONS: dict[str, type[nn.Module]] = {'tanh': nn.Tanh, 'silu': nn.SiLU}
 
@@ -95,17 +95,14 @@ class Network(nn.Module):
         super().__init__()
         self.joints, self.muscles, self.activation = joints, muscles, layers.activation
         blocks = blocks or {Group.whole(joints, muscles): layers.hidden}
-        self.groups, self.bases = tuple(blocks), tuple(bases) or tuple(range(len(blocks)))
+        self.groups, self.bases = tuple(blocks), complete_bases(bases, len(blocks))
         values, encoders, decoders = joints + 2 * muscles, [], []
         own = [group.columns(joints, muscles) for group in self.groups]
         latents = latent_places(self.groups, range(len(blocks)))
         read_latents = latent_places(self.groups, self.bases)
         inputs = [
-            np.append(
-                union([self.groups[r] for r in read]).columns(joints, muscles),
-                values + np.arange(3),
-            )
-            for read in read_blocks(self.bases)
+            np.append(group.columns(joints, muscles), values + np.arange(3))
+            for group in read_groups(self.groups, self.bases)
         ]
         for g, hidden in enumerate(blocks.values()):
             encoders.append(self._stack((len(inputs[g]), *hidden, len(latents[g]))))

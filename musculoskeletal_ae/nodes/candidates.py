@@ -63,15 +63,15 @@ class Candidates:
 
     def follow(self, body: BodyState) -> None:
         """Follow a change of the body state, and reject waiting candidates if an anomaly begins."""
-        waiting = None
+        in_use, waiting = self._networks.mae, None
         begins = body.has_anomaly and not self._networks.is_anomaly
-        if begins and self._networks.mae is not None:
+        if begins and in_use is not None:
             waiting = self.queue.give_up()
         proven = self._networks.follow(body, time.monotonic())
-        if proven is not None:
+        if proven is not None and in_use is not None:
             self._node.get_logger().warning(
-                f'an anomaly was detected soon after a new network was accepted; returned to '
-                f'checkpoint version {proven.version}'
+                f'checkpoint version {in_use.version}: an anomaly was detected soon after it was '
+                f'accepted; returned to checkpoint version {proven.version}'
             )
         if waiting is not None:
             with suppress(CheckpointError):  # an unfit checkpoint has no version

@@ -407,7 +407,7 @@ class ForeignArm(Arm):
         return friction
 
     def set_payload(self, mass: float) -> None:
-        """Set the mass [kg] in the hand, a ball of 5 cm radius at the end effector."""
+        """Set the payload: a ball of this mass [kg] and 5 cm radius at the end effector."""
         self._model.body_mass[self._hand] = mass
         self._model.body_inertia[self._hand] = 0.4 * mass * 0.05**2
         mujoco.mj_setConst(self._model, mujoco.MjData(self._model))

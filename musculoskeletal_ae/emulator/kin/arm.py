@@ -249,7 +249,7 @@ class EmulatedArm(modules.Arm):
         self._joint.q[:] = self.robot.kinematics.tree.angles(theta)
 
     def set_payload(self, mass: float) -> None:
-        """Set the mass [kg] in the hand, a ball of 5 cm radius at the end effector."""
+        """Set the payload: a ball of this mass [kg] and 5 cm radius at the end effector."""
         load = pin.Inertia.FromSphere(mass, 0.05) if mass > 0.0 else pin.Inertia.Zero()
         placed = load.se3Action(pin.SE3(np.eye(3), self._body.effector))
         self._model.inertias[self._body.effector_joint] = self._bare_inertia + placed
