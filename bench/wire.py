@@ -46,6 +46,7 @@ KINDS = {
     'nodes': NODES,
     'combined': ('hardware_emulator', 'sim', 'combined'),
     'with learner': (*NODES, 'learner'),
+    'combined, with learner': ('hardware_emulator', 'sim', 'combined', 'learner'),
     'plain node, torch': ('hardware_emulator', 'plain'),
     'messages alone': tuple(f'bare_{name}' for name in (*NODES, 'learner')),
 }
@@ -324,4 +325,4 @@ def main(argv: list[str]) -> None:
     )
     for robot in args.robots:
         for rate, kind, wire in systems(robot, args.rates, [*KINDS] * args.repeat, args.seconds):
-            print(f'{Path(robot).name:<20}{rate:4.0f} Hz  {kind:<18}{wire}', flush=True)
+            print(f'{Path(robot).name:<20}{rate:4.0f} Hz  {kind:<24}{wire}', flush=True)
