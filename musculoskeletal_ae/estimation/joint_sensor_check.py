@@ -15,9 +15,11 @@ and departs from the earlier ones, so that their difference stays. A constant of
 cancels out.
 
 A sensor is doubted while the median of |x_j| over the newest messages exceeds a limit: a constant
-or a multiple of the healthy spread of x_j, whichever is larger. Only messages of different postures
-count, because the error of a network in one posture says little about others. Messages of an arm
-that carries a load do not count.
+or a multiple of the healthy spread of θ_j − θ̂_j, whichever is larger. The spread is that of earlier
+messages when they arrived: a network that has learned from them fits them better than it will fit
+the next ones, above all at the beginning. Only messages of different postures count, because the
+error of a network in one posture says little about others. Messages of an arm that carries a load
+do not count.
 
 A change of muscle lengths also changes θ̂. The readings are therefore compared with two hypotheses:
 the sensors of the joints with large x are false, or the length of a single muscle has changed.
@@ -58,13 +60,13 @@ LOADED = 3.0
 ENOUGH = 80  # judge a sensor by at least this many earlier messages
 NEWEST = 48  # judge this many of the newest messages, by all messages before them
 #: Judge a sensor in these windows: number of messages, smallest limit of the median of |x| [rad],
-#: and limit in healthy spreads of x. The short window finds large errors fast; the long one
+#: and limit in healthy spreads. The short window finds large errors fast; the long one
 #: averages over more postures.
 WINDOWS = ((6, 0.12, 7.0), (24, 0.07, 3.0), (NEWEST, 0.06, 2.2))
 #: multiply the limits by 1 + FEW/n if there are n earlier messages
 FEW = 20.0
 #: Trust a sensor again once the median of |x| is below AGREEING_LIMIT [rad] or AGREEING_SPREADS
-#: healthy spreads of x, both over the newest AGREEING messages and over the newer half of them.
+#: healthy spreads, both over the newest AGREEING messages and over the newer half of them.
 AGREEING, AGREEING_LIMIT, AGREEING_SPREADS = 12, 0.035, 1.0
 #: assume at least this healthy spread of a length residual [m], because no length sensor is more
 #: precise
@@ -86,13 +88,14 @@ class _CountedMessage(NamedTuple):
     theta: Array  # readings of the joint sensors [rad], (D,); NaN where unknown or in doubt
     tension: Array  # bone-side tensions [N], (M,)
     length: Array  # lengths [m], (M,); NaN for isolated muscles
+    deviation: Array  # θ − θ̂ [rad], (D,), with the network that was in use when it arrived
 
 
 class _Usual(NamedTuple):
     """Medians of earlier messages, and their spread about them."""
 
     deviation: Array  # θ − θ̂ [rad], (D,); 0 if unknown
-    deviation_spread: Array  # [rad], (D,); NaN if unknown
+    deviation_spread: Array  # of the newest of them when they arrived [rad], (D,); NaN if unknown
     known_count: Ints  # number of these messages, (D,)
     residual: Array  # l − l_net(θ̂, T_end) [m], (M,)
     residual_spread: Array  # [m], (M,)
@@ -126,7 +129,7 @@ class JointSensorCheck:
         self._compared.clear()
         if not self._messages:
             return
-        theta, tension, length = map(np.array, zip(*(each[1:] for each in self._messages)))
+        theta, tension, length = map(np.array, zip(*(each[1:4] for each in self._messages)))
         estimate = mae.estimate(tension, np.nan_to_num(length)).theta
         used = ~np.isin(np.arange(length.shape[1]), mae.isolated)
         # Messages in which a muscle was isolated that is used now cannot be compared.
@@ -204,8 +207,9 @@ class JointSensorCheck:
         self._since, self._counted_at = 0.0, estimate
         length = np.where(sample.usable, sample.length, np.nan)
         tension = np.nan_to_num(sample.bone_tension)
-        self._messages.append(_CountedMessage(now, theta.copy(), tension, length))
-        self._compared.append((theta - estimate, length - self._mae.lengths(estimate, tension)))
+        deviation = theta - estimate
+        self._messages.append(_CountedMessage(now, theta.copy(), tension, length, deviation))
+        self._compared.append((deviation.copy(), length - self._mae.lengths(estimate, tension)))
         if len(self._messages) >= WINDOWS[0][0]:
             self._judge()
         if len(self._messages) > NEWEST:
@@ -245,7 +249,9 @@ class JointSensorCheck:
         count = np.isfinite(deviation).sum(axis=0)
         is_known = count >= ENOUGH
         middle = np.where(is_known, _median(deviation), 0.0)
-        spread = TO_SIGMA * _median(np.abs(deviation - middle))
+        arrived = np.array([message.deviation for message in self._messages])[: len(earlier)]
+        arrived = np.where(np.isnan(deviation), np.nan, arrived)[-ENOUGH:]
+        spread = TO_SIGMA * _median(np.abs(arrived - _median(arrived)))
         usual_residual = _median(residual)
         residual_spread = TO_SIGMA * _median(np.abs(residual - usual_residual))
         spread = np.where(is_known, spread, np.nan)
