@@ -17,9 +17,10 @@ Every command, tension and status is recorded and checked. The bench also kills 
 must lose nothing that they had saved (`attack_kills`; not with `--quick`), and reads hostile files
 (`attack_files`). `--parts` selects some of these: graph, kills, files.
 
-The bench prints a table: promise, number of trials, number of violations. The exit status is 1 if
-there is any violation. The hostile node does not do what every node on an open graph may do:
-command the modules within their limits, request a stop, or set a parameter to a legal value.
+The bench prints a table: promise, number of trials, number of violations, with the times of the
+nodes' logs. The exit status is 1 if there is any violation. The hostile node does not do what every
+node on an open graph may do: command the modules within their limits, request a stop, or set a
+parameter to a legal value.
 """
 
 import random
@@ -112,7 +113,7 @@ def changes(time: Array, number: Array, value: Array, rate: float, relieved: Boo
         float(ticks.max(initial=0.0)),
         [
             f'the command of muscle {m} changed by {1e3 * step[i, m]:.1f} mm'
-            f' in {1e3 * (time[i + 1] - time[i]):.0f} ms'
+            f' in {1e3 * (time[i + 1] - time[i]):.0f} ms, at {time[i + 1]:.2f} s'
             for i, m in zip(*np.nonzero(fast))
         ],
     )
@@ -240,15 +241,14 @@ def evaluate(attack: 'Attack') -> list[Row]:
         fast += steps.too_fast
         for begin, end, mode in stops:
             if (length := wound_in(at, value, begin + JITTER, end)) > STILL:
-                wound.append(f'{1e3 * length:.1f} mm in {mode}')
+                wound.append(f'{1e3 * length:.1f} mm in {mode}, from {begin:.2f} s')
     true = [load for load in attack.loads if without(np.array([load[0]]), attack.lying)[0]]
+    highest, when = max(((float(load.max()), at) for at, load in true), default=(0.0, 0.0))
     tense = [
-        f'{robot.muscles[m]} for {seconds:.1f} s'
+        f'{robot.muscles[m]} for {seconds:.1f} s, highest tension {highest:.0f} N at {when:.2f} s'
         for m, seconds in enumerate(overloads(true, ABOVE * robot.tension.limit))
         if seconds > MOMENT
     ]
-    highest = max((float(load.max()) for _, load in true), default=0.0)
-    tense = [f'{what}, highest tension {highest:.0f} N' for what in tense]
     silent = [f'{name}: {s:.1f} s' for name, s in attack.silences.items() if s > SILENT]
     fat = []
     for name, process in attack.processes.items():
