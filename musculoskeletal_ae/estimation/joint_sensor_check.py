@@ -43,7 +43,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.finding import Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
@@ -63,8 +63,6 @@ NEWEST = 48  # judge this many of the newest messages, by all messages before th
 #: and limit in healthy spreads. The short window finds large errors fast; the long one
 #: averages over more postures.
 WINDOWS = ((6, 0.12, 7.0), (24, 0.07, 3.0), (NEWEST, 0.06, 2.2))
-#: multiply the limits by 1 + FEW/n if there are n earlier messages
-FEW = 20.0
 #: Trust a sensor again once the median of |x| is below AGREEING_LIMIT [rad] or AGREEING_SPREADS
 #: healthy spreads, both over the newest AGREEING messages and over the newer half of them.
 AGREEING, AGREEING_LIMIT, AGREEING_SPREADS = 12, 0.035, 1.0
@@ -96,7 +94,6 @@ class _Usual(NamedTuple):
 
     deviation: Array  # θ − θ̂ [rad], (D,); 0 if unknown
     deviation_spread: Array  # of the newest of them when they arrived [rad], (D,); NaN if unknown
-    known_count: Ints  # number of these messages, (D,)
     residual: Array  # l − l_net(θ̂, T_end) [m], (M,)
     residual_spread: Array  # [m], (M,)
 
@@ -256,7 +253,7 @@ class JointSensorCheck:
         residual_spread = TO_SIGMA * _median(np.abs(residual - usual_residual))
         spread = np.where(is_known, spread, np.nan)
         residual_spread = np.fmax(residual_spread, LEAST_SPREAD)
-        return _Usual(middle, spread, count, usual_residual, residual_spread)
+        return _Usual(middle, spread, usual_residual, residual_spread)
 
     def _is_precise(self) -> bool:
         """Return whether errors below GROSS can be judged.
@@ -270,7 +267,6 @@ class JointSensorCheck:
         """Yield the length of each window and the limits of the median of |x| [rad], (D,)."""
         for count, smallest, spreads in WINDOWS:
             limit = np.fmax(smallest, spreads * usual.deviation_spread)
-            limit = limit * (1.0 + FEW / np.maximum(usual.known_count, 1))
             is_gross = np.isnan(usual.deviation_spread) | (not self._is_precise())
             yield count, np.where(is_gross, GROSS, limit)
 
