@@ -47,21 +47,22 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.joint_trust import NOT_USED, JointTrust, SensorTrust
 
-SPACING = 0.5  # count at most one message in this time [s]
-#: count a message only if the estimate of a joint has moved by this much since the last one that
-#: counted [rad]
+SPACING = 0.5  # judge sensors by at most one message in this time [s]
+#: skip a message unless the estimated angle of a joint has changed by this much since the last
+#: message that was stored [rad]: more messages of one posture tell nothing about others
 MOVED = 0.03
 EARLIER = 600  # keep this many earlier messages, which are at least 5 min of motion
-#: Count no message with more evidence for an external load than this (`contact.py`, d). Under a
-#: load that was not learned, the estimate may be wrong, and not the joint sensor.
+#: Skip messages in which the evidence d for an external load (`contact.py`) exceeds this. Under a
+#: load that was not learned, the estimate may be wrong instead of the joint sensor.
 LOADED = 3.0
 ENOUGH = 80  # judge a sensor by at least this many earlier messages
 NEWEST = 48  # judge this many of the newest messages, by all messages before them
-#: Judge a sensor in these windows: number of messages, smallest limit of the median of |x| [rad],
-#: and limit in healthy spreads of x. The short window finds large errors fast; the long one
-#: averages over more postures.
+#: Judge a sensor by its deviation x in three windows, each with the number of newest messages, the
+#: smallest limit of the median of |x| [rad], and the limit in healthy spreads of x. The short
+#: window finds large errors fast; the long one averages over more postures.
 WINDOWS = ((6, 0.12, 7.0), (24, 0.07, 3.0), (NEWEST, 0.06, 2.2))
-#: multiply the limits by 1 + FEW/n if there are n earlier messages
+#: multiply the limits by 1 + FEW/n if there are n earlier messages, so that a comparison with few
+#: messages reveals only large deviations
 FEW = 20.0
 #: Trust a sensor again once the median of |x| is below AGREEING_LIMIT [rad] or AGREEING_SPREADS
 #: healthy spreads of x, both over the newest AGREEING messages and over the newer half of them.
@@ -72,7 +73,7 @@ LEAST_SPREAD = 0.0005
 #: Doubt joint sensors if false joint sensors would leave a smaller sum of squares of Δ than this
 #: share of what a change of any single muscle would leave
 BETTER = 0.7
-USES = 10  # compute the medians of the earlier messages again after this many messages
+USES = 10  # compute the medians of the earlier messages again only after this many new messages
 TO_SIGMA = 1.48  # multiply a median of absolute deviations by this to get the standard deviation
 #: doubt a sensor even with few earlier messages if its reading differs from the estimate by this
 #: much [rad]
@@ -80,7 +81,7 @@ GROSS = 0.8
 
 
 class _CountedMessage(NamedTuple):
-    """The readings of one message that counts for the judgement."""
+    """The readings of one message by which the joint sensors are judged."""
 
     time: float  # [s]
     theta: Array  # readings of the joint sensors [rad], (D,); NaN where unknown or in doubt
@@ -89,7 +90,7 @@ class _CountedMessage(NamedTuple):
 
 
 class _Usual(NamedTuple):
-    """Medians of earlier messages, and their spread about them."""
+    """What is usual on the healthy arm: medians of earlier messages, and spreads about them."""
 
     deviation: Array  # θ − θ̂ [rad], (D,); 0 if unknown
     deviation_spread: Array  # [rad], (D,); NaN if unknown
@@ -99,10 +100,10 @@ class _Usual(NamedTuple):
 
 
 class JointSensorCheck:
-    """Judges the joint sensors of one arm.
+    """Decides which joint sensors of one arm are trusted, by comparing them with muscle lengths.
 
     Attributes:
-        trust: The newest decision.
+        trust: The newest decision on every sensor.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -181,13 +182,14 @@ class JointSensorCheck:
     # -- messages -------------------------------------------------------------------------------
 
     def step(self, observation: Observation, theta: Array, now: float, load: float = 0.0) -> None:
-        """Judge the sensors by a message of an arm without an anomaly, whose offsets are known.
+        """Judge the sensors by one message. The arm has no anomaly, and its offsets are known.
 
         Args:
             observation: The message.
             theta: Usable readings of the joint sensors [rad], (D,), NaN for other joints.
             now: Time of a steady clock [s].
-            load: Evidence for an external load; NaN if unknown.
+            load: Evidence d for an external load; the message is skipped if it exceeds LOADED. NaN
+                if unknown.
         """
         if load > LOADED:
             return
@@ -253,7 +255,7 @@ class JointSensorCheck:
         return _Usual(middle, spread, count, usual_residual, residual_spread)
 
     def _is_precise(self) -> bool:
-        """Return whether errors below GROSS can be judged.
+        """Return whether estimates are precise enough to judge errors smaller than GROSS.
 
         A network that has learned little makes large errors in new postures. Without tensions, a
         load changes the estimates as false joint sensors would.
@@ -311,7 +313,7 @@ class JointSensorCheck:
         return by_joints < BETTER * by_muscle
 
     def _give_up(self, joints: Bools) -> None:
-        """Give up the newest readings of joints, except those by which they are trusted again."""
+        """Discard the newest readings of joints, except those by which they are trusted again."""
         for place in range(max(-NEWEST, -len(self._messages)), -AGREEING):
             self._messages[place].theta[joints] = self._compared[place][0][joints] = np.nan
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The estimator's status: what is wrong with the body, and what it knows of it."""
+"""Reports the estimator's status for /diagnostics: faults of the body, and present estimates."""
 
 from __future__ import annotations
 
@@ -17,16 +17,18 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.estimator import Estimator
     from musculoskeletal_ae.mae.mae import Mae
 
-#: call the sensor itself faulty if at least this share of its readings is impossible
+#: blame the joint sensor itself if at least this share of its readings is impossible; below it, a
+#: second publisher or a loose contact may be the cause
 ALL = 0.9
+#: report this value of `contact` and `tension` for a robot that does not measure tensions
 UNKNOWN_TENSION = 'unknown: tension_source is none'
 
 
 def report(core: Estimator, now: float) -> Report:
     """Report the status of an estimator; `now` is the time of a steady clock [s].
 
-    The value `verification` is an identifier for programs, and `last outcome` is one of
-    `verification.Outcome`.
+    The value `verification` is 'none' or 'running', and `last outcome` is a value of
+    `suspect_verification.Outcome`, so that programs can read both.
     """
     mae, present = core.mae, conditions(core, now)
     if mae is None:

@@ -43,20 +43,27 @@ from musculoskeletal_ae.signals.limits import slack_tension
 
 FAULTY = 1.0  # report a module after this time of evidence [s]
 SMOOTHING = 0.1  # smooth differences and speeds with this time constant [s]
-#: expect no more of a winch that turns at this share of its largest speed, if that is known
+#: reduce the evidence while the winch turns at more than this share of its largest speed, if that
+#: is known: it can hardly correct faster
 FULL_SPEED = 0.5
 #: expect a healthy module to correct a difference of T_limit at least this fast [m/s]
 CORRECTING = 0.2
 #: tolerate a difference T − T_ref of this share of T_limit, plus this share of T_ref for errors of
 #: the sensor's gain and of the module's stiffness
 ALLOWED, ALLOWED_SHARE = 0.04, 0.1
-#: let the evidence grow fastest once e exceeds the tolerance by this share of T_limit
+#: let the evidence grow at its fastest rate once the unexplained difference e exceeds the tolerance
+#: by this share of T_limit
 CLEAR = 0.05
-SURE = 2.0  # tolerate this many standard deviations of an uncertain tension
-BEHIND = 0.005  # tolerate this |l − l_target| of a position-controlled module [m]
-CLEARLY_BEHIND = 0.005  # let the evidence grow fastest once e exceeds BEHIND by this [m]
-LAG = 0.6  # expect a healthy position-controlled module to lag by at most this [s]
-FULL = 0.9  # expect no more of a position-controlled module above this share of T_max
+SURE = 2.0  # tolerate in addition this many standard deviations of an uncertain tension
+BEHIND = 0.005  # tolerate this distance of a position-controlled module from its target length [m]
+#: let the evidence grow at its fastest rate once a position-controlled module is further behind
+#: than BEHIND by this [m]
+CLEARLY_BEHIND = 0.005
+#: expect a healthy position-controlled module to lag behind its command by at most this time [s]
+LAG = 0.6
+#: reduce the evidence against a position-controlled module above this share of T_max, because it
+#: cannot pull harder
+FULL = 0.9
 
 
 class ModuleFollowing(Detector):
@@ -119,7 +126,9 @@ class ModuleFollowing(Detector):
         return np.minimum(demand, self._complete_robot.tension.max)
 
     def _growth(self, observation: Observation, away: Array, correcting: Array) -> Array:
-        """Return how fast the evidence grows, not limited to ±1, (M,).
+        """Return the growth of the evidence against each module [s/s], (M,).
+
+        The values are not yet limited to ±1.
 
         Args:
             observation: The message.

@@ -47,8 +47,10 @@ SURE = 2.0
 #: Take the stretch of a taut tendon from the first of this many consecutive messages in which it
 #: was taut: that message certainly came before the tendon began to lose its tension.
 RECENT = 5
-SLACK_LENGTH = 0.06  # wait until a muscle module has wound in this much slack [m]
-SLACK_SPEED = 0.005  # count a muscle module as stationary below this winding speed [m/s]
+#: while a muscle module winds in slack, wait until it has wound in this length before the muscle is
+#: reported [m]
+SLACK_LENGTH = 0.06
+SLACK_SPEED = 0.005  # wait no longer for a muscle module that winds in more slowly than this [m/s]
 DEAD_TIME = 0.5  # report a muscle that has had no tension for this long [s]
 
 
@@ -56,7 +58,7 @@ class SlackTendon(Detector):
     """Reports a muscle whose tendon has been slack for some time and is not being wound in.
 
     Attributes:
-        is_winding_in: Whether each tendon is slack and being wound in, (M,).
+        is_winding_in: Which tendons are slack and still being wound in, (M,).
     """
 
     def __init__(self, robot: Robot) -> None:

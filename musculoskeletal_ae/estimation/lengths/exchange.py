@@ -35,27 +35,33 @@ from musculoskeletal_ae.signals.limits import slack_tension
 from musculoskeletal_ae.signals.muscle_readings import Row
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement, decide, single_faults
 
-SPACING = 0.25  # keep one message in this time [s]
-USUAL_COUNT = 120  # take the median A of this many messages as the usual one
-ENOUGH = 20  # know the usual A only from at least this many messages
+SPACING = 0.25  # store at most one message in this time [s]
+#: take the median anomaly score A of at most this many stored messages as the usual one
+USUAL_COUNT = 120
+ENOUGH = 20  # judge no finding before this many messages have been stored
 RECENT = 20  # judge a finding by this many of the newest messages
-ANOMALOUS = 2.0  # judge only by messages whose A is above this multiple of the usual A
-#: assume an exchange only if A after putting the columns back is below this multiple of the usual A
+#: among these, use only messages whose anomaly score A exceeds this multiple of the usual one: the
+#: others are from before the fault
+ANOMALOUS = 2.0
+#: assume an exchange only if the anomaly score, with the columns put back, is below this multiple
+#: of the usual one
 USUAL = 1.5
-#: Assume an exchange only if putting the columns back divides A by at least this factor. In moments
-#: of two learned arms, USUAL and BETTER together blamed an exchange for 3 of 475 shifts of one or
-#: two lengths, and recognised 194 of 229 exchanges.
+#: Assume an exchange only if putting the columns back divides the anomaly score by at least this
+#: factor. On messages of two learned arms, USUAL and BETTER together blamed an exchange for 3 of
+#: 475 shifts of one or two lengths, and recognised 194 of 229 exchanges.
 BETTER = 3.0
 #: assume that the driver may have restarted after a pause of all messages of this length [s]
 SILENT = 0.3
-#: judge a finding by the lengths around a silence for this time after it [s]
+#: for this time after such a pause, compare the lengths before and after it to explain a finding
+#: [s]
 RESTARTED = 5.0
-#: a length that has changed by more than this during a silence may belong to another muscle [m]
+#: suspect that a column belongs to another muscle, or has lost its offset, if its length has
+#: changed by more than this during the pause [m]
 DISCONTINUOUS = 0.02
 #: assume another wiring only if it divides the change of its lengths during the silence by at least
 #: this factor, and if that change exceeds the change of all other lengths by this factor
 CONTINUOUS = 3.0
-#: kinds of findings to which an exchange can lead
+#: look for exchanged muscles only after a finding of one of these kinds, to which an exchange leads
 EXPLAINED = frozenset(
     {
         ConditionKind.LENGTHS_JUMPED,
@@ -64,12 +70,16 @@ EXPLAINED = frozenset(
         ConditionKind.RESIDUAL_DISTANCE,
     }
 )
-#: kinds that the lengths around a silence may explain
+#: compare the lengths before and after a pause of the messages only after a finding of one of these
+#: kinds
 EXPLAINED_BY_SILENCE = EXPLAINED | {ConditionKind.LENGTH_JUMP}
 
 
 class ExchangeCheck:
-    """Replaces a finding by the fault of the driver that explains it: order, sign or offsets."""
+    """Checks whether a fault of the driver explains a finding, and then reports that fault instead.
+
+    The fault is a wrong order of the muscles, a wrong sign of a length, or lost length offsets.
+    """
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
@@ -89,7 +99,7 @@ class ExchangeCheck:
         self._mae = mae
 
     def read(self, states: Array, now: float) -> None:
-        """Read the raw l of a message, accepted or not, and note whether a silence has ended.
+        """Read the raw lengths of a message, accepted or not, to notice a pause of the driver.
 
         Args:
             states: The raw readings, (Q, M).
@@ -103,7 +113,7 @@ class ExchangeCheck:
         self._newest = now, length
 
     def note(self, observation: Observation) -> None:
-        """Note a message at regular intervals, while the length offsets are known."""
+        """Note a message, at most one in 0.25 s, while the length offsets are known."""
         self._since += observation.dt
         if self._since < SPACING - 1e-9:
             return
@@ -215,7 +225,7 @@ class ExchangeCheck:
         tension, length = tension[is_anomalous], length[is_anomalous]
 
         def cost(wiring: Wiring) -> float:
-            """Return the median A, or infinity if it is not healthy."""
+            """Return the median anomaly score under a wiring; ∞ if it stays unusually high."""
             value = float(np.median(scores(wiring)))
             return value if value < USUAL * usual else math.inf
 

@@ -17,7 +17,9 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
 WINDOW = 0.25  # average the readings of a moment over this time [s]
-MOVED = 0.002  # count the arm as moved if a muscle's length has changed by more than this [m]
+#: conclude that the arm has moved since the last moment if a length has changed by more than this
+#: [m]
+MOVED = 0.002
 #: skip moments in which a muscle is faster, because inertial forces matter then [m/s]
 FASTEST = 0.05
 MOST = 240  # keep at most this many moments

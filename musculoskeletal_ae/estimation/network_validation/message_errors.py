@@ -15,10 +15,13 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.network_validation.recent_messages import RecentMessages
 from musculoskeletal_ae.mae.mae import Mae
 
-WORSE = 2.0  # permit this multiple of the error of the network in use
-#: permit these errors of T [N] and l [m] in any case
+#: reject a network whose error exceeds the one of the network in use by this factor
+WORSE = 2.0
+#: never reject a network for errors of tensions T [N] and lengths l [m] smaller than these; ① and ②
+#: are the masks with which the network computes them
 FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}
-#: call a network worse than the one in use only from this error of a length on [m]
+#: warn that a network chosen by a user is worse than the one in use only if its error of a length
+#: exceeds this [m]
 CLEAR = 0.01
 
 

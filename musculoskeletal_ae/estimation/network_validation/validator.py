@@ -96,7 +96,10 @@ class CheckpointValidator:
     # -- decisions ------------------------------------------------------------------------------
 
     def decide(self, mae: Mae, now: float) -> None:
-        """Use a candidate of the learner, or reject it; `propose` does the same in steps."""
+        """Decide on a candidate of the learner: use it, or call `rejected` with the reason.
+
+        Nothing is decided if it is the network in use. `propose` does the same in steps.
+        """
         if self.is_in_use(mae):
             return
         try:
@@ -126,10 +129,14 @@ class CheckpointValidator:
             raise
 
     def choose(self, mae: Mae, now: float) -> None:
-        """Use a network that a user has chosen, and find out whether it fits this arm worse.
+        """Use a network that a user has chosen, and set `unsuitable_because`.
+
+        Args:
+            mae: The network.
+            now: Time on the steady clock [s].
 
         Raises:
-            CheckpointError: If it is refused.
+            CheckpointError: If a check rejects it; the network in use then stays.
         """
         self.check(mae, is_chosen=True)
         self._accept(mae, now, unsuitable_because=self._weakness(mae))
@@ -178,13 +185,14 @@ class CheckpointValidator:
         )
 
     def _weakness(self, mae: Mae) -> str:
-        """Say in what a network is clearly worse on recent messages than a learned one in use.
+        """Return in what a network is clearly worse than the learned one in use, for users.
 
-        Joint sensors tell, or else the lengths that each network computes at its own estimate.
+        On recent messages, the errors of estimated joint angles are compared, if joint sensors
+        measured them, or else those of the lengths that each network computes at its estimate.
 
         Returns:
-            The quantity, its error and that of the network in use; '' if it is not clearly worse,
-            or if nothing is known about it.
+            The quantity, its error and that of the network in use; '' if the network is not clearly
+            worse, or if there are too few messages.
         """
         if self.mae is None or self.mae.covariance is None or not self._messages.are_enough:
             return ''
@@ -347,6 +355,6 @@ class CheckpointValidator:
 
     @cached_property
     def _likely_cause(self) -> str:
-        """Text on a property of the robot that may cause a rejection; '' if there is none."""
+        """Text on a property of the robot that may cause a rejection; '' if it has none."""
         warning = jump_warning(self._robot)
         return f' ({warning})' if warning else ''
