@@ -31,21 +31,22 @@ LEAST_MOTION = 0.05  # judge a joint only if the range of its θ is at least thi
 #: and both emulator models, a_j of joints that moved enough is between 0.4 and 1.9.
 LEAST_SCALE = 0.3
 BEYOND = 0.3  # let a correct θ exceed the joint limits by at most this [rad]
-#: Another unit, order or sign of θ (`_possible_faults`) is assumed if it reduces the misfit of l to
-#: less than this fraction.
+#: Assume another unit, order or sign of the joint angles (`_possible_faults`) if it reduces the
+#: misfit of the muscle lengths to less than this fraction.
 BETTER = 0.8
 MOST_SAMPLES = 600  # use at most this many messages, evenly distributed
 LEAST_SAMPLES = 20  # judge sensors only by at least this many messages
-STUCK_TIME = 5.0  # count a reading as stuck only if it repeats for at least this time [s]
-#: count a repeated reading as stuck if the lengths show that its joint moves by more than this
+STUCK_TIME = 5.0  # examine a repeated reading only if it lasts for at least this time [s]
+#: report a repeated reading as stuck if the lengths show that its joint moves by more than this
 #: [rad]
 STUCK_MOTION = 0.2
-#: count a repeated reading as stuck if the lengths show that its joint is further away from it than
-#: this [rad]
+#: report a repeated reading as stuck if the lengths show that its joint is further away from it
+#: than this [rad]
 STUCK_OFFSET = 0.5
-#: believe in a hidden motion or distance of a joint only if it leaves at most this fraction of the
-#: mean square of the misfit of l
+#: assume that a joint has moved unnoticed only if this leaves at most this fraction of the mean
+#: square of the length errors
 STUCK_EXPLAINED = 0.5
+#: kinds of faults: angles in degrees, a wrong sign, exchanged joints, a stuck reading
 DEGREES, SIGN, ORDER, STUCK = 'degrees', 'joint sign', 'joint order', 'joint stuck'
 
 
@@ -73,10 +74,10 @@ def corrected(theta: Array, faults: Iterable[JointFault], units: JointUnits) -> 
 
 
 class Judgement(NamedTuple):
-    """Faults of joint sensors, and the joints whose sign was found to be right."""
+    """Faults of joint sensors, and the joints whose sign is certainly right."""
 
     faults: list[JointFault]
-    right: tuple[int, ...]
+    right: tuple[int, ...]  # indices of the joints
 
 
 def judge(
@@ -94,7 +95,7 @@ def judge(
         theta: Measured θ [rad], (N, D). Messages with NaN are not used.
         length: l [m], (N, M).
         tension: T [N], (N, M).
-        used: Muscles to judge by, (M,); None for all. The sign of their l must be right.
+        used: Muscles to judge by, (M,); None for all. Their lengths must have the right sign.
         segments: Number of the segment to which each message belongs, (N,); None for one segment.
             Short segments reduce the effect of drifting lengths.
     """
@@ -132,7 +133,7 @@ def sign_notes(robot: Robot, right: Sequence[int], remedy: str) -> list[str]:
     Args:
         robot: The robot.
         right: Indices of the joints whose sign is right.
-        remedy: How to make the other joints move more.
+        remedy: A sentence on how to make the other joints move more; it ends the last note.
     """
     notes = []
     unknown = [name for j, name in enumerate(robot.joints) if j not in right]
@@ -201,7 +202,7 @@ class _Signs(NamedTuple):
 
 
 class _Lengths:
-    """Muscle lengths of a moving arm, with which postures are compared."""
+    """Muscle lengths of a moving arm, which show whether measured joint angles are right."""
 
     def __init__(
         self, robot: Robot, length: Array, tension: Array, used: Bools, segments: Ints

@@ -39,8 +39,8 @@ SPEED = 10.0
 #: report a series of impossible readings that has lasted for this time [s]; a burst is shorter,
 #: even with the time in which the readings of a moving arm settle again
 LASTING = 2.0
-MISSING = 1.0  # report a joint that has had no reading for this time [s]
-#: a series of impossible readings has ended if there was none for this time [s]
+MISSING = 1.0  # report a joint sensor that has stopped sending readings after this time [s]
+#: treat a series of impossible readings as ended when the last one is older than this [s]
 ENDED = 1.0
 #: Reject a whole message if at least this share of its readings is impossible. A single sensor
 #: never rejects the readings of others.
@@ -85,7 +85,7 @@ _NONE = ImpossibleSeries(-math.inf, -math.inf, 0, 0)
 
 
 class JointChannel:
-    """The readings of one joint sensor.
+    """Judges the readings of one joint sensor, and records series of impossible ones.
 
     Attributes:
         series: The newest series of impossible readings.
@@ -202,16 +202,19 @@ class JointStream:
 
     @staticmethod
     def _is_foreign(kinds: list[JointReading]) -> bool:
-        """Return whether a message with these readings describes another posture."""
+        """Return whether at least half of the readings, and at least two, are impossible.
+
+        The message then describes another posture, such as that of a second publisher.
+        """
         usable = kinds.count(JointReading.USABLE)
         impossible = len(kinds) - usable - kinds.count(JointReading.MISSING)
         return impossible > 1 and impossible >= FOREIGN_SHARE * (impossible + usable)
 
     def pass_time(self, seconds: float) -> None:
-        """Let time pass [s] in which readings should have arrived.
+        """Let time pass [s] in which readings should have arrived, to notice missing sensors.
 
-        Pauses of the driver or of this process do not count. Callers therefore pass the time
-        between two messages that are not far apart.
+        Callers limit the time between two messages that are far apart: pauses of the driver or of
+        this process do not count.
         """
         self._passed += seconds
 

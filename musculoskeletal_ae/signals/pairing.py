@@ -36,7 +36,7 @@ class Paired(Generic[Message]):
 
 
 class Pairing(Generic[Message]):
-    """Pairs each muscle message with the nearest posture θ.
+    """Pairs each muscle message with the posture θ that is nearest in time.
 
     The pair is complete, and is returned, when the next muscle message arrives.
     """
