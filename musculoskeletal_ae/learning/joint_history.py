@@ -14,14 +14,14 @@ from collections import deque
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.joint_trust import JointTrust, SensorTrust
 
-MOST_RECENT = 400  # remember the times of this many newest samples
+MOST_RECENT = 400  # remember the times of this many newest samples, to find those of a doubt
 
 
 class JointHistory:
     """Removes angles from the samples of one store, and puts them back.
 
     Attributes:
-        given_up: Number of angles that were given up, not counting those that were put back.
+        given_up: Number of angles that were removed from samples and have not been put back.
     """
 
     def __init__(self, samples: SampleStore, joint_count: int) -> None:
@@ -35,7 +35,7 @@ class JointHistory:
         self.given_up = 0
 
     def accepted(self, now: float) -> None:
-        """Record that the newest sample of the store was taken at `now` [s]."""
+        """Record that the newest accepted sample of the store was taken at `now` [s]."""
         self._recent.append((now, self._samples.accepted))
 
     def use(self, trust: JointTrust) -> tuple[int, ...]:

@@ -14,7 +14,7 @@ from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.training import TINY, one_thread
 from musculoskeletal_ae.mae.units import LENGTH_SCALE
 
-STEP_SIZE = 2e-3  # begin online training with this step size
+STEP_SIZE = 2e-3  # begin online training with this step size of the optimiser
 BATCH = 128  # train on this many samples at once
 AVERAGED_SHARE = 0.1  # average the weights over this share of all steps so far
 LEAST_AVERAGED = 20.0  # average the weights over at least this many steps
@@ -61,12 +61,15 @@ class NetworkTrainer:
         return float(np.mean(losses[len(losses) // 2 :]))
 
     def move(self, length: Array) -> None:
-        """Move the network's muscle lengths by `length` [m] (M,), without training."""
+        """Move all lengths that the network computes by `length` [m], (M,), without training."""
         for network in (self.network, self._raw):
             network.mean[-len(length) :] += torch.as_tensor(LENGTH_SCALE * length)
 
     def restart(self) -> None:
-        """Restart with a large step size and a short weight average, as the body has changed."""
+        """Restart with a large step size and a short weight average, because the body has changed.
+
+        The weights are kept.
+        """
         self.steps = min(self.steps, int(LEAST_AVERAGED / AVERAGED_SHARE))
 
     def _average(self) -> None:

@@ -17,7 +17,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 CHECKSUM = 4  # begin a state file with a checksum of this size [bytes]
 
-Values = tuple[float, ...]
+Values = tuple[float, ...]  # an array of numbers, as it is saved
 
 
 class SavedSample(msgspec.Struct, frozen=True, array_like=True):
@@ -58,7 +58,7 @@ class SavedState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def collect(robot: Robot, samples: SampleStore, network: bytes | None) -> SavedState:
-    """Return the state to be saved: the samples of a store, and a checkpoint's content."""
+    """Collect what is saved: the samples of a store, and a network as a checkpoint's content."""
     stored = map(StoredSample, samples.samples, samples.known, samples.numbers)
     return SavedState(
         robot.joints,

@@ -20,7 +20,7 @@ LEAST_BLIND = 20
 
 
 class UpdateScheduler:
-    """Schedules the updates.
+    """Decides when an update of the network begins.
 
     Attributes:
         least_samples: Number of samples required for an update.
@@ -42,7 +42,11 @@ class UpdateScheduler:
         self._updates_to_repeat = 0
 
     def restart(self, updates_to_repeat: int = 0) -> None:
-        """Restart; run at least `updates_to_repeat` updates even without new data."""
+        """Restart after the network has been replaced.
+
+        Args:
+            updates_to_repeat: Number of updates that are run even without new samples.
+        """
         self._updates_to_repeat, self.last_update = updates_to_repeat, None
 
     def note_news(self) -> None:
@@ -70,7 +74,7 @@ class UpdateScheduler:
         )
 
     def finish(self, update: Update) -> Mae:
-        """Count a finished update and return its network.
+        """Record that an update has finished, and return its network.
 
         If a muscle has changed since the update began, the network is marked as uncalibrated.
         """

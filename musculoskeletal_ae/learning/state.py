@@ -39,7 +39,7 @@ class StateStore:
 
     Attributes:
         directory: The state directory.
-        not_used: Why a state on disk was unusable and where its backup is, or ''.
+        not_used: Why a state on disk was not used, and where its backup is, for users; '' if none.
     """
 
     def __init__(self, directory: str | Path, robot: Robot) -> None:

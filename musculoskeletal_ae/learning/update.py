@@ -44,7 +44,7 @@ REAL_SHARE = 0.1  # replace this share of the training samples by rest samples
 #: replace at most this share of the training samples by motion samples; with MANY_MESSAGES of them,
 #: half of this share
 MOVING_SHARE = 0.3
-USES = 3  # use each training sample this often on average
+USES = 3  # draw so many training samples that each is used this often on average in one update
 LEAST_WEIGHT = 0.3  # train only with rest samples of at least this robust weight
 
 
