@@ -19,14 +19,15 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
 PROBES = 200  # average the length of each muscle over this many postures
-#: report a muscle as changed if at least this many of its newest samples contradict the body, all
-#: with residuals of the same sign
+#: report a muscle as changed if at least this many of its newest samples contradict the fitted
+#: body, all with length residuals of the same sign
 LEAST_NEWEST = 4
-LEAST_BEFORE = 8  # report it only if at least this many samples came before those
-#: count a sample as contradicting the body only if its residual is at least this large [m]
+#: report a muscle as changed only if at least this many samples came before the contradicting ones
+LEAST_BEFORE = 8
+#: conclude that a sample contradicts the body only if its length residual exceeds this [m]
 LEAST_CHANGE = 0.004
-#: count a sample as contradicting the body only if its residual has at least this many standard
-#: deviations
+#: conclude that a sample contradicts the body only if its length residual exceeds this many
+#: standard deviations
 OUTLIER = 6.0
 
 
@@ -83,9 +84,9 @@ class BodyFit:
         return fit_body(self.body, observed, self._prior_mean, guess)
 
     def lengthened(self) -> Array:
-        """Return the growth of each muscle's mean length since the previous call [m], (M,).
+        """Return by how much each muscle has lengthened since the previous call [m], (M,).
 
-        The mean is taken over a fixed set of postures and tensions.
+        Its length is the mean over a fixed set of postures and tensions.
         """
         before, self._mean_length = self._mean_length, self._probe_lengths()
         return self._mean_length - before

@@ -33,11 +33,14 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.signals.friction import LARGEST_GAIN, Transmission
 
-#: permit no larger |γ|, |b|/T_limit and |F|/T_limit of `signals.friction.Transmission`
+#: clip the constants of a motor current, |γ|, |b|/T_limit and |F|/T_limit
+#: (`signals.friction.Transmission`), to these values
 LARGEST_DRIVE = np.array([LARGEST_GAIN, 1.0, 1.0])
-#: permit no larger |μ|: at this value, friction halves or doubles the tension along the route
+#: clip the tendon friction |μ| to this, at which friction halves or doubles the tension along the
+#: route
 LARGEST_FRICTION = 0.7
-LARGEST_LOG = 1.5  # permit no larger |κ|
+#: clip the logarithmic errors |κ| of the elastic constants to this, a factor of about 4.5
+LARGEST_LOG = 1.5
 
 
 class Layout:
@@ -121,11 +124,11 @@ class CalibratedBody:
         return springs.learned(self.robot.kinematics.elasticity, self.springs)
 
     def shift(self, m: int) -> Array:
-        """Return how far one muscle's route points are displaced (δ) [m], (P, 3)."""
+        """Return the shift δ of each of the P route points of muscle `m` [m], (P, 3)."""
         return self.parameters[m][self.layouts[m].attachment].reshape(-1, 3)
 
     def elastic(self, m: int) -> SeriesElastic:
-        """Return the elastic constants of one muscle as arrays of shape ()."""
+        """Return the fitted elastic constants of muscle `m`, as arrays of shape ()."""
         nominal = self.robot.series_elastic
         log = self.parameters[m][self.layouts[m].elastic]
         force, rate, stretch = np.exp(np.clip(log, -LARGEST_LOG, LARGEST_LOG))
@@ -138,7 +141,7 @@ class CalibratedBody:
         return np.array([self.friction(m) for m in range(len(self.layouts))])
 
     def friction(self, m: int) -> float:
-        """Return the tendon friction μ of one muscle."""
+        """Return the fitted tendon friction μ of muscle `m`, clipped to ±LARGEST_FRICTION."""
         value = self.parameters[m][self.layouts[m].friction]
         return float(np.clip(value, -LARGEST_FRICTION, LARGEST_FRICTION))
 

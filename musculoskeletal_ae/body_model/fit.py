@@ -38,13 +38,13 @@ from musculoskeletal_ae.mae.mae import Mae
 ROUNDS = 30  # end the fit of one muscle after this many Gauss–Newton iterations
 #: end the fit of one muscle if an iteration lowers the cost by less than this, per measured length
 LEAST_DECREASE = 1e-11
-LEAST_NOISE = 0.0003  # assume at least this σ of a length at rest [m]
+LEAST_NOISE = 0.0003  # assume that lengths at rest have at least this standard deviation [m]
 #: derive a new prior for a changed muscle only from at least this many samples before the change
 LEAST_BEFORE_CHANGE = 8
 
 
 class FittedBody(NamedTuple):
-    """The noise, weights, postures and uncertainty that a fit has found."""
+    """Result of the fit of a body, besides its parameters, which are changed in place."""
 
     #: measured minus computed lengths [m], (N, M), at measured angles, or else at fitted ones
     residual: Array
@@ -221,9 +221,9 @@ class MuscleFit:
         return self.point(point.parameters + step.common)
 
 
-NETWORK_STATES = 400  # evaluate the network at this many states
-NETWORK_ERROR = 0.001  # assume at least this σ of the network's lengths [m]
-FIXED = 1e-6  # keep a parameter at its prior mean by this prior spread
+NETWORK_STATES = 400  # fit a body to the lengths of a network at this many random states
+NETWORK_ERROR = 0.001  # assume that these lengths have at least this standard deviation [m]
+FIXED = 1e-6  # give a parameter that must stay at its prior mean this prior spread
 
 
 def fit_to_network(

@@ -29,7 +29,7 @@ from musculoskeletal_ae.robot.stiffness import muscle_hessian
 DIFFERENCE = 1e-6  # differentiate numerically with this step [rad]
 #: reuse Σ T ∂²l/∂θ² of the geometric model until a joint has moved by more than this [rad]
 REUSED_MOTION = 0.05
-SMALL = 1e-6  # raise smaller divisors to this value
+SMALL = 1e-6  # divide the vector of gravity by at least this norm
 
 
 class Unknowns(NamedTuple):
@@ -76,7 +76,10 @@ class Bent(NamedTuple):
 
 
 class PostureModel:
-    """Computes residuals and derivatives for N samples of one group."""
+    """Computes the residuals of N rest samples of one group of joints and muscles.
+
+    The derivatives of the residuals are computed as well.
+    """
 
     def __init__(
         self, body: CalibratedBody, observed: Observations, joints: Ints, muscles: Ints, bent: Bent

@@ -52,21 +52,27 @@ from musculoskeletal_ae.learning.samples import Observations
 if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 
-GRAVITY_NOISE = 0.02  # expect this error of u, by noise and mounting of the accelerometer (σ) [rad]
-FIRST_NOISE = 0.002  # assume this σ of a length in the first iteration [m]
-LEAST_NOISE = 0.0008  # weigh lengths by no smaller σ than this, for errors of the body model [m]
+#: expect measured directions of gravity to have this standard deviation [rad], due to noise and
+#: mounting of the accelerometer
+GRAVITY_NOISE = 0.02
+#: assume that lengths have this standard deviation in the first iteration [m]
+FIRST_NOISE = 0.002
+#: weigh lengths by at least this standard deviation [m], which covers errors of the body model
+LEAST_NOISE = 0.0008
 #: Expect errors of the torque balance (σ_τ) of this share of the muscles' absolute torques at a
 #: joint. The share is high, because all samples have the same friction and sensor offsets.
 TORQUE_NOISE = 0.3
 #: assume at least this usual residual torque, as a share of the muscles' absolute torques
 LEAST_TORQUE = 0.01
-SCALINGS = 2  # recompute the Birge ratio this many times
+#: recompute the factor for the spreads of the prior (Birge ratio, `GroupFit._posterior`) this many
+#: times
+SCALINGS = 2
 ROUNDS = 12  # end the fit after this many Gauss–Newton iterations
 #: End the fit if an iteration lowers the cost by less than this, per measured length. The step is
 #: then far shorter than the posterior spread. With ten times this value, the fit mistakes a slipped
 #: joint sensor for a changed muscle more often.
 LEAST_DECREASE = 3e-4
-TYPICAL_STEP = 0.3  # expect a posture to move by this much per iteration [rad]
+TYPICAL_STEP = 0.3  # scale the damping of the solver to changes of an angle by this [rad]
 
 
 class Weights(NamedTuple):
@@ -338,7 +344,7 @@ def fit_jointly(
             model.
 
     Returns:
-        The fields of `Fit`, in their order.
+        The fields of `fit.FittedBody`, in their order.
     """
     own, zero = np.isfinite(observed.theta) & (observed.spread == 0.0), body.zero
     theta, samples = start - own * zero, [length.tobytes() for length in observed.length]

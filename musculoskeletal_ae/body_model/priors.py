@@ -15,12 +15,12 @@ from musculoskeletal_ae.body_model.posture_model import PostureModel
 from musculoskeletal_ae.robot.model_errors import ATTACHMENT, ELASTIC
 from musculoskeletal_ae.signals.friction import DRIVE_FRICTION_MEAN, DRIVE_SPREAD
 
-#: Count all samples together as at most this many independent ones, because they share the errors
+#: Weigh all samples together as at most this many independent ones, because they share the errors
 #: of the body model. This applies to joint-sensor offsets, springs of the joints, constants of
 #: motor currents, and joints without a sensor (torque and stops).
 INDEPENDENT_SAMPLES = 10.0
-SENSOR_NOISE = 0.002  # expect this noise of a joint sensor (σ_y) [rad]
-LEAST_ANGLE_NOISE = 1e-6  # assume at least this σ_y [rad]
+SENSOR_NOISE = 0.002  # expect readings of a joint sensor to have this standard deviation [rad]
+LEAST_ANGLE_NOISE = 1e-6  # assume at least this standard deviation of a measured angle [rad]
 
 
 @dataclass(frozen=True)

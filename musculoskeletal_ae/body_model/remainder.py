@@ -45,15 +45,15 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
     from musculoskeletal_ae.body_model.priors import MusclePrior
 
-#: Unknowns of the evidence are the natural logarithms of a, b, e, c, ν and σ, relative to these
-#: units: [m], joint ranges, 1, T_limit, 1 and [m].
+#: Express the six constants a [m], b [joint ranges], e, c [T_limit], ν and σ [m] of the covariance
+#: in these units. The evidence is a function of the natural logarithms of the six ratios.
 UNITS = np.array([0.002, 0.5, 1.0, 1.0, 1.0, 0.001])
-#: expect these unknowns of the evidence before the samples (prior means)
+#: expect these logarithms (prior means) before there are samples
 USUAL = np.array([-1.5, 0.5, 1.0, 2.0, 1.0, -2.0])
-#: prior standard deviations of the hyperparameters about USUAL; the search for the largest evidence
-#: is drawn towards USUAL by them
+#: expect the logarithms to differ from USUAL by these standard deviations; they draw the search for
+#: the largest evidence towards USUAL
 SPREAD = np.array([2.0, 0.4, 1.0, 1.0, 1.0, 1.5])
-#: search each hyperparameter within these limits
+#: search each of the six logarithms within these limits
 BOUNDS = ((-8.0, 4.0), (-1.5, 3.0), (0.0, 4.0), (-1.5, 4.0), (0.0, 3.5), (-2.5, 3.0))
 #: start a search from these values: a trusted body, a wrong body, and a rough remainder
 STARTS = (
@@ -66,9 +66,9 @@ STARTS = (
 FEW_SAMPLES = 60
 ROUNDS = 25  # end a search that starts from STARTS after this many iterations
 FEW_ROUNDS = 4  # end a search that continues from the last result after this many iterations
-JUDGING = 150  # compute the evidence from at most this many samples
+JUDGING = 150  # compute the evidence from at most this many samples, to bound the time of a search
 LEAST_SAMPLES = 5  # learn a remainder only from at least this many samples
-UNKNOWN = 1.0  # assume this variance of a length that a sample lacks [m²]
+UNKNOWN = 1.0  # give a length that a sample lacks this variance, so that it has no effect [m²]
 JITTER = 1e-10  # add this variance to keep covariances positive definite [m²]
 
 
