@@ -182,7 +182,7 @@ def from_mae(mae: Mae) -> Network:
 
 
 class TorchLengths:
-    """Computes a network's muscle lengths and their gradients for simulation on a torch device."""
+    """Computes a network's muscle lengths and their gradients on a torch device, for simulation."""
 
     def __init__(self, mae: Mae, device: str = 'cpu') -> None:
         """Copy the weights of a network to the device."""

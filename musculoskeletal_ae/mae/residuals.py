@@ -19,12 +19,14 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, State
 
-# Assume at least this standard deviation of a residual in scaled units: 0.02 N or 0.01 mm, which no
-# sensor resolves. It keeps the covariance invertible if a network restores some combination of its
-# inputs perfectly.
+#: Assume at least this standard deviation of a residual in scaled units: 0.02 N or 0.01 mm, which
+#: no sensor resolves. It keeps the covariance invertible if a network restores some combination of
+#: its inputs perfectly.
 FLOOR = 1e-4
-ANYTHING = 10.0  # give residuals that are ignored this standard deviation, in scaled units
-#: trust touch statistics only if they cover at least this duration of motion [s]
+#: give the residuals of an ignored muscle this standard deviation in scaled units, which is 2000 N
+#: or 1 m, so that they do not matter
+ANYTHING = 10.0
+#: detect contact only after the residual torque was measured during at least this much motion [s]
 LEAST_MOTION = 60.0
 
 
@@ -82,11 +84,11 @@ class AnomalyStatistics:
         return np.sqrt(squares)
 
     def without(self, muscles: Sequence[int]) -> AnomalyStatistics:
-        """Return the statistics for residuals that are always 0 for these muscles."""
+        """Return the statistics without these muscles, whose residuals are then always 0."""
         return self._with_spread(muscles, FLOOR)
 
     def ignoring(self, muscles: Sequence[int]) -> AnomalyStatistics:
-        """Return statistics in which any residual of these muscles counts as normal.
+        """Return statistics ignoring these muscles: any residual of theirs is normal.
 
         Their residuals then hardly change the result of `distances`.
         """
