@@ -20,7 +20,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 
-TINY = 1e-12  # added to every norm that is a divisor, because a norm may be zero
+TINY = 1e-12  # add this to every norm that is a divisor, because a norm may be zero
 
 
 class Term(NamedTuple):
@@ -32,7 +32,7 @@ class Term(NamedTuple):
 
 
 class StepSearch(NamedTuple):
-    """Constants of the descent."""
+    """Constants of the search for a step size in the descent (equation 11 of the paper)."""
 
     largest_step: float  # γ_max
     candidates: int  # N, which the paper's list of constants calls C_batch
@@ -46,7 +46,7 @@ class Loss:
     """
 
     def __init__(self, terms: Sequence[Term]) -> None:
-        """Stack the matrices and targets of all terms."""
+        """Prepare the loss: stack the matrices and targets of all terms."""
         rows = np.array([len(term.target) for term in terms])
         self._weights = np.array([term.weight for term in terms])
         self._matrix = np.concatenate([term.matrix for term in terms])
