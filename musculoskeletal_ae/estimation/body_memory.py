@@ -25,7 +25,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.signals.body_state import MOST_OFFSET, BodyState, LengthOffsets
 
-FILE = 'estimator.offsets'
+FILE = 'estimator.offsets'  # name of the file, in the directory that the user chooses
 LARGEST = 1_000_000  # treat a file larger than this as damaged, and use none of its values [bytes]
 RETRY_INTERVAL = 2.0  # wait this long after a failed attempt to write [s]
 

@@ -49,7 +49,7 @@ TURNED = 0.02
 #: report contact if the evidence d exceeds this; on five healthy arms that explored for ten minutes
 #: each without contact, d was at most 8.6
 CONTACT = 10.0
-IN_A_ROW = 2  # report contact after this many consecutive messages with d > CONTACT
+IN_A_ROW = 2  # report contact once the evidence exceeds CONTACT in this many consecutive messages
 
 
 class Contact(NamedTuple):

@@ -384,11 +384,14 @@ class Estimator:
         return posture_of_marker(self.robot, pose, start)
 
     def report(self, now: float) -> Report:
-        """Report the status for /diagnostics."""
+        """Report the status for /diagnostics; `now` is a time of the steady clock [s]."""
         return status.report(self, now)
 
     def conditions(self, now: float) -> tuple[Condition, ...]:
-        """Return everything that users should know about the readings and the body."""
+        """Return the conditions of readings, body and network that users should know.
+
+        `now` is a time of the steady clock [s].
+        """
         return status.conditions(self, now)
 
     def rejected_because(self, now: float) -> str:
@@ -521,7 +524,10 @@ class Estimator:
             self.stream.use_body(self.body)
 
     def _measured_theta(self, readings: Array) -> Array | None:
-        """Return the readings (D,) if all are fresh and their sensors are used; otherwise None."""
+        """Return the readings [rad], (D,), as the measured posture, or None.
+
+        It is None unless every joint has a fresh reading of a sensor that is trusted.
+        """
         is_known = not self.joint_trust.unused and np.isfinite(readings).all()
         return readings if is_known else None
 
@@ -563,7 +569,7 @@ class Estimator:
         self._confirm(used)
 
     def _confirm(self, muscles: Iterable[int]) -> None:
-        """Confirm the offsets of repaired muscles, if their lengths have changed in the repair."""
+        """Confirm the length offsets of repaired muscles whose lengths changed in the repair."""
         moved = [muscle for muscle in muscles if self.trust.evidence[muscle] is Evidence.MOVED]
         self._note(Evidence.CONFIRMED, moved)
 

@@ -140,5 +140,5 @@ class Detector:
         return None
 
     def step(self, observation: Observation) -> Finding | None:  # noqa: ARG002
-        """Check a message for which there is an estimate; return a finding or None."""
+        """Check a message for which the network has made an estimate; return a finding or None."""
         return None

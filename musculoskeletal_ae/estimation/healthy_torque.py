@@ -16,8 +16,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION
 
-MEMORY = 180.0  # average over at most this much time in motion (time constant) [s]
-MOVING = 0.05  # count an arm as moving above this norm of the joint velocities [rad/s]
+MEMORY = 180.0  # average the squared torque over this much time in motion (time constant) [s]
+MOVING = 0.05  # measure only while the norm of the joint velocities exceeds this [rad/s]
 #: clip external torques to this multiple of σ before they enter the average, because larger ones
 #: indicate contact
 OUTLIER = 5.0

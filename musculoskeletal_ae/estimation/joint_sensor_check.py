@@ -51,7 +51,8 @@ SPACING = 0.5  # judge sensors by at most one message in this time [s]
 #: skip a message unless the estimated angle of a joint has changed by this much since the last
 #: message that was stored [rad]: more messages of one posture tell nothing about others
 MOVED = 0.03
-EARLIER = 600  # keep this many earlier messages, which are at least 5 min of motion
+#: compare new readings with at most this many earlier messages, which are at least 5 min of motion
+EARLIER = 600
 #: Skip messages in which the evidence d for an external load (`contact.py`) exceeds this. Under a
 #: load that was not learned, the estimate may be wrong instead of the joint sensor.
 LOADED = 3.0
@@ -64,14 +65,15 @@ WINDOWS = ((6, 0.12, 7.0), (24, 0.07, 3.0), (NEWEST, 0.06, 2.2))
 #: multiply the limits by 1 + FEW/n if there are n earlier messages, so that a comparison with few
 #: messages reveals only large deviations
 FEW = 20.0
-#: Trust a sensor again once the median of |x| is below AGREEING_LIMIT [rad] or AGREEING_SPREADS
-#: healthy spreads of x, both over the newest AGREEING messages and over the newer half of them.
+#: Trust a doubted sensor again once the median of its deviation |x| is below AGREEING_LIMIT [rad]
+#: or AGREEING_SPREADS healthy spreads of x, whichever is larger: over the newest AGREEING messages,
+#: and also over the newer half of them.
 AGREEING, AGREEING_LIMIT, AGREEING_SPREADS = 12, 0.035, 1.0
 #: assume at least this healthy spread of a length residual [m], because no length sensor is more
 #: precise
 LEAST_SPREAD = 0.0005
-#: Doubt joint sensors if false joint sensors would leave a smaller sum of squares of Δ than this
-#: share of what a change of any single muscle would leave
+#: Doubt joint sensors only if they explain the length errors clearly better than a changed muscle:
+#: the sum of squares that they leave is below this share of what any single muscle leaves.
 BETTER = 0.7
 USES = 10  # compute the medians of the earlier messages again only after this many new messages
 TO_SIGMA = 1.48  # multiply a median of absolute deviations by this to get the standard deviation
@@ -83,7 +85,7 @@ GROSS = 0.8
 class _CountedMessage(NamedTuple):
     """The readings of one message by which the joint sensors are judged."""
 
-    time: float  # [s]
+    time: float  # time of the message on the steady clock [s]
     theta: Array  # readings of the joint sensors [rad], (D,); NaN where unknown or in doubt
     tension: Array  # bone-side tensions [N], (M,)
     length: Array  # lengths [m], (M,); NaN for isolated muscles
@@ -92,11 +94,11 @@ class _CountedMessage(NamedTuple):
 class _Usual(NamedTuple):
     """What is usual on the healthy arm: medians of earlier messages, and spreads about them."""
 
-    deviation: Array  # θ − θ̂ [rad], (D,); 0 if unknown
-    deviation_spread: Array  # [rad], (D,); NaN if unknown
-    known_count: Ints  # number of these messages, (D,)
-    residual: Array  # l − l_net(θ̂, T_end) [m], (M,)
-    residual_spread: Array  # [m], (M,)
+    deviation: Array  # usual deviation θ − θ̂ of each joint sensor [rad], (D,); 0 if unknown
+    deviation_spread: Array  # spread of these deviations [rad], (D,); NaN if unknown
+    known_count: Ints  # number of messages with a reading of each sensor, (D,)
+    residual: Array  # usual length error l − l_net(θ̂, T_end) of each muscle [m], (M,)
+    residual_spread: Array  # spread of these length errors [m], (M,)
 
 
 class JointSensorCheck:
@@ -115,8 +117,8 @@ class JointSensorCheck:
         self._messages: deque[_CountedMessage] = deque(maxlen=EARLIER + NEWEST)
         #: θ − θ̂ [rad] (D,) and l − l_net(θ̂, T_end) [m] (M,) of each message with the network in use
         self._compared: deque[tuple[Array, Array]] = deque(maxlen=EARLIER + NEWEST)
-        self._since = 0.0  # time since the last message that counted [s]
-        #: estimate at the last message that counted [rad], (D,)
+        self._since = 0.0  # time since a message was last stored [s]
+        #: estimated joint angles at that message [rad], (D,)
         self._counted_at = np.full(robot.joint_count, np.inf)
         self._usual: _Usual | None = None  # None if it has to be computed
         self._uses = 0  # number of messages judged by `_usual`
@@ -149,9 +151,12 @@ class JointSensorCheck:
         self._compared.clear()
 
     def confirm(self) -> tuple[int, ...]:
-        """Confirm all doubted sensors, as the user wants; return their joints.
+        """Confirm all doubted sensors, because a user says that they are right.
 
-        Later readings are not compared with those from before the doubt, which contradict them.
+        Earlier readings, which contradict them, are discarded.
+
+        Returns:
+            Indices of the joints whose sensors were in doubt.
         """
         joints, doubted = self.trust.doubted, self.trust.is_doubted
         if not joints:
@@ -238,7 +243,7 @@ class JointSensorCheck:
             self._give_up(agrees)
 
     def _compute_usual(self) -> _Usual:
-        """Compute the medians of the earlier messages, and their spreads about them."""
+        """Compute what is usual: medians of the earlier messages, and spreads about them."""
         earlier = list(self._compared)[:-NEWEST]
         deviation, residual = (
             np.array([each[part] for each in earlier]).reshape(len(earlier), len(values))
@@ -263,7 +268,11 @@ class JointSensorCheck:
         return self._mae is not None and self._mae.is_calibrated and self._has_tensions
 
     def _limits(self, usual: _Usual) -> Iterator[tuple[int, Array]]:
-        """Yield the length of each window and the limits of the median of |x| [rad], (D,)."""
+        """Yield the limits of each joint's deviation in each window.
+
+        Each item is the number of messages in the window, and the limit of the median of |x| [rad],
+        (D,).
+        """
         for count, smallest, spreads in WINDOWS:
             limit = np.fmax(smallest, spreads * usual.deviation_spread)
             limit = limit * (1.0 + FEW / np.maximum(usual.known_count, 1))
@@ -271,7 +280,7 @@ class JointSensorCheck:
             yield count, np.where(is_gross, GROSS, limit)
 
     def _agrees(self, excess: Array, usual: _Usual) -> Bools:
-        """Return which joints agree with the lengths again, (D,)."""
+        """Return the joints whose newest readings agree with the muscle lengths again, (D,)."""
         limit = np.fmax(AGREEING_LIMIT, AGREEING_SPREADS * usual.deviation_spread)
         agrees = np.ones(len(limit), dtype=bool)
         for count in (AGREEING // 2, AGREEING):

@@ -50,8 +50,8 @@ MOVED = 0.2  # use another posture only after a joint has moved by this much [ra
 #: use at most one posture in this time [s], because noise makes the estimated posture jump
 SPACING = 0.5
 AT_STOP = 0.12  # assume that a joint may rest against its stop this close to its limit [rad]
-MEMORY = 100  # judge the direction by at most this many of the newest postures
-ENOUGH = 30  # judge the direction by at least this many postures
+MEMORY = 100  # judge the direction of gravity by at most this many of the newest postures
+ENOUGH = 30  # judge the direction of gravity by at least this many postures
 #: Report that gravity acts in another direction once the evidence exceeds this. On learned arms
 #: that explored (emulator model `foreign`, individuals 0 and 1), it was at most 33 in 150 s. It
 #: reached 78 and 86 in the 70 s after the base had been turned by 176°.

@@ -64,7 +64,7 @@ def conditions(core: Estimator, now: float) -> tuple[Condition, ...]:
 
 
 def _finding(core: Estimator) -> Iterator[Condition]:
-    """Yield the latched finding. While its muscle is being verified, it ends by itself."""
+    """Yield the condition of the latched finding, with the steps by which a user ends it."""
     finding = core.suspects.finding
     if finding is None:
         return
@@ -82,7 +82,7 @@ def _changed_modules(core: Estimator) -> Iterator[Condition]:
 
 
 def _isolated(core: Estimator) -> Iterator[Condition]:
-    """Yield each isolated muscle, except a suspect that is isolated only to be verified."""
+    """Yield a condition for each isolated muscle, except one that is only being verified."""
     verification = core.suspects.verification
     for muscle in core.body.isolated:
         if verification is not None and verification.muscle == muscle:
@@ -95,7 +95,7 @@ def _isolated(core: Estimator) -> Iterator[Condition]:
 
 
 def _unknown_offsets(core: Estimator) -> Iterator[Condition]:
-    """Yield which length offsets are unknown, with the evidence, and how a calibration proceeds."""
+    """Yield conditions on unknown length offsets, with the reason and a calibration's progress."""
     kind, calibration, finding = ConditionKind, core.calibration, core.suspects.finding
     steps: tuple[Step, ...] = (Step.CALIBRATE_LENGTHS,)
     if calibration is not None:
@@ -128,7 +128,7 @@ def _doubted_joints(core: Estimator) -> Iterator[Condition]:
 
 
 def _unreadable_joints(core: Estimator, now: float) -> Iterator[Condition]:
-    """Yield the joints with lasting impossible readings, and those without readings."""
+    """Yield conditions on joints with lasting impossible readings, and on joints without any."""
     if series := core.joint_stream.impossible(now):
         names = [core.robot.joints[j] for j in series]
         impossible = sum(each.impossible for each in series.values())

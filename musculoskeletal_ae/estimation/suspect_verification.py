@@ -54,7 +54,8 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.signals.limits import slack_tension
 
-#: count the suspect as being wound in once its length command has decreased by more than this [m]
+#: conclude that the suspect is being wound in once its length command has decreased by more than
+#: this [m]
 WINDING_CHANGE = 0.001
 CLASSIFICATION_TIME = 0.8  # classify the suspect after it was wound in for this time [s]
 PATIENCE = 8.0  # end the verification of a suspect that was not wound in within this time [s]
@@ -104,6 +105,7 @@ class Outcome(Enum):
     SENSOR_SATURATED = 'sensor_saturated'
 
 
+#: outcomes as texts for users
 _TEXTS = {
     Outcome.HEALTHY: 'healthy',
     Outcome.RUPTURED: 'ruptured',
@@ -119,7 +121,7 @@ _TEXTS = {
 
 
 class VerificationVerdict(NamedTuple):
-    """The outcome of a verification, with its evidence."""
+    """The verdict on a suspect muscle: the outcome of its verification, with its evidence."""
 
     outcome: Outcome
     evidence: str = ''  # size of the fault, such as '50 mm'
@@ -132,7 +134,7 @@ class VerificationVerdict(NamedTuple):
 class _Moment(NamedTuple):
     """The readings of the suspect at one moment, and the demand and stretch computed from them."""
 
-    tension: float  # T [N]
+    tension: float  # measured tension T [N]
     length: float  # measured length l [m]
     command: float  # length command l_target [m]
     likely: float  # length l' that the other muscles indicate [m]

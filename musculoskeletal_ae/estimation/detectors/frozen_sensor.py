@@ -98,9 +98,9 @@ class FrozenSensor(Detector):
         self._longest = max(predicted, self._longest)
         if self._longest - self._shortest <= MOVED:
             return None
-        return Finding(
-            muscle, ConditionKind.SENSOR_FROZEN, 'a sensor is frozen while the arm moves'
-        )
+        quantity = 'length' if by_length[muscle] >= FROZEN_TIME else 'tension'
+        evidence = f'its {quantity} reading stays exactly the same while the arm moves'
+        return Finding(muscle, ConditionKind.SENSOR_FROZEN, evidence)
 
     def _stop_observing(self) -> None:
         self._reduced_mae = None

@@ -37,7 +37,7 @@ from musculoskeletal_ae.signals.limits import slack_tension
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 SPACING = 0.1  # compare measured and computed lengths at this interval [s]
-COUNT = 10  # take the median g over this many of these comparisons, against outliers
+COUNT = 10  # take the median of this many comparisons, so that single outliers do not matter
 #: report lengths once their differences have exceeded the limits for this long [s]
 LASTING = 1.0
 
@@ -86,19 +86,24 @@ class Largest(NamedTuple):
 #     networks with a calibrated detector  Δ 0.013 m, 0.006 m     g 0.013 m, 0.006 m
 #
 # The limits for calibrated networks detect an error of 0.05 m of a single muscle in every posture.
-#: tolerate this change Δ of a length difference, with networks without a calibrated detector
+#: with a network whose detector is not calibrated, tolerate this change Δ of the difference between
+#: measured and computed lengths
 CHANGE_YOUNG = Largest(0.06, 0.028)
-#: tolerate this length difference g while the usual one is unknown, with such networks
+#: with such a network, tolerate this difference g itself while the usual one is not known
 GAP_YOUNG = Largest(0.08, 0.045)
-#: tolerate this change Δ of a length difference, with networks with a calibrated detector
+#: with a network whose detector is calibrated, tolerate this change Δ of the difference between
+#: measured and computed lengths
 CHANGE_LEARNED = Largest(0.035, 0.016)
-#: tolerate this length difference g while the usual one is unknown, with such networks
+#: with a network whose detector is calibrated, tolerate this difference g itself while the usual
+#: one is not known
 GAP_LEARNED = Largest(0.035, 0.016)
-HEALTHY_SPACING = 1.0  # store a healthy message for the usual difference at this interval [s]
-HEALTHY_COUNT = 60  # compute the usual difference from at most this many healthy messages
-ENOUGH = 5  # compute the usual difference from at least this many healthy messages
-#: treat a message as healthy if the change Δ is at most this multiple of its limits; the value is
-#: low, so that the usual difference does not follow a drift
+#: Store a healthy message at this interval [s]. The stored messages show the usual difference
+#: between measured and computed lengths.
+HEALTHY_SPACING = 1.0
+HEALTHY_COUNT = 60  # keep at most this many healthy messages, from about a minute
+ENOUGH = 5  # treat the usual difference as unknown with fewer healthy messages than this
+#: treat a message as healthy if no change Δ exceeds this multiple of its limit; the value is low,
+#: so that the usual difference does not follow a drift
 HEALTHY_EXCESS = 0.5
 #: blame the joint sensors only if an error of their angles leaves at most this share of the changes
 #: Δ unexplained

@@ -41,8 +41,9 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import slack_tension
 
-FAULTY = 1.0  # report a module after this time of evidence [s]
-SMOOTHING = 0.1  # smooth differences and speeds with this time constant [s]
+FAULTY = 1.0  # report a module once the evidence against it amounts to this time [s]
+#: smooth differences from the command, and winding speeds, with this time constant [s]
+SMOOTHING = 0.1
 #: reduce the evidence while the winch turns at more than this share of its largest speed, if that
 #: is known: it can hardly correct faster
 FULL_SPEED = 0.5
@@ -54,7 +55,9 @@ ALLOWED, ALLOWED_SHARE = 0.04, 0.1
 #: let the evidence grow at its fastest rate once the unexplained difference e exceeds the tolerance
 #: by this share of T_limit
 CLEAR = 0.05
-SURE = 2.0  # tolerate in addition this many standard deviations of an uncertain tension
+#: tolerate in addition this many standard deviations of a tension that a motor current shows; a
+#: tension sensor has none
+SURE = 2.0
 BEHIND = 0.005  # tolerate this distance of a position-controlled module from its target length [m]
 #: let the evidence grow at its fastest rate once a position-controlled module is further behind
 #: than BEHIND by this [m]
@@ -67,7 +70,7 @@ FULL = 0.9
 
 
 class ModuleFollowing(Detector):
-    """Reports a module that has not followed its commands for some time."""
+    """Reports a module whose tension does not follow the tension that its command demands."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = self._complete_robot = robot
@@ -86,7 +89,7 @@ class ModuleFollowing(Detector):
         self._speed: Array = np.zeros(count)  # smoothed dl/dt [m/s]
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report the module with the most evidence; None if there is less than 1 s of it."""
+        """Report the module with the most evidence against it; None if that is less than 1 s."""
         difference = self._differences(observation)
         if difference is None or not observation.lengths_known:
             self.reset()
@@ -115,7 +118,10 @@ class ModuleFollowing(Detector):
         return Finding(muscle, ConditionKind.MODULE_NOT_FOLLOWING, text, others)
 
     def _differences(self, observation: Observation) -> Array | None:
-        """Return tension minus demanded tension T − T_ref [N], (M,); None without a command."""
+        """Return the differences T − T_ref between measured and demanded tensions [N], (M,).
+
+        The result is None without a command.
+        """
         if observation.demand is None:
             return None
         difference: Array = observation.sample.motor_tension - self._reference(observation.demand)
@@ -156,10 +162,13 @@ class ModuleFollowing(Detector):
 
 
 class PositionFollowing(ModuleFollowing):
-    """Reports a position-controlled module that has not followed its target length."""
+    """Reports a position-controlled module whose length does not follow the target length."""
 
     def _differences(self, observation: Observation) -> Array | None:
-        """Return length minus commanded length l − l_target [m], (M,); None without a command."""
+        """Return the differences l − l_target between measured and target lengths [m], (M,).
+
+        The result is None without a command.
+        """
         if observation.command is None:
             return None
         return observation.sample.length - observation.command

@@ -40,8 +40,8 @@ SPACING = 0.25  # store at most one message in this time [s]
 USUAL_COUNT = 120
 ENOUGH = 20  # judge no finding before this many messages have been stored
 RECENT = 20  # judge a finding by this many of the newest messages
-#: among these, use only messages whose anomaly score A exceeds this multiple of the usual one: the
-#: others are from before the fault
+#: judge a finding only by recent messages whose anomaly score A exceeds this multiple of the usual
+#: one, because the others are from before the fault
 ANOMALOUS = 2.0
 #: assume an exchange only if the anomaly score, with the columns put back, is below this multiple
 #: of the usual one
@@ -58,8 +58,9 @@ RESTARTED = 5.0
 #: suspect that a column belongs to another muscle, or has lost its offset, if its length has
 #: changed by more than this during the pause [m]
 DISCONTINUOUS = 0.02
-#: assume another wiring only if it divides the change of its lengths during the silence by at least
-#: this factor, and if that change exceeds the change of all other lengths by this factor
+#: Assume that columns are exchanged or reversed since a pause of the messages only if correcting
+#: this divides their change over the pause by this factor, and if they had changed more than all
+#: other lengths by this factor.
 CONTINUOUS = 3.0
 #: look for exchanged muscles only after a finding of one of these kinds, to which an exchange leads
 EXPLAINED = frozenset(
@@ -126,10 +127,11 @@ class ExchangeCheck:
             self._messages.append((sample.bone_tension, sample.length_read))
 
     def explain(self, finding: Finding | None, observation: Observation) -> Finding | None:
-        """Return a finding of exchanged muscles or a reversed length if it explains `finding`.
+        """Explain a finding: return the finding of the driver's fault that explains it, if any.
 
-        If neither does, and `finding` only states that the readings do not fit the learned body,
-        several lengths that have changed in a recent silence explain it: they have lost their
+        Exchanged muscles or a reversed length are considered first. If neither explains `finding`,
+        and `finding` only states that the readings do not fit the learned body, several lengths
+        that have changed in a recent pause of the messages explain it: they have lost their
         offsets. Otherwise, the result is `finding`.
         """
         if finding is None or finding.kind not in EXPLAINED_BY_SILENCE:
@@ -151,16 +153,17 @@ class ExchangeCheck:
 
     @property
     def _may_have_restarted(self) -> bool:
-        """Whether a silence has ended recently, in which the driver may have restarted."""
+        """Whether all messages paused recently, so that the driver may have restarted."""
         if self._silence is None or self._newest is None:
             return False
         return self._newest[0] - self._silence[0] <= RESTARTED
 
     def _jumped_in_silence(self) -> Finding | None:
-        """Return the finding of lengths that a recent silence has changed; None for fewer than two.
+        """Return the finding of several lengths that jumped in a recent pause of the messages.
 
-        A driver that counts lengths from 0 again changes all of them. An arm that has moved in the
-        silence changes them as well, but that leads to no finding that could be explained here.
+        The result is None if fewer than two lengths have changed. A driver that counts lengths from
+        0 again changes all of them. An arm that has moved in the pause changes them as well, but
+        that leads to no finding that could be explained here.
         """
         if not self._may_have_restarted or self._silence is None or self._mae is None:
             return None
@@ -171,7 +174,10 @@ class ExchangeCheck:
         return finding_of(changed) if len(changed) > 1 else None
 
     def _judge_silence(self) -> WiringJudgement | None:
-        """Judge which wiring makes lengths continue over the last silence; None if unknown."""
+        """Judge which order and signs make the lengths continue over the last pause of messages.
+
+        The result is None if no pause has been observed, or without a network.
+        """
         if self._silence is None or self._mae is None:
             return None
         _, before, after = self._silence
@@ -179,7 +185,7 @@ class ExchangeCheck:
         straight = Wiring.straight(self._robot.muscle_count)
 
         def change(wiring: Wiring, columns: Bools) -> float:
-            """Return how far lengths change over the silence with this wiring (RMS)."""
+            """Return the root mean square change of lengths over the pause with this wiring [m]."""
             gap = wiring.signed(after) - before
             return float(np.sqrt(np.square(gap[columns]).mean())) if columns.any() else 0.0
 
@@ -197,7 +203,11 @@ class ExchangeCheck:
         return WiringJudgement(best, tuple(wiring for _, wiring in explaining), (), least)
 
     def _judge(self, observation: Observation) -> WiringJudgement | None:
-        """Judge which wiring restores the usual A; return None if that cannot be judged."""
+        """Judge which order and signs restore the usual anomaly score; None if that is unclear.
+
+        It is unclear if the network is not calibrated, if there are too few messages, or if a
+        tendon is slack.
+        """
         mae, sample = self._mae, observation.sample
         if mae is None or not mae.is_calibrated:
             return None

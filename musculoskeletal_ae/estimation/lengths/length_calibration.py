@@ -34,7 +34,7 @@ from musculoskeletal_ae.signals.wiring import WiringJudgement, judge
 
 ENOUGH_WITH_ANGLES = 20.0  # with joint sensors, require gentle motion for this long [s]
 ENOUGH = 38.0  # without joint sensors, require gentle motion for this long [s]
-STANDING = 1.0  # require an arm to stand in a stated posture for this long [s]
+STANDING = 1.0  # require the arm to stand still in a posture stated by the user for this long [s]
 #: begin the first fit after this time, and fits of an arm that stands at this interval [s]
 FIRST_FIT = 0.5
 FIT_INTERVAL = 2.0  # begin later fits of a moving arm at this interval [s]
@@ -42,7 +42,7 @@ FIT_INTERVAL = 2.0  # begin later fits of a moving arm at this interval [s]
 #: Do at least one piece and at most MOST_PIECES at each message. A fit therefore takes equally long
 #: with messages at 50 to 200 Hz.
 PIECE_TIME = 0.005
-MOST_PIECES = 4  # do at most this many pieces of work at one message
+MOST_PIECES = 4  # do at most this many pieces of a fit at one message, so that none is delayed
 #: reject a fit with a larger median residual of a length [m]; correct offsets leave 0.0003 m
 LARGEST_RESIDUAL = 0.02
 #: reject a fit with a larger cost per residual: correct offsets cost 0.2 to 0.5, offsets of a wrong
@@ -126,7 +126,7 @@ class LengthCalibration:
 
     @property
     def is_done(self) -> bool:
-        """Whether the offsets are known."""
+        """Whether the offsets are known, which ends the calibration."""
         return self._estimate is not None and self._estimate.known and not self._problem
 
     @property
@@ -144,7 +144,7 @@ class LengthCalibration:
 
     @property
     def enough(self) -> float:
-        """Required duration of gentle motion, or of standing [s]."""
+        """Duration of gentle motion, or of standing, that is enough [s]."""
         if self.is_standing:
             return STANDING
         return ENOUGH_WITH_ANGLES if self._has_angles else ENOUGH
@@ -208,7 +208,7 @@ class LengthCalibration:
         return None
 
     def _posture_problem(self) -> str:
-        """Return why the arm does not stand in the stated posture, as a text for users, or ''."""
+        """Return for users why the arm does not stand in the stated posture; '' if it does."""
         if self._stated is None or len(self._measured) < LEAST:
             return ''
         measured = np.median(self._measured, axis=0)

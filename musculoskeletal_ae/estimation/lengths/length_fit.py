@@ -26,9 +26,10 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement, decide, single_faults
 
 # Constants of the search for initial values.
-DRAWN_POSTURES = 3200  # compare the torques of this many random postures at the first moment
+#: draw this many random postures, and compare how well their torques balance at the first moment
+DRAWN_POSTURES = 3200
 FITTED_POSTURES = 400  # fit this many of the best drawn postures coarsely to the lengths
-COMPARED_FITS = 30  # compare this many of the best coarse fits also by torque
+COMPARED_FITS = 30  # compare this many of the best coarse fits by torque as well
 REFINED_FITS = 6  # refine this many of the best coarse fits
 FEW_MOMENTS = 24  # compare initial values on this many moments (means over 0.25 s), not on all
 BATCH = 20  # fit this many postures in one piece of work, which runs between two messages

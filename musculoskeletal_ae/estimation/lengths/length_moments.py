@@ -16,13 +16,13 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
-WINDOW = 0.25  # average the readings of a moment over this time [s]
+WINDOW = 0.25  # average readings over this time; the mean is called a moment [s]
 #: conclude that the arm has moved since the last moment if a length has changed by more than this
 #: [m]
 MOVED = 0.002
 #: skip moments in which a muscle is faster, because inertial forces matter then [m/s]
 FASTEST = 0.05
-MOST = 240  # keep at most this many moments
+MOST = 240  # keep at most this many of the newest moments, which bounds the time of a fit
 
 
 class Moments(NamedTuple):

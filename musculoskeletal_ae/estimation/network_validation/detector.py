@@ -20,7 +20,8 @@ from musculoskeletal_ae.mae.residuals import AnomalyStatistics, residuals
 
 #: reject a network if no imitated rupture raises d to at least this share of its threshold
 LEAST_RUPTURED = 0.1
-#: raise an inherited threshold to at least this multiple of the largest d of the messages
+#: raise a detector's threshold that a candidate inherits to at least this multiple of the largest
+#: residual distance d in recent messages, so that the candidate reports nothing on a healthy arm
 WIDENED = 3.5
 
 

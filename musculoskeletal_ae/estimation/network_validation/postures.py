@@ -39,7 +39,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.robot import Robot
 
-POSTURES = 64  # check a network on this many fixed states
+POSTURES = 64  # check a network on this many fixed random states of the geometric model
 #: name of the error of the scale: the factor by which all route lengths differ from the model's
 SCALE = 'scale of l by ①'
 
@@ -60,7 +60,9 @@ LIMITS = {
     'mean θ by ①': 0.6,
     'mean θ by ③': 0.7,
 }
-LEAST_SPREAD = 0.04  # divide errors of lengths by at least this standard deviation [m]
+#: divide the error of a length by at least this standard deviation [m], so that a small error of a
+#: muscle that hardly changes its length is no large relative error
+LEAST_SPREAD = 0.04
 LEAST_ARM = 0.01  # divide errors of the muscle Jacobian by moment arms of at least this size [m]
 #: before comparing lengths, multiply the modelled elongation of each muscle by a factor between
 #: these two: the constants of a real elastic element may be e^±1.5 times those of the model

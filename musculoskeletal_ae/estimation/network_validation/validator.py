@@ -49,8 +49,10 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 
-PROOF = 10.0  # count a network as proven after this time in use without an anomaly [s]
-MOST_USED = 20  # keep at most this many networks for a rollback
+#: after an anomaly, return to a network that had been in use for at least this long without an
+#: anomaly [s]
+PROOF = 10.0
+MOST_USED = 20  # keep at most this many networks to which the estimator can return
 RELEARNING_TIME = 600.0  # expect that a muscle may be relearned for this long after its repair [s]
 
 
@@ -272,7 +274,7 @@ class CheckpointValidator:
         self._repaired_at |= dict.fromkeys(muscles, now)
 
     def take(self, mae: Mae, now: float) -> None:
-        """Take this network as the one in use from the time `now` [s] on."""
+        """Take this network as the one in use from the time `now` [s] on, without any check."""
         self._used.append((now, mae))
         while len(self._used) > 1 and now - self._used[1][0] >= PROOF:
             del self._used[0]
