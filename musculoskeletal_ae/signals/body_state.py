@@ -19,8 +19,8 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import MessageError
 
-#: Standard deviation of an offset that nothing has determined [m]. Offsets that are constructed
-#: without a trust count as known if their standard deviation is smaller.
+#: Give an offset that nothing has determined this standard deviation [m]. Offsets that are
+#: constructed without a trust are known if their standard deviation is smaller.
 UNKNOWN = 1.0
 MOST_OFFSET = 10.0  # reject a body state with a larger offset of a length sensor than this [m]
 ROWS = 6  # expect this many rows in a message on `body_state` (`BodyState.of_rows`)
@@ -184,7 +184,7 @@ class BodyState:
         return self.anomaly in PRESENT
 
     def with_isolated(self, muscles: Iterable[int]) -> BodyState:
-        """Return the state in which exactly these muscles are isolated."""
+        """Return the state in which exactly the muscles with these indices are isolated."""
         isolated = tuple(sorted({int(muscle) for muscle in muscles}))
         return self if isolated == self.isolated else replace(self, isolated=isolated)
 

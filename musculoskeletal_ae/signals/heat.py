@@ -27,8 +27,10 @@ from musculoskeletal_ae.robot.robot import Robot
 
 HELD = 60.0  # plan no tension that overheats a winding when it is held for this time [s]
 MOMENT = 5.0  # command no tension that overheats a winding when it is held for this time [s]
-EVERY = 1.0  # compute the winding temperatures again after this time [s]
-LONGEST = 10.0  # let one update cover at most this time [s]
+EVERY = 1.0  # compute the winding temperatures at this interval, from the means over it [s]
+#: after a longer gap between two messages than this, let the temperatures settle without learning
+#: the thermal constants [s]
+LONGEST = 10.0
 #: If a housing's temperature differs from the estimate by more than this [°C], adopt it without
 #: learning from it: the sensor or another source of heat is the cause, not the motor.
 JUMP = 2.0
@@ -58,7 +60,7 @@ LEARNED = 1200.0
 #: logarithms
 KNOWN = 0.2
 REST_STEP = 30.0  # search for the end of a rest in steps of this [s]
-LONGEST_REST = 3600.0  # predict no longer rest than this [s]
+LONGEST_REST = 3600.0  # end this search here, and report a longer rest as 'more than 60 min' [s]
 CHANGED = 1.5  # report a module once a thermal constant differs from its reference by this factor
 
 
@@ -94,7 +96,10 @@ def soon(seconds: float) -> str:
 
 
 class Heat:
-    """Estimates temperatures and thermal constants of all modules, and their tension limits."""
+    """Estimates temperatures of all muscle modules, and the tensions that these permit.
+
+    The constants of the thermal model are estimated as well, because they differ between modules.
+    """
 
     def __init__(self, robot: Robot) -> None:
         self._tension, count = robot.tension, robot.muscle_count

@@ -27,15 +27,16 @@ from musculoskeletal_ae.robot.joint_units import JointUnits
 from musculoskeletal_ae.robot.robot import Robot
 
 LEAST_MOTION = 0.05  # judge a joint only if the range of its θ is at least this [rad]
-#: Judge a sign only if |a_j| is at least this. On the emulated individuals 0–4 of two shipped arms
-#: and both emulator models, a_j of joints that moved enough is between 0.4 and 1.9.
+#: Judge the sign of a joint sensor only if its factor |a_j| (docstring of this module) is at least
+#: this. On the emulated individuals 0–4 of two shipped arms and both emulator models, a_j of
+#: joints that moved enough is between 0.4 and 1.9.
 LEAST_SCALE = 0.3
-BEYOND = 0.3  # let a correct θ exceed the joint limits by at most this [rad]
+BEYOND = 0.3  # treat readings as impossible if they exceed the joint limits by more than this [rad]
 #: Assume another unit, order or sign of the joint angles (`_possible_faults`) if it reduces the
 #: misfit of the muscle lengths to less than this fraction.
 BETTER = 0.8
-MOST_SAMPLES = 600  # use at most this many messages, evenly distributed
-LEAST_SAMPLES = 20  # judge sensors only by at least this many messages
+MOST_SAMPLES = 600  # judge sensors by at most this many messages, evenly distributed
+LEAST_SAMPLES = 20  # judge no sensor by fewer messages than this
 STUCK_TIME = 5.0  # examine a repeated reading only if it lasts for at least this time [s]
 #: report a repeated reading as stuck if the lengths show that its joint moves by more than this
 #: [rad]
@@ -51,7 +52,7 @@ DEGREES, SIGN, ORDER, STUCK = 'degrees', 'joint sign', 'joint order', 'joint stu
 
 
 class JointFault(NamedTuple):
-    """A fault of joint sensors."""
+    """A fault of one or several joint sensors."""
 
     kind: str  # DEGREES, SIGN, ORDER or STUCK
     joints: tuple[int, ...]  # indices of the joints
@@ -60,7 +61,7 @@ class JointFault(NamedTuple):
 
 
 def corrected(theta: Array, faults: Iterable[JointFault], units: JointUnits) -> Array:
-    """Return θ (N, D) as the joint sensors would publish it without these faults."""
+    """Return corrected angles θ [rad], (N, D), as the joint sensors without these faults."""
     theta = units.to_position(theta)  # the sensors publish positions
     for fault in faults:
         joints = list(fault.joints)

@@ -55,10 +55,12 @@ CONTINUOUS = 0.95
 #: report a smaller share of messages with false readings as a remark instead of a fault
 TOLERATED = 0.01
 MOST_NAMED = 6  # name at most this many kinds of false readings in a text
+#: advice for users if readings are false
 REMEDY = (
     'stop a second program that publishes joint_states, and let the driver leave out readings that '
     'failed'
 )
+#: advice for users if readings are off by whole turns
 TURN_REMEDY = (
     'let the driver subtract the whole turns that the encoder counts, so that θ is within the '
     'limits of robot.urdf'

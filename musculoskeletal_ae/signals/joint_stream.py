@@ -36,8 +36,8 @@ from musculoskeletal_ae.signals.limits import LIMITS
 STEP = 0.1
 #: expect no joint to move faster [rad/s]; emulated arms reach 5.4 rad/s when a tendon slips
 SPEED = 10.0
-#: report a series of impossible readings that has lasted for this time [s]; a burst is shorter,
-#: even with the time in which the readings of a moving arm settle again
+#: report a series of impossible readings that has lasted for this time [s]; a burst of glitches is
+#: shorter, even together with the time after which new readings are accepted (`LIMITS.settled`)
 LASTING = 2.0
 MISSING = 1.0  # report a joint sensor that has stopped sending readings after this time [s]
 #: treat a series of impossible readings as ended when the last one is older than this [s]
@@ -81,7 +81,7 @@ class ImpossibleSeries(NamedTuple):
         return self.is_present(now) and self.until - self.since > LASTING
 
 
-_NONE = ImpossibleSeries(-math.inf, -math.inf, 0, 0)
+_NONE = ImpossibleSeries(-math.inf, -math.inf, 0, 0)  # stands for no series so far
 
 
 class JointChannel:
@@ -106,7 +106,7 @@ class JointChannel:
         self.reset()
 
     def reset(self) -> None:
-        """Discard all readings, but not whether the joint has a sensor."""
+        """Discard all readings, but remember whether the joint has a sensor."""
         # Time of the last reading within the limits [s], this reading, the last usable reading
         # [rad], and the time since which all readings have followed each other plausibly [s]; NaN
         # before the first.
@@ -114,7 +114,7 @@ class JointChannel:
         self.series = _NONE
 
     def judge(self, time: float, value: float) -> JointReading:
-        """Judge a reading [rad] received at `time` [s]."""
+        """Judge whether a reading [rad] received at `time` [s] is usable, by those before it."""
         if not math.isfinite(value):
             return JointReading.MISSING
         if not self._low <= value <= self._high:

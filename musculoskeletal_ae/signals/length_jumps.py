@@ -63,7 +63,7 @@ class Change:
 
     @property
     def is_jump(self) -> bool:
-        """Whether any of the changes was too large."""
+        """Whether any of the changes was larger than is legal."""
         return self.jumped_at > -math.inf
 
     @property

@@ -69,7 +69,7 @@ class Limits(NamedTuple):
     pause: float = 0.5
 
 
-LIMITS = Limits()
+LIMITS = Limits()  # the limits that all nodes and tools use
 #: treat a tendon as slack below this fraction of T_bias or of the demanded tension
 SLACK_SHARE = 0.2
 POSTURES = 500  # search this many random postures for the shortest and longest muscle lengths

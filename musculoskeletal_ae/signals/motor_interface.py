@@ -24,7 +24,7 @@ from musculoskeletal_ae.message_reading import joint_names, read_array
 from musculoskeletal_ae.robot.motors import ARRAY, JOINT_STATE, NO_MOTORS, Motors
 from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Row
 
-STATES = 'muscle_states'
+STATES = 'muscle_states'  # topic of the readings of a robot with a driver
 
 
 class MotorInterface:

@@ -58,6 +58,7 @@ def _possible_temperatures(_: Robot) -> tuple[float, float]:
     return LIMITS.lowest_temperature, LIMITS.highest_temperature
 
 
+#: the rows of a message of `muscle_states`, in this order
 QUANTITIES: tuple[Quantity, ...] = (
     Quantity('length', 'm', 'length beyond what the joints allow', _possible_lengths),
     Quantity('tension', 'N', 'tension beyond the maximum', reading_range),

@@ -162,7 +162,7 @@ class MuscleStream:
         self._transmission = transmission
 
     def use_body(self, body: BodyState) -> None:
-        """Use another body state from now on."""
+        """Use the length offsets and isolated muscles of another body state from now on."""
         has_new_offsets = body.offsets != self.body.offsets
         is_calibrated = has_new_offsets and not body.offsets.revoked
         if has_new_offsets:  # the change of lengths is not a motion

@@ -48,7 +48,7 @@ COST_BETTER = 1.1
 #: add noise of this standard deviation to every misfit [m]; an arm that hardly moves then shows
 #: neither a fault nor that the wiring is right
 NOISE = 0.0005
-MOST_SAMPLES = 400  # use at most this many messages, evenly distributed
+MOST_SAMPLES = 400  # judge the wiring by at most this many messages, evenly distributed
 
 #: computes the lengths [m], (N, M), for θ [rad], (N, D), and T [N], (N, M)
 Lengths = Callable[[Array, Array], Array]
