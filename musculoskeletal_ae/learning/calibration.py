@@ -31,13 +31,14 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, anomaly, residuals
 
 CAPACITY = 4000  # keep a random selection of at most this many healthy messages by default
-SPACING = 0.1  # consider at most one message in this time [s]
+SPACING = 0.1  # consider at most one message in this time for the selection [s]
 LEAST_TIME = 60.0  # calibrate a detector only after the arm has been healthy for this long [s]
 #: calibrate a detector only if the healthy arm has rested in at least this many distinct postures,
 #: and if the network has learned at least as many samples
 LEAST_SAMPLES = 20
-#: Multiply the largest healthy d by this to get the threshold, once the body is well known. An
-#: unknown load of 3.6 kg doubles d; a ruptured tendon multiplies it by six to ten within 0.3 s.
+#: Multiply the largest residual distance d of healthy messages by this to get the threshold, once
+#: the body is well known. An unknown load of 3.6 kg doubles d; a ruptured tendon multiplies it by
+#: six to ten within 0.3 s.
 MARGIN = 3.5
 #: n_few: multiply the threshold by 1 + n_few/samples, and thus double it at this number of samples,
 #: because few samples determine the body poorly

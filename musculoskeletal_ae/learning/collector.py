@@ -107,7 +107,7 @@ class SampleCollector:
 
     @property
     def jumps(self) -> int:
-        """How often lengths have jumped."""
+        """Number of jumps of lengths since the start after which the new level was accepted."""
         return self._stream.jumps.count
 
     @property
@@ -233,8 +233,8 @@ class SampleCollector:
     def use_body(self, body: BodyState) -> None:
         """Use another body state from now on.
 
-        Incomplete samples are discarded, unless only the anomaly has changed. No samples are
-        collected from shortly before an anomaly until shortly after its reset.
+        Incomplete samples are discarded, unless only the anomaly has changed. From 2 s before an
+        anomaly until 2 s after its end (DETECTION_DELAY), no samples are collected.
         """
         before = self.body
         self._stream.use_body(body)

@@ -19,7 +19,7 @@ class Job(NamedTuple):
     #: whether the statistics of the anomaly detector are valid for the present arm; not after a
     #: muscle has been changed
     statistics_hold: bool
-    steps: int  # number of training steps
+    steps: int  # number of training steps of preset `default`
     isolated: tuple[int, ...] = ()  # indices of the muscles that the messages do not describe
 
 

@@ -14,7 +14,8 @@ from collections import deque
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.joint_trust import JointTrust, SensorTrust
 
-MOST_RECENT = 400  # remember the times of this many newest samples, to find those of a doubt
+#: remember the times of this many newest samples, to find those taken after a doubt began
+MOST_RECENT = 400
 
 
 class JointHistory:

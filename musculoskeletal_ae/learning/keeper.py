@@ -130,7 +130,7 @@ class CheckpointKeeper:
         self.store()
 
     def clear(self) -> None:
-        """Clear all networks of the learner."""
+        """Clear all networks of the learner, and withdraw the one to be published."""
         self.mae = self._saved = self.checkpoint = None
         self.publication.offer(None)
 

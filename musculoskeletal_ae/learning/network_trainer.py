@@ -16,10 +16,12 @@ from musculoskeletal_ae.mae.units import LENGTH_SCALE
 
 STEP_SIZE = 2e-3  # begin online training with this step size of the optimiser
 BATCH = 128  # train on this many samples at once
-AVERAGED_SHARE = 0.1  # average the weights over this share of all steps so far
+#: publish an average of the weights over this share of all steps so far, because single steps are
+#: noisy
+AVERAGED_SHARE = 0.1
 LEAST_AVERAGED = 20.0  # average the weights over at least this many steps
 MOST_AVERAGED = 2000.0  # average the weights over at most this many steps
-HALVING_STEPS = 2000.0  # halve the step size after this many steps
+HALVING_STEPS = 2000.0  # divide the step size by 1 + steps/HALVING_STEPS: by 2 at this step
 #: Lower the step size to no less than this share of the initial one. The weight average then no
 #: longer drifts, but the network still follows a slowly changing body.
 LEAST_STEP_SHARE = 0.1

@@ -25,7 +25,7 @@ from musculoskeletal_ae.learning.samples import NOTHING, Sample
 REST_TIME = 0.3  # conclude that the arm rests after it has been still for this long [s]
 JOINT_RATE = 0.02  # conclude that the arm moves if a joint is faster than this [rad/s]
 LENGTH_RATE = 0.002  # conclude that the arm moves if a length changes faster than this [m/s]
-LONGEST_PART = 1.0  # average at most this much of a rest in one sample [s]
+LONGEST_PART = 1.0  # average at most this much of a rest in one sample, then begin another [s]
 #: keep at most this many readings of a rest, which bounds the memory if the clock stands still
 MOST_READINGS = 20_000
 #: Require this many readings in each half of the window, and lengthen it if messages are slow: with
@@ -116,7 +116,7 @@ class OpenRest:
 
 
 class RestDetector:
-    """Turns a stream of readings into one mean for each rest."""
+    """Detects rests of the arm in a stream of readings, and returns the mean of each rest."""
 
     def __init__(self, blind: bool = False) -> None:
         """Start with an empty window.

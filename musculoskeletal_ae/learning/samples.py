@@ -22,7 +22,7 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.signals.friction import Transmission
 
-CAPACITY = 400  # keep at most this many samples by default
+CAPACITY = 400  # keep at most this many samples by default, and drop the most similar ones
 #: Estimate tendon creep once the number of accepted samples exceeds this share of the capacity, and
 #: this share of the samples has all joint angles.
 CREEP_SHARE = 0.5

@@ -12,7 +12,8 @@ from musculoskeletal_ae.learning.job import Job, Update
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae.mae import Mae
 
-STEPS = 50  # training steps in one update of preset `default`; 100 would reduce the error by 3 %
+#: train for this many steps in one update of preset `default`; 100 would reduce the error by 3 %
+STEPS = 50
 #: let at least this time pass between the starts of two updates, and between two checkpoints [s]
 LEAST_INTERVAL = 1.0
 #: require this many samples for the first update of an arm without joint sensors

@@ -20,7 +20,7 @@ from musculoskeletal_ae.learning.samples import MOMENT_ARM, NOTHING, Sample
 
 PERIOD = 1.0  # learn the slowest moment of each interval of this duration [s]
 MOMENT = 0.1  # average the readings of a moment over this duration [s]
-LEAST_READINGS = 3  # use no moment with fewer readings
+LEAST_READINGS = 3  # average at least this many readings of a moment, from which its speed follows
 LONGEST_GAP = 0.3  # discard the readings before a gap longer than this [s]
 
 

@@ -22,7 +22,7 @@ LONGEST_IDLE = 5.0
 
 
 def learner_report(learner: Learner) -> Report:
-    """Return the status of a learner."""
+    """Return the report on a learner for /diagnostics: its values and conditions."""
     present = learner_conditions(learner)
     return Report('' if present else 'learning', _values(learner), present)
 

@@ -63,7 +63,7 @@ class Trainer:
         return None if self._updater is None else self._updater.body
 
     def submit(self, job: Job) -> None:
-        """Run a job; `poll` then returns its update."""
+        """Submit a job: run it at once; `poll` then returns its update."""
         assert self._updater is not None
         self._update = self._updater.update(job)
 
@@ -85,7 +85,7 @@ class Trainer:
 
 NICENESS = 5  # run the training process with a niceness higher than the node's by this
 FIRST_PAUSE = 1.0  # wait this long before restarting a lost training process [s]; doubles each time
-LONGEST_PAUSE = 60.0  # wait at most this long before a restart [s]
+LONGEST_PAUSE = 60.0  # wait at most this long before restarting a lost training process [s]
 #: restart a training process, as hung, if its first answer takes longer than this [s], plus
 #: PATIENCE_PER_STEP for each training step; imports take minutes on a slow disk
 PATIENCE_AT_FIRST = 300.0
