@@ -18,7 +18,8 @@ from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-PROBES = 200  # average the length of each muscle over this many postures
+#: measure by how much an update lengthens each muscle as the mean over this many random postures
+PROBES = 200
 #: report a muscle as changed if at least this many of its newest samples contradict the fitted
 #: body, all with length residuals of the same sign
 LEAST_NEWEST = 4

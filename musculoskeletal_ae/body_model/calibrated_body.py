@@ -147,7 +147,7 @@ class CalibratedBody:
 
     @property
     def drive(self) -> Array | None:
-        """The constants γ, b [N] and F [N] of every muscle's motor current, (3, M).
+        """Scale error γ, offset b [N] and friction F [N] of every muscle's motor current, (3, M).
 
         `Transmission` explains them. The value is None if the robot has tension sensors.
         """

@@ -22,7 +22,7 @@ MANY_MESSAGES = 200
 #: Draw this many bodies from the posterior: many more than joints, because a covariance from few
 #: draws underestimates the errors of other draws.
 BODIES = 100
-POSTURES_PER_BODY = 10  # draw errors of each body at this many postures
+POSTURES_PER_BODY = 10  # draw estimation errors of each drawn body at this many postures
 #: Multiply the covariance by this factor if there are fewer than MANY_MESSAGES validation messages.
 #: It stands for errors that all samples share and no prior describes, for example where tendons
 #: wrap round bones. With this factor, the ellipsoids contain 95 % of the true angles on emulator

@@ -138,7 +138,7 @@ def _reopened(
 
 
 class MusclePoint(NamedTuple):
-    """Parameters of one muscle, with residuals and derivatives."""
+    """A point of the fit of one muscle: its parameters, with residuals and derivatives."""
 
     parameters: Array  # w, fitted constants of the muscle, (P,)
     residual: Array  # measured minus computed lengths [m], (N, 1)
@@ -146,7 +146,7 @@ class MusclePoint(NamedTuple):
 
 
 class MuscleFit:
-    """Fits one muscle at known postures; a `gauss_newton.Problem`."""
+    """Fits the parameters of one muscle at known postures, as a `gauss_newton.Problem`."""
 
     def __init__(
         self,
@@ -179,7 +179,7 @@ class MuscleFit:
         return minimise(self, start, ROUNDS, enough).point.parameters
 
     def point(self, parameters: Array) -> MusclePoint:
-        """Return these parameters with their residuals and derivatives."""
+        """Return the point of the fit with these parameters."""
         m, observed = self._m, self._observed
         of_all = list(self._body.parameters)
         of_all[m] = parameters
@@ -205,19 +205,19 @@ class MuscleFit:
         return float((self._weight * point.residual**2).sum() + self._precision @ deviation**2)
 
     def equations(self, point: MusclePoint) -> Equations:
-        """Return the normal equations at a point."""
+        """Return the normal equations of a Gauss–Newton step from a point."""
         curvature = (point.jacobian * self._weight).T @ point.jacobian
         self._determined = np.array([determined(curvature, self._precision)])
         return Equations.of_common(curvature + np.diag(self._precision))
 
     def right_sides(self, point: MusclePoint) -> RightSides:
-        """Return the right sides of the normal equations."""
+        """Return the right sides of the normal equations of a Gauss–Newton step from a point."""
         by_samples = point.jacobian.T @ (self._weight * point.residual)[:, 0]
         by_prior = self._precision * (self._mean - point.parameters)
         return RightSides.of_common(by_samples + by_prior)
 
     def moved(self, point: MusclePoint, step: SolvedStep) -> MusclePoint:
-        """Return the parameters after a step of the solver, with residuals and derivatives."""
+        """Return the point to which a step of the solver leads."""
         return self.point(point.parameters + step.common)
 
 

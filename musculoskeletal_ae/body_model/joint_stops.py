@@ -40,8 +40,9 @@ STOP_SPREAD = 0.01  # expect a stop to be this far from its joint limit (standar
 OFFSETS = np.linspace(-4.0 * ROUGH_OFFSET, 4.0 * ROUGH_OFFSET, 281)
 NO_STOPS = 0.1  # assume that a joint's limits are no mechanical stops with this probability
 NOT_REACHED = 0.5  # assume that the arm never reaches a given stop with this probability
-SHARES = 0.03, 0.1, 0.3  # consider these shares π of rests at a stop that is reached
-WIDTHS = 0.001, 0.002, 0.004  # consider these widths σ of the cluster of readings there [rad]
+SHARES = 0.03, 0.1, 0.3  # consider that this share π of all rests is at a stop that is reached
+#: consider that the readings at a stop scatter with these standard deviations σ [rad]
+WIDTHS = 0.001, 0.002, 0.004
 WIDTH_RATIO = 2.0  # beyond a limit, widen the cluster by this factor, because stops are compliant
 #: beyond a limit, expect this density of other readings, relative to that within the range
 DENSITY_RATIO = 0.01

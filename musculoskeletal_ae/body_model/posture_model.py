@@ -27,7 +27,8 @@ from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 
 DIFFERENCE = 1e-6  # differentiate numerically with this step [rad]
-#: reuse Σ T ∂²l/∂θ² of the geometric model until a joint has moved by more than this [rad]
+#: Compute the joint stiffness Σ T ∂²l/∂θ² due to muscle tensions again only after a joint has moved
+#: by more than this [rad], because it is costly and changes little.
 REUSED_MOTION = 0.05
 SMALL = 1e-6  # divide the vector of gravity by at least this norm
 
@@ -42,7 +43,7 @@ class Unknowns(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Residuals and their derivatives at given values of the unknowns."""
+    """Residuals of lengths, torques, angles and gravity, and their derivatives, at one point."""
 
     length: Array  # residuals of the lengths [m], (N, M)
     muscle_jacobian: Array  # G [m/rad], (N, M, D)

@@ -62,7 +62,8 @@ LEAST_NOISE = 0.0008
 #: Expect errors of the torque balance (σ_τ) of this share of the muscles' absolute torques at a
 #: joint. The share is high, because all samples have the same friction and sensor offsets.
 TORQUE_NOISE = 0.3
-#: assume at least this usual residual torque, as a share of the muscles' absolute torques
+#: assume that unbalanced torques are usually at least this share of the muscles' summed absolute
+#: torques at a joint
 LEAST_TORQUE = 0.01
 #: recompute the factor for the spreads of the prior (Birge ratio, `GroupFit._posterior`) this many
 #: times
@@ -85,14 +86,14 @@ class Weights(NamedTuple):
 
 
 class PosturePoint(NamedTuple):
-    """Values of the unknowns, and the residuals at these values."""
+    """A point of the fit: values of the unknowns, and the residuals at these values."""
 
     unknowns: Unknowns
     residuals: Residuals
 
 
 class GroupFit:
-    """Fits one group of joints and muscles; a `gauss_newton.Problem`.
+    """Fits parameters and postures of one group of joints and muscles, as a `gauss_newton.Problem`.
 
     Attributes:
         noise: σ of each muscle's length [m], (M,).
@@ -193,7 +194,7 @@ class GroupFit:
             self.noise[m] = np.hypot(self.noise[m], np.sqrt(variance.mean()))
 
     def point(self, unknowns: Unknowns) -> PosturePoint:
-        """Return these values of the unknowns with their residuals."""
+        """Return the point of the fit with these values of the unknowns."""
         return PosturePoint(unknowns, self.model.residuals(unknowns))
 
     def weigh(self, point: PosturePoint) -> None:
@@ -234,7 +235,10 @@ class GroupFit:
         )
 
     def equations(self, point: PosturePoint) -> Equations:
-        """Return the normal equations of θ, and of (w, z, e)."""
+        """Return the normal equations of a Gauss–Newton step from a point.
+
+        Their unknowns are the postures θ of the samples, and (w, z, e), which all samples share.
+        """
         model, weights, residuals = self.model, self._weights, point.residuals
         count, places = model.by_sensor.shape
         size = model.parameter_count
@@ -283,7 +287,7 @@ class GroupFit:
         return np.array([determined(c, p) for c, p in zip(curvature, precisions, strict=True)])
 
     def right_sides(self, point: PosturePoint) -> RightSides:
-        """Return the right-hand sides of the normal equations at `point`."""
+        """Return the right sides of the normal equations of a Gauss–Newton step from a point."""
         unknowns, residuals = point
         weights, prior = self._weights, self.prior
         length, torque = weights.length * residuals.length, weights.torque * residuals.torque
@@ -307,7 +311,7 @@ class GroupFit:
         return unknowns.springs[:, self.model.sprung].ravel()
 
     def moved(self, point: PosturePoint, step: SolvedStep) -> PosturePoint:
-        """Return the unknowns after a step of the solver, with their residuals."""
+        """Return the point to which a step of the solver leads."""
         theta, zero, parameters, springs = point.unknowns
         joints, size = self.model.joints, self.model.parameter_count
         after_zero, sprung = size + len(joints), self.model.sprung

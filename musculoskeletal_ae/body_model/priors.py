@@ -57,7 +57,7 @@ class Prior:
         return mean
 
 
-PRIOR = Prior()
+PRIOR = Prior()  # expect a body to differ this much from its geometric model
 #: expect a replaced muscle or tendon to differ this much from its earlier parameters
 REOPENED = Prior(attachment=0.004, elastic=0.3, offset=0.03)
 

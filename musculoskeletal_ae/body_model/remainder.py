@@ -55,7 +55,8 @@ USUAL = np.array([-1.5, 0.5, 1.0, 2.0, 1.0, -2.0])
 SPREAD = np.array([2.0, 0.4, 1.0, 1.0, 1.0, 1.5])
 #: search each of the six logarithms within these limits
 BOUNDS = ((-8.0, 4.0), (-1.5, 3.0), (0.0, 4.0), (-1.5, 4.0), (0.0, 3.5), (-2.5, 3.0))
-#: start a search from these values: a trusted body, a wrong body, and a rough remainder
+#: start a search from these logarithms: for a body that explains the lengths, for one that does
+#: not, and for a rough remainder
 STARTS = (
     USUAL,
     USUAL + [2.5, 0.0, 0.0, 0.0, 0.0, 0.0],
@@ -114,10 +115,13 @@ class Lengths(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GroupRemainder:
-    """The remainder g of one group of joints and muscles."""
+    """The remainder g of one group of joints and muscles.
 
-    joints: Ints
-    muscles: Ints
+    g is the part of the muscle lengths that the parameters of the body cannot express.
+    """
+
+    joints: Ints  # indices of the joints
+    muscles: Ints  # indices of the muscles
     scale: Array  # units of the inputs: R of the joints, T_limit of the muscles, (D+M,)
     crossed: Bools  # whether each muscle crosses each joint, (M, D)
     logarithms: Array  # natural logarithms of a, b, e, c, ν and σ in units of UNITS, (6,)
@@ -130,7 +134,7 @@ class GroupRemainder:
     roots: tuple[Array, ...]
 
     def at(self, theta: Array, tension: Array) -> Array:
-        """Return g [m] of the group's muscles, (N, M), for θ and T of the whole body."""
+        """Return the remainder of the group's muscles [m], (N, M), at θ and T of the whole body."""
         result = np.empty((len(theta), len(self.muscles)))
         for own, covariance in self._covariances(theta, tension):
             result[:, own] = covariance @ self.weights[:, own]
@@ -161,10 +165,10 @@ class GroupRemainder:
 
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """The remainder g of a whole body: the groups in which samples have shown one.
+    """The remainder of a whole body: what its parameters cannot express of the muscle lengths.
 
-    `before` is a remainder that is added, for example that of the network from which learning
-    continues.
+    `groups` are the parts of groups with enough samples. `before` is a remainder that is added, for
+    example that of the network from which learning continues.
     """
 
     muscle_count: int
@@ -187,7 +191,7 @@ class Remainder:
         return result
 
     def drawn_error(self, theta: Array, tension: Array, rng: np.random.Generator) -> Array:
-        """Draw errors of g [m] (N, M) from its posterior, independently for each state."""
+        """Draw errors of the remainder [m], (N, M), from its posterior, one for each state."""
         result = np.zeros((len(theta), self.muscle_count))
         for group in self.groups:
             spread = group.spread(theta, tension)
