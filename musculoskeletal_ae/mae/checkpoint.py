@@ -37,9 +37,9 @@ FORMAT_VERSION = 1  # reject checkpoints of any other version of the file format
 #: reject a larger checkpoint [bytes]; those of the shipped robots are a hundred times smaller
 MAX_BYTES = 64 * 1024 * 1024
 MAX_HEADER_BYTES = 1024 * 1024  # reject a checkpoint with a larger header [bytes]
-# Reject values beyond the following limits: no trained network has them, and they could overflow
-# when `Mae` folds units and standardisation into the layers.
-LARGEST = 1e9  # reject a checkpoint with a number of a larger absolute value
+#: reject a checkpoint with a number of a larger absolute value: no trained network has one, and it
+#: could overflow when `Mae` folds units and standardisation into the layers
+LARGEST = 1e9
 SMALLEST_STD = 1e-9  # reject a checkpoint with a smaller standard deviation, which is a divisor
 #: reject a checkpoint with a larger tendon friction |μ|, at which the tensions at the ends of a
 #: tendon would differ 150-fold

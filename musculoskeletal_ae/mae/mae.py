@@ -49,11 +49,10 @@ from musculoskeletal_ae.robot.groups import Group, union
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.signals.friction import Transmission
 
-#: (weight, bias) of one layer
-Layer = tuple[Array, Array]
+Layer = tuple[Array, Array]  # weight (out, in) and bias (out,) of one layer
 
 # Constants of the estimate with isolated muscles.
-ROUNDS = 15  # end the fit of θ after this many Gauss–Newton steps
+ROUNDS = 15  # end the fit of a posture to lengths after this many Gauss–Newton steps
 #: add sensor noise of this standard deviation to the covariance Σ of the length residuals [m]
 LENGTH_NOISE = 0.0003
 #: assume this standard deviation of each length residual [m] if the checkpoint has no statistics
@@ -182,6 +181,7 @@ def _linear_slope(u: Singles, bias: Singles) -> tuple[Singles, Singles]:
     return u, np.ones(1, np.float32)
 
 
+#: activations by their names in a checkpoint
 ACTIVATIONS = {
     'tanh': Activation(_tanh, _tanh_slope, 1.0),
     'silu': Activation(_silu, _silu_slope, 0.5),

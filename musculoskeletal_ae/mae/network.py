@@ -21,6 +21,7 @@ from musculoskeletal_ae.mae.mae import Layer, Mae, complete_bases, latent_places
 from musculoskeletal_ae.mae.units import ActivationName, Mask, scale_vector, visible
 from musculoskeletal_ae.robot.groups import Group
 
+#: activations by their names in a checkpoint
 ACTIVATIONS: dict[str, type[nn.Module]] = {'tanh': nn.Tanh, 'silu': nn.SiLU}
 
 

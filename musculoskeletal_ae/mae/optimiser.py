@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.optim.adam import adam
 
 TINY = 1e-20  # add this to eigenvalues, so that the inverse root of a zero matrix is finite
-MOMENTUM = 0.95  # multiply Muon's momentum by this in each step
+MOMENTUM = 0.95  # multiply Muon's momentum by this in each step, before the gradient is added
 # Coefficients (a, b, c) of the Newton–Schulz polynomials a x + b x³ + c x⁵. Applied one after the
 # other, they bring every singular value close to 1.
 POLYNOMIALS = (
