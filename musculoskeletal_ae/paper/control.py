@@ -39,6 +39,7 @@ from musculoskeletal_ae.paper.constants import (
 from musculoskeletal_ae.paper.latent_descent import StepSearch, Term, descend
 from musculoskeletal_ae.robot.robot import Robot
 
+#: search for step sizes in the descent of method `proposed` with these constants
 SEARCH = StepSearch(CONTROL_LARGEST_STEP, CONTROL_CANDIDATES, CONTROL_EPOCHS)
 
 
