@@ -33,6 +33,7 @@ MOST_REJECTED = 0.1  # report a fault if a larger share of a topic's messages is
 USUAL_REJECTIONS = 'length offsets unknown', 'missing joint', 'missing motor'
 #: report a fault if one of these topics pauses while others are recorded
 READINGS = 'joint_states', 'muscle_states'
+#: remedy for an unfinished recording
 _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 
 
@@ -159,8 +160,8 @@ def _rejected(bag: Bag, streams: Streams) -> list[str]:
         total = bag.topics[label.partition(' as ')[0]].message_count
         if count > MOST_REJECTED * total and reason not in USUAL_REJECTIONS:
             faults.append(
-                f'{count / total:.0%} of the messages of {label} were rejected: {reason}. See '
-                'check_driver, mend the driver, and record again'
+                f'{count / total:.0%} of the messages of {label} were rejected: {reason}. Run '
+                'check_driver, correct the driver, and record again'
             )
     return faults
 

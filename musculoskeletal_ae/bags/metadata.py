@@ -25,7 +25,7 @@ from musculoskeletal_ae.bags.storage import CONVERT, NAME_A_BAG, BagTopic, readi
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.files import read_yaml
 
-FILE = 'metadata.yaml'
+FILE = 'metadata.yaml'  # name of the file in a bag directory
 VERSION = 9  # write the format of metadata.yaml that ROS 2 Jazzy writes
 SUFFIXES = ('.mcap', '.db3')  # read files with these suffixes if metadata.yaml cannot be used
 

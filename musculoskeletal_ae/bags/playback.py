@@ -37,8 +37,8 @@ TAUGHT_TOPIC = 'estimated_joint_states'  # read a demonstrated motion from this 
 #: motion of a hand, which takes longer, and remove noise, which varies faster.
 SMOOTHING = 0.15
 SPACING = 0.1  # place the points of the trajectory at this interval [s]
-LEAD_TIME = 3.0  # move to the first posture in this time [s]
-SHORTEST_MOTION = 0.5  # refuse a shorter motion [s]
+LEAD_TIME = 3.0  # let the arm reach the first posture of the motion in this time [s]
+SHORTEST_MOTION = 0.5  # refuse to send a demonstrated motion that is shorter than this [s]
 
 
 def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:

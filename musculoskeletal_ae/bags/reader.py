@@ -100,7 +100,7 @@ class Bag:
         return heapq.merge(*ordered, key=lambda message: message.log_time)
 
     def decode(self, message: BagMessage) -> Any:
-        """Deserialize a message.
+        """Decode a message: deserialize it with the type of its topic.
 
         Raises:
             BagError: If the message does not fit the type of its topic.

@@ -40,7 +40,7 @@ MESSAGES = 'messages'  # name of the table that contains the messages
 MOST_ROWS = 1 << 40  # end the search for the next readable row after this many ids
 _ROWS = 'SELECT id, topic_id, timestamp, data FROM messages WHERE id >= ? ORDER BY id'
 _INSERT = 'INSERT INTO messages (id, topic_id, timestamp, data) VALUES (?, ?, ?, ?)'
-_LOGS = '-wal', '-journal'  # ends of the names of sqlite's logs of changes
+_LOGS = '-wal', '-journal'  # recognise sqlite's logs of changes by these ends of their names
 _DEFINITION_ENCODINGS = {
     MessageDefinitionFormat.NONE: '',
     MessageDefinitionFormat.MSG: MSG,

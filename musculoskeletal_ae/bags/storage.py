@@ -40,6 +40,7 @@ CONVERT_ROS1 = (
 )
 #: problem and remedy of a recording of which nothing can be read
 EMPTY = 'contains no complete message', 'record again, or use another recording'
+#: remedy for a recording that is legal elsewhere, but cannot be read here
 CONVERT = 'convert it with `rosbags-convert` (of the Python package rosbags) or `ros2 bag convert`'
 
 _TOPIC_NAME = re.compile(r'(/[A-Za-z_]\w*)+', re.ASCII)
@@ -87,7 +88,7 @@ class BagTopic:
 
 
 class BagMessage(NamedTuple):
-    """A recorded message."""
+    """A recorded message, still serialized, with its times."""
 
     topic: str  # absolute name
     log_time: int  # time of reception [ns]
@@ -97,7 +98,7 @@ class BagMessage(NamedTuple):
 
 
 class StorageFile(Protocol):
-    """One file of a recording."""
+    """One mcap or sqlite3 file of a recording, from which messages are read."""
 
     path: Path
     topics: dict[str, BagTopic]  # by recorded name

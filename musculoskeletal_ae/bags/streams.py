@@ -53,7 +53,7 @@ class Pairs(NamedTuple):
     isolated: Ints  # 1 for isolated muscles, 0 for others, -1 if not recorded, (P, M)
 
     def at(self, rows: Ints | Bools | slice) -> 'Pairs':
-        """Return the pairs in some rows."""
+        """Return the pairs in some rows, which indices, a mask or a slice selects."""
         time, theta, length, tension, isolated = self
         return Pairs(time[rows], theta[rows], length[rows], tension[rows], isolated[rows])
 
@@ -265,7 +265,7 @@ class _ArmStreams:
 
 #: suspect the recording of another robot if messages are rejected for one of these reasons
 OTHER_ROBOT = 'wrong length', 'missing joint', 'missing motor', 'wrong layout'
-CHOOSE_ROBOT = 'choose the robot that was recorded'  # remedy for these reasons
+CHOOSE_ROBOT = 'choose the robot that was recorded'  # remedy for a reason in OTHER_ROBOT
 #: remedy if all messages of a topic are rejected for another reason
 CHECK_DRIVER = (
     'if this robot was recorded, correct what the driver publishes (check_driver names the fault), '

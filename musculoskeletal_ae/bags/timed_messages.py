@@ -62,7 +62,7 @@ def find_pauses(times: Iterable[Sequence[int] | Ints]) -> list[Pause]:
 
 
 class _Bunched(NamedTuple):
-    """A topic with bunched log times."""
+    """A topic whose messages were written late and in bunches, with its times to correct."""
 
     offset: int  # min(d) [ns], to be added to a publish time
     longest: int  # longest time by which a log time is later than the best time [ns]

@@ -30,7 +30,7 @@ class BagWriter:
     """
 
     def __init__(self, directory: Path, compression: str = 'zstd') -> None:
-        """Create the directory.
+        """Create the bag directory with an mcap file that contains no messages yet.
 
         Raises:
             BagError: If the directory exists and is not empty, cannot be written, or has a name
