@@ -32,7 +32,8 @@ class Kind(Enum):
 
 
 _METRES = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}  # size of each unit of length [m]
-#: size of each unit in SI units, by kind of quantity; the first unit is the default
+#: accept these units for each kind of quantity, with the size of each in SI units; the first one is
+#: the default
 UNITS: dict[Kind, dict[str, float]] = {
     Kind.ANGLE: {'rad': 1.0, 'deg': np.pi / 180.0, '°': np.pi / 180.0},
     Kind.TRAVEL: _METRES,

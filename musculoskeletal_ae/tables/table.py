@@ -116,7 +116,10 @@ class Table:
                 usable &= ~missing
         if not usable.any():
             why = ', '.join(f'{reason}: {n} rows' for reason, n in left_out.items())
-            raise TableError(f'no row is usable ({why or "there is none"}); record the readings')
+            raise TableError(
+                f'no row is usable ({why or "the table is empty"}); a usable row has all lengths '
+                'and tensions, and at least one joint position'
+            )
         when = when[usable] - (0.0 if time is None else when[usable][0])
         if (back := np.flatnonzero(np.diff(when) < 0.0)).size:
             row = int(np.flatnonzero(usable)[back[0]]) + 1
