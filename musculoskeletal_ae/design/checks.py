@@ -45,7 +45,9 @@ from musculoskeletal_ae.schema import Strict
 #: report a fault if the muscles hold the arm in less than this share of the postures, or if it is
 #: stiff enough in less than this share
 REQUIRED_SHARE = 0.95
-REQUIRED_STIFFNESS = 5.0  # require this joint stiffness, or less if the load is small [N·m/rad]
+#: require this smallest eigenvalue of the joint stiffness [N·m/rad], or less if the load of the
+#: joints is small (STIFFNESS_PER_LOAD)
+REQUIRED_STIFFNESS = 5.0
 #: require no more stiffness than this multiple of the largest load of a joint [1/rad]: a change of
 #: that load by a tenth then moves no joint by more than 0.05 rad
 STIFFNESS_PER_LOAD = 2.0
@@ -65,7 +67,9 @@ SHORT_ARM = 0.015
 #: tolerate this share of postures in which a muscle acts with the wrong sign, or a joint lacks
 #: muscles on one side
 TOLERATED_SHARE = 0.05
-LEAST_DETOUR = 1e-6  # regard a smaller length added by wrapping as a rounding error [m]
+#: conclude that a tendon touches a wrapped object if the object lengthens its route by more than
+#: this [m]; less is a rounding error
+LEAST_DETOUR = 1e-6
 LONGEST_ARM = 1.0  # warn about a longer moment arm [m]: its points are probably in millimetres
 #: report a fault if half of the muscles have a longer moment arm than this [m]: all points are then
 #: in millimetres
@@ -104,11 +108,11 @@ class Setting(NamedTuple):
     """A robot in N postures, with the quantities that determine holding and stiffness."""
 
     robot: Robot
-    theta: Array  # [rad], (N, D)
-    jacobian: Array  # G [m/rad], (N, M, D)
-    hessian: Array  # ∂²l/∂θ² [m/rad²], (N, M, D, D)
+    theta: Array  # joint angles [rad], (N, D)
+    jacobian: Array  # muscle Jacobian G = ∂l/∂θ [m/rad], (N, M, D)
+    hessian: Array  # its derivative ∂²l/∂θ² [m/rad²], (N, M, D, D)
     torque: Array  # g + K θ − b + h, which holds the arm against weight and springs [N·m], (N, D)
-    weight: Array  # g [N·m], (N, D)
+    weight: Array  # torque g that holds the arm against its weight [N·m], (N, D)
     springs: Array  # stiffness of springs and passive tendons [N·m/rad], (N, D, D)
 
     @classmethod

@@ -37,7 +37,7 @@ BALANCED = 0.01
 class Equilibria(NamedTuple):
     """Postures and tensions of N equilibria."""
 
-    theta: Array  # [rad], (N, D)
+    theta: Array  # joint angles [rad], (N, D)
     tension: Array  # T [N], (N, M); NaN where no equilibrium was found
     missing: Array  # torque that is not balanced [N·m], (N, D); 0 where an equilibrium was found
     gradient: Array  # ∂(g + K θ − b)/∂θ [N·m/rad], (N, D, D)

@@ -31,7 +31,7 @@ PENALTY = 10.0
 START_SPREAD = 0.2  # start the search with this standard deviation of the variables x
 TRIES = 40  # evaluate this many candidates for each of the 3P coordinates of the via points
 RESOLUTION = 1e-4  # round displacements of via points to this step [m]
-THIN = 0.003  # draw muscles this wide in the picture [m]
+THIN = 0.003  # draw muscles this wide in the picture of old and new routes [m]
 
 
 def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array, float, float]:
