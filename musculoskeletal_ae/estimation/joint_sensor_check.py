@@ -293,7 +293,7 @@ class JointSensorCheck:
         Args:
             joints: The joints whose sensors may be false, (D,).
             excess: x of these messages [rad], (N, D).
-            usual: Medians and spreads of earlier messages.
+            usual: What is usual on the healthy arm, from earlier messages.
         """
         mae, spread = self._mae, usual.residual_spread
         assert mae is not None

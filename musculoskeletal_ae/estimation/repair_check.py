@@ -44,7 +44,9 @@ class RepairCheck(NamedTuple):
     theta: Array | None  # θ from joint sensors [rad], (D,), or None without them
     demand: Array | None  # tensions that the newest command demands [N], (M,); None if unknown
     jumping: Collection[int]  # indices of the muscles whose lengths have just jumped
-    limit: float  # largest |l − l'| [m]; infinite while the length offsets are unknown
+    #: largest legal difference |l − l'| of a length from the predicted one [m]; infinite while the
+    #: length offsets are unknown
+    limit: float
 
     def problem(self, muscle: int) -> str:
         """Return why a muscle must not be used yet, as a text for users; '' if it may be used."""

@@ -268,7 +268,7 @@ class LengthDisagreement(Detector):
         Args:
             muscle: Index of the muscle whose length differs most.
             sample: The readings.
-            change: Difference of each length from what is usual [m], (M,).
+            change: Change of each length difference since the arm was healthy [m], (M,).
             largest: The limits of these differences.
         """
         lowest = slack_tension(self._robot.tension.bias[muscle])

@@ -85,7 +85,7 @@ class ModuleFollowing(Detector):
         count = self._complete_robot.muscle_count
         self._evidence: Array = np.zeros(count)  # time of evidence [s]
         self._length: Array | None = None  # l in the previous message [m]
-        self._difference: Array | None = None  # smoothed difference from the command
+        self._difference: Array | None = None  # smoothed difference from the command [N or m]
         self._speed: Array = np.zeros(count)  # smoothed dl/dt [m/s]
 
     def step(self, observation: Observation) -> Finding | None:

@@ -185,8 +185,8 @@ class LengthCalibration:
             theta: Measured joint angles [rad], (D,), or None without joint sensors.
 
         Returns:
-            CALIBRATING if `offsets` are to be used from now on, CALIBRATED if they also count as
-            known, which ends the calibration, or None.
+            CALIBRATING if `offsets` are to be used from now on; CALIBRATED if they are also known,
+            which ends the calibration; None if nothing changes.
         """
         has_failed = self.is_standing and (self._problem or self._collector.has_moved_away)
         if has_failed:

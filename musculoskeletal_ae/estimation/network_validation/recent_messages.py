@@ -16,8 +16,8 @@ LEAST = 20  # skip the checks on recent messages if there are fewer than this
 
 class _Message(NamedTuple):
     time: float  # time on the steady clock [s]
-    tension: Array  # T [N], (M,)
-    length: Array  # l [m], (M,)
+    tension: Array  # tensions as read [N], (M,)
+    length: Array  # muscle lengths [m], (M,)
     sliding: Array  # s: direction in which each tendon slid last, (M,)
     theta: Array  # measured θ [rad], NaN if it was not measured, (D,)
 
