@@ -83,7 +83,7 @@ class LengthOffsets:
 
     @classmethod
     def unknown(cls, muscle_count: int) -> LengthOffsets:
-        """Return offsets that nothing has determined: all are 0 and count as unknown."""
+        """Return unknown offsets, which nothing has determined; they are 0 until then."""
         return cls(np.zeros(muscle_count), np.full(muscle_count, UNKNOWN))
 
     def __eq__(self, other: object) -> bool:

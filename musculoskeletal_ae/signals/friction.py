@@ -154,8 +154,8 @@ class FrictionDirection:
     gain g is low, and noise is averaged. While it slides, g rises, and L follows l without the
     delay of a low-pass filter.
 
-    The remaining noise of L must not count as sliding. A tendon therefore counts as sliding only
-    when L leaves a dead band of ±NOISE √(g / (2 − g)) [m], which then moves with L.
+    The remaining noise of L must not look like sliding. A tendon is therefore regarded as sliding
+    only when L leaves a dead band of ±NOISE √(g / (2 − g)) [m], which then moves with L.
 
     Outliers have little effect, because each reading is limited to the range of the two readings
     before it, extended by SPIKE on both sides.
