@@ -33,8 +33,9 @@ class SlowMoments:
     def reset(self) -> None:
         """Reset the detector: discard all readings, for example after a jump of the clock."""
         self._time = 0.0  # time of the newest reading since the start of the period [s]
-        self._readings: list[tuple[float, Sample]] = []  # of the moment that has not ended
-        self._slowest: tuple[float, Sample] | None = None  # speed and mean of a moment
+        self._readings: list[tuple[float, Sample]] = []  # times and readings of the present moment
+        #: speed [rad/s] and mean of the slowest moment of this period so far
+        self._slowest: tuple[float, Sample] | None = None
 
     def step(self, reading: Sample, dt: float) -> Sample | None:
         """Add a reading; return the slowest moment when a period ends, otherwise None.

@@ -108,7 +108,7 @@ class TrainerProcess(Trainer):
         """Train on one of `parameters.DEVICES`, or on the CPU if that device is not available."""
         super().__init__(robot, preset, seed)
         self._device = device
-        self.restarts = 0  # number of processes lost
+        self.restarts = 0  # number of training processes that were lost and restarted
         self._mae: Mae | None = None
         self._job: Job | None = None
         self._process: SpawnProcess | None = None
