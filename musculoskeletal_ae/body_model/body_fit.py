@@ -54,7 +54,7 @@ class BodyFit:
         self._is_prior_confirmed = False
         rng = np.random.default_rng([seed, 0x3E])
         self._probe = robot.random_postures(PROBES, rng), held_tensions(robot, PROBES, rng)
-        self._mean_length = self._probe_lengths()  # [m], (M,)
+        self._mean_length = self._probe_lengths()  # mean length of each muscle [m], (M,)
 
     def is_of_another_arm(self, observed: Observations) -> bool:
         """Return whether samples contradict the body that was fitted to the network.

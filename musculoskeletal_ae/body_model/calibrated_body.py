@@ -56,10 +56,11 @@ class Layout:
         self.points = points  # indices of the muscle's route points
         #: factor with which each line between consecutive route points counts in the length
         self.weights = weights
-        self.attachment = slice(0, end)  # δ [m]
+        self.attachment = slice(0, end)  # errors δ of the attachment points [m]
         #: κ: logarithms of force, rate and wire_stretch relative to their nominal values
         self.elastic = slice(end, end + 3)
-        self.friction, self.offset, self.creep = end + 3, end + 4, end + 5  # μ; o, r [m]
+        #: tendon friction μ, length offset o [m], and creep r per sample [m]
+        self.friction, self.offset, self.creep = end + 3, end + 4, end + 5
         #: γ, b/T_limit and F/T_limit of `Transmission` where motor currents are measured
         self.drive = slice(end + 6, end + 6 + 3 * with_drive)
         self.size = self.drive.stop
@@ -68,8 +69,8 @@ class Layout:
 class Poses(NamedTuple):
     """Poses of pinocchio's joints in the root link's frame, and the extra length from wrapping."""
 
-    rotation: Array  # (N, J, 3, 3)
-    translation: Array  # [m], (N, J, 3)
+    rotation: Array  # rotation matrices of the J joints, (N, J, 3, 3)
+    translation: Array  # positions of the joints [m], (N, J, 3)
     detour: Array  # length that wrapping adds to the straight lines of the nominal body [m], (N, M)
 
 
@@ -85,7 +86,7 @@ class CalibratedBody:
         """
         self.robot, routes = robot, robot.routes
         self._has_drive, limit = robot.tension_source.is_current, robot.description.tension.limit
-        #: units of the parameters of a drive: γ, b and F, (3, M)
+        #: units of the constants γ, b and F of motor currents: 1, T_limit and T_limit, (3, M)
         self.drive_units: Array = np.array([np.ones_like(limit), limit, limit])
         self.layouts = list[Layout]()
         for m in range(robot.muscle_count):

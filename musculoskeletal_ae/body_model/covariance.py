@@ -79,7 +79,7 @@ def estimate_covariance(
 def drive_covariance(body: CalibratedBody, fit: FittedBody) -> Array | None:
     """Return the posterior covariances of each motor current's scale, offset and friction.
 
-    `Transmission` explains the constants. All samples together count as at most
+    `Transmission` explains the constants. All samples together have the weight of at most
     INDEPENDENT_SAMPLES samples, because errors of the body model are common to all of them.
 
     Returns:

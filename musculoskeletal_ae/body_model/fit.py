@@ -48,9 +48,10 @@ class FittedBody(NamedTuple):
 
     #: measured minus computed lengths [m], (N, M), at measured angles, or else at fitted ones
     residual: Array
-    noise: Array  # σ of each muscle's length [m], (M,)
-    weight: Array  # ω in (0, 1], (N, M); 0 where a sample does not describe a muscle
-    theta: Array  # fitted postures [rad], (N, D)
+    noise: Array  # standard deviation σ of each muscle's length [m], (M,)
+    #: robust weights ω of the lengths, (N, M); 0 where a sample does not describe a muscle
+    weight: Array
+    theta: Array  # fitted postures of the samples [rad], (N, D)
     #: for each group, its muscles and R; (RᵀR)⁻¹ is the covariance of w, z and e (`postures`)
     root: list[tuple[Ints, Array]]
 

@@ -195,8 +195,8 @@ class Stops:
 
         Args:
             own: θ [rad], (N, D).
-            repeated: Number of readings of each joint's sensor that together count as a single
-                independent one, (D,).
+            repeated: Number of readings of each joint's sensor that together have the weight of a
+                single independent one, (D,).
         """
         goal = np.where(np.isnan(self._at), np.clip(own, self._lower, self._upper), self._at)
         is_pulled = ~np.isnan(self._at) | (goal != own)

@@ -46,11 +46,12 @@ class Residuals(NamedTuple):
     """Residuals of lengths, torques, angles and gravity, and their derivatives, at one point."""
 
     length: Array  # residuals of the lengths [m], (N, M)
-    muscle_jacobian: Array  # G [m/rad], (N, M, D)
-    by_body: list[Array]  # ∂l/∂w of each muscle, (N, its parameters)
+    muscle_jacobian: Array  # muscle Jacobian G [m/rad], (N, M, D)
+    by_body: list[Array]  # derivatives of each muscle's length by its parameters, (N, parameters)
     torque: Array  # residuals of the torques τ [N·m], (N, D)
-    torque_by_body: Array  # −∂τ/∂w, (N, D, W)
-    torque_by_springs: Array  # −∂τ/∂(α, β) of the S joints with springs, (N, D, 2S)
+    torque_by_body: Array  # negative derivatives of τ by the W parameters of all muscles, (N, D, W)
+    #: negative derivatives of τ by α and β of the S joints with springs, (N, D, 2S)
+    torque_by_springs: Array
     #: median over the samples of the sum of the muscles' absolute torques at each joint [N·m], (D,)
     load: Array
     angle: Array  # residuals of the angles [rad], (N, D); 0 where no angle was measured
@@ -67,7 +68,7 @@ class Bent(NamedTuple):
     """
 
     theta: Array  # postures of the last evaluation [rad], (N, D)
-    stiffness: Array  # Σ T ∂²l/∂θ² [N·m/rad], (N, D, D)
+    stiffness: Array  # joint stiffness Σ T ∂²l/∂θ² at these postures [N·m/rad], (N, D, D)
 
     @classmethod
     def unknown(cls, count: int, joint_count: int) -> Bent:

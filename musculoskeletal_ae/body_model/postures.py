@@ -79,10 +79,10 @@ TYPICAL_STEP = 0.3  # scale the damping of the solver to changes of an angle by 
 class Weights(NamedTuple):
     """Weights of all residuals: robust weights ω, divided by the variances."""
 
-    length: Array  # (N, M)
-    torque: Array  # (N, D)
-    angle: Array  # (N, D)
-    gravity: Array  # (N, 3J)
+    length: Array  # of the lengths [1/m²], (N, M)
+    torque: Array  # of the torque balances [1/(N·m)²], (N, D)
+    angle: Array  # of the measured angles [1/rad²], (N, D); 0 where none was measured
+    gravity: Array  # of the directions of gravity, (N, 3J); 0 where none was measured
 
 
 class PosturePoint(NamedTuple):
@@ -96,9 +96,11 @@ class GroupFit:
     """Fits parameters and postures of one group of joints and muscles, as a `gauss_newton.Problem`.
 
     Attributes:
-        noise: σ of each muscle's length [m], (M,).
-        weight: ω of each length in (0, 1]; 0 where a sample does not describe a muscle, (N, M).
-        usual: Inverse squares of typical steps of θ (D,) and of (w, z, e).
+        noise: Standard deviation σ of each muscle's length [m], (M,).
+        weight: Robust weight ω of each length in (0, 1], (N, M); 0 where a sample does not describe
+            a muscle.
+        usual: Inverse squares of typical steps of θ, (D,), and of (w, z, e), by which the solver
+            damps its steps.
     """
 
     def __init__(

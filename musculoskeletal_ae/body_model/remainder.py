@@ -76,11 +76,11 @@ JITTER = 1e-10  # add this variance to keep covariances positive definite [m²]
 class Lengths(NamedTuple):
     """Lengths of the N samples of one group, relative to the prior mean of the body."""
 
-    theta: Array  # θ [rad], (N, D)
-    tension: Array  # T or T_read [N], (N, M)
-    deviation: list[Array]  # l − l(θ, T; w̄) of each muscle [m], (N,)
+    theta: Array  # joint angles θ [rad], (N, D)
+    tension: Array  # tension readings T or T_read [N], (N, M)
+    deviation: list[Array]  # measured length minus that of the prior mean body [m], (N,) each
     by_body: list[Array]  # J S: derivatives of lengths by w, times the prior spreads [m], (N, P)
-    weight: Array  # robust weights ω, (N, M)
+    weight: Array  # robust weights ω of the lengths, (N, M)
 
     @classmethod
     def of(
