@@ -89,7 +89,7 @@ class Metadata(Strict, frozen=True):
     #: duration of motion in the touch statistics [s]; None if there are no touch statistics
     touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None
     uncertain: bool  # whether the covariance of the estimates is included
-    drive: bool = False  # whether γ, b and F of motor currents are included
+    drive: bool = False  # whether learned constants of motor currents are included
     elastic: bool = False  # whether learned springs of the joints are included
     #: index of the base of each group's block, or of the block itself; () if none has a base
     bases: Annotated[tuple[Count, ...], Meta(max_length=1000)] = ()

@@ -59,10 +59,10 @@ def anomaly(error: Array) -> Array:
 class AnomalyStatistics:
     """Mean and covariance of the residuals e = (T_est − T, l_est − l) over healthy data."""
 
-    mean: Array  # mean μ of e, (2M,)
-    covariance: Array  # covariance Σ of e, symmetric and positive definite, (2M, 2M)
+    mean: Array  # mean μ of the residuals e, (2M,)
+    covariance: Array  # their covariance Σ, symmetric and positive definite, (2M, 2M)
     calibrated: bool  # whether enough data of the real arm, in its present state, are included
-    samples: int  # number of residuals e from which mean and covariance were computed
+    samples: int  # number of messages from which mean and covariance were computed
     #: thresholds of the detectors, by name; all are finite
     thresholds: Mapping[str, float] = field(default_factory=dict)
     #: θ [rad] (K, D) of healthy postures far apart from each other; K may be 0
@@ -111,8 +111,8 @@ class TouchStatistics:
     #: root mean square of the estimated τ_ext of the healthy moving arm [N·m], (D,); positive
     spread: Array
     time: float = 0.0  # duration of the motion in which `spread` was measured [s]
-    #: γ, b [N] and F [N] of motor currents (`signals.friction.Transmission`), (3, M); None for
-    #: tension sensors
+    #: scale error γ, offset b [N] and friction F [N] of motor currents, (3, M), as
+    #: `signals.friction.Transmission` explains; None for tension sensors
     drive: Array | None = None
     #: covariances of γ, b and F, (M, 3, 3); None for tension sensors
     drive_covariance: Array | None = None

@@ -122,7 +122,7 @@ class PairError(NamedTuple):
     mask: Mask
     output: str  # 'theta', 'tension' or 'length'
     unit: str  # unit of `norm` and `elements`
-    norm: float  # mean over samples of the L2 norm
+    norm: float  # mean over the states of the error's Euclidean norm
     elements: Array  # mean absolute error of each joint or muscle, (D,) or (M,)
 
 
