@@ -153,9 +153,9 @@ class TaughtMotion(NamedTuple):
     """A demonstrated motion of D joints, as the N points of a trajectory."""
 
     joints: tuple[str, ...]
-    time: Array  # including LEAD_TIME to reach the first posture [s], (N,)
-    position: Array  # [rad or m], (N, D)
-    velocity: Array  # [rad/s or m/s], zero at both ends, (N, D)
+    time: Array  # time of each point since the start, which includes LEAD_TIME [s], (N,)
+    position: Array  # positions of the joints [rad or m], (N, D)
+    velocity: Array  # velocities of the joints, zero at both ends [rad/s or m/s], (N, D)
 
 
 def taught_motion(bag: Bag, topic: str, start: int, stop: int) -> TaughtMotion:

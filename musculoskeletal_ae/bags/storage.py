@@ -68,9 +68,9 @@ def reading(file: Path, remedy: str = DAMAGED) -> Iterator[None]:
 class BagTopic:
     """A topic of a recording: its name, its type, and whether its messages can be used."""
 
-    name: str  # absolute, as recorded
-    type: str
-    qos: list[Qos] = field(default_factory=list)  # offered profiles
+    name: str  # absolute name, as recorded
+    type: str  # message type, such as 'sensor_msgs/msg/Imu'
+    qos: list[Qos] = field(default_factory=list)  # QoS profiles that its publishers offered
     encoding: str = CDR  # encoding of its messages
     schema: Schema | None = None  # the recorded definition of the type
     problem: str = ''  # why its messages cannot be used; '' if they can
@@ -90,10 +90,10 @@ class BagTopic:
 class BagMessage(NamedTuple):
     """A recorded message, still serialized, with its times."""
 
-    topic: str  # absolute name
+    topic: str  # absolute name of its topic
     log_time: int  # time of reception [ns]
     publish_time: int  # time of publication [ns]; 0 if not recorded
-    data: bytes  # serialized
+    data: bytes  # the message, serialized with the encoding of its topic
     file: Path  # the storage file that contains it
 
 

@@ -47,9 +47,9 @@ class Pairs(NamedTuple):
     """P pairs, each of a muscle message and of the joint angles at the same time."""
 
     time: Array  # time since the bag's start [s], (P,)
-    theta: Array  # θ [rad], (P, D); NaN for joints without a sensor or with a false reading
-    length: Array  # l [m], (P, M)
-    tension: Array  # T [N], (P, M)
+    theta: Array  # joint angles [rad], (P, D); NaN for joints without a sensor or a right reading
+    length: Array  # muscle lengths [m], (P, M)
+    tension: Array  # tensions [N], (P, M)
     isolated: Ints  # 1 for isolated muscles, 0 for others, -1 if not recorded, (P, M)
 
     def at(self, rows: Ints | Bools | slice) -> 'Pairs':
@@ -61,10 +61,10 @@ class Pairs(NamedTuple):
 class Streams(NamedTuple):
     """Sensor data and commands of one arm; missing topics are empty series."""
 
-    joints: Series  # usable θ [rad], (N, D); NaN where a joint has no usable reading
+    joints: Series  # usable joint angles [rad], (N, D); NaN where a joint has no usable reading
     muscles: Series  # the quantities of muscle modules (`signals/muscle_readings.py`), (N, Q, M)
-    length_commands: Series  # l_target [m], (N, M)
-    tension_commands: Series  # T_target [N], (N, M)
+    length_commands: Series  # target lengths of the muscle modules [m], (N, M)
+    tension_commands: Series  # target tensions of the muscle modules [N], (N, M)
     isolated: Series  # 1 for isolated muscles, else 0, (N, M)
     rejected: Counter[str]  # rejected messages by topic and reason
     ignored: Counter[str]  # unused parts of messages by topic and part

@@ -64,8 +64,8 @@ def find_pauses(times: Iterable[Sequence[int] | Ints]) -> list[Pause]:
 class _Bunched(NamedTuple):
     """A topic whose messages were written late and in bunches, with its times to correct."""
 
-    offset: int  # min(d) [ns], to be added to a publish time
-    longest: int  # longest time by which a log time is later than the best time [ns]
+    offset: int  # add this to a publish time to get the best time [ns]: the smallest delay, min(d)
+    longest: int  # log times are later than the best times by at most this [ns]
 
 
 class TimedMessages:
