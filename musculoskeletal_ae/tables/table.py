@@ -65,7 +65,7 @@ class Table:
         """Return a table of arrays.
 
         Rows without any joint position, and rows in which a length, a measured tension or the time
-        is missing, are left out and counted.
+        is missing, are left out; `left_out` has their number.
 
         Args:
             robot: The robot, which gives the order of joints and muscles.
