@@ -142,13 +142,13 @@ class RobotCheck:
     """Results of `check_robot` in N postures."""
 
     setting: Setting
-    moment_arms: Array  # r [m], (N, M, D)
+    moment_arms: Array  # moment arm r of each muscle at each joint [m], (N, M, D)
     tension: Array  # holding tension [N], (N, M); NaN where the posture is not held
     missing_torque: Array  # torque that the muscles lack to hold a posture [N·m], (N, D)
     stiffness: Array  # smallest joint-stiffness eigenvalue [N·m/rad], (N,); NaN if not held
-    #: like `stiffness`, but muscles at the tension that their modules maintain count as slack, (N,)
+    #: like `stiffness`, but without muscles at the tension that their modules maintain, (N,)
     one_sided: Array
-    required: float  # required stiffness [N·m/rad]
+    required: float  # smallest eigenvalue of the joint stiffness that is required [N·m/rad]
     matters: Array  # smallest moment arm with which a muscle acts on each joint [m], (D,)
     softest: Ints  # index of the softest joint in each posture that is held but not stiff
     faults: tuple[CheckFinding, ...] = ()  # reasons why the arm is not sound; empty if it is sound
@@ -297,8 +297,8 @@ class ArmTerms(NamedTuple):
     """
 
     scale: float  # factor from a moment arm in metres to the shown number [1/m]
-    unit: str  # unit of the shown number
-    name: str
+    unit: str  # unit of the shown number, 'mm' or '%'
+    name: str  # what the number is called, such as 'moment arm'
     other: str  # where to route a muscle that must act in the other direction
     better: str  # where to route a muscle for a larger moment arm
     guided: str  # how to keep a tendon on one side of the joint, as the end of a sentence, or ''

@@ -38,9 +38,9 @@ class Equilibria(NamedTuple):
     """Postures and tensions of N equilibria."""
 
     theta: Array  # joint angles [rad], (N, D)
-    tension: Array  # T [N], (N, M); NaN where no equilibrium was found
+    tension: Array  # tensions [N], (N, M); NaN where no equilibrium was found
     missing: Array  # torque that is not balanced [N·m], (N, D); 0 where an equilibrium was found
-    gradient: Array  # ∂(g + K θ − b)/∂θ [N·m/rad], (N, D, D)
+    gradient: Array  # derivative of the torque of weight and springs by θ [N·m/rad], (N, D, D)
 
 
 def is_suspended(robot: Robot) -> bool:
