@@ -94,10 +94,10 @@ class Estimator:
         stream: Converts messages into samples.
         mae: The network in use, without the isolated muscles; None before the first.
         complete_mae: The same network with all muscles.
-        health: The detectors.
+        health: Checks each message with all detectors.
         suspects: The latched finding and its verification.
         calibration: The running length calibration, or None.
-        contact: The contact estimator.
+        contact: Estimates the external load, and detects contact.
         healthy_torque: Measures the external torque that is wrongly estimated without contact.
         mounting: Checks the direction of gravity.
         networks: Decides which network is used.

@@ -292,7 +292,7 @@ class JointSensorCheck:
 
         Args:
             joints: The joints whose sensors may be false, (D,).
-            excess: x of these messages [rad], (N, D).
+            excess: Deviations x of the sensors in these messages [rad], (N, D).
             usual: What is usual on the healthy arm, from earlier messages.
         """
         mae, spread = self._mae, usual.residual_spread
@@ -332,7 +332,7 @@ class JointSensorCheck:
         Args:
             joints: The joints, (D,).
             trust: The new trust in each of them.
-            excess: x of the newest messages [rad], (N, D).
+            excess: Deviations x of the sensors in the newest messages [rad], (N, D).
         """
         old = self.trust
         trusts = tuple(trust if is_it else each for is_it, each in zip(joints, old.trust))

@@ -18,9 +18,9 @@ S is summed over the newest n postures, and the evidence is the largest one of a
 turned while the arm works is thus found as soon as one that was wrong from the beginning. Earlier
 postures are discarded once the newest ones show the direction of `robot.urdf`.
 
-A posture counts only if it differs from the last one that counted. An arm that stands still, with
+A posture is used only if it differs from the last one that was used. An arm that stands still, with
 the same friction all the time, therefore adds no evidence. At the stop of a joint, the muscles need
-not hold the weight: a residual counts there only if the stop would have to pull.
+not hold the weight: a residual is used there only if the stop would have to pull.
 """
 
 from __future__ import annotations
@@ -128,8 +128,8 @@ class MountingCheck:
         """Reset the check: discard all evidence, for example after a reset by the user."""
         self.tilt: Tilt | None = None
         self.evidence = 0.0
-        self._counted_at = np.full(self._robot.joint_count, np.inf)  # last θ that counted
-        self._since = SPACING  # time since the last posture that counted [s]
+        self._counted_at = np.full(self._robot.joint_count, np.inf)  # last posture that was used
+        self._since = SPACING  # time since the last posture that was used [s]
         #: terms of S for each posture, newest first, (noise levels, payloads, directions)
         self._costs: deque[Array] = deque(maxlen=MEMORY)
 

@@ -21,8 +21,8 @@ likely are named as well, because in one posture, muscles that span the same joi
 anomaly equally well. If tendons are slack, only they can be suspect.
 
 Slack. While a slack tendon is being wound in, its measured length is longer than the restored
-length, and messages do not count. The measured length of a ruptured tendon is shorter than the
-restored length, so its messages do count.
+length, and messages are no evidence. The measured length of a ruptured tendon is shorter than the
+restored length, so its messages are evidence.
 """
 
 import math
@@ -79,8 +79,8 @@ class ResidualDistance(Detector):
 
         Args:
             robot: The nominal body.
-            slack: The detector that knows which slack tendons are being wound in. Meanwhile,
-                messages do not count. If it is None, all messages count.
+            slack: The detector that knows which slack tendons are being wound in. Messages from
+                this time are ignored. With None, no message is ignored.
         """
         self._robot = self._complete_robot = robot
         self._slack = slack
@@ -161,9 +161,9 @@ class ResidualDistance(Detector):
     def unfamiliarity(self, theta: Array) -> float:
         """Return how far a posture is from the nearest one in which the detector was calibrated.
 
-        The result is 1 if every joint differs by a quarter of its range; in between, the root sum
-        square over the joints decides. Above 1, the posture is unfamiliar. Without calibrated
-        postures, the result is 0.
+        The distance is the root sum square of the joints' differences, each divided by the joint's
+        range. It is divided by 0.25 (NEAR), so that a posture is unfamiliar above 1. Without
+        calibrated postures, the result is 0.
 
         Args:
             theta: Joint angles [rad], (D,).
@@ -199,7 +199,7 @@ class ResidualDistance(Detector):
             observation: The message.
             distance: Residual distance d of the message.
             has_slack: Whether a tendon is slack, so that the threshold does not grow.
-            waits: Whether the message does not count, because a slack tendon is being wound in.
+            waits: Whether the message is ignored, because a slack tendon is being wound in.
         """
         if not self.is_calibrated:
             return ''

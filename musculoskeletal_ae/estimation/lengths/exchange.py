@@ -11,12 +11,12 @@ putting the columns back makes their lengths continue those before the silence. 
 and no sign does this for several lengths, and the readings do not fit the learned body, then these
 lengths have lost their offsets.
 
-Anomaly score. If muscles are exchanged, putting the two columns back restores the usual A in all
-recent messages (`signals/wiring.py`). A network that has learned the arm is exact enough for this.
-With any other network, the length calibration judges the order, because the arm moves meanwhile.
-Shortly after a silence, wrong signs are judged in this way as well: a length near 0 changes by
-little when its sign is reversed. Without a silence, no driver has restarted, and a length offset
-that has been lost could look like a wrong sign.
+Anomaly score. If muscles are exchanged, putting the two columns back restores the usual anomaly
+score A in all recent messages (`signals/wiring.py`). A network that has learned the arm is exact
+enough for this. With any other network, the length calibration judges the order, because the arm
+moves meanwhile. Shortly after a silence, wrong signs are judged in this way as well: a length near
+0 changes by little when its sign is reversed. Without a silence, no driver has restarted, and a
+length offset that has been lost could look like a wrong sign.
 """
 
 import math

@@ -11,7 +11,7 @@ is therefore judged (`signals/wiring.py`), and a wrong one is refused with the n
 A standing arm does not show the wiring.
 
 If an arm stands still, some offsets explain its readings even if it does not stand in the stated
-posture. They count as known only if the joint sensors, where there are any, measure that posture.
+posture. They are known only if the joint sensors, if there are any, measure that posture.
 """
 
 from __future__ import annotations

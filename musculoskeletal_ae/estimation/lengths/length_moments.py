@@ -2,9 +2,9 @@
 """Collects the readings for a length calibration: means over short windows, called moments.
 
 Tendon friction changes its sign with the direction of motion. The moments therefore have to cover
-many postures, reached from different sides. A moment of a moving arm counts only if the arm has
-moved since the previous moment, but not so fast that inertial forces matter. The moments of an arm
-that stands in a stated posture count until the arm moves.
+many postures, reached from different sides. A moment of a moving arm is kept only if the arm has
+moved since the previous moment, but not so fast that inertial forces matter. If the arm is to stand
+in a stated posture, moments are kept until it moves.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks how exactly a candidate network restores the readings of recent messages.
 
-Three errors are compared: those of the tensions and lengths that the network restores from both
-(mask ②), and that of the lengths that it computes at the joint angles estimated by ② (mask ①).
-The limit of the median error of each muscle is WORSE times that of the network in use, but at least
-FLOOR.
+Three errors are compared. With mask ②, the network estimates joint angles from tensions and
+lengths, and restores both: two errors. With mask ①, it computes the lengths at these joint angles:
+the third error. The median error of each muscle over the messages must be below WORSE times that
+of the network in use, or below FLOOR.
 """
 
 from collections.abc import Iterable, Iterator

@@ -77,7 +77,7 @@ AFFINE = 1000
 
 
 class PostureCheck:
-    """Fixed random states of one robot, and the errors of networks on them.
+    """Checks networks on fixed random states of the geometric model of one robot.
 
     Attributes:
         theta: Joint angles [rad], (N, D).

@@ -111,7 +111,9 @@ class CheckpointValidator:
             self.rejected(mae, str(error))
 
     def propose(self, mae: Mae, clock: Callable[[], float]) -> Iterator[None]:
-        """Decide in steps of some milliseconds, between which a node can do other work.
+        """Propose a candidate of the learner: decide on it as `decide` does, but in steps.
+
+        Each step takes some milliseconds, so that a node can do other work in between.
 
         Args:
             mae: The candidate. Nothing is decided if it is the network in use.
@@ -251,9 +253,9 @@ class CheckpointValidator:
             raise GateError(f'{error}{self._likely_cause}') from error
 
     def trial(self, mae: Mae, is_chosen: bool = False) -> Iterator[None]:
-        """Check a network in steps of some milliseconds, between which a node can do other work.
+        """Try a network: check it as `check` does, but in steps of some milliseconds.
 
-        `check` describes the arguments and the error.
+        A node can do other work between the steps. `check` describes the arguments and the error.
         """
         faults, steps = list[str](), self._steps(mae.without(self.isolated), is_chosen)
         while True:
