@@ -95,7 +95,7 @@ class Transmission:
 
         Args:
             read: Readings T_read [N], (..., M).
-            direction: Sliding directions s, (..., M).
+            direction: Last sliding directions s: 1 for winding in, −1 for paying out, (..., M).
         """
         if self.drive is None:
             return read
@@ -110,7 +110,7 @@ class Transmission:
 
         Args:
             read: Readings T_read [N], (M,).
-            direction: Sliding directions s, (M,).
+            direction: Last sliding directions s: 1 for winding in, −1 for paying out, (M,).
         """
         if self.drive is None or self.drive_covariance is None:
             return np.zeros_like(read)
@@ -125,7 +125,7 @@ class Transmission:
 
         Args:
             read: Readings T_read [N], (..., M).
-            direction: Sliding directions s, (..., M).
+            direction: Last sliding directions s: 1 for winding in, −1 for paying out, (..., M).
         """
         end: Array = self.motor(read, direction) * np.exp(-self.friction * direction)
         return end
@@ -135,7 +135,7 @@ class Transmission:
 
         Args:
             motor: Motor-side tensions T [N], (..., M).
-            direction: Sliding directions s, (..., M).
+            direction: Last sliding directions s: 1 for winding in, −1 for paying out, (..., M).
         """
         if self.drive is None:
             return motor

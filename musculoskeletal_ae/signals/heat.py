@@ -194,7 +194,7 @@ class Heat:
         """Process one measurement of all modules.
 
         Args:
-            tension: T [N], (M,).
+            tension: Tensions T [N], (M,).
             housing: Temperatures of the housings [°C], (M,); unknown where not finite.
             dt: Time since the previous measurement [s].
         """

@@ -93,9 +93,9 @@ def judge(
 
     Args:
         robot: The geometric model.
-        theta: Measured θ [rad], (N, D). Messages with NaN are not used.
-        length: l [m], (N, M).
-        tension: T [N], (N, M).
+        theta: Measured joint angles θ [rad], (N, D). Messages with NaN are not used.
+        length: Muscle lengths l [m], (N, M).
+        tension: Tensions T [N], (N, M).
         used: Muscles to judge by, (M,); None for all. Their lengths must have the right sign.
         segments: Number of the segment to which each message belongs, (N,); None for one segment.
             Short segments reduce the effect of drifting lengths.
@@ -166,9 +166,9 @@ def stuck_sensors(
     Args:
         robot: The geometric model.
         time: Times of the messages [s], (N,).
-        theta: Measured θ [rad], (N, D).
-        length: l [m], (N, M).
-        tension: T [N], (N, M).
+        theta: Measured joint angles θ [rad], (N, D).
+        length: Muscle lengths l [m], (N, M).
+        tension: Tensions T [N], (N, M).
         used: Muscles to judge by, (M,); None for all.
     """
     used = np.ones(robot.muscle_count, dtype=bool) if used is None else used

@@ -71,7 +71,8 @@ class JointSeries(NamedTuple):
     """The usable readings of joint sensors in a series of N messages.
 
     Attributes:
-        theta: θ [rad], (N, D), without whole turns; NaN where a reading is unknown or not usable.
+        theta: Joint angles θ without whole turns [rad], (N, D); NaN where a reading is unknown or
+            not usable.
         share: Share of the messages with at least one false reading, in [0, 1].
         text: Description of the false readings for users; '' if there are none.
         remedy: What to do about them, for users.
@@ -102,7 +103,7 @@ def judge_series(robot: Robot, time: Array, theta: Array) -> JointSeries:
     Args:
         robot: The robot.
         time: Times of the messages [s], (N,), in order.
-        theta: Measured θ [rad], (N, D), with NaN for joints that a message does not name.
+        theta: Measured joint angles θ [rad], (N, D); NaN for joints that a message does not name.
     """
     usable = theta.copy()
     turned = _subtract_turns(robot, time, usable)
@@ -146,7 +147,7 @@ def _subtract_turns(robot: Robot, time: Array, theta: Array) -> list[tuple[int, 
     Args:
         robot: The robot.
         time: Times of the messages [s], (N,).
-        theta: Measured θ [rad], (N, D), which is changed in place.
+        theta: Measured joint angles θ [rad], (N, D), which is changed in place.
 
     Returns:
         The number of changed readings of each joint, with a text about it.
@@ -187,7 +188,7 @@ def _drop_constants(robot: Robot, time: Array, theta: Array) -> list[tuple[int, 
     Args:
         robot: The robot.
         time: Times of the messages [s], (N,).
-        theta: Measured θ [rad], (N, D), which is changed in place.
+        theta: Measured joint angles θ [rad], (N, D), which is changed in place.
 
     Returns:
         The number of readings of each false constant, with a text about it.
@@ -224,7 +225,7 @@ def _has_wrong_scale(time: Array, theta: Array, is_outside: Bools) -> bool:
 
     Args:
         time: Times of the messages [s], (N,).
-        theta: Measured θ [rad], (N, D).
+        theta: Measured joint angles θ [rad], (N, D).
         is_outside: Which readings are far outside the limits, (N, D).
     """
     for j in np.flatnonzero(is_outside.any(axis=0)).tolist():
@@ -239,7 +240,7 @@ def _has_wrong_scale(time: Array, theta: Array, is_outside: Bools) -> bool:
 
 
 def _interrupting(which: Ints, readings: Array, largest: Array) -> list[int]:
-    """Return the constants that interrupt other readings.
+    """Return the numbers of the constants (repeated values) that interrupt other readings.
 
     Args:
         which: Number of the constant that each message has, (N,).

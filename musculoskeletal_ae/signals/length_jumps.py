@@ -219,7 +219,7 @@ class LengthJumps:
         show how far the arm has moved until the next message.
 
         Args:
-            length: Lengths as measured [m], (M,). One that is not finite counts as unchanged.
+            length: Lengths as measured [m], (M,). One that is not finite is taken as unchanged.
             used: Which muscles to check, (M,).
             now: Time of reception by a steady clock [s].
             delay: How late the message is (`Arrival.delay`) [s].
@@ -279,12 +279,12 @@ class LengthJumps:
         return LENGTH_JUMPED, f'{self._robot.muscles[muscle]} by {1e3 * jump.change[muscle]:.0f} mm'
 
     def use_body(self, body: BodyState, is_calibrated: bool) -> None:
-        """Use another body state: isolated muscles no longer count as displaced.
+        """Use another body state: remove its isolated muscles from `displaced`.
 
         Args:
             body: The body state.
-            is_calibrated: Whether new length offsets have been calibrated. Then no muscle counts
-                as displaced, and no rupture is presumed.
+            is_calibrated: Whether new length offsets have been calibrated. Then `displaced` is
+                emptied, and no rupture is presumed any more.
         """
         if is_calibrated:
             self._rupture.forget()

@@ -26,7 +26,8 @@ class Paired(Generic[Message]):
         time: Time of reception of the message [s].
         message: The message as the caller passed it.
         dt: Time since the previous message [s]; 0 for the first.
-        theta: θ [rad], (D,), NaN for joints without a matching value; None if no joint has a match.
+        theta: Joint angles θ [rad], (D,); NaN for joints without a matching value. None if no joint
+            has one.
     """
 
     time: float

@@ -195,7 +195,7 @@ def judge(
 
     Args:
         lengths: The lengths of a model.
-        theta: Measured θ [rad], (N, D). Messages with NaN are not used.
+        theta: Measured joint angles θ [rad], (N, D). Messages with NaN are not used.
         length: l as read [m], (N, M).
         tension: T as read [N], (N, M).
         segments: Number of the segment to which each message belongs, (N,); None for one segment.
