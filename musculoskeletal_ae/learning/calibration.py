@@ -11,7 +11,7 @@ margin is `MARGIN`, and n_few is `FEW_SAMPLES`.
 A reservoir keeps a uniform random selection of all messages, from motion and from rest. Each new
 network gets the statistics of its own residuals on these messages. The thresholds use the maximum,
 because friction gives d heavy tails. This maximum includes messages that were not used to
-compute Σ. Single messages far beyond all others count as sensor glitches and are excluded.
+compute Σ. Single messages far beyond all others are regarded as sensor glitches and excluded.
 
 If joint sensors read all angles, the network also learns from every second recent message
 (`update`). The other recent messages serve to validate its estimates.
@@ -94,7 +94,7 @@ class Reservoir:
     def step(self, reading: Sample, dt: float) -> None:
         """Add a message to the selection with a probability that keeps the selection uniform.
 
-        Only one message in SPACING [s] is considered; all others are ignored.
+        Only one message in 0.1 s (SPACING) is considered; all others are ignored.
 
         Args:
             reading: The message, with NaN for unmeasured θ.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gives up the readings of joint sensors that the estimator does not use.
+"""Removes the angles of joint sensors from samples while the estimator does not use the sensors.
 
 The estimator doubts a sensor some time after its fault, and publishes when the doubt begins
 (`signals/joint_trust.py`). Samples of the doubtful time then lose the angle of this joint. They

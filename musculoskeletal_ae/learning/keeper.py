@@ -35,7 +35,7 @@ class Publication:
 
     Attributes:
         checkpoint: The newest checkpoint; None before the first.
-        count: Number of checkpoints released.
+        count: Number of checkpoints published so far.
     """
 
     def __init__(self) -> None:

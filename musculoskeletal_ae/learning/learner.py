@@ -53,7 +53,7 @@ from musculoskeletal_ae.signals.pairing import Paired
 
 
 class Learner:
-    """Learns the body of one arm.
+    """Learns the body of one arm online: collects samples from messages, and updates the network.
 
     Attributes:
         robot: The nominal body.
@@ -138,9 +138,9 @@ class Learner:
 
         Args:
             time: Time of the measurements [s].
-            theta: θ [rad], (D,), or None if it was not measured.
-            tension: T [N], (M,).
-            length: l [m], (M,).
+            theta: Joint angles θ [rad], (D,), or None if it was not measured.
+            tension: Tensions T [N], (M,).
+            length: Muscle lengths l [m], (M,).
 
         Returns:
             A checkpoint if one is due for publication, else None.
