@@ -167,14 +167,14 @@ class CalibratedBody:
         return Transmission(self.frictions(), self.drive)
 
     def end(self, m: int, tension: Array, direction: Array) -> tuple[Array, Array]:
-        """Return one muscle's bone-side tension T_end [N] (N,), and its derivatives by μ and drive.
+        """Return the bone-side end tension T_end of muscle `m` [N], (N,), and its derivatives.
 
         The derivatives are ∂T_end/∂(μ, γ, b/T_limit, F/T_limit), (N, 4), or, if the robot has
         tension sensors, ∂T_end/∂μ alone, (N, 1).
 
         Args:
-            m: The muscle.
-            tension: T or T_read [N], (N,).
+            m: Index of the muscle.
+            tension: Tension readings T or T_read [N], (N,).
             direction: Direction of sliding s, (N,).
         """
         passed = np.exp(-self.friction(m) * direction)
@@ -221,8 +221,8 @@ class CalibratedBody:
         The lengths do not include creep (see `crept`).
 
         Args:
-            theta: θ [rad], (N, D).
-            tension: T or T_read [N], (N, M).
+            theta: Joint angles θ [rad], (N, D).
+            tension: Tension readings T or T_read [N], (N, M).
             direction: Directions s of sliding in [−1, 1], (N, M) each. 0 lies midway between
                 winding in and paying out.
         """

@@ -64,10 +64,10 @@ def fit_body(
 ) -> FittedBody:
     """Fit the parameters of a body in place, together with the samples' postures.
 
-    The fit starts from the present parameters. A muscle counts as changed if at least
-    LEAST_BEFORE_CHANGE samples no longer describe it, although it was not isolated when they were
-    taken. Such a muscle is first fitted to these earlier samples, and the result is the prior mean
-    of its new parameters.
+    The fit starts from the present parameters. A muscle has been changed, by a repair or a
+    replacement, if at least LEAST_BEFORE_CHANGE samples no longer describe it, although it was not
+    isolated when they were taken. Such a muscle is first fitted to these earlier samples, and the
+    result is the prior mean of its new parameters.
 
     Args:
         body: The body.

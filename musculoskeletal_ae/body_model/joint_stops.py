@@ -171,7 +171,7 @@ class Stops:
         """Return which joints are free of their stops, so that their torques must balance.
 
         Args:
-            own: θ [rad], (N, D).
+            own: Joint angles θ of the group [rad], (N, D).
             score: Residual torque at each joint relative to its usual size, (N, D). A positive
                 torque pushes the joint towards its upper limit.
 
@@ -194,7 +194,7 @@ class Stops:
         a joint limit.
 
         Args:
-            own: θ [rad], (N, D).
+            own: Joint angles θ of the group [rad], (N, D).
             repeated: Number of readings of each joint's sensor that together have the weight of a
                 single independent one, (D,).
         """

@@ -241,8 +241,8 @@ def group_remainder(
         joints: Joints of the group.
         muscles: Muscles of the group.
         lengths: The samples.
-        start: Logarithms of a, b, e, c, ν and σ from which the search starts; None to search from
-            the beginning.
+        start: Logarithms of the six constants (see UNITS) from which the search starts; None to
+            start from STARTS.
     """
     ranges = (robot.upper - robot.lower)[joints]
     scale = np.concatenate([ranges, robot.tension.limit[muscles]])
