@@ -169,8 +169,8 @@ def _rejected(bag: Bag, streams: Streams) -> list[str]:
 def _silences(bag: Bag, topics: dict[str, str], times: dict[str, array[int]]) -> list[str]:
     """Return a fault for each topic of readings that is silent while others are recorded.
 
-    A recorder may lose a topic in the middle of a recording. Times in which nothing was recorded
-    are not counted here.
+    A recorder may lose a topic in the middle of a recording. Pauses of the whole recording are not
+    reported here.
 
     Args:
         bag: The recording.

@@ -52,7 +52,7 @@ class _Document(Struct):
 
 
 def offered_qos(latched: bool, reliable: bool = True) -> Qos:
-    """Return the QoS profile of a publisher.
+    """Return the QoS profile that a publisher offers.
 
     Args:
         latched: Whether subscribers that join later receive the last message.
