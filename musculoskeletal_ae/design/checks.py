@@ -10,10 +10,11 @@ For postures drawn uniformly within the joint limits, the check computes
 
 A tendon parallel to the axis of a prismatic joint has r = RACK (`robot/joint_units.py`).
 
-doc/explanation/method.md ("An arm must be holdable") defines a sound arm. A joint with a spring
-or a passive tendon may have muscles on one side only, if these muscles can hold the joint. The
-report also shows the one-sided stiffness, for information only. There, muscles at the tension that
-their modules maintain (T_bias, or 0 for position-controlled modules) count as slack.
+An arm without faults is called sound; doc/explanation/method.md ("An arm must be holdable") states
+the requirements. A joint with a spring or a passive tendon may have muscles on one side only, if
+these muscles can hold the joint. The report also shows the one-sided stiffness, for information
+only. It regards muscles at the tension that their modules maintain (T_bias, or 0 for
+position-controlled modules) as slack.
 
 A suspended robot, such as a platform that hangs on four tendons, is judged in its equilibria only
 (`equilibria.py`), and need only be stable there.

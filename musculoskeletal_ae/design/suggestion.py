@@ -37,8 +37,8 @@ THIN = 0.003  # draw muscles this wide in the picture of old and new routes [m]
 def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array, float, float]:
     """Suggest a change of the via points that makes a robot sound.
 
-    A muscle that changes the sign of its main action more often than before counts as a failed
-    requirement as well.
+    A change after which a muscle acts in the wrong direction in more postures than before is not
+    accepted either.
 
     Args:
         robot: The robot.
