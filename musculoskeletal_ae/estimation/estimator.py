@@ -69,7 +69,7 @@ class Output(NamedTuple):
         state: Joint angles, tensions and lengths that the network estimates from the readings.
         covariance: Covariance of the joint angles [rad²], (D, D), or None if it is unknown.
         anomaly: Anomaly score A: the size of the network's residual, in scaled units.
-        detected: Whether this message has led to a finding that is now latched.
+        detected: Whether this message made a detector report a fault, which was then latched.
         contact: External load; None while the length offsets are unknown, on a robot whose tensions
             are unknown, and for a message that follows the last checked one within 6 ms (SPACING).
     """
@@ -95,7 +95,7 @@ class Estimator:
         mae: The network in use, without the isolated muscles; None before the first.
         complete_mae: The same network with all muscles.
         health: Checks each message with all detectors.
-        suspects: The latched finding and its verification.
+        suspects: The latched fault that a detector found, and the verification of its muscle.
         calibration: The running length calibration, or None.
         contact: Estimates the external load, and detects contact.
         healthy_torque: Measures the external torque that is wrongly estimated without contact.
@@ -473,7 +473,7 @@ class Estimator:
             now: Time on the steady clock [s].
 
         Returns:
-            Whether a finding has been latched.
+            Whether a detector has found a fault, and the anomaly has been latched.
         """
         dt, sent_apart = min(self._unchecked, LONGEST_STEP), self._unchecked_sent
         self._unchecked = self._unchecked_sent = 0.0

@@ -191,7 +191,7 @@ class Heat:
         return self._rests[key]
 
     def step(self, tension: Array, housing: Array, dt: float) -> None:
-        """Process one measurement of all modules.
+        """Update the temperatures with one measurement of all modules.
 
         Args:
             tension: Tensions T [N], (M,).
