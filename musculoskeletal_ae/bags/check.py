@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check a recording: contents, completeness and fit to a robot (`replay --check`)."""
+"""Checks a recording: contents, completeness and fit to a robot (`replay --check`)."""
 
 from __future__ import annotations
 
@@ -28,16 +28,18 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.wiring import Wiring, judge
 
 MOST_REJECTED = 0.1  # report a fault if a larger share of a topic's messages is rejected
-#: do not report these reasons of rejection as a fault: lengths were being calibrated, or another
-#: program publishes its own joints on the topic
+#: report no fault, however many messages are rejected for these reasons: lengths were being
+#: calibrated, or another program publishes its own joints on the topic
 USUAL_REJECTIONS = 'length offsets unknown', 'missing joint', 'missing motor'
-READINGS = 'joint_states', 'muscle_states'  # report a pause of these topics as a fault
+#: report a fault if one of these topics pauses while others are recorded
+READINGS = 'joint_states', 'muscle_states'
+#: remedy for an unfinished recording
 _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 
 
 @dataclass
 class BagCheck:
-    """The report on the contents, completeness and fit of a recording."""
+    """Report on a recording: its contents, whether it is complete, and whether it fits a robot."""
 
     lines: list[str] = field(default_factory=list)  # texts on the contents of the recording
     faults: list[str] = field(default_factory=list)  # why the recording is incomplete or unfit
@@ -125,11 +127,11 @@ def _postures(robot: Robot, recording: Pairs, what: str, *, from_motion: bool = 
 
 
 def recorded_wiring(pairs: Pairs, robot: Robot) -> Wiring:
-    """Judge to which muscles the recorded columns belong, and which signs their lengths have.
+    """Return the wiring of a recording: to which muscle each column belongs, and with which sign.
 
     Column i of the arrays should belong to muscle i of the robot, but arrays carry no names. The
-    lengths are compared with those of the geometric model at the recorded joint angles. Columns
-    that were isolated at any time are not judged.
+    lengths are therefore compared with those of the geometric model at the recorded joint angles.
+    Columns of muscles that were isolated at any time are not judged.
     """
     straight = Wiring.straight(robot.muscle_count)
     if np.count_nonzero(np.isfinite(pairs.theta).all(axis=1)) < 2:
@@ -158,8 +160,8 @@ def _rejected(bag: Bag, streams: Streams) -> list[str]:
         total = bag.topics[label.partition(' as ')[0]].message_count
         if count > MOST_REJECTED * total and reason not in USUAL_REJECTIONS:
             faults.append(
-                f'{count / total:.0%} of the messages of {label} were rejected: {reason}. See '
-                'check_driver, mend the driver, and record again'
+                f'{count / total:.0%} of the messages of {label} were rejected: {reason}. Run '
+                'check_driver, correct the driver, and record again'
             )
     return faults
 
@@ -167,8 +169,8 @@ def _rejected(bag: Bag, streams: Streams) -> list[str]:
 def _silences(bag: Bag, topics: dict[str, str], times: dict[str, array[int]]) -> list[str]:
     """Return a fault for each topic of readings that is silent while others are recorded.
 
-    A recorder may lose a topic in the middle of a recording. Times in which nothing was recorded
-    are not counted here.
+    A recorder may lose a topic in the middle of a recording. Pauses of the whole recording are not
+    reported here.
 
     Args:
         bag: The recording.
@@ -213,7 +215,7 @@ def _contents(bag: Bag, times: dict[str, array[int]]) -> list[str]:
 class _Fit(NamedTuple):
     faults: list[str]  # reasons why the bag does not fit the robot
     notes: list[str]  # remarks on unused messages
-    motion: str = ''  # text on the motion that can be learned from
+    motion: str = ''  # text for users on how much the recorded motion teaches
     has_its_messages: bool = False  # whether the messages have the joints and muscles of the robot
 
 

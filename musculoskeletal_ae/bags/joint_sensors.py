@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Warnings about the joint sensors of a recording, for `train` and `replay --check`."""
+"""Finds faults of the joint sensors of a recording, for `train` and `replay --check`."""
 
 from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.robot.robot import Robot
@@ -12,10 +12,10 @@ from musculoskeletal_ae.signals.joint_sensors import (
     stuck_sensors,
 )
 
-#: judge parts of a recording with this duration separately, because lengths may drift from one part
-#: to the next [s]
+#: compare joint angles and lengths only within parts of a recording of this duration [s], because
+#: lengths may drift from one part to the next
 SEGMENT = 30.0
-#: by kind of fault, what was observed and what to do
+#: text for users by kind of fault: what was observed, and what to do
 TEXTS = {
     SIGN: (
         'the lengths fit only if the sign of these joint sensors is reversed: {names}. '

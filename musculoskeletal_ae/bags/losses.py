@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Count the messages that a recorder has missed, by the sequence numbers of their publishers."""
+"""Counts the messages that a recorder has missed, by the sequence numbers of their publishers."""
 
 from collections import Counter
 from collections.abc import Callable
 
-#: sequence numbers of middleware that does not number messages
+#: ignore these sequence numbers, which come from middleware that does not number messages
 UNNUMBERED = 0, (1 << 64) - 1
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read mcap files with the library mcap, with limits on size and disorder."""
+"""Reads mcap files with the library mcap, with limits on size and disorder."""
 
 from __future__ import annotations
 
@@ -32,12 +32,13 @@ from musculoskeletal_ae.bags.storage import (
 )
 from musculoskeletal_ae.exceptions import BagError
 
-MAGIC = b'\x89MCAP0\r\n'  # first and last bytes of a file
+MAGIC = b'\x89MCAP0\r\n'  # recognise an mcap file by its first bytes, a complete one by its last
 LARGEST_RECORD = 64 << 20  # refuse a larger record or decompressed chunk [bytes]
-# Refuse a file that decompresses to more than MOST_EXPANDED bytes plus LARGEST_EXPANSION times its
-# size. A malicious file of a few kB could otherwise take hours to read.
+#: Refuse a file that decompresses to more than MOST_EXPANDED bytes plus LARGEST_EXPANSION times its
+#: size. A malicious file of a few kB could otherwise take hours to read.
 MOST_EXPANDED, LARGEST_EXPANSION = 8 << 20, 100
 
+#: remedy if log times go back
 _JUMP = 'record again without `replay --loop`, a second publisher of /clock, or other jumps of time'
 _LONGEST_QOS = 10_000  # ignore longer QoS profiles, as YAML [characters]
 
@@ -55,7 +56,7 @@ class _Span(NamedTuple):
 
 
 class McapFile:
-    """An mcap file. If its recorder was killed, it is read up to the last complete record."""
+    """Reads an mcap file, up to the last complete record if its recorder was killed."""
 
     def __init__(self, path: Path) -> None:
         """Read the whole file and verify its checksums.

@@ -11,14 +11,14 @@ from typing import Any
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-TYPESTORE = get_typestore(Stores.ROS2_JAZZY)
-# No sequence in the messages of this package is nearly as long. The size of a message is a further
-# limit.
+TYPESTORE = get_typestore(Stores.ROS2_JAZZY)  # decode all messages with these types
+# Refuse messages with a longer sequence: no sequence in the messages of this package is nearly as
+# long. The size of a message is a further limit.
 TYPESTORE.max_sequence_length = 1 << 26
 
 CDR = 'cdr'  # the message encoding of ROS 2
 MSG = 'ros2msg'  # the encoding of definitions in .msg format
-#: whether a CDR message is little-endian, by its first two bytes
+#: read from the first two bytes of a CDR message whether it is little-endian
 _LITTLE_ENDIAN = {b'\0\0': False, b'\0\1': True}
 #: refuse a longer definition [bytes]; those of the types in the interface are several times shorter
 _LONGEST_DEFINITION = 1 << 16
@@ -32,7 +32,7 @@ def definition(type_name: str) -> str:
 
 @cache
 def type_hash(type_name: str) -> str:
-    """Return the RIHS01 hash of a type."""
+    """Return the RIHS01 hash of a type, by which recorders identify its definition."""
     return TYPESTORE.hash_rihs01(type_name)
 
 
@@ -42,7 +42,7 @@ def is_known(type_name: str) -> bool:
 
 
 def decode(data: bytes, type_name: str) -> Any:
-    """Deserialize a message; raises various exceptions if the bytes do not fit the type.
+    """Decode a serialized message; raises various exceptions if the bytes do not fit the type.
 
     Surplus bytes after the message are ignored, because rmw_fastrtps sends its whole buffer. The
     type store's own `deserialize_cdr` would raise an error for them.
@@ -56,7 +56,7 @@ def decode(data: bytes, type_name: str) -> Any:
 
 
 def mismatch(type_name: str, encoding: str, text: bytes, recorded_hash: str) -> str:
-    """Return why messages of a recorded type cannot be decoded, '' if they can.
+    """Return the mismatch by which messages of a recorded type cannot be decoded; '' if they can.
 
     A recorder may store the RIHS01 hash and the definition of a type. Each of them that is stored
     must agree with the type of this name in ROS 2 Jazzy. Only definitions in .msg format are

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write metadata.yaml of a rosbag2 directory in version 9, and read the names of its files.
+"""Writes metadata.yaml of a rosbag2 directory in version 9, and reads the names of its files.
 
 The recorder writes metadata.yaml when recording starts and replaces it when recording ends. Readers
 of a bag take times and counts from the storage files instead.
@@ -25,12 +25,12 @@ from musculoskeletal_ae.bags.storage import CONVERT, NAME_A_BAG, BagTopic, readi
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.files import read_yaml
 
-FILE = 'metadata.yaml'
-VERSION = 9
-SUFFIXES = ('.mcap', '.db3')
+FILE = 'metadata.yaml'  # name of the file in a bag directory
+VERSION = 9  # write the format of metadata.yaml that ROS 2 Jazzy writes
+SUFFIXES = ('.mcap', '.db3')  # read files with these suffixes if metadata.yaml cannot be used
 
-_NO_TIME = (1 << 63) - 1  # [ns]; rosbag2's starting time of a bag without messages
-_FOREVER = QosTime(9223372036, 854775807)
+_NO_TIME = (1 << 63) - 1  # write this start of a bag without messages, as rosbag2 does [ns]
+_FOREVER = QosTime(9223372036, 854775807)  # QoS duration of a deadline that never passes
 
 
 class Contents(NamedTuple):
@@ -52,7 +52,7 @@ class _Document(Struct):
 
 
 def offered_qos(latched: bool, reliable: bool = True) -> Qos:
-    """Return the QoS profile of a publisher.
+    """Return the QoS profile that a publisher offers.
 
     Args:
         latched: Whether subscribers that join later receive the last message.
@@ -141,7 +141,7 @@ def _topic_entry(topic: BagTopic, type_hash: str) -> Mapping[str, Any]:
 
 
 def read_metadata(directory: Path) -> Contents:
-    """Return the storage files of a bag that metadata.yaml names.
+    """Read from metadata.yaml which storage files a bag has.
 
     If metadata.yaml is missing or invalid, all storage files in the directory are returned.
 

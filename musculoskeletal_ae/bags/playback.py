@@ -28,20 +28,21 @@ from musculoskeletal_ae.exceptions import BagError, MessageError
 from musculoskeletal_ae.message_reading import MOST_ENTRIES, target_values
 
 LONGEST_LAG = 1.0  # after a longer interruption, resume playback instead of catching up [s]
-#: after a skipped pause, go on this recorded time before the next message [ns]
+#: when a pause of the recording is skipped, continue at this recorded time before the next message
+#: [ns]
 SKIP_LEAD = 500_000_000
 
-TAUGHT_TOPIC = 'estimated_joint_states'
-# Standard deviation of the Gaussian weights that smooth a motion [s]. They keep the motion of a
-# hand, which takes longer, and remove noise, which varies faster.
+TAUGHT_TOPIC = 'estimated_joint_states'  # read a demonstrated motion from this topic
+#: Smooth a demonstrated motion by Gaussian weights of this standard deviation [s]. They keep the
+#: motion of a hand, which takes longer, and remove noise, which varies faster.
 SMOOTHING = 0.15
 SPACING = 0.1  # place the points of the trajectory at this interval [s]
-LEAD_TIME = 3.0  # move to the first posture in this time [s]
-SHORTEST_MOTION = 0.5  # refuse a shorter motion [s]
+LEAD_TIME = 3.0  # let the arm reach the first posture of the motion in this time [s]
+SHORTEST_MOTION = 0.5  # refuse to send a demonstrated motion that is shorter than this [s]
 
 
 def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
-    """Return the recorded times [ns] at which playback begins and ends.
+    """Return the window of a recording to play: the times [ns] at which it begins and ends.
 
     Args:
         bag: The recording.
@@ -61,7 +62,7 @@ def window(bag: Bag, start: float, duration: float | None) -> tuple[int, int]:
 
 
 def lap(messages: TimedMessages, start: int, stop: int) -> Iterator[BagMessage]:
-    """Yield the messages that playback publishes from one recorded time to another [ns].
+    """Yield the messages of one lap of playback, from one recorded time to another [ns].
 
     In these messages, the log time is the time at which to publish the message. The last message
     before `start` of each latched topic comes first, because a subscriber that joins at this time
@@ -152,9 +153,9 @@ class TaughtMotion(NamedTuple):
     """A demonstrated motion of D joints, as the N points of a trajectory."""
 
     joints: tuple[str, ...]
-    time: Array  # including LEAD_TIME to reach the first posture [s], (N,)
-    position: Array  # [rad or m], (N, D)
-    velocity: Array  # [rad/s or m/s], zero at both ends, (N, D)
+    time: Array  # time of each point since the start, which includes LEAD_TIME [s], (N,)
+    position: Array  # positions of the joints [rad or m], (N, D)
+    velocity: Array  # velocities of the joints, zero at both ends [rad/s or m/s], (N, D)
 
 
 def taught_motion(bag: Bag, topic: str, start: int, stop: int) -> TaughtMotion:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Open rosbag2 recordings and read their messages in chronological order.
+"""Opens rosbag2 recordings, and reads their messages in chronological order.
 
 bag = Bag.open('my_bag')
 for message in bag.messages(): …
@@ -29,9 +29,9 @@ from musculoskeletal_ae.bags.storage import (
 )
 from musculoskeletal_ae.exceptions import BagError
 
-ROS1_MAGIC = b'#ROSBAG V'  # first bytes of a bag file of ROS 1
+ROS1_MAGIC = b'#ROSBAG V'  # recognise a bag file of ROS 1, which is refused, by its first bytes
 MOST_HELD = 64 << 20  # hold messages of at most this size in memory to sort them [bytes]
-_OVERHEAD = 100  # count a message as this much larger than its data [bytes]
+_OVERHEAD = 100  # add this to the size of each message that is held in memory [bytes]
 
 
 @dataclass
@@ -100,7 +100,7 @@ class Bag:
         return heapq.merge(*ordered, key=lambda message: message.log_time)
 
     def decode(self, message: BagMessage) -> Any:
-        """Deserialize a message.
+        """Decode a message: deserialize it with the type of its topic.
 
         Raises:
             BagError: If the message does not fit the type of its topic.

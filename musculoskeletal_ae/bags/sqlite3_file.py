@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read sqlite3 files of rosbag2 with the library rosbags.
+"""Reads sqlite3 files of rosbag2 with the library rosbags.
 
 A recorder that was killed leaves a write-ahead log (`-wal`) with its last messages, or a journal
 (`-journal`) that undoes an incomplete change. The library ignores both. If one exists, this module
@@ -33,13 +33,14 @@ from musculoskeletal_ae.bags.storage import (
 )
 from musculoskeletal_ae.exceptions import BagError
 
-MAGIC = b'SQLite format 3\0'  # first bytes of a file
+MAGIC = b'SQLite format 3\0'  # recognise a sqlite3 file by its first bytes
+#: remedy for a damaged file
 RECOVER = f'{DAMAGED}, or save what can be read with `record --recover BAG`'
-MESSAGES = 'messages'  # table of the messages
-MOST_ROWS = 1 << 40  # give up the search for a readable row after this many ids
+MESSAGES = 'messages'  # name of the table that contains the messages
+MOST_ROWS = 1 << 40  # end the search for the next readable row after this many ids
 _ROWS = 'SELECT id, topic_id, timestamp, data FROM messages WHERE id >= ? ORDER BY id'
 _INSERT = 'INSERT INTO messages (id, topic_id, timestamp, data) VALUES (?, ?, ?, ?)'
-_LOGS = '-wal', '-journal'  # ends of the names of sqlite's logs of changes
+_LOGS = '-wal', '-journal'  # recognise sqlite's logs of changes by these ends of their names
 _DEFINITION_ENCODINGS = {
     MessageDefinitionFormat.NONE: '',
     MessageDefinitionFormat.MSG: MSG,
@@ -48,7 +49,7 @@ _DEFINITION_ENCODINGS = {
 
 
 class Sqlite3File:
-    """A sqlite3 file of rosbag2, a format without checksums."""
+    """Reads a sqlite3 file of rosbag2, a format without checksums."""
 
     has_checksums = False
 
@@ -135,7 +136,7 @@ def is_damaged(path: Path) -> bool:
 
 
 def logs_of(path: Path) -> list[Path]:
-    """Return the logs of changes that a recorder has left beside a file."""
+    """Return sqlite's logs of changes that a killed recorder has left beside a file."""
     logs = (path.with_name(f'{path.name}{end}') for end in _LOGS)
     return [log for log in logs if log.exists() and log.stat().st_size]
 
@@ -147,7 +148,7 @@ def _read_only(path: Path) -> closing[sqlite3.Connection]:
 
 
 def salvage(path: Path, target: Path) -> int:
-    """Copy the rows of a damaged file that sqlite can read to a new file.
+    """Salvage a damaged file: copy all rows that sqlite can read to a new file.
 
     Rows are read in the order of their ids. After a row that cannot be read, the next readable id
     is searched with steps that double, and then by bisection, because a damaged page contains

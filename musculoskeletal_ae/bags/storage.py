@@ -21,15 +21,16 @@ from musculoskeletal_ae.bags.message_types import CDR, mismatch
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.files import open_regular
 
-# The log times of a topic may go back by this much; more is a jump of the recorder's clock.
-LONGEST_DISORDER = 1_000_000_000  # [ns]
-# Messages of different topics may be out of order by this much, because a recorder that was paused
-# for this long then writes one topic after the other.
-LONGEST_PAUSE = 10_000_000_000  # [ns]
-LATEST = (1 << 63) - 1  # [ns]; the largest ROS time
+#: refuse a recording in which the log times of a topic go back by more than this [ns]: the clock of
+#: the recorder has jumped
+LONGEST_DISORDER = 1_000_000_000
+#: refuse a recording in which messages of different topics are out of order by more than this [ns];
+#: a recorder that was paused for a shorter time writes one topic after the other
+LONGEST_PAUSE = 10_000_000_000
+LATEST = (1 << 63) - 1  # the largest ROS time [ns]; stands for the end of any recording
 
 ROS1 = 'ros1'  # the message encoding of ROS 1
-DAMAGED = 'use a copy or another recording'
+DAMAGED = 'use a copy or another recording'  # remedy for a damaged recording
 #: remedy if a path is not a recording
 NAME_A_BAG = 'name a bag directory, or one mcap or sqlite3 file'
 #: remedy for messages of ROS 1; their definitions have to become those of ROS 2
@@ -39,6 +40,7 @@ CONVERT_ROS1 = (
 )
 #: problem and remedy of a recording of which nothing can be read
 EMPTY = 'contains no complete message', 'record again, or use another recording'
+#: remedy for a recording that is legal elsewhere, but cannot be read here
 CONVERT = 'convert it with `rosbags-convert` (of the Python package rosbags) or `ros2 bag convert`'
 
 _TOPIC_NAME = re.compile(r'(/[A-Za-z_]\w*)+', re.ASCII)
@@ -47,7 +49,7 @@ _LONGEST_NAME = 256  # refuse a longer name of a topic [characters]
 
 @contextmanager
 def reading(file: Path, remedy: str = DAMAGED) -> Iterator[None]:
-    """Turn every exception that reading a recording raises into a BagError with this remedy.
+    """Turn every exception raised while reading a recording into a BagError with this remedy.
 
     With damaged files, the libraries raise almost any type of exception, from struct.error to
     MemoryError.
@@ -64,11 +66,11 @@ def reading(file: Path, remedy: str = DAMAGED) -> Iterator[None]:
 
 @dataclass
 class BagTopic:
-    """A topic of a recording."""
+    """A topic of a recording: its name, its type, and whether its messages can be used."""
 
-    name: str  # absolute, as recorded
-    type: str
-    qos: list[Qos] = field(default_factory=list)  # offered profiles
+    name: str  # absolute name, as recorded
+    type: str  # message type, such as 'sensor_msgs/msg/Imu'
+    qos: list[Qos] = field(default_factory=list)  # QoS profiles that its publishers offered
     encoding: str = CDR  # encoding of its messages
     schema: Schema | None = None  # the recorded definition of the type
     problem: str = ''  # why its messages cannot be used; '' if they can
@@ -86,17 +88,17 @@ class BagTopic:
 
 
 class BagMessage(NamedTuple):
-    """A recorded message."""
+    """A recorded message, still serialized, with its times."""
 
-    topic: str  # absolute name
+    topic: str  # absolute name of its topic
     log_time: int  # time of reception [ns]
     publish_time: int  # time of publication [ns]; 0 if not recorded
-    data: bytes  # serialized
+    data: bytes  # the message, serialized with the encoding of its topic
     file: Path  # the storage file that contains it
 
 
 class StorageFile(Protocol):
-    """One file of a recording."""
+    """One mcap or sqlite3 file of a recording, from which messages are read."""
 
     path: Path
     topics: dict[str, BagTopic]  # by recorded name
@@ -134,7 +136,10 @@ def absolute(name: str) -> str:
 
 
 def topic_problem(topic: BagTopic, recorded_hash: str) -> str:
-    """Return why messages of a topic cannot be used; '' if they can."""
+    """Return the problem why messages of a topic cannot be used, for users; '' if they can.
+
+    The text continues a sentence that begins with the topic.
+    """
     if len(topic.name) > _LONGEST_NAME or not _TOPIC_NAME.fullmatch(topic.name):
         return 'has a name that is not legal in ROS'
     if topic.encoding != CDR:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The valid messages of a recording as arrays, for offline training."""
+"""Reads the valid messages of a recording as arrays, for offline training."""
 
 import heapq
 import math
@@ -37,23 +37,23 @@ from musculoskeletal_ae.signals.pairing import Pairing
 
 
 class Series(NamedTuple):
-    """The valid messages of a topic."""
+    """The times and values of the N valid messages of a topic."""
 
-    time: Array  # since the bag's start [s], (N,)
+    time: Array  # times since the bag's start [s], (N,)
     values: Array  # values of the N messages, one row for each
 
 
 class Pairs(NamedTuple):
-    """P pairs, each of joint angles and of the muscle lengths and tensions at the same time."""
+    """P pairs, each of a muscle message and of the joint angles at the same time."""
 
     time: Array  # time since the bag's start [s], (P,)
-    theta: Array  # θ [rad], (P, D); NaN for joints without a sensor or with a false reading
-    length: Array  # l [m], (P, M)
-    tension: Array  # T [N], (P, M)
+    theta: Array  # joint angles [rad], (P, D); NaN for joints without a sensor or a right reading
+    length: Array  # muscle lengths [m], (P, M)
+    tension: Array  # tensions [N], (P, M)
     isolated: Ints  # 1 for isolated muscles, 0 for others, -1 if not recorded, (P, M)
 
     def at(self, rows: Ints | Bools | slice) -> 'Pairs':
-        """Return the pairs in some rows."""
+        """Return the pairs in some rows, which indices, a mask or a slice selects."""
         time, theta, length, tension, isolated = self
         return Pairs(time[rows], theta[rows], length[rows], tension[rows], isolated[rows])
 
@@ -61,10 +61,10 @@ class Pairs(NamedTuple):
 class Streams(NamedTuple):
     """Sensor data and commands of one arm; missing topics are empty series."""
 
-    joints: Series  # usable θ [rad], (N, D); NaN where a joint has no usable reading
+    joints: Series  # usable joint angles [rad], (N, D); NaN where a joint has no usable reading
     muscles: Series  # the quantities of muscle modules (`signals/muscle_readings.py`), (N, Q, M)
-    length_commands: Series  # l_target [m], (N, M)
-    tension_commands: Series  # T_target [N], (N, M)
+    length_commands: Series  # target lengths of the muscle modules [m], (N, M)
+    tension_commands: Series  # target tensions of the muscle modules [N], (N, M)
     isolated: Series  # 1 for isolated muscles, else 0, (N, M)
     rejected: Counter[str]  # rejected messages by topic and reason
     ignored: Counter[str]  # unused parts of messages by topic and part
@@ -265,15 +265,16 @@ class _ArmStreams:
 
 #: suspect the recording of another robot if messages are rejected for one of these reasons
 OTHER_ROBOT = 'wrong length', 'missing joint', 'missing motor', 'wrong layout'
-CHOOSE_ROBOT = 'choose the robot that was recorded'
+CHOOSE_ROBOT = 'choose the robot that was recorded'  # remedy for a reason in OTHER_ROBOT
+#: remedy if all messages of a topic are rejected for another reason
 CHECK_DRIVER = (
     'if this robot was recorded, correct what the driver publishes (check_driver names the fault), '
     'and record again; otherwise choose the robot that was recorded'
 )
-#: topics of the body state; they are read before all others, because the recorder may have received
-#: a body state only after the first readings to which it applies
+#: read these topics, which contain the body state, before all others: the recorder may have
+#: received a body state only after the first readings to which it applies
 BODY_TOPICS = 'body_state', *EARLIER
-ISOLATED_ROW = 3  # row of a body state that tells which muscles are isolated
+ISOLATED_ROW = 3  # read from this row of a body state which muscles are isolated
 
 
 def read_streams(

@@ -30,14 +30,15 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LATEST, LONGEST_PAUSE, BagMessage
 from musculoskeletal_ae.report import duration
 
-# The log times of a topic count as bunched if all of the following conditions hold.
-FEW = 20  # it has at least this number of messages
-BUNCHED = 50_000_000  # the delays of its messages differ by more than this [ns]
-MANY = 0.1  # more than this fraction of its messages was written together with the message before
+# Use publish times instead of the log times of a topic, because it was written late and in bunches,
+# only if all of the following conditions hold.
+FEW = 20  # the topic has at least this many messages
+BUNCHED = 50_000_000  # its delays (log time minus publish time) differ by more than this [ns]
+MANY = 0.1  # more than this share of its messages was written together with the one before
 
 
 class Pause(NamedTuple):
-    """A time in which nothing was recorded."""
+    """A pause of more than 10 s (LONGEST_PAUSE), in which nothing was recorded."""
 
     begin: int  # log time of the last message before it [ns]
     end: int  # log time of the first message after it [ns]
@@ -61,10 +62,10 @@ def find_pauses(times: Iterable[Sequence[int] | Ints]) -> list[Pause]:
 
 
 class _Bunched(NamedTuple):
-    """A topic with bunched log times."""
+    """A topic whose messages were written late and in bunches, with its times to correct."""
 
-    offset: int  # min(d) [ns], to be added to a publish time
-    longest: int  # longest time by which a log time is later than the best time [ns]
+    offset: int  # add this to a publish time to get the best time [ns]: the smallest delay, min(d)
+    longest: int  # log times are later than the best times by at most this [ns]
 
 
 class TimedMessages:

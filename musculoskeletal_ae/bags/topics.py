@@ -12,21 +12,21 @@ from musculoskeletal_ae.robot.motors import ARRAY, FILE, JOINT_STATE, NO_MOTORS,
 
 
 class Topic(NamedTuple):
-    """One row of the table in doc/reference/topics_and_services.md."""
+    """A topic of the interface: one row of the table in doc/reference/topics_and_services.md."""
 
-    type: str
+    type: str  # message type, such as 'sensor_msgs/msg/JointState'
     latched: bool = False  # whether late joiners receive the last message
     #: whether it is an input from hardware, vision or user, or a command to the muscle modules; all
     #: other topics follow from these
     sent: bool = False
 
 
-DIAGNOSTICS = '/diagnostics'  # the only absolute name
-DEFAULT, ALL = 'default', 'all'  # selections of topics
+DIAGNOSTICS = '/diagnostics'  # the only topic of the interface with an absolute name
+DEFAULT, ALL = 'default', 'all'  # values of `--topics` that select several topics (`select`)
 
-TOPICS = read_table(__file__, 'topics.yaml', dict[str, Topic])
-SENT = [name for name, topic in TOPICS.items() if topic.sent]
-#: topics that recordings of earlier versions have instead of `body_state`
+TOPICS = read_table(__file__, 'topics.yaml', dict[str, Topic])  # the interface, by relative name
+SENT = [name for name, topic in TOPICS.items() if topic.sent]  # replay these topics by default
+#: read these topics instead of `body_state` from recordings of earlier versions
 EARLIER = {
     'isolated_muscles': Topic('std_msgs/msg/String', latched=True),
     'muscle_length_zeros': Topic(ARRAY, latched=True),

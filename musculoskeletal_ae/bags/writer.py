@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write a rosbag2 directory that remains readable up to the last flush if the writer is killed."""
+"""Writes a rosbag2 directory that remains readable up to the last flush if the writer is killed."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import EMPTY, BagTopic
 from musculoskeletal_ae.exceptions import BagError
 
+#: compression of the chunks of an mcap file, by the value of an option
 COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
-_LARGEST_CHUNK = 1 << 20  # end a chunk at this size, and begin the next one [bytes]
+_LARGEST_CHUNK = 1 << 20  # write a chunk to the file once it has reached this size [bytes]
 
 
 class BagWriter:
@@ -29,7 +30,7 @@ class BagWriter:
     """
 
     def __init__(self, directory: Path, compression: str = 'zstd') -> None:
-        """Create the directory.
+        """Create the bag directory with an mcap file that contains no messages yet.
 
         Raises:
             BagError: If the directory exists and is not empty, cannot be written, or has a name
@@ -165,7 +166,7 @@ class BagWriter:
 
 
 class Recovered(NamedTuple):
-    """The result of a recovery."""
+    """What the recovery of a damaged or unfinished recording has saved, and what it has not."""
 
     message_count: int  # number of messages in the new bag
     left_out: list[str]  # topics that were left out because their messages are not in CDR
@@ -173,7 +174,7 @@ class Recovered(NamedTuple):
 
 
 def recover(path: Path, target: Path, compression: str = 'zstd') -> Recovered:
-    """Write all readable messages of a recording to a new, finished bag.
+    """Recover a recording: write all readable messages to a new, finished bag.
 
     Raises:
         BagError: If no message can be read, or a bag cannot be read or written.

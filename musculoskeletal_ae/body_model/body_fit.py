@@ -18,15 +18,17 @@ from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-PROBES = 200  # average the length of each muscle over this many postures
-#: report a muscle as changed if at least this many of its newest samples contradict the body, all
-#: with residuals of the same sign
+#: measure by how much an update lengthens each muscle as the mean over this many random postures
+PROBES = 200
+#: report a muscle as changed if at least this many of its newest samples contradict the fitted
+#: body, all with length residuals of the same sign
 LEAST_NEWEST = 4
-LEAST_BEFORE = 8  # report it only if at least this many samples came before those
-#: count a sample as contradicting the body only if its residual is at least this large [m]
+#: report a muscle as changed only if at least this many samples came before the contradicting ones
+LEAST_BEFORE = 8
+#: conclude that a sample contradicts the body only if its length residual exceeds this [m]
 LEAST_CHANGE = 0.004
-#: count a sample as contradicting the body only if its residual has at least this many standard
-#: deviations
+#: conclude that a sample contradicts the body only if its length residual exceeds this many
+#: standard deviations
 OUTLIER = 6.0
 
 
@@ -52,7 +54,7 @@ class BodyFit:
         self._is_prior_confirmed = False
         rng = np.random.default_rng([seed, 0x3E])
         self._probe = robot.random_postures(PROBES, rng), held_tensions(robot, PROBES, rng)
-        self._mean_length = self._probe_lengths()  # [m], (M,)
+        self._mean_length = self._probe_lengths()  # mean length of each muscle [m], (M,)
 
     def is_of_another_arm(self, observed: Observations) -> bool:
         """Return whether samples contradict the body that was fitted to the network.
@@ -83,9 +85,9 @@ class BodyFit:
         return fit_body(self.body, observed, self._prior_mean, guess)
 
     def lengthened(self) -> Array:
-        """Return the growth of each muscle's mean length since the previous call [m], (M,).
+        """Return by how much each muscle has lengthened since the previous call [m], (M,).
 
-        The mean is taken over a fixed set of postures and tensions.
+        Its length is the mean over a fixed set of postures and tensions.
         """
         before, self._mean_length = self._mean_length, self._probe_lengths()
         return self._mean_length - before

@@ -33,11 +33,14 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.signals.friction import LARGEST_GAIN, Transmission
 
-#: permit no larger |γ|, |b|/T_limit and |F|/T_limit of `signals.friction.Transmission`
+#: clip the constants of a motor current, |γ|, |b|/T_limit and |F|/T_limit
+#: (`signals.friction.Transmission`), to these values
 LARGEST_DRIVE = np.array([LARGEST_GAIN, 1.0, 1.0])
-#: permit no larger |μ|: at this value, friction halves or doubles the tension along the route
+#: clip the tendon friction |μ| to this, at which friction halves or doubles the tension along the
+#: route
 LARGEST_FRICTION = 0.7
-LARGEST_LOG = 1.5  # permit no larger |κ|
+#: clip the logarithmic errors |κ| of the elastic constants to this, a factor of about 4.5
+LARGEST_LOG = 1.5
 
 
 class Layout:
@@ -53,10 +56,11 @@ class Layout:
         self.points = points  # indices of the muscle's route points
         #: factor with which each line between consecutive route points counts in the length
         self.weights = weights
-        self.attachment = slice(0, end)  # δ [m]
+        self.attachment = slice(0, end)  # errors δ of the attachment points [m]
         #: κ: logarithms of force, rate and wire_stretch relative to their nominal values
         self.elastic = slice(end, end + 3)
-        self.friction, self.offset, self.creep = end + 3, end + 4, end + 5  # μ; o, r [m]
+        #: tendon friction μ, length offset o [m], and creep r per sample [m]
+        self.friction, self.offset, self.creep = end + 3, end + 4, end + 5
         #: γ, b/T_limit and F/T_limit of `Transmission` where motor currents are measured
         self.drive = slice(end + 6, end + 6 + 3 * with_drive)
         self.size = self.drive.stop
@@ -65,8 +69,8 @@ class Layout:
 class Poses(NamedTuple):
     """Poses of pinocchio's joints in the root link's frame, and the extra length from wrapping."""
 
-    rotation: Array  # (N, J, 3, 3)
-    translation: Array  # [m], (N, J, 3)
+    rotation: Array  # rotation matrices of the J joints, (N, J, 3, 3)
+    translation: Array  # positions of the joints [m], (N, J, 3)
     detour: Array  # length that wrapping adds to the straight lines of the nominal body [m], (N, M)
 
 
@@ -82,7 +86,7 @@ class CalibratedBody:
         """
         self.robot, routes = robot, robot.routes
         self._has_drive, limit = robot.tension_source.is_current, robot.description.tension.limit
-        #: units of the parameters of a drive: γ, b and F, (3, M)
+        #: units of the constants γ, b and F of motor currents: 1, T_limit and T_limit, (3, M)
         self.drive_units: Array = np.array([np.ones_like(limit), limit, limit])
         self.layouts = list[Layout]()
         for m in range(robot.muscle_count):
@@ -121,11 +125,11 @@ class CalibratedBody:
         return springs.learned(self.robot.kinematics.elasticity, self.springs)
 
     def shift(self, m: int) -> Array:
-        """Return how far one muscle's route points are displaced (δ) [m], (P, 3)."""
+        """Return the shift δ of each of the P route points of muscle `m` [m], (P, 3)."""
         return self.parameters[m][self.layouts[m].attachment].reshape(-1, 3)
 
     def elastic(self, m: int) -> SeriesElastic:
-        """Return the elastic constants of one muscle as arrays of shape ()."""
+        """Return the fitted elastic constants of muscle `m`, as arrays of shape ()."""
         nominal = self.robot.series_elastic
         log = self.parameters[m][self.layouts[m].elastic]
         force, rate, stretch = np.exp(np.clip(log, -LARGEST_LOG, LARGEST_LOG))
@@ -138,13 +142,13 @@ class CalibratedBody:
         return np.array([self.friction(m) for m in range(len(self.layouts))])
 
     def friction(self, m: int) -> float:
-        """Return the tendon friction μ of one muscle."""
+        """Return the fitted tendon friction μ of muscle `m`, clipped to ±LARGEST_FRICTION."""
         value = self.parameters[m][self.layouts[m].friction]
         return float(np.clip(value, -LARGEST_FRICTION, LARGEST_FRICTION))
 
     @property
     def drive(self) -> Array | None:
-        """The constants γ, b [N] and F [N] of every muscle's motor current, (3, M).
+        """Scale error γ, offset b [N] and friction F [N] of every muscle's motor current, (3, M).
 
         `Transmission` explains them. The value is None if the robot has tension sensors.
         """
@@ -163,14 +167,14 @@ class CalibratedBody:
         return Transmission(self.frictions(), self.drive)
 
     def end(self, m: int, tension: Array, direction: Array) -> tuple[Array, Array]:
-        """Return one muscle's bone-side tension T_end [N] (N,), and its derivatives by μ and drive.
+        """Return the bone-side end tension T_end of muscle `m` [N], (N,), and its derivatives.
 
         The derivatives are ∂T_end/∂(μ, γ, b/T_limit, F/T_limit), (N, 4), or, if the robot has
         tension sensors, ∂T_end/∂μ alone, (N, 1).
 
         Args:
-            m: The muscle.
-            tension: T or T_read [N], (N,).
+            m: Index of the muscle.
+            tension: Tension readings T or T_read [N], (N,).
             direction: Direction of sliding s, (N,).
         """
         passed = np.exp(-self.friction(m) * direction)
@@ -217,8 +221,8 @@ class CalibratedBody:
         The lengths do not include creep (see `crept`).
 
         Args:
-            theta: θ [rad], (N, D).
-            tension: T or T_read [N], (N, M).
+            theta: Joint angles θ [rad], (N, D).
+            tension: Tension readings T or T_read [N], (N, M).
             direction: Directions s of sliding in [−1, 1], (N, M) each. 0 lies midway between
                 winding in and paying out.
         """

@@ -16,19 +16,21 @@ from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import TINY
 
-#: scale the covariance by validation messages only if there are at least this many
+#: scale the covariance to the network's actual errors on validation messages only if there are at
+#: least this many of them
 MANY_MESSAGES = 200
 #: Draw this many bodies from the posterior: many more than joints, because a covariance from few
 #: draws underestimates the errors of other draws.
 BODIES = 100
-POSTURES_PER_BODY = 10  # draw errors of each body at this many postures
+POSTURES_PER_BODY = 10  # draw estimation errors of each drawn body at this many postures
 #: Multiply the covariance by this factor if there are fewer than MANY_MESSAGES validation messages.
 #: It stands for errors that all samples share and no prior describes, for example where tendons
 #: wrap round bones. With this factor, the ellipsoids contain 95 % of the true angles on emulator
 #: model `foreign`, and on `kin` if no joint reaches its limits; if joints do, they are too large on
 #: `kin` (doc/limitations.md, `python -m bench covariance`).
 UNVALIDATED_FACTOR = 1.7
-CONTAINED_SHARE = 0.95  # the ellipsoid of a covariance has to contain this share of the errors
+#: scale a covariance so that its ellipsoid contains this share of the estimation errors
+CONTAINED_SHARE = 0.95
 
 
 def estimate_covariance(
@@ -77,7 +79,7 @@ def estimate_covariance(
 def drive_covariance(body: CalibratedBody, fit: FittedBody) -> Array | None:
     """Return the posterior covariances of each motor current's scale, offset and friction.
 
-    `Transmission` explains the constants. All samples together count as at most
+    `Transmission` explains the constants. All samples together have the weight of at most
     INDEPENDENT_SAMPLES samples, because errors of the body model are common to all of them.
 
     Returns:
@@ -141,7 +143,7 @@ def _drawn_errors(
 
 
 def _spread(error: Array) -> Array:
-    """Return a covariance whose 95 % ellipsoid contains 95 % of the errors (N, D).
+    """Return a covariance (D, D) whose 95 % ellipsoid contains 95 % of the errors (N, D).
 
     The ellipsoid of the plain covariance would contain less than 95 % of the errors, because they
     have heavier tails than a normal distribution.
@@ -160,9 +162,10 @@ def _excess(covariance: Array, error: Array) -> float:
 
 
 def ellipsoids(covariance: Array, error: Array) -> Array:
-    """Return by which factor the covariance must grow for its ellipsoid to reach each error, (N,).
+    """Return the factor by which the ellipsoid of a covariance must grow to reach each error, (N,).
 
-    The ellipsoid of a covariance contains the share CONTAINED_SHARE of its normal distribution.
+    The factor multiplies the covariance. The ellipsoid contains the share CONTAINED_SHARE of the
+    normal distribution with this covariance.
 
     Args:
         covariance: A covariance [rad²], (D, D).

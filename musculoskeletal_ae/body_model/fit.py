@@ -38,19 +38,20 @@ from musculoskeletal_ae.mae.mae import Mae
 ROUNDS = 30  # end the fit of one muscle after this many Gauss–Newton iterations
 #: end the fit of one muscle if an iteration lowers the cost by less than this, per measured length
 LEAST_DECREASE = 1e-11
-LEAST_NOISE = 0.0003  # assume at least this σ of a length at rest [m]
+LEAST_NOISE = 0.0003  # assume that lengths at rest have at least this standard deviation [m]
 #: derive a new prior for a changed muscle only from at least this many samples before the change
 LEAST_BEFORE_CHANGE = 8
 
 
 class FittedBody(NamedTuple):
-    """The noise, weights, postures and uncertainty that a fit has found."""
+    """Result of the fit of a body, besides its parameters, which are changed in place."""
 
     #: measured minus computed lengths [m], (N, M), at measured angles, or else at fitted ones
     residual: Array
-    noise: Array  # σ of each muscle's length [m], (M,)
-    weight: Array  # ω in (0, 1], (N, M); 0 where a sample does not describe a muscle
-    theta: Array  # fitted postures [rad], (N, D)
+    noise: Array  # standard deviation σ of each muscle's length [m], (M,)
+    #: robust weights ω of the lengths, (N, M); 0 where a sample does not describe a muscle
+    weight: Array
+    theta: Array  # fitted postures of the samples [rad], (N, D)
     #: for each group, its muscles and R; (RᵀR)⁻¹ is the covariance of w, z and e (`postures`)
     root: list[tuple[Ints, Array]]
 
@@ -63,10 +64,10 @@ def fit_body(
 ) -> FittedBody:
     """Fit the parameters of a body in place, together with the samples' postures.
 
-    The fit starts from the present parameters. A muscle counts as changed if at least
-    LEAST_BEFORE_CHANGE samples no longer describe it, although it was not isolated when they were
-    taken. Such a muscle is first fitted to these earlier samples, and the result is the prior mean
-    of its new parameters.
+    The fit starts from the present parameters. A muscle has been changed, by a repair or a
+    replacement, if at least LEAST_BEFORE_CHANGE samples no longer describe it, although it was not
+    isolated when they were taken. Such a muscle is first fitted to these earlier samples, and the
+    result is the prior mean of its new parameters.
 
     Args:
         body: The body.
@@ -138,7 +139,7 @@ def _reopened(
 
 
 class MusclePoint(NamedTuple):
-    """Parameters of one muscle, with residuals and derivatives."""
+    """A point of the fit of one muscle: its parameters, with residuals and derivatives."""
 
     parameters: Array  # w, fitted constants of the muscle, (P,)
     residual: Array  # measured minus computed lengths [m], (N, 1)
@@ -146,7 +147,7 @@ class MusclePoint(NamedTuple):
 
 
 class MuscleFit:
-    """Fits one muscle at known postures; a `gauss_newton.Problem`."""
+    """Fits the parameters of one muscle at known postures, as a `gauss_newton.Problem`."""
 
     def __init__(
         self,
@@ -179,7 +180,7 @@ class MuscleFit:
         return minimise(self, start, ROUNDS, enough).point.parameters
 
     def point(self, parameters: Array) -> MusclePoint:
-        """Return these parameters with their residuals and derivatives."""
+        """Return the point of the fit with these parameters."""
         m, observed = self._m, self._observed
         of_all = list(self._body.parameters)
         of_all[m] = parameters
@@ -205,25 +206,25 @@ class MuscleFit:
         return float((self._weight * point.residual**2).sum() + self._precision @ deviation**2)
 
     def equations(self, point: MusclePoint) -> Equations:
-        """Return the normal equations at a point."""
+        """Return the normal equations of a Gauss–Newton step from a point."""
         curvature = (point.jacobian * self._weight).T @ point.jacobian
         self._determined = np.array([determined(curvature, self._precision)])
         return Equations.of_common(curvature + np.diag(self._precision))
 
     def right_sides(self, point: MusclePoint) -> RightSides:
-        """Return the right sides of the normal equations."""
+        """Return the right sides of the normal equations of a Gauss–Newton step from a point."""
         by_samples = point.jacobian.T @ (self._weight * point.residual)[:, 0]
         by_prior = self._precision * (self._mean - point.parameters)
         return RightSides.of_common(by_samples + by_prior)
 
     def moved(self, point: MusclePoint, step: SolvedStep) -> MusclePoint:
-        """Return the parameters after a step of the solver, with residuals and derivatives."""
+        """Return the point to which a step of the solver leads."""
         return self.point(point.parameters + step.common)
 
 
-NETWORK_STATES = 400  # evaluate the network at this many states
-NETWORK_ERROR = 0.001  # assume at least this σ of the network's lengths [m]
-FIXED = 1e-6  # keep a parameter at its prior mean by this prior spread
+NETWORK_STATES = 400  # fit a body to the lengths of a network at this many random states
+NETWORK_ERROR = 0.001  # assume that these lengths have at least this standard deviation [m]
+FIXED = 1e-6  # give a parameter that must stay at its prior mean this prior spread
 
 
 def fit_to_network(

@@ -28,38 +28,51 @@ from musculoskeletal_ae.arrays import Array, Bools
 if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.posture_model import PostureModel
 
-ROUGH_OFFSET = np.deg2rad(2.0)  # expect this offset of a roughly calibrated sensor (σ) [rad]
-ACCURATE_OFFSET = 0.003  # expect this offset of an accurately calibrated sensor (σ) [rad]
-#: refuse an update that finds a larger |z|: ten times σ of a roughly calibrated sensor [rad]
+#: expect roughly calibrated joint sensors to have offsets of this standard deviation [rad]
+ROUGH_OFFSET = np.deg2rad(2.0)
+#: expect accurately calibrated joint sensors to have offsets of this standard deviation [rad]
+ACCURATE_OFFSET = 0.003
+#: refuse an update that estimates a larger offset of a joint sensor than this [rad]: ten standard
+#: deviations of a roughly calibrated sensor
 LARGEST_OFFSET = 10.0 * ROUGH_OFFSET
-STOP_SPREAD = 0.01  # expect a stop to be this far from its limit (standard deviation) [rad]
-#: compute the posterior of these offsets z [rad]
+STOP_SPREAD = 0.01  # expect a stop to be this far from its joint limit (standard deviation) [rad]
+#: consider these offsets z of a joint sensor, and compute the probability of each [rad]
 OFFSETS = np.linspace(-4.0 * ROUGH_OFFSET, 4.0 * ROUGH_OFFSET, 281)
 NO_STOPS = 0.1  # assume that a joint's limits are no mechanical stops with this probability
 NOT_REACHED = 0.5  # assume that the arm never reaches a given stop with this probability
-SHARES = 0.03, 0.1, 0.3  # consider these shares π of rests at a stop that is reached
-WIDTHS = 0.001, 0.002, 0.004  # consider these widths σ of the cluster of readings there [rad]
+SHARES = 0.03, 0.1, 0.3  # consider that this share π of all rests is at a stop that is reached
+#: consider that the readings at a stop scatter with these standard deviations σ [rad]
+WIDTHS = 0.001, 0.002, 0.004
 WIDTH_RATIO = 2.0  # beyond a limit, widen the cluster by this factor, because stops are compliant
 #: beyond a limit, expect this density of other readings, relative to that within the range
 DENSITY_RATIO = 0.01
 # A joint is at its stop if it is near a limit and the muscles push it there.
-NEAR_STOP = 0.05  # count a joint without a sensor as near a limit within this distance [rad]
-#: count a joint as pushed if its torque is at least this multiple of the usual residual torque
+#: assume that a joint without a sensor may be at its stop within this distance from a limit [rad]
+NEAR_STOP = 0.05
+#: conclude that muscles push a joint against its stop if the unbalanced torque exceeds the usual
+#: one by this factor
 LEAST_PUSH = 3.0
-SMALL = 1e-6  # weight of every angle relative to that of a stop; keeps the normal equations regular
-NEAR_LIMIT = 0.3  # ignore readings that are farther than this from a limit [rad]
+#: give every angle this weight relative to that of a stop, so that the normal equations have a
+#: unique solution
+SMALL = 1e-6
+NEAR_LIMIT = 0.3  # use no readings that are farther than this from a limit [rad]
 # Two rests are distinct if another joint or the reading itself differs.
-OTHER_DIFFERENCE = 0.1  # count rests as distinct if another joint differs by more than this [rad]
-OWN_DIFFERENCE = 0.01  # count rests as distinct if the reading differs by more than this [rad]
+#: use another reading of a joint only if another joint has moved by more than this [rad], or if
+#: this joint has moved by more than OWN_DIFFERENCE
+OTHER_DIFFERENCE = 0.1
+OWN_DIFFERENCE = 0.01  # see OTHER_DIFFERENCE [rad]
 
 
 def sensor_zeros(read: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Return the joint-sensor offsets and their standard deviations, both [rad] (D,).
+    """Estimate the zeros (offsets) of joint sensors from readings that pile up at joint limits.
 
     Args:
-        read: Sensor readings at rest, (N, D); NaN where nothing was measured.
-        lower: Lower limits, (D,).
-        upper: Upper limits, (D,).
+        read: Sensor readings at rest [rad], (N, D); NaN where nothing was measured.
+        lower: Lower joint limits [rad], (D,).
+        upper: Upper joint limits [rad], (D,).
+
+    Returns:
+        The offsets and their standard deviations [rad], (D,) each.
     """
     theta = read.T
     apart = np.abs(theta[:, None] - theta[:, :, None])  # (D, N, N)
@@ -158,7 +171,7 @@ class Stops:
         """Return which joints are free of their stops, so that their torques must balance.
 
         Args:
-            own: θ [rad], (N, D).
+            own: Joint angles θ of the group [rad], (N, D).
             score: Residual torque at each joint relative to its usual size, (N, D). A positive
                 torque pushes the joint towards its upper limit.
 
@@ -181,9 +194,9 @@ class Stops:
         a joint limit.
 
         Args:
-            own: θ [rad], (N, D).
-            repeated: Number of readings of each joint's sensor that together count as a single
-                independent one, (D,).
+            own: Joint angles θ of the group [rad], (N, D).
+            repeated: Number of readings of each joint's sensor that together have the weight of a
+                single independent one, (D,).
         """
         goal = np.where(np.isnan(self._at), np.clip(own, self._lower, self._upper), self._at)
         is_pulled = ~np.isnan(self._at) | (goal != own)

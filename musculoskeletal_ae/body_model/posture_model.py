@@ -27,9 +27,10 @@ from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 
 DIFFERENCE = 1e-6  # differentiate numerically with this step [rad]
-#: reuse Σ T ∂²l/∂θ² of the geometric model until a joint has moved by more than this [rad]
+#: Compute the joint stiffness Σ T ∂²l/∂θ² due to muscle tensions again only after a joint has moved
+#: by more than this [rad], because it is costly and changes little.
 REUSED_MOTION = 0.05
-SMALL = 1e-6  # raise smaller divisors to this value
+SMALL = 1e-6  # divide the vector of gravity by at least this norm
 
 
 class Unknowns(NamedTuple):
@@ -42,14 +43,15 @@ class Unknowns(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Residuals and their derivatives at given values of the unknowns."""
+    """Residuals of lengths, torques, angles and gravity, and their derivatives, at one point."""
 
     length: Array  # residuals of the lengths [m], (N, M)
-    muscle_jacobian: Array  # G [m/rad], (N, M, D)
-    by_body: list[Array]  # ∂l/∂w of each muscle, (N, its parameters)
+    muscle_jacobian: Array  # muscle Jacobian G [m/rad], (N, M, D)
+    by_body: list[Array]  # derivatives of each muscle's length by its parameters, (N, parameters)
     torque: Array  # residuals of the torques τ [N·m], (N, D)
-    torque_by_body: Array  # −∂τ/∂w, (N, D, W)
-    torque_by_springs: Array  # −∂τ/∂(α, β) of the S joints with springs, (N, D, 2S)
+    torque_by_body: Array  # negative derivatives of τ by the W parameters of all muscles, (N, D, W)
+    #: negative derivatives of τ by α and β of the S joints with springs, (N, D, 2S)
+    torque_by_springs: Array
     #: median over the samples of the sum of the muscles' absolute torques at each joint [N·m], (D,)
     load: Array
     angle: Array  # residuals of the angles [rad], (N, D); 0 where no angle was measured
@@ -66,7 +68,7 @@ class Bent(NamedTuple):
     """
 
     theta: Array  # postures of the last evaluation [rad], (N, D)
-    stiffness: Array  # Σ T ∂²l/∂θ² [N·m/rad], (N, D, D)
+    stiffness: Array  # joint stiffness Σ T ∂²l/∂θ² at these postures [N·m/rad], (N, D, D)
 
     @classmethod
     def unknown(cls, count: int, joint_count: int) -> Bent:
@@ -76,7 +78,10 @@ class Bent(NamedTuple):
 
 
 class PostureModel:
-    """Computes residuals and derivatives for N samples of one group."""
+    """Computes the residuals of N rest samples of one group of joints and muscles.
+
+    The derivatives of the residuals are computed as well.
+    """
 
     def __init__(
         self, body: CalibratedBody, observed: Observations, joints: Ints, muscles: Ints, bent: Bent

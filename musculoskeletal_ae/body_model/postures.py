@@ -52,46 +52,55 @@ from musculoskeletal_ae.learning.samples import Observations
 if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 
-GRAVITY_NOISE = 0.02  # expect this error of u, by noise and mounting of the accelerometer (σ) [rad]
-FIRST_NOISE = 0.002  # assume this σ of a length in the first iteration [m]
-LEAST_NOISE = 0.0008  # weigh lengths by no smaller σ than this, for errors of the body model [m]
+#: expect measured directions of gravity to have this standard deviation [rad], due to noise and
+#: mounting of the accelerometer
+GRAVITY_NOISE = 0.02
+#: assume that lengths have this standard deviation in the first iteration [m]
+FIRST_NOISE = 0.002
+#: weigh lengths by at least this standard deviation [m], which covers errors of the body model
+LEAST_NOISE = 0.0008
 #: Expect errors of the torque balance (σ_τ) of this share of the muscles' absolute torques at a
 #: joint. The share is high, because all samples have the same friction and sensor offsets.
 TORQUE_NOISE = 0.3
-#: assume at least this usual residual torque, as a share of the muscles' absolute torques
+#: assume that unbalanced torques are usually at least this share of the muscles' summed absolute
+#: torques at a joint
 LEAST_TORQUE = 0.01
-SCALINGS = 2  # recompute the Birge ratio this many times
+#: recompute the factor for the spreads of the prior (Birge ratio, `GroupFit._posterior`) this many
+#: times
+SCALINGS = 2
 ROUNDS = 12  # end the fit after this many Gauss–Newton iterations
 #: End the fit if an iteration lowers the cost by less than this, per measured length. The step is
 #: then far shorter than the posterior spread. With ten times this value, the fit mistakes a slipped
 #: joint sensor for a changed muscle more often.
 LEAST_DECREASE = 3e-4
-TYPICAL_STEP = 0.3  # expect a posture to move by this much per iteration [rad]
+TYPICAL_STEP = 0.3  # scale the damping of the solver to changes of an angle by this [rad]
 
 
 class Weights(NamedTuple):
     """Weights of all residuals: robust weights ω, divided by the variances."""
 
-    length: Array  # (N, M)
-    torque: Array  # (N, D)
-    angle: Array  # (N, D)
-    gravity: Array  # (N, 3J)
+    length: Array  # of the lengths [1/m²], (N, M)
+    torque: Array  # of the torque balances [1/(N·m)²], (N, D)
+    angle: Array  # of the measured angles [1/rad²], (N, D); 0 where none was measured
+    gravity: Array  # of the directions of gravity, (N, 3J); 0 where none was measured
 
 
 class PosturePoint(NamedTuple):
-    """Values of the unknowns, and the residuals at these values."""
+    """A point of the fit: values of the unknowns, and the residuals at these values."""
 
     unknowns: Unknowns
     residuals: Residuals
 
 
 class GroupFit:
-    """Fits one group of joints and muscles; a `gauss_newton.Problem`.
+    """Fits parameters and postures of one group of joints and muscles, as a `gauss_newton.Problem`.
 
     Attributes:
-        noise: σ of each muscle's length [m], (M,).
-        weight: ω of each length in (0, 1]; 0 where a sample does not describe a muscle, (N, M).
-        usual: Inverse squares of typical steps of θ (D,) and of (w, z, e).
+        noise: Standard deviation σ of each muscle's length [m], (M,).
+        weight: Robust weight ω of each length in (0, 1], (N, M); 0 where a sample does not describe
+            a muscle.
+        usual: Inverse squares of typical steps of θ, (D,), and of (w, z, e), by which the solver
+            damps its steps.
     """
 
     def __init__(
@@ -187,7 +196,7 @@ class GroupFit:
             self.noise[m] = np.hypot(self.noise[m], np.sqrt(variance.mean()))
 
     def point(self, unknowns: Unknowns) -> PosturePoint:
-        """Return these values of the unknowns with their residuals."""
+        """Return the point of the fit with these values of the unknowns."""
         return PosturePoint(unknowns, self.model.residuals(unknowns))
 
     def weigh(self, point: PosturePoint) -> None:
@@ -228,7 +237,10 @@ class GroupFit:
         )
 
     def equations(self, point: PosturePoint) -> Equations:
-        """Return the normal equations of θ, and of (w, z, e)."""
+        """Return the normal equations of a Gauss–Newton step from a point.
+
+        Their unknowns are the postures θ of the samples, and (w, z, e), which all samples share.
+        """
         model, weights, residuals = self.model, self._weights, point.residuals
         count, places = model.by_sensor.shape
         size = model.parameter_count
@@ -277,7 +289,7 @@ class GroupFit:
         return np.array([determined(c, p) for c, p in zip(curvature, precisions, strict=True)])
 
     def right_sides(self, point: PosturePoint) -> RightSides:
-        """Return the right-hand sides of the normal equations at `point`."""
+        """Return the right sides of the normal equations of a Gauss–Newton step from a point."""
         unknowns, residuals = point
         weights, prior = self._weights, self.prior
         length, torque = weights.length * residuals.length, weights.torque * residuals.torque
@@ -301,7 +313,7 @@ class GroupFit:
         return unknowns.springs[:, self.model.sprung].ravel()
 
     def moved(self, point: PosturePoint, step: SolvedStep) -> PosturePoint:
-        """Return the unknowns after a step of the solver, with their residuals."""
+        """Return the point to which a step of the solver leads."""
         theta, zero, parameters, springs = point.unknowns
         joints, size = self.model.joints, self.model.parameter_count
         after_zero, sprung = size + len(joints), self.model.sprung
@@ -338,7 +350,7 @@ def fit_jointly(
             model.
 
     Returns:
-        The fields of `Fit`, in their order.
+        The fields of `fit.FittedBody`, in their order.
     """
     own, zero = np.isfinite(observed.theta) & (observed.spread == 0.0), body.zero
     theta, samples = start - own * zero, [length.tobytes() for length in observed.length]

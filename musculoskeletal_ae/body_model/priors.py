@@ -15,12 +15,12 @@ from musculoskeletal_ae.body_model.posture_model import PostureModel
 from musculoskeletal_ae.robot.model_errors import ATTACHMENT, ELASTIC
 from musculoskeletal_ae.signals.friction import DRIVE_FRICTION_MEAN, DRIVE_SPREAD
 
-#: Count all samples together as at most this many independent ones, because they share the errors
+#: Weigh all samples together as at most this many independent ones, because they share the errors
 #: of the body model. This applies to joint-sensor offsets, springs of the joints, constants of
 #: motor currents, and joints without a sensor (torque and stops).
 INDEPENDENT_SAMPLES = 10.0
-SENSOR_NOISE = 0.002  # expect this noise of a joint sensor (σ_y) [rad]
-LEAST_ANGLE_NOISE = 1e-6  # assume at least this σ_y [rad]
+SENSOR_NOISE = 0.002  # expect readings of a joint sensor to have this standard deviation [rad]
+LEAST_ANGLE_NOISE = 1e-6  # assume at least this standard deviation of a measured angle [rad]
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,8 @@ class Prior:
 
     attachment: float = ATTACHMENT  # σ of each coordinate of each route point [m]
     elastic: float = ELASTIC  # σ of the logarithm of each elastic constant
-    friction: float = 0.05  # σ of μ around `friction_mean`
-    friction_mean: float = 0.05  # mean of μ
+    friction: float = 0.05  # σ of the tendon friction μ around `friction_mean`
+    friction_mean: float = 0.05  # mean of the tendon friction μ
     offset: float = 0.001  # σ of the offset of the length sensor [m]
     creep: float = 1e-5  # σ of the creep of a tendon from one sample to the next [m]
     #: σ of the logarithm of a motor current's scale, and of its offset and drive friction as shares
@@ -57,7 +57,7 @@ class Prior:
         return mean
 
 
-PRIOR = Prior()
+PRIOR = Prior()  # expect a body to differ this much from its geometric model
 #: expect a replaced muscle or tendon to differ this much from its earlier parameters
 REOPENED = Prior(attachment=0.004, elastic=0.3, offset=0.03)
 
@@ -74,16 +74,18 @@ class GroupPrior:
     """Prior of one group, and the accuracy of its joint sensors.
 
     Attributes:
-        mean: Prior mean of the parameters w̄, (W,).
-        precision: 1/s², (W,).
-        zero: Prior mean of the joint-sensor offsets z̄ [rad], (D,).
-        zero_precision: 1/s_z², (D,).
-        angle_precision: 1/σ_y²; 0 where the angle was not measured, (N, D).
-        repeated: Number of readings of a joint sensor that together count as a single independent
-            one, (D,).
-        unread: Number of samples that together count as a single independent one for a joint
-            without a sensor, (D,).
-        spring_precision: 1/s_e² of α of all S joints with springs, then of β, (2S,).
+        mean: Prior means w̄ of the parameters of all muscles, (W,).
+        precision: Inverse squares of their prior spreads, 1/s², (W,).
+        zero: Prior means z̄ of the joint-sensor offsets [rad], (D,).
+        zero_precision: Inverse squares of their prior spreads, 1/s_z² [1/rad²], (D,).
+        angle_precision: Inverse variances of the measured angles, 1/σ_y² [1/rad²], (N, D); 0 where
+            the angle was not measured.
+        repeated: Number of readings of a joint sensor that together have the weight of a single
+            independent one, (D,).
+        unread: Number of samples that together have the weight of a single independent one, for a
+            joint without a sensor, (D,).
+        spring_precision: Inverse squares of the prior spreads of the springs' corrections, 1/s_e²:
+            first of α of all S joints with springs, then of β, (2S,).
     """
 
     mean: Array

@@ -45,17 +45,18 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
     from musculoskeletal_ae.body_model.priors import MusclePrior
 
-#: Unknowns of the evidence are the natural logarithms of a, b, e, c, ν and σ, relative to these
-#: units: [m], joint ranges, 1, T_limit, 1 and [m].
+#: Express the six constants a [m], b [joint ranges], e, c [T_limit], ν and σ [m] of the covariance
+#: in these units. The evidence is a function of the natural logarithms of the six ratios.
 UNITS = np.array([0.002, 0.5, 1.0, 1.0, 1.0, 0.001])
-#: expect these unknowns of the evidence before the samples (prior means)
+#: expect these logarithms (prior means) before there are samples
 USUAL = np.array([-1.5, 0.5, 1.0, 2.0, 1.0, -2.0])
-#: prior standard deviations of the hyperparameters about USUAL; the search for the largest evidence
-#: is drawn towards USUAL by them
+#: expect the logarithms to differ from USUAL by these standard deviations; they draw the search for
+#: the largest evidence towards USUAL
 SPREAD = np.array([2.0, 0.4, 1.0, 1.0, 1.0, 1.5])
-#: search each hyperparameter within these limits
+#: search each of the six logarithms within these limits
 BOUNDS = ((-8.0, 4.0), (-1.5, 3.0), (0.0, 4.0), (-1.5, 4.0), (0.0, 3.5), (-2.5, 3.0))
-#: start a search from these values: a trusted body, a wrong body, and a rough remainder
+#: start a search from these logarithms: for a body that explains the lengths, for one that does
+#: not, and for a rough remainder
 STARTS = (
     USUAL,
     USUAL + [2.5, 0.0, 0.0, 0.0, 0.0, 0.0],
@@ -66,20 +67,20 @@ STARTS = (
 FEW_SAMPLES = 60
 ROUNDS = 25  # end a search that starts from STARTS after this many iterations
 FEW_ROUNDS = 4  # end a search that continues from the last result after this many iterations
-JUDGING = 150  # compute the evidence from at most this many samples
+JUDGING = 150  # compute the evidence from at most this many samples, to bound the time of a search
 LEAST_SAMPLES = 5  # learn a remainder only from at least this many samples
-UNKNOWN = 1.0  # assume this variance of a length that a sample lacks [m²]
+UNKNOWN = 1.0  # give a length that a sample lacks this variance, so that it has no effect [m²]
 JITTER = 1e-10  # add this variance to keep covariances positive definite [m²]
 
 
 class Lengths(NamedTuple):
     """Lengths of the N samples of one group, relative to the prior mean of the body."""
 
-    theta: Array  # θ [rad], (N, D)
-    tension: Array  # T or T_read [N], (N, M)
-    deviation: list[Array]  # l − l(θ, T; w̄) of each muscle [m], (N,)
+    theta: Array  # joint angles θ [rad], (N, D)
+    tension: Array  # tension readings T or T_read [N], (N, M)
+    deviation: list[Array]  # measured length minus that of the prior mean body [m], (N,) each
     by_body: list[Array]  # J S: derivatives of lengths by w, times the prior spreads [m], (N, P)
-    weight: Array  # robust weights ω, (N, M)
+    weight: Array  # robust weights ω of the lengths, (N, M)
 
     @classmethod
     def of(
@@ -114,10 +115,13 @@ class Lengths(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class GroupRemainder:
-    """The remainder g of one group of joints and muscles."""
+    """The remainder g of one group of joints and muscles.
 
-    joints: Ints
-    muscles: Ints
+    g is the part of the muscle lengths that the parameters of the body cannot express.
+    """
+
+    joints: Ints  # indices of the joints
+    muscles: Ints  # indices of the muscles
     scale: Array  # units of the inputs: R of the joints, T_limit of the muscles, (D+M,)
     crossed: Bools  # whether each muscle crosses each joint, (M, D)
     logarithms: Array  # natural logarithms of a, b, e, c, ν and σ in units of UNITS, (6,)
@@ -130,7 +134,7 @@ class GroupRemainder:
     roots: tuple[Array, ...]
 
     def at(self, theta: Array, tension: Array) -> Array:
-        """Return g [m] of the group's muscles, (N, M), for θ and T of the whole body."""
+        """Return the remainder of the group's muscles [m], (N, M), at θ and T of the whole body."""
         result = np.empty((len(theta), len(self.muscles)))
         for own, covariance in self._covariances(theta, tension):
             result[:, own] = covariance @ self.weights[:, own]
@@ -161,10 +165,10 @@ class GroupRemainder:
 
 @dataclass(frozen=True, eq=False)
 class Remainder:
-    """The remainder g of a whole body: the groups in which samples have shown one.
+    """The remainder of a whole body: what its parameters cannot express of the muscle lengths.
 
-    `before` is a remainder that is added, for example that of the network from which learning
-    continues.
+    `groups` are the parts of groups with enough samples. `before` is a remainder that is added, for
+    example that of the network from which learning continues.
     """
 
     muscle_count: int
@@ -187,7 +191,7 @@ class Remainder:
         return result
 
     def drawn_error(self, theta: Array, tension: Array, rng: np.random.Generator) -> Array:
-        """Draw errors of g [m] (N, M) from its posterior, independently for each state."""
+        """Draw errors of the remainder [m], (N, M), from its posterior, one for each state."""
         result = np.zeros((len(theta), self.muscle_count))
         for group in self.groups:
             spread = group.spread(theta, tension)
@@ -237,8 +241,8 @@ def group_remainder(
         joints: Joints of the group.
         muscles: Muscles of the group.
         lengths: The samples.
-        start: Logarithms of a, b, e, c, ν and σ from which the search starts; None to search from
-            the beginning.
+        start: Logarithms of the six constants (see UNITS) from which the search starts; None to
+            start from STARTS.
     """
     ranges = (robot.upper - robot.lower)[joints]
     scale = np.concatenate([ranges, robot.tension.limit[muscles]])

@@ -17,11 +17,13 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 
-STIFFNESS_SPREAD = 0.5  # assume that α of an arm has this standard deviation
+#: assume that the logarithm α of a spring's true stiffness, relative to the stated one, has this
+#: standard deviation
+STIFFNESS_SPREAD = 0.5
 #: assume that the angle at which a spring exerts no torque differs from that of the robot
 #: description by this standard deviation [rad]
 REST_SPREAD = 0.2
-LARGEST_LOG = 2.0  # permit no larger |α|
+LARGEST_LOG = 2.0  # clip the logarithmic error |α| of a stiffness to this, a factor of about 7
 
 
 def none_learned(joint_count: int) -> Array:

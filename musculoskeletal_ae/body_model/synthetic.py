@@ -11,7 +11,7 @@ from musculoskeletal_ae.mae.default_training import highest_tensions
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
 
-#: draw this share of the samples with most tensions near T_bias, as in an arm that holds a posture
+#: draw this share of the samples with most tensions near T_bias, as on an arm that holds a posture
 HELD_SHARE = 0.5
 #: let postures exceed the joint limits by this share of the range, because friction or contact can
 #: move a joint slightly beyond a limit
@@ -25,7 +25,8 @@ class TrainingData(NamedTuple):
     true: Array  # target of the network's output
 
 
-#: assume that this share of the friction stays unknown although the sliding direction is estimated
+#: assume that this share of tendon friction stays unknown, although the direction in which a tendon
+#: slid last is estimated
 UNKNOWN_FRICTION = 0.25
 
 

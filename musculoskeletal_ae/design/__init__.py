@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Help in designing an arm; nothing of it runs while an arm moves."""
+"""Helps to design an arm: checks and remedies. No part of it runs while an arm moves."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check whether the muscles of an arm can hold it (`check_robot`).
+"""Checks whether the muscles of an arm can hold it (`check_robot`).
 
 For postures drawn uniformly within the joint limits, the check computes
 
@@ -10,10 +10,11 @@ For postures drawn uniformly within the joint limits, the check computes
 
 A tendon parallel to the axis of a prismatic joint has r = RACK (`robot/joint_units.py`).
 
-doc/explanation/method.md ("An arm must be holdable") defines a sound arm. A joint with a spring
-or a passive tendon may have muscles on one side only, if these muscles can hold the joint. The
-report also shows the one-sided stiffness, for information only. There, muscles at the tension that
-their modules maintain (T_bias, or 0 for position-controlled modules) count as slack.
+An arm without faults is called sound; doc/explanation/method.md ("An arm must be holdable") states
+the requirements. A joint with a spring or a passive tendon may have muscles on one side only, if
+these muscles can hold the joint. The report also shows the one-sided stiffness, for information
+only. It regards muscles at the tension that their modules maintain (T_bias, or 0 for
+position-controlled modules) as slack.
 
 A suspended robot, such as a platform that hangs on four tendons, is judged in its equilibria only
 (`equilibria.py`), and need only be stable there.
@@ -42,44 +43,54 @@ from musculoskeletal_ae.robot.stiffness import joint_stiffness, muscle_hessian
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.schema import Strict
 
-#: a sound arm must hold at least this share of the postures, and be stiff enough in as many
+#: report a fault if the muscles hold the arm in less than this share of the postures, or if it is
+#: stiff enough in less than this share
 REQUIRED_SHARE = 0.95
-REQUIRED_STIFFNESS = 5.0  # require this joint stiffness, or less if the load is small [N·m/rad]
+#: require this smallest eigenvalue of the joint stiffness [N·m/rad], or less if the load of the
+#: joints is small (STIFFNESS_PER_LOAD)
+REQUIRED_STIFFNESS = 5.0
 #: require no more stiffness than this multiple of the largest load of a joint [1/rad]: a change of
 #: that load by a tenth then moves no joint by more than 0.05 rad
 STIFFNESS_PER_LOAD = 2.0
 LEAST_INERTIA = 1e-12  # regard a smaller inertia of a joint as a rounding error [kg·m²]
-#: count a muscle as slack up to this much above the tension that its module maintains [N], because
-#: the solver rounds
+#: for the one-sided stiffness, treat a muscle as slack up to this much above the tension that its
+#: module maintains [N], because the solver rounds
 SLACK_MARGIN = 1e-3
-COUNTED_ARM = 0.003  # count a moment arm above this, with which 300 N produce about 1 N·m [m]
-COUNTED_ARM_SHARE = 0.1  # also count a moment arm above this share of the longest one at its joint
-LEAST_COUNTED_ARM = 1e-4  # but count no shorter moment arm than this [m]
-#: warn about joints without longer moment arms [m]: shorter ones deviate by half or more in
-#: emulated individuals
+#: treat a muscle as acting on a joint if its moment arm exceeds this [m]: 300 N then produce about
+#: 1 N·m
+COUNTED_ARM = 0.003
+#: also treat it as acting if its moment arm exceeds this share of the longest one at the joint
+COUNTED_ARM_SHARE = 0.1
+LEAST_COUNTED_ARM = 1e-4  # but ignore every moment arm below this [m]
+#: warn about a joint all of whose moment arms are shorter than this [m]: in emulated individuals,
+#: they deviate by half or more
 SHORT_ARM = 0.015
 #: tolerate this share of postures in which a muscle acts with the wrong sign, or a joint lacks
 #: muscles on one side
 TOLERATED_SHARE = 0.05
-LEAST_DETOUR = 1e-6  # regard a smaller length added by wrapping as a rounding error [m]
+#: conclude that a tendon touches a wrapped object if the object lengthens its route by more than
+#: this [m]; less is a rounding error
+LEAST_DETOUR = 1e-6
 LONGEST_ARM = 1.0  # warn about a longer moment arm [m]: its points are probably in millimetres
-#: report a fault if the typical moment arm is longer [m]: all points are then in millimetres
+#: report a fault if half of the muscles have a longer moment arm than this [m]: all points are then
+#: in millimetres
 MILLIMETRES = 5.0
 #: warn about a wider range of a joint: its limits are probably in degrees (revolute, [rad]) or in
 #: millimetres (prismatic, [m])
 WIDEST_RANGES = 4.0 * np.pi, 10.0
+#: file of a robot directory in which a user declares signs of moment arms
 DECLARATION_FILE = 'moment_arms.csv'
-COLUMNS = ['muscle', 'joint', 'sign']
+COLUMNS = ['muscle', 'joint', 'sign']  # require these columns in this file
 
 
 class FindingTexts(Strict, frozen=True, array_like=True):
-    """Message and remedy for one kind of finding, as findings.yaml contains them."""
+    """Message and remedy for one kind of fault or warning, with placeholders (findings.yaml)."""
 
     message: str
     remedy: str
 
 
-#: texts by kind of finding; the part of a key after a comma distinguishes variants of a kind
+#: texts by kind of fault or warning; a part of the key after a comma names a variant of the kind
 FINDINGS = read_table(__file__, 'findings.yaml', dict[str, FindingTexts])
 
 
@@ -98,11 +109,11 @@ class Setting(NamedTuple):
     """A robot in N postures, with the quantities that determine holding and stiffness."""
 
     robot: Robot
-    theta: Array  # [rad], (N, D)
-    jacobian: Array  # G [m/rad], (N, M, D)
-    hessian: Array  # ∂²l/∂θ² [m/rad²], (N, M, D, D)
+    theta: Array  # joint angles [rad], (N, D)
+    jacobian: Array  # muscle Jacobian G = ∂l/∂θ [m/rad], (N, M, D)
+    hessian: Array  # its derivative ∂²l/∂θ² [m/rad²], (N, M, D, D)
     torque: Array  # g + K θ − b + h, which holds the arm against weight and springs [N·m], (N, D)
-    weight: Array  # g [N·m], (N, D)
+    weight: Array  # torque g that holds the arm against its weight [N·m], (N, D)
     springs: Array  # stiffness of springs and passive tendons [N·m/rad], (N, D, D)
 
     @classmethod
@@ -132,14 +143,14 @@ class RobotCheck:
     """Results of `check_robot` in N postures."""
 
     setting: Setting
-    moment_arms: Array  # r [m], (N, M, D)
+    moment_arms: Array  # moment arm r of each muscle at each joint [m], (N, M, D)
     tension: Array  # holding tension [N], (N, M); NaN where the posture is not held
     missing_torque: Array  # torque that the muscles lack to hold a posture [N·m], (N, D)
     stiffness: Array  # smallest joint-stiffness eigenvalue [N·m/rad], (N,); NaN if not held
-    #: like `stiffness`, but muscles at the tension that their modules maintain count as slack, (N,)
+    #: like `stiffness`, but without muscles at the tension that their modules maintain, (N,)
     one_sided: Array
-    required: float  # required stiffness [N·m/rad]
-    matters: Array  # smallest moment arm at each joint that is taken into account [m], (D,)
+    required: float  # smallest eigenvalue of the joint stiffness that is required [N·m/rad]
+    matters: Array  # smallest moment arm with which a muscle acts on each joint [m], (D,)
     softest: Ints  # index of the softest joint in each posture that is held but not stiff
     faults: tuple[CheckFinding, ...] = ()  # reasons why the arm is not sound; empty if it is sound
     warnings: tuple[CheckFinding, ...] = ()  # questionable properties that do not make it unsound
@@ -207,7 +218,7 @@ def judge(setting: Setting) -> RobotCheck:
 
 
 def measure(setting: Setting) -> RobotCheck:
-    """Measure tensions, stiffness and moment arms in given postures, without any finding."""
+    """Measure tensions, stiffness and moment arms in given postures, without judging them."""
     robot, _, jacobian, _, torque, *_ = setting
     bias, limit = robot.tension.bias, robot.tension.limit
     tension, missing = np.full(jacobian.shape[:2], np.nan), np.zeros(torque.shape)
@@ -223,7 +234,7 @@ def measure(setting: Setting) -> RobotCheck:
 def _at_tensions(
     setting: Setting, tension: Array, missing: Array, required: float, passive: Array
 ) -> RobotCheck:
-    """Return the check of postures in which the holding tensions are known, without any finding.
+    """Return the check of a robot at known holding tensions, without faults and warnings.
 
     Args:
         setting: The robot and the postures.
@@ -287,8 +298,8 @@ class ArmTerms(NamedTuple):
     """
 
     scale: float  # factor from a moment arm in metres to the shown number [1/m]
-    unit: str  # unit of the shown number
-    name: str
+    unit: str  # unit of the shown number, 'mm' or '%'
+    name: str  # what the number is called, such as 'moment arm'
     other: str  # where to route a muscle that must act in the other direction
     better: str  # where to route a muscle for a larger moment arm
     guided: str  # how to keep a tendon on one side of the joint, as the end of a sentence, or ''
@@ -372,7 +383,7 @@ def read_declared_actions(description: RobotDescription) -> dict[tuple[int, int]
 
 
 def _finding(key: str, **fields: object) -> CheckFinding:
-    """Return a finding with the texts that findings.yaml has under a key.
+    """Return a fault or warning with the texts that findings.yaml has under a key.
 
     `fields` are the values of the placeholders in these texts.
     """
@@ -433,7 +444,7 @@ def _one_way_joints(
 
 
 def _useless_muscles(robot: Robot, moment_arms: Array, matters: Array) -> Iterator[CheckFinding]:
-    """Yield a fault for each muscle that has no effective moment arm at any joint."""
+    """Yield a fault for each muscle that acts on no joint: all its moment arms are too short."""
     along = ', or parallel to that of a prismatic joint' * bool(robot.units.slides.any())
     for muscle, arms in zip(robot.muscles, np.abs(moment_arms).max(axis=0), strict=True):
         if (arms < matters).all():
@@ -510,7 +521,7 @@ def _jumping_muscles(robot: Robot) -> Iterator[CheckFinding]:
 
 
 def _idle_objects(robot: Robot, theta: Array) -> Iterator[CheckFinding]:
-    """Yield a warning about objects of routes that the tendon touches in none of the postures."""
+    """Yield a warning about wrapped objects that the tendon touches in none of the postures."""
     described = [
         f'{muscle} ({written(item)["wrap"]} of {round(1e3 * item.radius, 1):g} mm on {item.link})'
         for muscle, route in zip(robot.muscles, robot.description.routes, strict=True)

@@ -21,28 +21,30 @@ from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 
-NEAR = 1.0  # expect an equilibrium this far from θ₀ (standard deviation) [rad]
-SHARE = 0.5  # expect a tension to deviate by this share of T_limit (standard deviation)
-#: accept τ of this size (standard deviation), as a share of the typical torque of weight and
-#: muscles
+NEAR = 1.0  # expect an equilibrium about this far from the random posture θ₀ [rad]
+#: expect tensions to differ from the desired one by about this share of T_limit
+SHARE = 0.5
+#: weigh the unbalanced torque τ in the search as an error with this standard deviation, relative to
+#: the typical torque of weight and muscles
 BALANCE = 1e-4
-DIFFERENCE = 1e-5  # half width of the differences of the weight's torque [rad]
+DIFFERENCE = 1e-5  # differentiate the torque of weight and springs over ± this angle [rad]
 ROUNDS = 60  # end the search after this many steps
-#: count a posture as an equilibrium if no joint lacks a larger share of the typical torque
+#: accept a posture as an equilibrium if the unbalanced torque of each joint is at most this share
+#: of the typical torque
 BALANCED = 0.01
 
 
 class Equilibria(NamedTuple):
     """Postures and tensions of N equilibria."""
 
-    theta: Array  # [rad], (N, D)
-    tension: Array  # T [N], (N, M); NaN where no equilibrium was found
+    theta: Array  # joint angles [rad], (N, D)
+    tension: Array  # tensions [N], (N, M); NaN where no equilibrium was found
     missing: Array  # torque that is not balanced [N·m], (N, D); 0 where an equilibrium was found
-    gradient: Array  # ∂(g + K θ − b)/∂θ [N·m/rad], (N, D, D)
+    gradient: Array  # derivative of the torque of weight and springs by θ [N·m/rad], (N, D, D)
 
 
 def is_suspended(robot: Robot) -> bool:
-    """Return whether the muscles cannot hold a posture without weight or springs of the joints.
+    """Return whether a robot is suspended: its muscles cannot hold it without weight or springs.
 
     Robots with as many muscles as joints are judged like others if a joint has a spring, because
     one muscle and a spring hold a joint.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find remedies for an arm that is not holdable or not stiff, by testing each of them.
+"""Finds remedies for an arm that is not holdable or not stiff, by testing each of them.
 
 The postures of the check are evaluated again with other values in muscles.yaml, less mass, longer
 moment arms or narrower limits. Each of these changes has several steps. If a change is sufficient
@@ -31,7 +31,8 @@ from musculoskeletal_ae.robot.description import shown
 
 #: suggest a change only if it raises the share of held or stiff postures by at least this
 LEAST_GAIN = 0.01
-#: changes to try, the costliest first, each with its factors, the smallest step first
+#: try these changes of muscles.yaml, links, moment arms or limits, the costliest first, each with
+#: its factors, the smallest step first
 CHANGES = {
     'limits': (0.8, 0.6),
     'moment arms': (1.25, 1.5, 2.0),
@@ -105,7 +106,7 @@ def rounded(values: Array) -> Array:
 
 
 def changed(setting: Setting, what: str, factor: float, joint: int) -> tuple[Setting, str]:
-    """Return a robot in N postures with one change, and a text that describes the change.
+    """Return a changed robot in N postures, and a text that describes the change.
 
     Args:
         setting: The unchanged robot and its postures.

@@ -19,17 +19,18 @@ from musculoskeletal_ae.robot.tension import least_tension
 
 POSTURES = 150  # examine at most this many random postures
 BUDGET = 2.5  # examine no further posture after this time [s]
-LEAST_POSTURES = 20  # examine this many postures, however long it takes
+LEAST_POSTURES = 20  # examine at least this many postures, however long that takes
 #: warn that training is pointless below this share of holdable postures: the arm then explores at
 #: most where joint stops support it
 POINTLESS_SHARE = 0.02
-#: near this many random postures, seek postures in which joint stops support some joints
+#: if hardly any posture is holdable, seek near this many random postures others in which joint
+#: stops support some joints
 NEAR_POSTURES = 10
-HARD_SHARE = 0.5  # warn below this share of holdable postures
+HARD_SHARE = 0.5  # warn that the arm explores only a part if fewer postures are holdable than this
 
 
 class Prospects(NamedTuple):
-    """The share of holdable postures of a robot, and what prevents that others are held."""
+    """Prospects of learning a robot: how many postures it can hold, and what prevents more."""
 
     robot: Robot
     held: int  # number of postures that the muscles can hold
@@ -52,7 +53,7 @@ class Prospects(NamedTuple):
         return self.share < POINTLESS_SHARE and not self.supported
 
     def lines(self) -> list[str]:
-        """Return the prospects as lines of text; what makes training pointless comes first."""
+        """Return the prospects as lines of text for users, warnings first."""
         robot, lines = self.robot, list[str]()
         counts = f'{self.held} of {self.postures} random postures can be held'
         lacking = ', '.join(f'{name} ({count})' for name, count in self.lacking)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report and the figure of `check_robot`."""
+"""Prints the report of `check_robot`, and draws its figure."""
 
 from argparse import Namespace
 from typing import Any
@@ -82,7 +82,7 @@ def _suggested(robot: Robot, args: Namespace) -> int:
 
 
 def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
-    """Return the part of the report on how many postures are holdable and stiff enough."""
+    """Return the summary of the report: in how many postures the arm is held and stiff enough."""
     count, held = len(result.setting.theta), result.held
     share = f'{100 * REQUIRED_SHARE:.0f} %'
     need = (

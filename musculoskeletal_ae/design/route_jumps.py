@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find tendons whose length jumps while the arm moves smoothly.
+"""Finds tendons whose length jumps while the arm moves smoothly.
 
 If muscles.yaml states on which `side` a tendon passes an object, the tendon can slip over the end
 of that object. As in MuJoCo, the tendon then changes sides suddenly, and its length jumps by
@@ -15,10 +15,10 @@ from musculoskeletal_ae.robot.robot import Robot
 
 LINES = 60  # examine lengths along this many straight lines between random postures
 STEPS = 400  # examine this many postures along each line
-#: count a larger second difference of a length along a line as a jump [m]; the differences of
-#: smooth lengths are a hundred times smaller
+#: report a jump if the second difference of a length along a line exceeds this [m]; those of smooth
+#: lengths are a hundred times smaller
 JUMP = 0.001
-LEAST_RANGE = 0.3  # suggest no limits that leave a smaller share of a joint's range
+LEAST_RANGE = 0.3  # suggest no joint limits that leave a smaller share of the joint's range
 #: keep this distance between a suggested limit and the jumps, as a share of the range
 RANGE_MARGIN = 0.03
 #: draw the points of an emulated individual at most this often, to find ones without jumps

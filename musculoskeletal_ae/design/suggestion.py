@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find the smallest change of via points that makes an arm sound, by CMA-ES.
+"""Finds the smallest change of via points that makes an arm sound, by CMA-ES.
 
     min  mean_p |d_p| / r + penalty(d),    d_p = r · x_p / √(1 + |x_p|²)
 
@@ -23,21 +23,22 @@ from musculoskeletal_ae.robot.description import RoutePoint, refusal, written
 from musculoskeletal_ae.robot.drawing import draw_arm, save_picture
 from musculoskeletal_ae.robot.robot import Robot
 
-#: let this share of postures fail; the check, with other postures, tolerates a share of 0.05
+#: accept a change of via points if at most this share of postures misses the requirements; the
+#: check, with other postures, tolerates a share of 0.05
 FAILING_SHARE = 0.02
-#: weight of missed requirements in the cost; above that of the displacement, which is below 1
+#: weigh missed requirements by this in the cost, above the displacement, which costs less than 1
 PENALTY = 10.0
-START_SPREAD = 0.2  # start the search with this standard deviation of x
+START_SPREAD = 0.2  # start the search with this standard deviation of the variables x
 TRIES = 40  # evaluate this many candidates for each of the 3P coordinates of the via points
 RESOLUTION = 1e-4  # round displacements of via points to this step [m]
-THIN = 0.003  # draw muscles this wide in the picture [m]
+THIN = 0.003  # draw muscles this wide in the picture of old and new routes [m]
 
 
 def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array, float, float]:
     """Suggest a change of the via points that makes a robot sound.
 
-    A muscle that changes the sign of its main action more often than before counts as a failed
-    requirement as well.
+    A change after which a muscle acts in the wrong direction in more postures than before is not
+    accepted either.
 
     Args:
         robot: The robot.
@@ -115,7 +116,7 @@ def moved(robot: Robot, change: Array) -> Robot:
 
 
 def lacking(check: checks.RobotCheck) -> float:
-    """Return by how much an arm misses the requirements of `check_robot`, as a number without unit.
+    """Return how much is lacking for the requirements of `check_robot`, as a number without unit.
 
     Only requirements that depend on the via points count: holding torque, stiffness, and moment
     arms. The result is 0 if the arm meets all of them with a margin.

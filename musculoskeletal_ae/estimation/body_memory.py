@@ -25,8 +25,8 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.files import read_text
 from musculoskeletal_ae.signals.body_state import MOST_OFFSET, BodyState, LengthOffsets
 
-FILE = 'estimator.offsets'
-LARGEST = 1_000_000  # ignore a larger file [bytes]
+FILE = 'estimator.offsets'  # name of the file, in the directory that the user chooses
+LARGEST = 1_000_000  # treat a file larger than this as damaged, and use none of its values [bytes]
 RETRY_INTERVAL = 2.0  # wait this long after a failed attempt to write [s]
 
 
@@ -37,7 +37,7 @@ class BodyMemory:
         found: The body state that the previous estimator has left behind; None if there was none.
             Its offsets are known only if they were known to be zero, otherwise they are unknown,
             with 0 for muscles that the file does not name.
-        problem: Why the present body state is not saved, as a text for users, or ''.
+        problem: Why the present body state could not be saved, as a text for users; '' if it was.
     """
 
     def __init__(self, directory: Path | None, muscles: Sequence[str]) -> None:
@@ -49,7 +49,7 @@ class BodyMemory:
         """
         self._muscles = muscles
         self._file: Path | None = None
-        self._was_decided = True  # whether the last offsets were known or revoked
+        self._was_decided = True  # whether the last offsets were known or revoked, not provisional
         self._saved: tuple[LengthOffsets, tuple[int, ...]] | None = None  # what the file contains
         self.found: BodyState | None = None
         self._has_file = False
@@ -65,7 +65,7 @@ class BodyMemory:
                     self.found = self._read(self._file)
 
     def _read(self, file: Path) -> BodyState:
-        """Return the content of the file; unknown offsets of 0 if it is damaged."""
+        """Read the body state from the file; if it is damaged, return unknown offsets of 0."""
         unknown = LengthOffsets.unknown(len(self._muscles))
         with suppress(MusculoskeletalError, ValueError, TypeError, KeyError, AttributeError):
             content = json.loads(

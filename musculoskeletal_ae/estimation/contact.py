@@ -33,18 +33,23 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-#: filter with this bandwidth [1/s] and a damping ratio of 0.5 (critical damping is a third slower)
+#: filter joint angles and torques with this bandwidth ω [1/s] and a damping ratio of 0.5; critical
+#: damping would make the filter a third slower
 BANDWIDTH = 25.0
-LARGEST_USUAL = 20.0  # F₀: assume no larger force at the hand in normal use [N]
+LARGEST_USUAL = 20.0  # F₀: expect no larger force at the hand in normal use [N]
+#: regularise the estimated force F with ‖F‖²/F₀² [1/N²], so that components stay small that produce
+#: no joint torque
 REGULARISATION = np.eye(3) / LARGEST_USUAL**2
-#: count a joint as at its stop below this distance from the limit [rad], which is about the error
-#: of the estimate
+#: assume that a joint may rest against its stop within this distance from its limit [rad]; this is
+#: about the error of the estimated angle
 AT_STOP = 0.06
-TURNED = 0.02  # evaluate G again after a joint has moved by this much [rad]
-#: report contact if d exceeds this; on five healthy arms that explored for ten minutes each, d was
-#: at most 8.6
+#: evaluate the muscle Jacobian G again once a joint has moved by this much [rad], not at every
+#: message, because G changes slowly
+TURNED = 0.02
+#: report contact if the evidence d exceeds this; on five healthy arms that explored for ten minutes
+#: each without contact, d was at most 8.6
 CONTACT = 10.0
-IN_A_ROW = 2  # report contact after this many consecutive messages with d > CONTACT
+IN_A_ROW = 2  # report contact once the evidence exceeds CONTACT in this many consecutive messages
 
 
 class Contact(NamedTuple):
@@ -57,7 +62,7 @@ class Contact(NamedTuple):
             effector, in the axes of the root link. It is a function because few callers need it.
         distance: Root sum square of the torques, each divided by its standard deviation on the
             healthy arm; NaN if this deviation is not calibrated, or if a reading is not finite.
-        is_contact: Whether there is contact.
+        is_contact: Whether `distance` has exceeded CONTACT in two consecutive messages (IN_A_ROW).
     """
 
     torque: Array
@@ -106,7 +111,7 @@ class ContactEstimator:
     """Estimates the external load message by message. `use` must be called before `step`.
 
     Attributes:
-        velocity: Filtered θ̇ [rad/s], (D,).
+        velocity: Filtered joint velocities θ̇ [rad/s], (D,).
         is_calibrated: Whether the residual torque of the healthy arm has been calibrated. Contacts
             are detected only then.
         count: Number of contacts detected so far.
@@ -122,7 +127,10 @@ class ContactEstimator:
         self.reset()
 
     def use(self, mae: Mae) -> None:
-        """Use another network, with its joint springs, its dampers and its residual torque σ."""
+        """Use another network, and its joint springs, dampers and residual torque σ (`mae.touch`).
+
+        Without a calibrated σ, external torques are estimated, but no contact is reported.
+        """
         joint_count, healthy = self._robot.joint_count, mae.touch
         self._robot = self._robot.with_elasticity(mae.elasticity)
         self._mae = mae
@@ -139,7 +147,7 @@ class ContactEstimator:
         self._beyond = 0  # consecutive messages with d > CONTACT
 
     def step(self, theta: Array, end_tension: Array, dt: float) -> Contact:
-        """Return the external load at one message.
+        """Step the filter by one message, and return the external load.
 
         Args:
             theta: Joint angles [rad], (D,).

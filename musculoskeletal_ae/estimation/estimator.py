@@ -56,8 +56,8 @@ from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.limits import Persistence
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
-#: Use measured joint angles with a message only if they are younger than this [s]. It is much
-#: shorter than SILENCE, because an older reading belongs to another posture of a moving arm.
+#: Use measured joint angles with a message of the muscles only if they are younger than this [s]:
+#: an older reading belongs to another posture of a moving arm.
 JOINTS_AGE = 0.05
 
 
@@ -65,13 +65,13 @@ class Output(NamedTuple):
     """What the estimator has computed from one message.
 
     Attributes:
-        sample: The readings.
-        state: Joint angles, tensions and lengths as the network restores them from the readings.
+        sample: The checked readings of the message.
+        state: Joint angles, tensions and lengths that the network estimates from the readings.
         covariance: Covariance of the joint angles [rad²], (D, D), or None if it is unknown.
         anomaly: Anomaly score A: the size of the network's residual, in scaled units.
-        detected: Whether a finding has been latched because of this message.
+        detected: Whether this message made a detector report a fault, which was then latched.
         contact: External load; None while the length offsets are unknown, on a robot whose tensions
-            are unknown, and for a message that follows the last checked one within SPACING.
+            are unknown, and for a message that follows the last checked one within 6 ms (SPACING).
     """
 
     sample: MuscleSample
@@ -94,10 +94,10 @@ class Estimator:
         stream: Converts messages into samples.
         mae: The network in use, without the isolated muscles; None before the first.
         complete_mae: The same network with all muscles.
-        health: The detectors.
-        suspects: The latched finding and its verification.
+        health: Checks each message with all detectors.
+        suspects: The latched fault that a detector found, and the verification of its muscle.
         calibration: The running length calibration, or None.
-        contact: The contact estimator.
+        contact: Estimates the external load, and detects contact.
         healthy_torque: Measures the external torque that is wrongly estimated without contact.
         mounting: Checks the direction of gravity.
         networks: Decides which network is used.
@@ -158,7 +158,7 @@ class Estimator:
 
     @property
     def remedy(self) -> tuple[Step, ...]:
-        """Steps by which a user ends the anomaly; () without one and during a verification.
+        """Steps by which a user ends the anomaly; () without an anomaly or during a verification.
 
         After a repair, the suspect may have another length offset. A reset is then refused, and a
         length calibration ends the anomaly instead.
@@ -176,7 +176,7 @@ class Estimator:
 
     @property
     def advice(self) -> str:
-        """What ends the anomaly, as a text for users; '' without an anomaly."""
+        """Advice on how to end the anomaly, as a text for users; '' without an anomaly."""
         if self.suspects.verification is not None:
             return f'wait until the muscle has been verified, within {LONGEST:g} s'
         return sentence(self.remedy)
@@ -216,7 +216,7 @@ class Estimator:
         return mae
 
     def isolate(self, muscles: Iterable[int]) -> None:
-        """Isolate exactly these muscles (indices in T and l), and restore all others.
+        """Isolate exactly the muscles with these indices, and restore all others.
 
         Restoring a suspect ends its verification; the finding stays latched.
         """
@@ -240,7 +240,7 @@ class Estimator:
         self._note(evidence, found=LengthOffsets(offset, unknown.deviation))
 
     def calibrate_lengths(self, posture: tuple[float, ...] = ()) -> None:
-        """Calibrate the lengths from now on, while the arm stands in a posture or moves gently.
+        """Start a length calibration, during which the arm stands in a posture or moves gently.
 
         Args:
             posture: Positions of the joints at which the arm stands [rad or m], (D,); () if it
@@ -266,9 +266,10 @@ class Estimator:
         self._commands.note(now, length, tension)
 
     def joints(self, theta: Array, now: float) -> None:
-        """Record θ [rad] (D,) as measured by joint sensors at `now` [s], NaN for other joints.
+        """Record joint angles θ [rad], (D,), that joint sensors measured at `now` [s].
 
-        A joint that had readings is reported if it has none for a second.
+        θ is NaN for joints that the message does not contain. A joint that had readings before is
+        reported as missing once it has had none for a second.
         """
         usable = self.joint_stream.take(now, theta)
         impossible = self.joint_stream.impossible(now)
@@ -282,10 +283,13 @@ class Estimator:
         return self.joint_check.trust
 
     def confirm_joint_sensors(self) -> tuple[int, ...]:
-        """Confirm the joint sensors, as the user wants; return the joints concerned.
+        """Confirm that the joint sensors are right, because a user says so.
 
-        Sensors in doubt are trusted again, and the readings of the doubtful time count as well.
-        Sensors without readings count as removed until they report again.
+        Sensors in doubt are trusted again, including their readings since the doubt began. Sensors
+        without readings are regarded as removed until they report again.
+
+        Returns:
+            Indices of the joints whose sensors were in doubt or missing.
         """
         return (*self.joint_check.confirm(), *self.joint_stream.do_without_missing())
 
@@ -293,8 +297,8 @@ class Estimator:
         """Use isolated muscles (indices) again; muscles that are not isolated are ignored.
 
         Raises:
-            MusculoskeletalError: If one of these muscles is being verified, or does not fit the
-                rest of the arm yet (`repair_check`). No muscle is restored then.
+            MusculoskeletalError: If one of these muscles is being verified, or if its readings
+                still contradict the rest of the arm (`repair_check`). No muscle is restored then.
         """
         restored = [muscle for muscle in self.body.isolated if muscle in set(muscles)]
         verification = self.suspects.verification
@@ -317,9 +321,9 @@ class Estimator:
             isolating: Muscles (indices) that the caller isolates next; they need not be healthy.
 
         Raises:
-            MusculoskeletalError: If the suspect does not fit the rest of the arm yet
-                (`repair_check`). Also if length offsets are unreliable, and joint sensors do not
-                confirm the lengths.
+            MusculoskeletalError: If the readings of the suspect muscle still contradict the rest of
+                the arm (`repair_check`), or if length offsets were revoked and no joint sensors
+                confirm the lengths. The anomaly then stays.
         """
         self._check_suspect(tuple(isolating))
         if self.body.offsets.revoked:
@@ -380,15 +384,18 @@ class Estimator:
         return posture_of_marker(self.robot, pose, start)
 
     def report(self, now: float) -> Report:
-        """Report the status for /diagnostics."""
+        """Report the status for /diagnostics; `now` is a time of the steady clock [s]."""
         return status.report(self, now)
 
     def conditions(self, now: float) -> tuple[Condition, ...]:
-        """Return everything that users should know about the readings and the body."""
+        """Return the conditions of readings, body and network that users should know.
+
+        `now` is a time of the steady clock [s].
+        """
         return status.conditions(self, now)
 
     def rejected_because(self, now: float) -> str:
-        """Return why muscle states have been rejected for longer than a glitch, or ''."""
+        """Return why all muscle states of the last 0.1 s or longer were rejected; '' otherwise."""
         return self._rejected.lasting(now)
 
     def _use_sample(self, sample: MuscleSample, now: float) -> Output | None:
@@ -466,7 +473,7 @@ class Estimator:
             now: Time on the steady clock [s].
 
         Returns:
-            Whether a finding has been latched.
+            Whether a detector has found a fault, and the anomaly has been latched.
         """
         dt, sent_apart = min(self._unchecked, LONGEST_STEP), self._unchecked_sent
         self._unchecked = self._unchecked_sent = 0.0
@@ -498,7 +505,10 @@ class Estimator:
         muscles: Iterable[int] | None = None,
         found: LengthOffsets | None = None,
     ) -> None:
-        """Note new evidence on length offsets, and use the decision on it (`LengthTrust.take`)."""
+        """Note evidence on length offsets; if it changes them or their trust, update the body.
+
+        `LengthTrust.take` describes the arguments.
+        """
         if self.trust.take(evidence, muscles, found):
             self._update_body(offsets=self.trust.offsets)
 
@@ -514,12 +524,18 @@ class Estimator:
             self.stream.use_body(self.body)
 
     def _measured_theta(self, readings: Array) -> Array | None:
-        """Return the readings (D,) if all are fresh and their sensors are used; otherwise None."""
+        """Return the readings [rad], (D,), as the measured posture, or None.
+
+        It is None unless every joint has a fresh reading of a sensor that is trusted.
+        """
         is_known = not self.joint_trust.unused and np.isfinite(readings).all()
         return readings if is_known else None
 
     def _fresh_readings(self, now: float) -> Array:
-        """Return the usable readings of joint sensors [rad], (D,), with NaN where they are old."""
+        """Return the usable readings of joint sensors [rad], (D,).
+
+        A joint without a reading in the last 0.05 s (JOINTS_AGE) has NaN.
+        """
         theta, time = self._readings
         return np.where(now - time < JOINTS_AGE, theta, np.nan)
 
@@ -536,12 +552,13 @@ class Estimator:
             self._handle(finding_of(jumped), now)
 
     def _check_suspect(self, isolating: Iterable[int]) -> None:
-        """Check that the suspects may be used again, unless they are among the muscles `isolating`.
+        """Check that suspect muscles are repaired, unless they are among the muscles `isolating`.
 
         Then confirm the length offset of each suspect whose length has jumped since the finding.
 
         Raises:
-            MusculoskeletalError: If the suspect may not be used yet.
+            MusculoskeletalError: If the readings of a suspect still contradict the rest of the arm;
+                the text says what to repair.
         """
         suspected = self.suspects.finding
         if suspected is None or suspected.kind.steps != REPAIR or suspected.muscle in isolating:
@@ -552,7 +569,7 @@ class Estimator:
         self._confirm(used)
 
     def _confirm(self, muscles: Iterable[int]) -> None:
-        """Confirm the offsets of repaired muscles, if their lengths have changed in the repair."""
+        """Confirm the length offsets of repaired muscles whose lengths changed in the repair."""
         moved = [muscle for muscle in muscles if self.trust.evidence[muscle] is Evidence.MOVED]
         self._note(Evidence.CONFIRMED, moved)
 
@@ -563,7 +580,7 @@ class Estimator:
 
     @property
     def _repair_check(self) -> RepairCheck | None:
-        """A check of the newest readings; None before the first and without a network."""
+        """Check of repaired muscles by the newest readings; None without readings or a network."""
         sample, mae, body = self.sample, self.complete_mae, self.body
         if sample is None or mae is None:
             return None
@@ -577,9 +594,12 @@ class Estimator:
     def _handle(self, finding: Finding | None, now: float) -> bool:
         """Latch a finding and isolate its muscle, as its kind and the settings require.
 
-        A finding that makes one length or several lengths unreliable also revokes its offset or
-        all offsets. Return whether the finding has just been latched; False without a finding, or
-        if another one is latched.
+        A finding that makes one length unreliable also revokes its offset, one that makes several
+        lengths unreliable revokes all offsets.
+
+        Returns:
+            Whether this finding has just been latched; False if `finding` is None, or if an earlier
+            finding is latched already.
         """
         if finding is None:
             return False

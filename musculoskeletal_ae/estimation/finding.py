@@ -16,7 +16,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-#: discard the messages of this time before a finding [s]: the fault may have begun so much earlier
+#: discard the messages of this time before a fault was detected [s], because the fault may have
+#: begun that much earlier
 DETECTION_DELAY = 2.0
 
 
@@ -25,11 +26,11 @@ class Finding:
     """A fault that a detector has found, and the muscle to which it is attributed.
 
     Attributes:
-        muscle: Index of the muscle. If the fault is of several muscles, it is the index of one of
-            them.
+        muscle: Index of the most suspect muscle. If several muscles are faulty, it is one of them.
         kind: Kind of the fault. Its declaration states the consequence and the remedy.
         evidence: The evidence as a text for users.
-        others: Indices of further muscles that the fault concerns, or that may be faulty instead.
+        others: Indices of further muscles that are also faulty, or that may be faulty instead of
+            `muscle`.
     """
 
     muscle: int
@@ -44,7 +45,7 @@ class Finding:
 
     @property
     def is_of_one_length(self) -> bool:
-        """Whether the length of a single muscle is wrong."""
+        """Whether the finding makes a single length unreliable, that of `muscle`."""
         return self.kind.revokes is Revokes.ONE
 
 
@@ -53,8 +54,8 @@ class Observation:
     """One message as the input of the detectors.
 
     Attributes:
-        sample: The readings.
-        estimate: The network's estimate.
+        sample: The checked readings.
+        estimate: What the network estimates from these readings.
         demand: Tensions that the newest command demands of the muscle modules [N], (M,); None
             without a command, and for position-controlled modules.
         dt: Time since the previous message [s]; the caller limits it after a pause.
@@ -139,5 +140,5 @@ class Detector:
         return None
 
     def step(self, observation: Observation) -> Finding | None:  # noqa: ARG002
-        """Check a message for which there is an estimate; return a finding or None."""
+        """Check a message for which the network has made an estimate; return a finding or None."""
         return None

@@ -26,7 +26,8 @@ class HealthMonitor:
     """Checks messages with all detectors, and returns the finding of the first that has one.
 
     Attributes:
-        residual: The detector of the residual distance, which also names the most suspect muscle.
+        residual: The detector that compares the network's residual with its healthy spread; it also
+            names the most suspect muscle.
         joints: The detector of lengths that disagree with joint sensors.
         heat: Thermal models of the muscle modules, which the caller updates.
     """

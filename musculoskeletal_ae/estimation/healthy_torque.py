@@ -16,11 +16,12 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION
 
-MEMORY = 180.0  # average over at most this much time in motion (time constant) [s]
-MOVING = 0.05  # count an arm as moving above this norm of the joint velocities [rad/s]
-#: clip torques to this multiple of σ, because larger ones indicate contact
+MEMORY = 180.0  # average the squared torque over this much time in motion (time constant) [s]
+MOVING = 0.05  # measure only while the norm of the joint velocities exceeds this [rad/s]
+#: clip external torques to this multiple of σ before they enter the average, because larger ones
+#: indicate contact
 OUTLIER = 5.0
-LEAST_SPREAD = 1e-3  # assume at least this σ [N·m]
+LEAST_SPREAD = 1e-3  # store at least this σ in the network [N·m], because torques are divided by it
 
 
 class HealthyTorque:
@@ -33,10 +34,10 @@ class HealthyTorque:
         self._square, self._time = np.zeros(joint_count), 0.0
 
     def put_into(self, mae: Mae) -> Mae:
-        """Return a copy of a network that contains the residual torque σ measured here.
+        """Put the measured residual torque σ into a network, and return the copy with it.
 
-        A network that contains no σ is returned unchanged. Until the arm has moved, the measurement
-        continues from the σ of the network.
+        A network that contains no σ is returned unchanged. Before the first measurement, the σ of
+        the network is adopted instead, and later measurements are averaged with it.
         """
         if (known := mae.touch) is None:
             return mae

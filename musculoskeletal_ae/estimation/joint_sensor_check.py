@@ -49,30 +49,32 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.joint_trust import NOT_USED, JointTrust, SensorTrust
 
-SPACING = 0.5  # count at most one message in this time [s]
-#: count a message only if the estimate of a joint has moved by this much since the last one that
-#: counted [rad]
+SPACING = 0.5  # judge sensors by at most one message in this time [s]
+#: skip a message unless the estimated angle of a joint has changed by this much since the last
+#: message that was stored [rad]: more messages of one posture tell nothing about others
 MOVED = 0.03
-EARLIER = 600  # keep this many earlier messages, which are at least 5 min of motion
-#: Count no message with more evidence for an external load than this (`contact.py`, d). Under a
-#: load that was not learned, the estimate may be wrong, and not the joint sensor.
+#: compare new readings with at most this many earlier messages, which are at least 5 min of motion
+EARLIER = 600
+#: Skip messages in which the evidence d for an external load (`contact.py`) exceeds this. Under a
+#: load that was not learned, the estimate may be wrong instead of the joint sensor.
 LOADED = 3.0
 ENOUGH = 80  # judge a sensor by at least this many earlier messages
 NEWEST = 48  # judge this many of the newest messages, by all messages before them
-#: Judge a sensor in these windows: number of messages, smallest limit of the median of |x| [rad],
-#: and limit in healthy spreads. The short window finds large errors fast; the long one
-#: averages over more postures.
+#: Judge a sensor by its deviation x in three windows, each with the number of newest messages, the
+#: smallest limit of the median of |x| [rad], and the limit in healthy spreads. The short
+#: window finds large errors fast; the long one averages over more postures.
 WINDOWS = ((6, 0.12, 7.0), (24, 0.07, 3.0), (NEWEST, 0.06, 2.2))
-#: Trust a sensor again once the median of |x| is below AGREEING_LIMIT [rad] or AGREEING_SPREADS
-#: healthy spreads, both over the newest AGREEING messages and over the newer half of them.
+#: Trust a doubted sensor again once the median of its deviation |x| is below AGREEING_LIMIT [rad]
+#: or AGREEING_SPREADS healthy spreads, whichever is larger: over the newest AGREEING messages,
+#: and also over the newer half of them.
 AGREEING, AGREEING_LIMIT, AGREEING_SPREADS = 12, 0.035, 1.0
 #: assume at least this healthy spread of a length residual [m], because no length sensor is more
 #: precise
 LEAST_SPREAD = 0.0005
-#: Doubt joint sensors if false joint sensors would leave a smaller sum of squares of Δ than this
-#: share of what a change of any single muscle would leave
+#: Doubt joint sensors only if they explain the length errors clearly better than a changed muscle:
+#: the sum of squares that they leave is below this share of what any single muscle leaves.
 BETTER = 0.7
-USES = 10  # compute the medians of the earlier messages again after this many messages
+USES = 10  # compute the medians of the earlier messages again only after this many new messages
 TO_SIGMA = 1.48  # multiply a median of absolute deviations by this to get the standard deviation
 #: doubt a sensor even with few earlier messages if its reading differs from the estimate by this
 #: much [rad]
@@ -80,9 +82,9 @@ GROSS = 0.8
 
 
 class _CountedMessage(NamedTuple):
-    """The readings of one message that counts for the judgement."""
+    """The readings of one message by which the joint sensors are judged."""
 
-    time: float  # [s]
+    time: float  # time of the message on the steady clock [s]
     theta: Array  # readings of the joint sensors [rad], (D,); NaN where unknown or in doubt
     tension: Array  # bone-side tensions [N], (M,)
     length: Array  # lengths [m], (M,); NaN for isolated muscles
@@ -90,19 +92,21 @@ class _CountedMessage(NamedTuple):
 
 
 class _Usual(NamedTuple):
-    """Medians of earlier messages, and their spread about them."""
+    """What is usual on the healthy arm: medians of earlier messages, and spreads about them."""
 
-    deviation: Array  # θ − θ̂ [rad], (D,); 0 if unknown
-    deviation_spread: Array  # of the newest of them when they arrived [rad], (D,); NaN if unknown
-    residual: Array  # l − l_net(θ̂, T_end) [m], (M,)
-    residual_spread: Array  # [m], (M,)
+    deviation: Array  # usual deviation θ − θ̂ of each joint sensor [rad], (D,); 0 if unknown
+    #: spread of these deviations in the newest of the messages, when they arrived [rad], (D,); NaN
+    #: if unknown
+    deviation_spread: Array
+    residual: Array  # usual length error l − l_net(θ̂, T_end) of each muscle [m], (M,)
+    residual_spread: Array  # spread of these length errors [m], (M,)
 
 
 class JointSensorCheck:
-    """Judges the joint sensors of one arm.
+    """Decides which joint sensors of one arm are trusted, by comparing them with muscle lengths.
 
     Attributes:
-        trust: The newest decision.
+        trust: The newest decision on every sensor.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -114,8 +118,8 @@ class JointSensorCheck:
         self._messages: deque[_CountedMessage] = deque(maxlen=EARLIER + NEWEST)
         #: θ − θ̂ [rad] (D,) and l − l_net(θ̂, T_end) [m] (M,) of each message with the network in use
         self._compared: deque[tuple[Array, Array]] = deque(maxlen=EARLIER + NEWEST)
-        self._since = 0.0  # time since the last message that counted [s]
-        #: estimate at the last message that counted [rad], (D,)
+        self._since = 0.0  # time since a message was last stored [s]
+        #: estimated joint angles at that message [rad], (D,)
         self._counted_at = np.full(robot.joint_count, np.inf)
         self._usual: _Usual | None = None  # None if it has to be computed
         self._uses = 0  # number of messages judged by `_usual`
@@ -148,9 +152,12 @@ class JointSensorCheck:
         self._compared.clear()
 
     def confirm(self) -> tuple[int, ...]:
-        """Confirm all doubted sensors, as the user wants; return their joints.
+        """Confirm all doubted sensors, because a user says that they are right.
 
-        Later readings are not compared with those from before the doubt, which contradict them.
+        Earlier readings, which contradict them, are discarded.
+
+        Returns:
+            Indices of the joints whose sensors were in doubt.
         """
         joints, doubted = self.trust.doubted, self.trust.is_doubted
         if not joints:
@@ -181,13 +188,14 @@ class JointSensorCheck:
     # -- messages -------------------------------------------------------------------------------
 
     def step(self, observation: Observation, theta: Array, now: float, load: float = 0.0) -> None:
-        """Judge the sensors by a message of an arm without an anomaly, whose offsets are known.
+        """Judge the sensors by one message. The arm has no anomaly, and its offsets are known.
 
         Args:
             observation: The message.
             theta: Usable readings of the joint sensors [rad], (D,), NaN for other joints.
             now: Time of a steady clock [s].
-            load: Evidence for an external load; NaN if unknown.
+            load: Evidence d for an external load; the message is skipped if it exceeds LOADED. NaN
+                if unknown.
         """
         if load > LOADED:
             return
@@ -237,7 +245,7 @@ class JointSensorCheck:
             self._give_up(agrees)
 
     def _compute_usual(self) -> _Usual:
-        """Compute the medians of the earlier messages, and their spreads about them."""
+        """Compute what is usual: medians of the earlier messages, and spreads about them."""
         earlier = list(self._compared)[:-NEWEST]
         deviation, residual = (
             np.array([each[part] for each in earlier]).reshape(len(earlier), len(values))
@@ -256,7 +264,7 @@ class JointSensorCheck:
         return _Usual(middle, spread, usual_residual, residual_spread)
 
     def _is_precise(self) -> bool:
-        """Return whether errors below GROSS can be judged.
+        """Return whether estimates are precise enough to judge errors smaller than GROSS.
 
         A network that has learned little makes large errors in new postures. Without tensions, a
         load changes the estimates as false joint sensors would.
@@ -264,14 +272,18 @@ class JointSensorCheck:
         return self._mae is not None and self._mae.is_calibrated and self._has_tensions
 
     def _limits(self, usual: _Usual) -> Iterator[tuple[int, Array]]:
-        """Yield the length of each window and the limits of the median of |x| [rad], (D,)."""
+        """Yield the limits of each joint's deviation in each window.
+
+        Each item is the number of messages in the window, and the limit of the median of |x| [rad],
+        (D,).
+        """
         for count, smallest, spreads in WINDOWS:
             limit = np.fmax(smallest, spreads * usual.deviation_spread)
             is_gross = np.isnan(usual.deviation_spread) | (not self._is_precise())
             yield count, np.where(is_gross, GROSS, limit)
 
     def _agrees(self, excess: Array, usual: _Usual) -> Bools:
-        """Return which joints agree with the lengths again, (D,)."""
+        """Return the joints whose newest readings agree with the muscle lengths again, (D,)."""
         limit = np.fmax(AGREEING_LIMIT, AGREEING_SPREADS * usual.deviation_spread)
         agrees = np.ones(len(limit), dtype=bool)
         for count in (AGREEING // 2, AGREEING):
@@ -283,8 +295,8 @@ class JointSensorCheck:
 
         Args:
             joints: The joints whose sensors may be false, (D,).
-            excess: x of these messages [rad], (N, D).
-            usual: Medians and spreads of earlier messages.
+            excess: Deviations x of the sensors in these messages [rad], (N, D).
+            usual: What is usual on the healthy arm, from earlier messages.
         """
         mae, spread = self._mae, usual.residual_spread
         assert mae is not None
@@ -313,7 +325,7 @@ class JointSensorCheck:
         return by_joints < BETTER * by_muscle
 
     def _give_up(self, joints: Bools) -> None:
-        """Give up the newest readings of joints, except those by which they are trusted again."""
+        """Discard the newest readings of joints, except those by which they are trusted again."""
         for place in range(max(-NEWEST, -len(self._messages)), -AGREEING):
             self._messages[place].theta[joints] = self._compared[place][0][joints] = np.nan
 
@@ -323,7 +335,7 @@ class JointSensorCheck:
         Args:
             joints: The joints, (D,).
             trust: The new trust in each of them.
-            excess: x of the newest messages [rad], (N, D).
+            excess: Deviations x of the sensors in the newest messages [rad], (N, D).
         """
         old = self.trust
         trusts = tuple(trust if is_it else each for is_it, each in zip(joints, old.trust))

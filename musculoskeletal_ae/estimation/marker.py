@@ -8,9 +8,11 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-# A larger error means that the camera sees another marker or is not calibrated.
-MARKER_DISTANCE = 0.05  # reject a pose with a larger error of the position [m]
-MARKER_ANGLE = 0.3  # reject a pose with a larger error of the orientation [rad]
+# If the end effector cannot come closer, the camera sees another marker or is not calibrated.
+#: reject a pose if the end effector stays further than this from its position [m]
+MARKER_DISTANCE = 0.05
+#: reject a pose if the orientation of the end effector differs by more than this angle [rad]
+MARKER_ANGLE = 0.3
 
 
 def posture_of_marker(robot: Robot, pose: pin.SE3, start: Array) -> Array:
@@ -33,6 +35,7 @@ def posture_of_marker(robot: Robot, pose: pin.SE3, start: Array) -> Array:
             'out of reach',
             f'in the nearest posture, the end effector is {posture.distance:.3f} m and '
             f'{posture.angle:.2f} rad away from the pose of the marker; '
-            f'legal: at most {MARKER_DISTANCE:g} m and {MARKER_ANGLE:g} rad',
+            f'legal: at most {MARKER_DISTANCE:g} m and {MARKER_ANGLE:g} rad; '
+            'check which marker the camera sees, and its calibration',
         )
     return posture.observed_theta

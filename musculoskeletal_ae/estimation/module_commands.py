@@ -13,7 +13,10 @@ COMMAND_AGE = 0.5
 
 
 class ModuleCommands:
-    """Stores the newest command: target lengths or target tensions."""
+    """Stores the newest command to the muscle modules: target lengths or target tensions.
+
+    A command older than 0.5 s (COMMAND_AGE) is ignored.
+    """
 
     def __init__(self) -> None:
         self._length: Array | None = None  # l_target [m], (M,)

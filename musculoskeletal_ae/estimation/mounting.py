@@ -18,9 +18,9 @@ S is summed over the newest n postures, and the evidence is the largest one of a
 turned while the arm works is thus found as soon as one that was wrong from the beginning. Earlier
 postures are discarded once the newest ones show the direction of `robot.urdf`.
 
-A posture counts only if it differs from the last one that counted. An arm that stands still, with
+A posture is used only if it differs from the last one that was used. An arm that stands still, with
 the same friction all the time, therefore adds no evidence. At the stop of a joint, the muscles need
-not hold the weight: a residual counts there only if the stop would have to pull.
+not hold the weight: a residual is used there only if the stop would have to pull.
 """
 
 from __future__ import annotations
@@ -35,24 +35,26 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-DIRECTIONS = 162  # compare this many directions u, which are about 16° apart
+DIRECTIONS = 162  # compare this many directions u of gravity, which are about 16° apart
 #: compare these masses m of a payload, as shares of the mass of the moving links
 PAYLOADS = 0.0, 0.3, 0.6, 1.2
-UPRIGHT = 25.0  # count a direction within this angle as that of `robot.urdf` [°]
-#: try these σ_j, as shares of the muscles' absolute torques at the joint; the one with the smallest
-#: S counts
+UPRIGHT = 25.0  # treat a direction within this angle as that of `robot.urdf` [°]
+#: try these torque errors σ_j, as shares of the muscles' summed absolute torques at joint j, and
+#: use the one that explains the postures best
 NOISE = 0.08, 0.16, 0.32
-LEAST_NOISE = 0.1  # assume at least this σ_j [N·m]
-FREEDOM = 4.0  # ν: let larger residuals count less than their squares
-MOVED = 0.2  # count a posture again only after a joint has moved by this much [rad]
-#: count at most one posture in this time [s], because noise makes the estimate jump
+LEAST_NOISE = 0.1  # assume at least this torque error σ_j [N·m]
+#: ν: degrees of freedom of Student's distribution of the torque errors; with few, single large
+#: errors due to friction or pushes decide little
+FREEDOM = 4.0
+MOVED = 0.2  # use another posture only after a joint has moved by this much [rad]
+#: use at most one posture in this time [s], because noise makes the estimated posture jump
 SPACING = 0.5
-AT_STOP = 0.12  # expect that a joint may rest at its stop within this distance from the limit [rad]
-MEMORY = 100  # judge the direction by at most this many of the newest postures
-ENOUGH = 30  # judge the direction by at least this many postures
-#: Report another direction of gravity from this evidence on. On learned arms that explored
-#: (foreign, individuals 0 and 1), it was at most 33 in 150 s. It reached 78 and 86 in the 70 s
-#: after the base had been turned by 176°.
+AT_STOP = 0.12  # assume that a joint may rest against its stop this close to its limit [rad]
+MEMORY = 100  # judge the direction of gravity by at most this many of the newest postures
+ENOUGH = 30  # judge the direction of gravity by at least this many postures
+#: Report that gravity acts in another direction once the evidence exceeds this. On learned arms
+#: that explored (emulator model `foreign`, individuals 0 and 1), it was at most 33 in 150 s. It
+#: reached 78 and 86 in the 70 s after the base had been turned by 176°.
 CERTAIN = 60.0
 #: end the report, and discard earlier postures, when the newest ENOUGH postures show the direction
 #: of `robot.urdf` with this evidence
@@ -74,7 +76,7 @@ class Tilt(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The direction of gravity that the tensions show, as a sentence for users."""
+        """Direction of gravity that the tensions show, as a text for users."""
         x, y, z = self.direction
         return (
             f'the tensions show that gravity acts along ({x:.1f}, {y:.1f}, {z:.1f}) of the root '
@@ -97,7 +99,8 @@ class MountingCheck:
     `use` must be called before `step`.
 
     Attributes:
-        tilt: The direction of gravity, if it certainly differs from the one of `robot.urdf`.
+        tilt: The direction of gravity, if it certainly differs from the one of `robot.urdf`; else
+            None.
         evidence: Logarithm of the likelihood ratio between the best direction and the best one near
             that of `robot.urdf`.
     """
@@ -117,7 +120,7 @@ class MountingCheck:
         self.reset()
 
     def use(self, mae: Mae) -> None:
-        """Use another network; without statistics of the learned arm, nothing is checked."""
+        """Use another network; nothing is checked if its anomaly detector is not calibrated."""
         self._mae = mae
         self._is_learned = mae.is_calibrated
 
@@ -125,8 +128,8 @@ class MountingCheck:
         """Reset the check: discard all evidence, for example after a reset by the user."""
         self.tilt: Tilt | None = None
         self.evidence = 0.0
-        self._counted_at = np.full(self._robot.joint_count, np.inf)  # last θ that counted
-        self._since = SPACING  # time since the last posture that counted [s]
+        self._counted_at = np.full(self._robot.joint_count, np.inf)  # last posture that was used
+        self._since = SPACING  # time since the last posture that was used [s]
         #: terms of S for each posture, newest first, (noise levels, payloads, directions)
         self._costs: deque[Array] = deque(maxlen=MEMORY)
 
@@ -191,7 +194,10 @@ class MountingCheck:
         return theta < robot.lower + AT_STOP, theta > robot.upper - AT_STOP
 
     def _regressors(self, theta: Array) -> tuple[Array, Array]:
-        """Return matrices from gravity to torques, of the arm and of 1 kg in the hand, (D, 3)."""
+        """Return two matrices by which gravity [m/s²] is multiplied to get torques [N·m], (D, 3).
+
+        The first yields the torques that hold the arm, the second those for 1 kg in the hand.
+        """
         kinematics, model = self._robot.kinematics, self._model
         angles, columns = kinematics.tree.angles(theta), []
         for unit in np.eye(3):

@@ -28,13 +28,14 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS, slack_tension
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-#: Refuse a repaired muscle if |l − l'| exceeds this [m], with a calibrated network or with any
-#: other. Healthy lengths differ by at most 0.013 and 0.051 m (`detectors/length_disagreement.py`).
+#: Refuse to use a repaired muscle if its length l differs from the predicted length l' by more than
+#: this [m]: the first limit is for networks with a calibrated detector, the second for all others.
+#: Healthy lengths differ by at most 0.013 and 0.051 m (`detectors/length_disagreement.py`).
 LARGEST_LEARNED, LARGEST_YOUNG = 0.02, 0.08
 
 
 class RepairCheck(NamedTuple):
-    """Checks muscles by the readings of one message."""
+    """Checks by the readings of one message whether repaired muscles may be used again."""
 
     robot: Robot  # the nominal body with all muscles
     mae: Mae  # the network with all muscles
@@ -43,7 +44,9 @@ class RepairCheck(NamedTuple):
     theta: Array | None  # θ from joint sensors [rad], (D,), or None without them
     demand: Array | None  # tensions that the newest command demands [N], (M,); None if unknown
     jumping: Collection[int]  # indices of the muscles whose lengths have just jumped
-    limit: float  # largest |l − l'| [m]; infinite while the length offsets are unknown
+    #: largest legal difference |l − l'| of a length from the predicted one [m]; infinite while the
+    #: length offsets are unknown
+    limit: float
 
     def problem(self, muscle: int) -> str:
         """Return why a muscle must not be used yet, as a text for users; '' if it may be used."""
@@ -84,7 +87,10 @@ class RepairCheck(NamedTuple):
         return bool(self.sample.motor_tension[muscle] < lowest)
 
     def _length_error(self, muscle: int) -> float:
-        """Return by how much the length of a muscle deviates from the posture (l − l') [m]."""
+        """Return the length error l − l' of a muscle [m]: measured minus predicted length.
+
+        l' is predicted at the posture that joint sensors or, without them, the other muscles show.
+        """
         theta, sample = self.theta, self.sample
         if theta is None:
             others = self.mae.without({*self.isolated, muscle})

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from musculoskeletal_ae.parameters import CheckedSettings, settable
 
-STOP, ISOLATE = ON_ANOMALY = ('stop', 'isolate')
+STOP, ISOLATE = ON_ANOMALY = ('stop', 'isolate')  # legal values of the parameter `on_anomaly`
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The estimator's status: what is wrong with the body, and what it knows of it."""
+"""Reports the estimator's status for /diagnostics: faults of the body, and present estimates."""
 
 from __future__ import annotations
 
@@ -17,16 +17,18 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.estimator import Estimator
     from musculoskeletal_ae.mae.mae import Mae
 
-#: call the sensor itself faulty if at least this share of its readings is impossible
+#: blame the joint sensor itself if at least this share of its readings is impossible; below it, a
+#: second publisher or a loose contact may be the cause
 ALL = 0.9
+#: report this value of `contact` and `tension` for a robot that does not measure tensions
 UNKNOWN_TENSION = 'unknown: tension_source is none'
 
 
 def report(core: Estimator, now: float) -> Report:
     """Report the status of an estimator; `now` is the time of a steady clock [s].
 
-    The value `verification` is an identifier for programs, and `last outcome` is one of
-    `verification.Outcome`.
+    The value `verification` is 'none' or 'running', and `last outcome` is a value of
+    `suspect_verification.Outcome`, so that programs can read both.
     """
     mae, present = core.mae, conditions(core, now)
     if mae is None:
@@ -62,7 +64,7 @@ def conditions(core: Estimator, now: float) -> tuple[Condition, ...]:
 
 
 def _finding(core: Estimator) -> Iterator[Condition]:
-    """Yield the latched finding. While its muscle is being verified, it ends by itself."""
+    """Yield the condition of the latched finding, with the steps by which a user ends it."""
     finding = core.suspects.finding
     if finding is None:
         return
@@ -80,7 +82,7 @@ def _changed_modules(core: Estimator) -> Iterator[Condition]:
 
 
 def _isolated(core: Estimator) -> Iterator[Condition]:
-    """Yield each isolated muscle, except a suspect that is isolated only to be verified."""
+    """Yield a condition for each isolated muscle, except one that is only being verified."""
     verification = core.suspects.verification
     for muscle in core.body.isolated:
         if verification is not None and verification.muscle == muscle:
@@ -93,7 +95,7 @@ def _isolated(core: Estimator) -> Iterator[Condition]:
 
 
 def _unknown_offsets(core: Estimator) -> Iterator[Condition]:
-    """Yield which length offsets are unknown, with the evidence, and how a calibration proceeds."""
+    """Yield conditions on unknown length offsets, with the reason and a calibration's progress."""
     kind, calibration, finding = ConditionKind, core.calibration, core.suspects.finding
     steps: tuple[Step, ...] = (Step.CALIBRATE_LENGTHS,)
     if calibration is not None:
@@ -126,7 +128,7 @@ def _doubted_joints(core: Estimator) -> Iterator[Condition]:
 
 
 def _unreadable_joints(core: Estimator, now: float) -> Iterator[Condition]:
-    """Yield the joints with lasting impossible readings, and those without readings."""
+    """Yield conditions on joints with lasting impossible readings, and on joints without any."""
     if series := core.joint_stream.impossible(now):
         names = [core.robot.joints[j] for j in series]
         impossible = sum(each.impossible for each in series.values())

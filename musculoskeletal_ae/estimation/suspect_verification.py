@@ -54,30 +54,38 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.signals.limits import slack_tension
 
-#: count the suspect as being wound in once its length command has decreased by more than this [m]
+#: conclude that the suspect is being wound in once its length command has decreased by more than
+#: this [m]
 WINDING_CHANGE = 0.001
 CLASSIFICATION_TIME = 0.8  # classify the suspect after it was wound in for this time [s]
-PATIENCE = 8.0  # let a suspect stay isolated if it was not wound in within this time [s]
+PATIENCE = 8.0  # end the verification of a suspect that was not wound in within this time [s]
 LONGEST = 10.0  # end a verification within this time, including the time for winding in [s]
-FAR = 0.025  # count |l − l'| as a fault from this on; noise and network errors are smaller [m]
-#: conclude a rupture if winding in lowers l − l' by this much: the loose end is wound in [m]
+#: conclude a fault if the measured length l differs from the estimated length l' by more than this
+#: [m]; noise and network errors are smaller
+FAR = 0.025
+#: conclude a rupture if l − l' falls by this much while a slack suspect is wound in [m]: the winch
+#: winds in the loose end of the tendon
 RUPTURE_CHANGE = 0.005
-#: CLOSE and JAM_EXCESS apply to this T_bias [N]; scale them down for a lower one
+#: reduce the limits CLOSE and JAM_EXCESS in proportion for a T_bias below this [N]
 USUAL_BIAS = 30.0
-CLOSE = 8.0  # tolerate this difference between T and T_ref [N]
-#: tolerate in addition this difference between T and T_ref, relative to T_ref − T_bias; count T as
-#: rising only if it rises by this share of the rise of T_ref
+CLOSE = 8.0  # tolerate this difference between the tension T and the demanded tension T_ref [N]
+#: tolerate, in addition to CLOSE, this share of T_ref − T_bias; conclude that T does not follow if
+#: it rises by less than this share of the rise of T_ref
 SHARE = 0.35
-#: call a suspect that was not wound in jammed if T exceeds T_ref by more than this [N]
+#: conclude that a suspect is jammed, although it was not wound in, if its tension T exceeds the
+#: demanded tension T_ref by more than this [N]
 JAM_EXCESS = 20.0
-#: expect a healthy tendon to have tension above this stretch, relative to that at T_bias
+#: conclude that a slack tendon is ruptured if its stretch exceeds the stretch at T_bias by this
+#: factor: a healthy tendon would have tension
 STRETCHED = 1.5
-LONGEST_WINDING = 2.5  # wind in a slack tendon for at most this time [s]
+#: with a position-controlled module, wait no longer than this for a tendon that is wound in to have
+#: tension [s]
+LONGEST_WINDING = 2.5
 BEHIND = 0.005  # judge whether a module follows once its position command has decreased by this [m]
-STANDS = 0.0005  # call a module jammed if it moved by at most this [m]
-# T_ref of a position-controlled module is found by bisection, over 0 to HIGHEST_TENSION.
-HIGHEST_TENSION = 5000.0  # end the search for T_ref at this tension [N]
-HALVINGS = 40  # end the search for T_ref after this many bisection steps
+STANDS = 0.0005  # treat a winch as standing still if the length changes by less than this [m]
+# T_ref of a position-controlled module is found by bisection between 0 and HIGHEST_TENSION.
+HIGHEST_TENSION = 5000.0  # search for T_ref up to this tension [N]
+HALVINGS = 40  # halve the range of T_ref this many times, to far below 1 mN
 FROZEN = 1e-6  # call a sensor frozen if its readings vary by less than this [m] or [N]
 
 
@@ -97,6 +105,7 @@ class Outcome(Enum):
     SENSOR_SATURATED = 'sensor_saturated'
 
 
+#: outcomes as texts for users
 _TEXTS = {
     Outcome.HEALTHY: 'healthy',
     Outcome.RUPTURED: 'ruptured',
@@ -112,7 +121,7 @@ _TEXTS = {
 
 
 class VerificationVerdict(NamedTuple):
-    """The outcome of a verification, with its evidence."""
+    """The verdict on a suspect muscle: the outcome of its verification, with its evidence."""
 
     outcome: Outcome
     evidence: str = ''  # size of the fault, such as '50 mm'
@@ -123,9 +132,9 @@ class VerificationVerdict(NamedTuple):
 
 
 class _Moment(NamedTuple):
-    """What was read of the suspect at one moment, and what follows from it."""
+    """The readings of the suspect at one moment, and the demand and stretch computed from them."""
 
-    tension: float  # T [N]
+    tension: float  # measured tension T [N]
     length: float  # measured length l [m]
     command: float  # length command l_target [m]
     likely: float  # length l' that the other muscles indicate [m]
@@ -321,5 +330,5 @@ class Verification:
 
 
 def _late_median(values: Array) -> float:
-    """Return the median of the second half of values (N,)."""
+    """Return the median of the later half of values (N,), when the suspect has responded."""
     return float(np.median(values[len(values) // 2 :]))

@@ -54,11 +54,14 @@ from musculoskeletal_ae.remedy import REPAIR
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly
 
-ACQUITTALS = 2  # verify no further suspect after this many were verified as healthy
-WITHIN = 60.0  # count a suspect that was verified as healthy for this long [s]
+#: verify no further suspect, and wait for a user, if this many suspects were verified as healthy
+#: within WITHIN: there must be a fault that a verification does not reveal
+ACQUITTALS = 2
+WITHIN = 60.0  # remember for this long that a suspect was verified as healthy [s]
 
 
-#: isolate without a verification after these reactions: there is no doubt which muscle is faulty
+#: isolate the muscle without a verification if its kind of finding declares one of these reactions,
+#: because there is no doubt which muscle is faulty
 AT_ONCE = FindingReaction.ISOLATE_AT_ONCE, FindingReaction.ISOLATE_ONLY
 
 
@@ -111,7 +114,7 @@ class SuspectHandling:
         return f'{self._robot.muscles[muscle]}: {verdict}'
 
     def take(self, finding: Finding, isolated: Iterable[int], now: float) -> tuple[int, ...]:
-        """Take a finding: latch it and isolate its muscle, if the settings and its kind say so.
+        """Take a finding: latch it and isolate its muscle, as its kind and the settings require.
 
         Args:
             finding: The finding of a detector.
@@ -145,10 +148,10 @@ class SuspectHandling:
         return (*isolated, muscle)
 
     def explains(self, finding: Finding) -> bool:
-        """Return whether a new finding is a wrong length that the repair of a muscle explains.
+        """Return whether the repair of a muscle explains a new finding of a wrong length.
 
-        This is the case if the latched finding may concern the same muscle and is to be remedied by
-        its repair.
+        It does if the latched finding names the same muscle and asks for its repair: a repaired
+        muscle may have another length offset.
         """
         suspected = self.finding
         if suspected is None or suspected.kind.steps != REPAIR:

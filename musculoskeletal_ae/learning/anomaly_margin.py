@@ -18,13 +18,13 @@ MOST_WAITING = 5000
 
 
 class Waiting(NamedTuple):
-    """A message that is held back.
+    """A message that waits until it is certain that no anomaly was near.
 
     Attributes:
         time: Time of the message as the sum of all `dt` [s].
         dt: Time since the previous message [s].
-        reading: The measurements.
-        rest: Mean of the rest that ended with the message, if one did.
+        reading: The measurements of this message.
+        rest: Rest sample that was completed with this message; None if none was.
     """
 
     time: float
@@ -59,8 +59,8 @@ class AnomalyMargin:
 
         Args:
             dt: Time since the previous message [s].
-            reading: The measurements.
-            rest: Mean of the rest that ended with the message, or None.
+            reading: The measurements of this message.
+            rest: Rest sample that was completed with this message, or None.
         """
         self._waiting.append(Waiting(self._time, dt, reading, rest))
         released = []
@@ -69,7 +69,10 @@ class AnomalyMargin:
         return released
 
     def set_anomaly(self, is_anomaly: bool) -> int:
-        """Set whether an anomaly is present; return the number of rests that are discarded."""
+        """Set whether an anomaly is present; return the number of rest samples it discards.
+
+        When an anomaly begins, all messages held back are discarded.
+        """
         lost = 0
         if is_anomaly and not self.is_anomaly:
             lost = sum(waiting.rest is not None for waiting in self._waiting)

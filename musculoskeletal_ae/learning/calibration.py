@@ -11,7 +11,7 @@ margin is `MARGIN`, and n_few is `FEW_SAMPLES`.
 A reservoir keeps a uniform random selection of all messages, from motion and from rest. Each new
 network gets the statistics of its own residuals on these messages. The thresholds use the maximum,
 because friction gives d heavy tails. This maximum includes messages that were not used to
-compute Σ. Single messages far beyond all others count as sensor glitches and are excluded.
+compute Σ. Single messages far beyond all others are regarded as sensor glitches and excluded.
 
 If joint sensors read all angles, the network also learns from every second recent message
 (`update`). The other recent messages serve to validate its estimates.
@@ -30,25 +30,27 @@ from musculoskeletal_ae.learning.samples import Observations, Sample, SampleStor
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, anomaly, residuals
 
-CAPACITY = 4000  # keep at most this many messages by default
-SPACING = 0.1  # keep one message in this time [s]
-LEAST_TIME = 60.0  # calibrate a detector only after this much healthy time [s]
-#: calibrate a detector only with this many distinct rests in the healthy time and as many learned
-#: samples
+CAPACITY = 4000  # keep a random selection of at most this many healthy messages by default
+SPACING = 0.1  # consider at most one message in this time for the selection [s]
+LEAST_TIME = 60.0  # calibrate a detector only after the arm has been healthy for this long [s]
+#: calibrate a detector only if the healthy arm has rested in at least this many distinct postures,
+#: and if the network has learned at least as many samples
 LEAST_SAMPLES = 20
-#: Multiply the largest healthy d by this to get the threshold, once the body is well known. An
-#: unknown load of 3.6 kg doubles d; a ruptured tendon multiplies it by six to ten within 0.3 s.
+#: Multiply the largest residual distance d of healthy messages by this to get the threshold, once
+#: the body is well known. An unknown load of 3.6 kg doubles d; a ruptured tendon multiplies it by
+#: six to ten within 0.3 s.
 MARGIN = 3.5
-#: n_few: double the threshold if there are this many samples, because few samples determine the
-#: body poorly
+#: n_few: multiply the threshold by 1 + n_few/samples, and thus double it at this number of samples,
+#: because few samples determine the body poorly
 FEW_SAMPLES = 20.0
-#: Mix this share of Σ's own diagonal into Σ. Otherwise combinations of muscles that did not occur
-#: in the messages would look impossible.
+#: Mix this share of the diagonal of Σ into the covariance Σ of the residuals. Otherwise residuals
+#: that combine muscles in ways not seen in the messages would look impossible.
 DIAGONAL_SHARE = 0.1
 GLITCH_SHARE = 0.002  # exclude at most this share of the messages as glitches
-#: exclude a message as a glitch if its d is this multiple of the largest d of all others
+#: exclude a message as a glitch if its residual distance d exceeds the largest d of all others by
+#: this factor
 GLITCH_RATIO = 3.0
-POSTURES = 200  # store this many postures, which show where the detector was calibrated
+POSTURES = 200  # store this many postures in the checkpoint; far from them, the threshold is raised
 # Messages from which the network learns must be recent, because tendons creep and bed in.
 RECENT_TIME = 3600.0  # learn from a message only if it is younger than this [s]
 RECENT_RESTS = 200  # learn from a message only if fewer rest samples than this came after it
@@ -57,7 +59,7 @@ RECENT_RESTS = 200  # learn from a message only if fewer rest samples than this 
 class Healthy(NamedTuple):
     """Messages of the healthy arm since its body last changed."""
 
-    messages: NDArray[np.float32]  # (T, l, s), (N, 3M)
+    messages: NDArray[np.float32]  # tensions T, lengths l and sliding directions s, (N, 3M)
     time: float  # healthy time from which the messages were drawn [s]
     rests: int  # number of distinct rests in the healthy time
     #: half of the recent messages with all joint angles, from motion and rest, for training
@@ -92,7 +94,7 @@ class Reservoir:
     def step(self, reading: Sample, dt: float) -> None:
         """Add a message to the selection with a probability that keeps the selection uniform.
 
-        Only one message in SPACING [s] is considered; all others are ignored.
+        Only one message in 0.1 s (SPACING) is considered; all others are ignored.
 
         Args:
             reading: The message, with NaN for unmeasured θ.
@@ -114,7 +116,7 @@ class Reservoir:
             self._kept[place : place + 1] = [row]
 
     def rest(self, rest: Sample) -> None:
-        """Count a rest if it differs from all earlier ones."""
+        """Count a rest sample if its posture or tension differs from those of all earlier ones."""
         if self._rests.is_new(rest):
             self._rests.add(rest)
 
@@ -164,14 +166,14 @@ class Reservoir:
 
 
 def recalibrated(mae: Mae, before: AnomalyStatistics | None, healthy: Healthy, samples: int) -> Mae:
-    """Return a network with statistics of its residuals on messages of the healthy arm.
+    """Return a recalibrated network: with statistics of its residuals on healthy messages.
 
     Calibrated statistics are not replaced by uncalibrated ones. After a restart, the statistics of
     the saved network therefore stay in use until there are enough messages.
 
     Args:
         mae: The network.
-        before: Statistics of the preceding network.
+        before: Statistics of the preceding network; None if it had none.
         healthy: Messages of the healthy arm.
         samples: Number of samples that the network has learned.
     """

@@ -33,9 +33,10 @@ from musculoskeletal_ae.signals.pairing import Paired, Pairing
 
 #: sources of θ: sensors of some or all joints, a camera at irregular intervals, or none
 SENSOR, MARKER, NONE = 'sensor', 'marker', 'none'
-NO_MESSAGES = 'no muscle_states are received'
+NO_MESSAGES = 'no muscle_states are received'  # obstacle for users: no message has arrived
+#: obstacle for users: messages arrive, but none with a joint angle that the learner requires
 NO_JOINTS = 'muscle_states are received without usable joint angles'
-SPREAD = 0.02  # assume this error of θ measured by a camera (standard deviation) [rad]
+SPREAD = 0.02  # assume that θ measured by a camera has this standard deviation [rad]
 
 
 class SampleCollector:
@@ -44,10 +45,10 @@ class SampleCollector:
     Attributes:
         samples: The samples so far.
         healthy: Messages of the healthy arm, from motion and rest.
-        rejected: Number of messages and rests that were not used, by reason.
+        rejected: Number of messages and rest samples that were not used, by reason.
         usable: Arrival of the messages that were suitable for learning, on the clock of the
             messages.
-        obstacle: Why all messages since the last suitable one were unsuitable.
+        obstacle: Why all messages since the last suitable one were unsuitable, for users.
         joint_trust: Which joint sensors the estimator trusts.
     """
 
@@ -98,12 +99,15 @@ class SampleCollector:
 
     @property
     def has_jumped(self) -> bool:
-        """Whether lengths were observed to jump after the last length calibration."""
+        """Whether a length has jumped since the last length calibration.
+
+        A jump during a pause of the messages does not count, because the arm may have moved.
+        """
         return self._stream.has_jumped
 
     @property
     def jumps(self) -> int:
-        """How often lengths have jumped."""
+        """Number of jumps of lengths since the start after which the new level was accepted."""
         return self._stream.jumps.count
 
     @property
@@ -221,7 +225,7 @@ class SampleCollector:
         return False
 
     def accept(self, sample: Sample) -> None:
-        """Store a sample as a description of those muscles that are not isolated."""
+        """Accept a sample: store it, as a description of the muscles that are not isolated."""
         self.samples.add(sample, self.body.used.copy())
 
     # -- changes of state -----------------------------------------------------------------------
@@ -229,8 +233,8 @@ class SampleCollector:
     def use_body(self, body: BodyState) -> None:
         """Use another body state from now on.
 
-        Incomplete samples are discarded, unless only the anomaly has changed. No samples are
-        collected from shortly before an anomaly until shortly after its reset.
+        Incomplete samples are discarded, unless only the anomaly has changed. From 2 s before an
+        anomaly until 2 s after its end (DETECTION_DELAY), no samples are collected.
         """
         before = self.body
         self._stream.use_body(body)
@@ -241,7 +245,7 @@ class SampleCollector:
             self.reset()
 
     def use_joint_trust(self, trust: JointTrust) -> None:
-        """Use another trust in the joint sensors for readings from now on."""
+        """Use no readings from now on of joint sensors that the estimator does not trust."""
         self.joint_trust = trust
 
     def reset(self) -> None:

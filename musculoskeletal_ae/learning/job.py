@@ -12,17 +12,19 @@ from musculoskeletal_ae.mae.mae import Mae
 
 
 class Job(NamedTuple):
-    """Everything that an update needs."""
+    """A job for the training process: everything that an update of the network needs."""
 
     observed: Observations  # the samples, oldest first
-    healthy: Healthy  # messages of the healthy arm
-    statistics_hold: bool  # whether the detector's statistics are valid for the present arm
-    steps: int  # number of training steps
-    isolated: tuple[int, ...] = ()  # muscles that the messages do not describe
+    healthy: Healthy  # messages of the healthy arm, with which the anomaly detector is calibrated
+    #: whether the statistics of the anomaly detector are valid for the present arm; not after a
+    #: muscle has been changed
+    statistics_hold: bool
+    steps: int  # number of training steps of preset `default`
+    isolated: tuple[int, ...] = ()  # indices of the muscles that the messages do not describe
 
 
 class Update(NamedTuple):
-    """Everything that an update returns."""
+    """The result of one update: the trained network, and what the update has found."""
 
     mae: Mae  # the trained network
     loss: float  # training loss

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gives up the readings of joint sensors that the estimator does not use.
+"""Removes the angles of joint sensors from samples while the estimator does not use the sensors.
 
 The estimator doubts a sensor some time after its fault, and publishes when the doubt begins
 (`signals/joint_trust.py`). Samples of the doubtful time then lose the angle of this joint. They
@@ -14,14 +14,15 @@ from collections import deque
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.joint_trust import JointTrust, SensorTrust
 
-MOST_RECENT = 400  # remember the times of this many newest samples
+#: remember the times of this many newest samples, to find those taken after a doubt began
+MOST_RECENT = 400
 
 
 class JointHistory:
     """Removes angles from the samples of one store, and puts them back.
 
     Attributes:
-        given_up: Number of angles that were given up, not counting those that were put back.
+        given_up: Number of angles that were removed from samples and have not been put back.
     """
 
     def __init__(self, samples: SampleStore, joint_count: int) -> None:
@@ -35,7 +36,7 @@ class JointHistory:
         self.given_up = 0
 
     def accepted(self, now: float) -> None:
-        """Record that the newest sample of the store was taken at `now` [s]."""
+        """Record that the newest accepted sample of the store was taken at `now` [s]."""
         self._recent.append((now, self._samples.accepted))
 
     def use(self, trust: JointTrust) -> tuple[int, ...]:

@@ -31,11 +31,11 @@ from musculoskeletal_ae.robot.robot import Robot
 
 
 class Publication:
-    """Releases each new checkpoint once, and at most one per second.
+    """Decides when a checkpoint is published: each new one once, and at most one per second.
 
     Attributes:
         checkpoint: The newest checkpoint; None before the first.
-        count: Number of checkpoints released.
+        count: Number of checkpoints published so far.
     """
 
     def __init__(self) -> None:
@@ -49,7 +49,7 @@ class Publication:
         self.checkpoint, self._is_pending = data, data is not None
 
     def hurry(self) -> None:
-        """Release the next checkpoint without waiting."""
+        """Hurry: release the next checkpoint at once, even if the last was less than 1 s ago."""
         self._published_at = -math.inf
 
     def take(self, now: float) -> bytes | None:
@@ -130,7 +130,7 @@ class CheckpointKeeper:
         self.store()
 
     def clear(self) -> None:
-        """Clear all networks of the learner."""
+        """Clear all networks of the learner, and withdraw the one to be published."""
         self.mae = self._saved = self.checkpoint = None
         self.publication.offer(None)
 
@@ -234,7 +234,7 @@ class CheckpointKeeper:
 
     @property
     def trouble(self) -> str:
-        """Why samples and network are not on disk, or ''."""
+        """Why the newest samples and network are not on disk, for users; '' if they are."""
         return '' if self._state is None else self._state.trouble(self._samples)
 
     def values(self) -> dict[str, str]:

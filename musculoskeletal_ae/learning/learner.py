@@ -53,7 +53,7 @@ from musculoskeletal_ae.signals.pairing import Paired
 
 
 class Learner:
-    """Learns the body of one arm.
+    """Learns the body of one arm online: collects samples from messages, and updates the network.
 
     Attributes:
         robot: The nominal body.
@@ -138,9 +138,9 @@ class Learner:
 
         Args:
             time: Time of the measurements [s].
-            theta: θ [rad], (D,), or None if it was not measured.
-            tension: T [N], (M,).
-            length: l [m], (M,).
+            theta: Joint angles θ [rad], (D,), or None if it was not measured.
+            tension: Tensions T [N], (M,).
+            length: Muscle lengths l [m], (M,).
 
         Returns:
             A checkpoint if one is due for publication, else None.
@@ -249,10 +249,13 @@ class Learner:
             self.scheduler.note_news()
 
     def use_joint_trust(self, trust: JointTrust) -> None:
-        """Use another trust in the joint sensors, whose times are those of the messages.
+        """Use another trust in the joint sensors: learn nothing from sensors in doubt.
 
-        Sensors in doubt are not learned. Their readings since the begin of the doubt are given up,
-        unless the user confirms them (`joint_history`).
+        Their angles since the beginning of the doubt are removed from the samples, and are put back
+        if the user confirms the sensors (`joint_history`).
+
+        Args:
+            trust: The trust, with times on the clock of the messages.
         """
         self.collector.use_joint_trust(trust)
         unused = self.joint_history.use(trust)
@@ -276,7 +279,7 @@ class Learner:
         self.keeper.store()
 
     def enable(self, enabled: bool) -> None:
-        """Stop or resume learning; samples and network are kept.
+        """Enable or disable learning; samples and network are kept.
 
         If an update finishes while learning is stopped, its result is discarded.
         """
@@ -324,7 +327,7 @@ class Learner:
         self.keeper.use(mae)
 
     def note_accepted(self, mae: Mae) -> None:
-        """Note that the estimator uses this network; see `CheckpointKeeper`."""
+        """Note that the estimator uses this network; it is saved (`CheckpointKeeper`)."""
         # The detector of this network may have been calibrated before a muscle was changed.
         self.keeper.note_accepted(mae if self.scheduler.statistics_hold else uncalibrated(mae))
 
@@ -333,7 +336,7 @@ class Learner:
         self.keeper.note_rejected(version, reason)
 
     def _forget(self, muscle: int, newest: int = 0) -> None:
-        """Forget what all but the last `newest` samples say about a muscle; schedule an update.
+        """Forget a muscle in all samples but the last `newest`, and schedule an update.
 
         All messages of the healthy arm are discarded.
         """
@@ -412,7 +415,10 @@ class Learner:
 
     @property
     def has_unsettled_jump(self) -> bool:
-        """Whether lengths have jumped without a reaction of the estimator."""
+        """Whether lengths have jumped, but the estimator has neither revoked them nor stopped.
+
+        Nothing is learned meanwhile.
+        """
         has_jumped = self.collector.has_jumped and self.body.offsets.known
         return has_jumped and not self.collector.is_anomaly
 
@@ -447,5 +453,5 @@ class Learner:
         return learner_report(self)
 
     def conditions(self, _: float) -> tuple[Condition, ...]:
-        """Return why nothing is learned, or what is learned is not kept."""
+        """Return the conditions for users: why nothing is learned, or what is not on disk."""
         return learner_conditions(self)

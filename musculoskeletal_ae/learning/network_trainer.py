@@ -14,12 +14,14 @@ from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.training import TINY, one_thread
 from musculoskeletal_ae.mae.units import LENGTH_SCALE
 
-STEP_SIZE = 2e-3  # begin online training with this step size
+STEP_SIZE = 2e-3  # begin online training with this step size of the optimiser
 BATCH = 128  # train on this many samples at once
-AVERAGED_SHARE = 0.1  # average the weights over this share of all steps so far
+#: publish an average of the weights over this share of all steps so far, because single steps are
+#: noisy
+AVERAGED_SHARE = 0.1
 LEAST_AVERAGED = 20.0  # average the weights over at least this many steps
 MOST_AVERAGED = 2000.0  # average the weights over at most this many steps
-HALVING_STEPS = 2000.0  # halve the step size after this many steps
+HALVING_STEPS = 2000.0  # divide the step size by 1 + steps/HALVING_STEPS: by 2 at this step
 #: Lower the step size to no less than this share of the initial one. The weight average then no
 #: longer drifts, but the network still follows a slowly changing body.
 LEAST_STEP_SHARE = 0.1
@@ -61,12 +63,15 @@ class NetworkTrainer:
         return float(np.mean(losses[len(losses) // 2 :]))
 
     def move(self, length: Array) -> None:
-        """Move the network's muscle lengths by `length` [m] (M,), without training."""
+        """Move all lengths that the network computes by `length` [m], (M,), without training."""
         for network in (self.network, self._raw):
             network.mean[-len(length) :] += torch.as_tensor(LENGTH_SCALE * length)
 
     def restart(self) -> None:
-        """Restart with a large step size and a short weight average, as the body has changed."""
+        """Restart with a large step size and a short weight average, because the body has changed.
+
+        The weights are kept.
+        """
         self.steps = min(self.steps, int(LEAST_AVERAGED / AVERAGED_SHARE))
 
     def _average(self) -> None:

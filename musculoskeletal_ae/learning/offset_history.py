@@ -24,10 +24,13 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.limits import LIMITS
 
-#: count the offsets of two calibrations as different only above this [m]
+#: conclude that length offsets have changed only if two calibrations differ by more than this [m]
 CALIBRATION_SPREAD = 0.008
-HELD_TIME = 5.0  # hold back samples from this long before a finding [s]
-#: rely on it that a larger jump of a length between two messages is detected [m]
+#: hold back samples taken up to this long before length offsets were revoked [s], because the
+#: offsets may already have been wrong
+HELD_TIME = 5.0
+#: Correct samples for a changed offset only if the change exceeds this [m]: such a jump would have
+#: been detected, so the offset was wrong from the start.
 DETECTED_JUMP = LIMITS.step + LIMITS.speed * LIMITS.longest_step
 
 
@@ -35,8 +38,8 @@ class OffsetHistory:
     """Drops or corrects the samples of one store when its length offsets change.
 
     Attributes:
-        dropped: Number of samples dropped because their offsets were revoked.
-        corrected: Number of samples corrected.
+        dropped: Number of samples dropped because their length offsets were revoked.
+        corrected: Number of samples whose lengths were corrected for offsets wrong from the start.
     """
 
     def __init__(self, samples: SampleStore, offset: Array) -> None:

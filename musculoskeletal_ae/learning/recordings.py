@@ -32,7 +32,7 @@ from musculoskeletal_ae.signals.muscle_readings import muscle_reading
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 from musculoskeletal_ae.tables.table import Table
 
-#: Learn a table of resting postures in this many updates with this many training steps each. On a
+#: Learn a table of resting postures in UPDATES updates of REST_STEPS training steps each. On a
 #: running arm, each rest causes an update of fewer steps.
 UPDATES, REST_STEPS = 8, 400
 #: learn from slow moments of the motion if a recording has fewer different resting postures
@@ -42,12 +42,16 @@ LEAST_RESTS = 20
 def learn_table(
     learner: Learner, table: Table, progress: Callable[[float], None] | None = None
 ) -> str:
-    """Learn from a table; create the learner with `steps=REST_STEPS` if the table is at rest.
+    """Learn from a table of resting postures or of recorded motion.
 
-    `progress` is called with the seconds or updates since its last call (`work`).
+    Args:
+        learner: The learner; create it with `steps=REST_STEPS` for resting postures.
+        table: The readings.
+        progress: Called with the work done since its last call, in the unit of `work`.
 
     Returns:
-        A warning if learning stopped before the end of the table or has learned nothing, or ''.
+        A warning for users if learning stopped before the end of the table, or has learned nothing;
+        '' otherwise.
     """
     if table.at_rest:
         learn_rests(learner, table.rows, progress)
@@ -59,7 +63,7 @@ def learn_table(
 
 
 def unchanged(learner: Learner) -> str:
-    """Return why the learner's network has not changed so far; '' if it has learned."""
+    """Return why the learner's network is unchanged, as a text for users; '' if it has learned."""
     if learner.last_update is not None:
         return learner.last_update.unchanged
     return (
@@ -106,7 +110,7 @@ def count_postures(
 
 
 def work(table: Table) -> float:
-    """Return how much `learn_table` has to do: recorded seconds, or updates."""
+    """Return the work of `learn_table`: recorded seconds, or the updates for resting postures."""
     if table.at_rest:
         return UPDATES
     return sum(float(without_pauses(np.diff(part.time)).sum()) for part in table.segments())
@@ -230,17 +234,23 @@ def errors(mae: Mae, recording: Pairs, at_rest: bool = False) -> Array:
 
 
 def table_errors(mae: Mae, table: Table) -> Array:
-    """Return the errors of a network on all rows of a table [rad], (N, D), as `errors` does."""
+    """Return the errors θ_est − θ of a network on all N rows of a table [rad], (N, D).
+
+    NaN marks angles that were not measured.
+    """
     return np.concatenate([errors(mae, part, table.at_rest) for part in table.segments()])
 
 
 def error(mae: Mae, recording: Pairs) -> float:
-    """Return the mean norm of a network's errors at the joints with sensors [rad]."""
+    """Return the error of a network on a recording: the mean norm of its angle errors [rad].
+
+    Joints without a measured angle are ignored.
+    """
     return mean_error(errors(mae, recording))
 
 
 def mean_error(off: Array) -> float:
-    """Return the mean norm of the errors (N, D) of the joints with sensors [rad]."""
+    """Return the mean norm of angle errors [rad], (N, D), in which NaN marks unknown ones."""
     is_known = np.isfinite(off).any(axis=1)
     return float(np.linalg.norm(np.nan_to_num(off), axis=1)[is_known].mean())
 

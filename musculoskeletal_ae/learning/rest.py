@@ -22,20 +22,22 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.samples import NOTHING, Sample
 
-REST_TIME = 0.3  # count the arm as resting after it has been still for this long [s]
-JOINT_RATE = 0.02  # count a joint as moving above this speed [rad/s]
-LENGTH_RATE = 0.002  # count a muscle as moving above this speed [m/s]
-LONGEST_PART = 1.0  # average at most this much of a rest in one sample [s]
+REST_TIME = 0.3  # conclude that the arm rests after it has been still for this long [s]
+JOINT_RATE = 0.02  # conclude that the arm moves if a joint is faster than this [rad/s]
+LENGTH_RATE = 0.002  # conclude that the arm moves if a length changes faster than this [m/s]
+LONGEST_PART = 1.0  # average at most this much of a rest in one sample, then begin another [s]
 #: keep at most this many readings of a rest, which bounds the memory if the clock stands still
 MOST_READINGS = 20_000
 #: Require this many readings in each half of the window, and lengthen it if messages are slow: with
 #: fewer readings, noise could hide a drift.
 LEAST_READINGS = 4
-NOISE_FACTOR = 3.0  # count a difference of means as noise up to this many standard errors
+#: attribute a difference between the means of both halves to sensor noise, not to motion, up to
+#: this many standard errors
+NOISE_FACTOR = 3.0
 
 
 class ReadingWindow:
-    """The latest readings with their times, and their values as rows of an array.
+    """Stores the latest readings with their times, and their values as rows of an array.
 
     The array is reused, because allocating one for every message would be slow.
     """
@@ -73,7 +75,7 @@ class ReadingWindow:
             self._first += 1
 
     def parts(self, time: float) -> tuple[Array, Array]:
-        """Return the rows of the readings up to `time` [s], and the rows of later readings."""
+        """Return the readings in two parts, up to `time` [s] and later, as rows of l and θ."""
         earlier_count = bisect_right(self.readings, time, key=itemgetter(0))
         middle, end = self._first + earlier_count, self._first + len(self.readings)
         return self._rows[self._first : middle], self._rows[middle:end]
@@ -97,7 +99,7 @@ class OpenRest:
     gravity: list[Array] = field(default_factory=list)
 
     def mean(self) -> Sample | None:
-        """Return the mean of the readings; None if there are none."""
+        """Return the mean of the readings as one sample; None if there are no readings."""
         if not self.readings:
             return None
         theta, tension, length, direction = (
@@ -114,10 +116,14 @@ class OpenRest:
 
 
 class RestDetector:
-    """Turns a stream of readings into one mean for each rest."""
+    """Detects rests of the arm in a stream of readings, and returns the mean of each rest."""
 
     def __init__(self, blind: bool = False) -> None:
-        """Start with an empty window; `blind` states that the arm has no joint sensors."""
+        """Start with an empty window.
+
+        Args:
+            blind: Whether the arm has no joint sensors. Then only the muscles have to be at rest.
+        """
         self.blind = blind
         self._window = ReadingWindow()
         self.reset()

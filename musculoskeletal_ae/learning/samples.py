@@ -22,20 +22,20 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.signals.friction import Transmission
 
-CAPACITY = 400  # keep at most this many samples by default
+CAPACITY = 400  # keep at most this many samples by default, and drop the most similar ones
 #: Estimate tendon creep once the number of accepted samples exceeds this share of the capacity, and
 #: this share of the samples has all joint angles.
 CREEP_SHARE = 0.5
-NOTHING: Array = np.zeros(0)  # stands for a quantity that was not measured
+NOTHING: Array = np.zeros(0)  # use this empty array for a quantity that was not measured
 #: divide lengths by this typical moment arm to compare them with angles, where not all joint angles
 #: were measured [m]
 MOMENT_ARM = 0.04
-JOINT_DISTANCE = 0.05  # count two samples as different if an angle differs by more [rad]
-TENSION_DISTANCE = 10.0  # count two samples as different if a tension differs by more [N]
+JOINT_DISTANCE = 0.05  # keep a sample if an angle differs from every stored one by more [rad]
+TENSION_DISTANCE = 10.0  # keep a sample if a tension differs from every stored one by more [N]
 
 
 class Sample(NamedTuple):
-    """Mean measurements over a rest."""
+    """One sample: the means of the measurements over a rest of the arm."""
 
     theta: Array  # θ [rad], (D,); NaN where it was not measured
     tension: Array  # T [N], (M,)
@@ -59,7 +59,7 @@ class StoredSample(NamedTuple):
 
 @dataclass(frozen=True)
 class Observations:
-    """N samples as arrays."""
+    """N samples as arrays, the oldest first."""
 
     theta: Array  # θ [rad], (N, D); NaN where it was not measured
     tension: Array  # motor-side tension T [N], (N, M)
@@ -100,14 +100,14 @@ class Observations:
         )
 
     def state(self) -> State:
-        """Return (θ, T, l)."""
+        """Return the state (θ, T, l) of each sample, with motor-side tensions."""
         return State(self.theta, self.tension, self.length)
 
     def end_tension(self, transmission: Transmission) -> Array:
-        """Return the tension at the elastic elements [N] (N, M), which is the input of a network.
+        """Return the bone-side tensions T_end [N], (N, M), which are the input of a network.
 
         Args:
-            transmission: Relation between the readings and the tension at the elastic elements.
+            transmission: Converts tension readings to bone-side tensions.
         """
         return transmission.end(self.tension, self.direction)
 
@@ -132,7 +132,10 @@ class SampleStore:
         return len(self.samples)
 
     def is_new(self, sample: Sample) -> bool:
-        """Return whether a sample differs from every stored one by more than the thresholds."""
+        """Return whether a sample is new: an angle or tension differs from every stored sample.
+
+        The thresholds are JOINT_DISTANCE and TENSION_DISTANCE.
+        """
         points = self._scaled([*self.samples, sample])
         return bool((np.nanmax(np.abs(points[:-1] - points[-1]), axis=1) > 1.0).all())
 

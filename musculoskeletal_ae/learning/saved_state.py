@@ -17,7 +17,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 CHECKSUM = 4  # begin a state file with a checksum of this size [bytes]
 
-Values = tuple[float, ...]
+Values = tuple[float, ...]  # an array of numbers, as it is saved
 
 
 class SavedSample(msgspec.Struct, frozen=True, array_like=True):
@@ -40,7 +40,7 @@ class SavedSample(msgspec.Struct, frozen=True, array_like=True):
 
 
 class SavedState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The samples, oldest first, and the newest network as the content of a checkpoint.
+    """What a learner saves: its samples, oldest first, and its network as a checkpoint's content.
 
     `held` are the samples that the store holds back, and `held_offset` the length offsets [m] under
     which they were taken. Both are empty if no samples are held back. `accepted` is the number of
@@ -58,7 +58,7 @@ class SavedState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def collect(robot: Robot, samples: SampleStore, network: bytes | None) -> SavedState:
-    """Return the state to be saved: the samples of a store, and a checkpoint's content."""
+    """Collect what is saved: the samples of a store, and a network as a checkpoint's content."""
     stored = map(StoredSample, samples.samples, samples.known, samples.numbers)
     return SavedState(
         robot.joints,
@@ -92,7 +92,7 @@ def _saved(stored: StoredSample) -> SavedSample:
 
 
 def to_bytes(state: SavedState) -> bytes:
-    """Return the content of a state file."""
+    """Return a state as the bytes of a state file, which begins with a checksum."""
     content = msgspec.msgpack.encode(state)
     return _checksum(content) + content
 

@@ -12,7 +12,8 @@ from musculoskeletal_ae.learning.job import Job, Update
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae.mae import Mae
 
-STEPS = 50  # training steps in one update of preset `default`; 100 would reduce the error by 3 %
+#: train for this many steps in one update of preset `default`; 100 would reduce the error by 3 %
+STEPS = 50
 #: let at least this time pass between the starts of two updates, and between two checkpoints [s]
 LEAST_INTERVAL = 1.0
 #: require this many samples for the first update of an arm without joint sensors
@@ -20,7 +21,7 @@ LEAST_BLIND = 20
 
 
 class UpdateScheduler:
-    """Schedules the updates.
+    """Decides when an update of the network begins.
 
     Attributes:
         least_samples: Number of samples required for an update.
@@ -42,7 +43,11 @@ class UpdateScheduler:
         self._updates_to_repeat = 0
 
     def restart(self, updates_to_repeat: int = 0) -> None:
-        """Restart; run at least `updates_to_repeat` updates even without new data."""
+        """Restart after the network has been replaced.
+
+        Args:
+            updates_to_repeat: Number of updates that are run even without new samples.
+        """
         self._updates_to_repeat, self.last_update = updates_to_repeat, None
 
     def note_news(self) -> None:
@@ -70,7 +75,7 @@ class UpdateScheduler:
         )
 
     def finish(self, update: Update) -> Mae:
-        """Count a finished update and return its network.
+        """Record that an update has finished, and return its network.
 
         If a muscle has changed since the update began, the network is marked as uncalibrated.
         """

@@ -20,8 +20,8 @@ from musculoskeletal_ae.learning.samples import MOMENT_ARM, NOTHING, Sample
 
 PERIOD = 1.0  # learn the slowest moment of each interval of this duration [s]
 MOMENT = 0.1  # average the readings of a moment over this duration [s]
-LEAST_READINGS = 3  # use no moment with fewer readings
-LONGEST_GAP = 0.3  # count readings after a longer gap as another motion [s]
+LEAST_READINGS = 3  # average at least this many readings of a moment, from which its speed follows
+LONGEST_GAP = 0.3  # discard the readings before a gap longer than this [s]
 
 
 class SlowMoments:
@@ -33,8 +33,9 @@ class SlowMoments:
     def reset(self) -> None:
         """Reset the detector: discard all readings, for example after a jump of the clock."""
         self._time = 0.0  # time of the newest reading since the start of the period [s]
-        self._readings: list[tuple[float, Sample]] = []  # of the moment that has not ended
-        self._slowest: tuple[float, Sample] | None = None  # speed and mean of a moment
+        self._readings: list[tuple[float, Sample]] = []  # times and readings of the present moment
+        #: speed [rad/s] and mean of the slowest moment of this period so far
+        self._slowest: tuple[float, Sample] | None = None
 
     def step(self, reading: Sample, dt: float) -> Sample | None:
         """Add a reading; return the slowest moment when a period ends, otherwise None.

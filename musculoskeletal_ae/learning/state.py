@@ -26,12 +26,12 @@ from musculoskeletal_ae.learning.saved_state import SavedState
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-NEWEST, PREVIOUS, LOCK = 'learner.state', 'previous.state', 'lock'
-NETWORK = 'network.safetensors'
+NEWEST, PREVIOUS, LOCK = 'learner.state', 'previous.state', 'lock'  # files in the state directory
+NETWORK = 'network.safetensors'  # file of the network of the last explicit save
 #: refuse a larger state file [bytes]; the states of the shipped arms are 100 times smaller
 LARGEST = 1 << 26
 CHECK_INTERVAL = 0.5  # check at this interval that the files still exist [s]
-RETRY_INTERVAL = 2.0  # try again to save after this time [s]
+RETRY_INTERVAL = 2.0  # after a failed save, try again after this time [s]
 
 
 class StateStore:
@@ -39,7 +39,7 @@ class StateStore:
 
     Attributes:
         directory: The state directory.
-        not_used: Why a state on disk was unusable and where its backup is, or ''.
+        not_used: Why a state on disk was not used, and where its backup is, for users; '' if none.
     """
 
     def __init__(self, directory: str | Path, robot: Robot) -> None:

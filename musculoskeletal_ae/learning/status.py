@@ -16,19 +16,19 @@ from musculoskeletal_ae.robot.robot import Robot
 if TYPE_CHECKING:
     from musculoskeletal_ae.learning.learner import Learner
 
-#: Report a learner that has received no usable message for this time [s]. It exceeds `SILENCE`,
-#: because the estimator reports what makes messages unusable for a short time.
+#: Report that a learner has nothing to learn if it has received no usable message for this time
+#: [s]. Shorter gaps are left to the estimator, which reports what makes messages unusable.
 LONGEST_IDLE = 5.0
 
 
 def learner_report(learner: Learner) -> Report:
-    """Return the status of a learner."""
+    """Return the report on a learner for /diagnostics: its values and conditions."""
     present = learner_conditions(learner)
     return Report('' if present else 'learning', _values(learner), present)
 
 
 def learner_conditions(learner: Learner) -> tuple[Condition, ...]:
-    """Return why a learner does not learn, or does not keep what it has learned."""
+    """Return a learner's conditions for users: why it does not learn, or what is not on disk."""
     return (*_failures(learner), *_obstacles(learner))
 
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 class Trainer:
-    """Runs each update in the calling process when its job is submitted."""
+    """Runs each update in the calling process, at once when its job is submitted."""
 
     def __init__(self, robot: Robot, preset: str, seed: int = 0) -> None:
         """Create a trainer for the preset of this name; `begin` sets the network.
@@ -43,7 +43,7 @@ class Trainer:
         `seed` is the random seed of all updates.
         """
         self.robot, self.preset, self.seed = robot, preset_named(preset), seed
-        self.trouble = ''  # why no updates are made, or ''
+        self.trouble = ''  # why no updates are made at present, for users; '' if they are
         self._updater: Updater | None = None
         self._update: Update | None = None
 
@@ -63,7 +63,7 @@ class Trainer:
         return None if self._updater is None else self._updater.body
 
     def submit(self, job: Job) -> None:
-        """Run a job; `poll` then returns its update."""
+        """Submit a job: run it at once; `poll` then returns its update."""
         assert self._updater is not None
         self._update = self._updater.update(job)
 
@@ -83,15 +83,17 @@ class Trainer:
 
 # -- separate training process --------------------------------------------------------------------
 
-NICENESS = 5  # add this to the niceness of the node
+NICENESS = 5  # run the training process with a niceness higher than the node's by this
 FIRST_PAUSE = 1.0  # wait this long before restarting a lost training process [s]; doubles each time
-LONGEST_PAUSE = 60.0  # wait at most this long before a restart [s]
-# A process counts as hung if it has not answered within PATIENCE, plus PATIENCE_PER_STEP for each
-# training step. The first answer may take longer, because imports take minutes on a slow disk.
-PATIENCE_AT_FIRST = 300.0  # wait this long for the first answer [s]
-PATIENCE = 60.0  # wait this long for an answer without training steps [s]
-PATIENCE_PER_STEP = 0.1  # wait this much longer for each training step [s]
-LONGEST_ENDING = 2.0  # wait at most this long for a killed process to end [s]
+LONGEST_PAUSE = 60.0  # wait at most this long before restarting a lost training process [s]
+#: restart a training process, as hung, if its first answer takes longer than this [s], plus
+#: PATIENCE_PER_STEP for each training step; imports take minutes on a slow disk
+PATIENCE_AT_FIRST = 300.0
+#: restart a training process if a later answer takes longer than this [s], plus PATIENCE_PER_STEP
+#: for each training step
+PATIENCE = 60.0
+PATIENCE_PER_STEP = 0.1  # wait this much longer for each training step of the job [s]
+LONGEST_ENDING = 2.0  # wait at most this long for a killed training process to end [s]
 
 
 class TrainerProcess(Trainer):
@@ -106,7 +108,7 @@ class TrainerProcess(Trainer):
         """Train on one of `parameters.DEVICES`, or on the CPU if that device is not available."""
         super().__init__(robot, preset, seed)
         self._device = device
-        self.restarts = 0  # number of processes lost
+        self.restarts = 0  # number of training processes that were lost and restarted
         self._mae: Mae | None = None
         self._job: Job | None = None
         self._process: SpawnProcess | None = None
@@ -152,7 +154,7 @@ class TrainerProcess(Trainer):
         return self._process is not None and self._job is None
 
     def submit(self, job: Job) -> None:
-        """Send a job to the process."""
+        """Submit a job to the training process; `poll` returns its update later."""
         self._job = job
         self._deadline = time.monotonic() + self._patience + PATIENCE_PER_STEP * job.steps
         self._jobs.put(job)

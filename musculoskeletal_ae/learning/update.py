@@ -41,11 +41,11 @@ from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.robot.robot import Robot
 
 REAL_SHARE = 0.1  # replace this share of the training samples by rest samples
-#: replace at most this share of the training samples by motion samples; with MANY_MESSAGES of them,
-#: half of this share
+#: replace at most this share of the training samples by motion samples; fewer if there are few, and
+#: half of this share if there are MANY_MESSAGES of them
 MOVING_SHARE = 0.3
-USES = 3  # use each training sample this often on average
-LEAST_WEIGHT = 0.3  # train only with rest samples of at least this robust weight
+USES = 3  # draw so many training samples that each is used this often on average in one update
+LEAST_WEIGHT = 0.3  # train only with rest samples whose robust weight in the fit is at least this
 
 
 def learned_steps(mae: Mae) -> int:

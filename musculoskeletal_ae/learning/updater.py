@@ -34,7 +34,7 @@ NEWEST = 20  # compute the estimation error over this many newest samples
 
 
 class Updater(ABC):
-    """Base class of an online learning method, which keeps its network between updates."""
+    """Base class of an online learning method; it keeps its network between updates."""
 
     def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
         """Continue from a network; `seed` is the random seed."""
@@ -46,7 +46,7 @@ class Updater(ABC):
         return None
 
     def update(self, job: Job) -> Update:
-        """Update body and network once; return the result.
+        """Update body and network once, and return the result.
 
         The duration is bounded, because the numbers of samples and training steps are bounded.
         """

@@ -37,11 +37,12 @@ FORMAT_VERSION = 1  # reject checkpoints of any other version of the file format
 #: reject a larger checkpoint [bytes]; those of the shipped robots are a hundred times smaller
 MAX_BYTES = 64 * 1024 * 1024
 MAX_HEADER_BYTES = 1024 * 1024  # reject a checkpoint with a larger header [bytes]
-# Reject values beyond the following limits: no trained network has them, and they could overflow
-# when `Mae` folds units and standardisation into the layers.
-LARGEST = 1e9  # reject any number with a larger absolute value
-SMALLEST_STD = 1e-9  # reject a smaller standard deviation
-#: reject a larger μ; it would make the tensions at the ends of a tendon differ 150-fold
+#: reject a checkpoint with a number of a larger absolute value: no trained network has one, and it
+#: could overflow when `Mae` folds units and standardisation into the layers
+LARGEST = 1e9
+SMALLEST_STD = 1e-9  # reject a checkpoint with a smaller standard deviation, which is a divisor
+#: reject a checkpoint with a larger tendon friction |μ|, at which the tensions at the ends of a
+#: tendon would differ 150-fold
 LARGEST_FRICTION = 5.0
 #: reject a covariance whose smallest eigenvalue is not above this multiple of the largest one
 SMALLEST_EIGENVALUE = 1e-12
@@ -52,14 +53,14 @@ SMALLEST_SPRING_EIGENVALUE = -1e-6
 #: range. Networks from before θ of such joints was in rad have a 17 times smaller span. A network
 #: whose inputs are not standardised passes, because its span is unknown.
 LEAST_SPAN = 0.25
-#: reject a network whose estimate of the middle posture exceeds these: θ [rad], T [N], l [m], G
-#: [m/rad]
+#: reject a network whose estimate at the middle of all joint ranges exceeds these absolute values:
+#: θ [rad], T [N], l [m] and muscle Jacobian G [m/rad]
 LARGEST_ESTIMATES = (100.0, 1e5, 100.0, 1e5)
 
-Count = Annotated[int, Meta(ge=0, le=2**53)]
-Names = Annotated[tuple[str, ...], Meta(min_length=1, max_length=1000)]
-Units = Annotated[int, Meta(ge=1, le=4096)]
-Threshold = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+Count = Annotated[int, Meta(ge=0, le=2**53)]  # a whole number that JSON represents exactly
+Names = Annotated[tuple[str, ...], Meta(min_length=1, max_length=1000)]  # joints or muscles
+Units = Annotated[int, Meta(ge=1, le=4096)]  # number of units in one layer
+Threshold = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]  # threshold of a detector
 #: copy these entries of the metadata to and from the attributes of `Mae` with the same name
 SHARED = (
     'joints', 'muscles', 'groups', 'bases', 'isolated', 'activation', 'preset', 'version',
@@ -88,7 +89,7 @@ class Metadata(Strict, frozen=True):
     #: duration of motion in the touch statistics [s]; None if there are no touch statistics
     touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None
     uncertain: bool  # whether the covariance of the estimates is included
-    drive: bool = False  # whether γ, b and F of motor currents are included
+    drive: bool = False  # whether learned constants of motor currents are included
     elastic: bool = False  # whether learned springs of the joints are included
     #: index of the base of each group's block, or of the block itself; () if none has a base
     bases: Annotated[tuple[Count, ...], Meta(max_length=1000)] = ()
@@ -231,7 +232,7 @@ def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoin
 
 
 def restored(data: bytes, robot: Robot | None = None) -> Mae:
-    """Return the network like `from_bytes`, but raise errors that state the problem only.
+    """Return the restored network like `from_bytes`, but with errors that state the problem only.
 
     Args:
         data: The bytes.

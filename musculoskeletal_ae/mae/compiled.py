@@ -14,6 +14,7 @@ from numba import njit
 from musculoskeletal_ae.arrays import Singles
 
 # Constants in single precision; with Python's floats, numba would compute in double precision.
+# Clip the argument of tanh to ±LARGEST, where tanh is ±1 in single precision.
 ONE, TWO, LARGEST = np.float32(1.0), np.float32(2.0), np.float32(7.9)
 P0, P1, P2, P3, P4, P5, P6 = np.array(
     [4.89352455891786e-3, 6.37261928875436e-4, 1.48572235717979e-5, 5.12229709037114e-8,
@@ -56,4 +57,5 @@ def silu_slope(u: Singles, bias: Singles) -> tuple[Singles, Singles]:
     return u, slope
 
 
+#: compiled functions of each activation that return its value and slope
 WITH_SLOPE = {'tanh': tanh_slope, 'silu': silu_slope}

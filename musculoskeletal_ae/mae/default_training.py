@@ -45,31 +45,36 @@ from musculoskeletal_ae.mae.units import LENGTH_SCALE, State, scale_vector
 from musculoskeletal_ae.robot.groups import Group, parts
 from musculoskeletal_ae.robot.robot import Robot
 
+# The reference arm has 5 joints and 10 muscles.
 LAYERS = Layers((200, 100), 'silu')  # give the reference arm these hidden layers
-STEPS = 3000  # train the reference arm on this many mini-batches
-MOST_STEPS = 5000  # train no body on more mini-batches
+STEPS = 3000  # train the network of the reference arm on this many mini-batches
+MOST_STEPS = 5000  # train the network of any body on at most this many mini-batches
 BATCH = 128  # train on this many samples at once
 SAMPLES = 200_000  # draw at most this many different samples
 STEP_SIZE = 0.004  # train biases with this step size; `optimiser` derives that of the matrices
-REFERENCE = 5 + 10  # scale LAYERS and STEPS for a body with another D + M than this
-LARGE = 2  # divide a group into parts if its size is more than this multiple of REFERENCE
-# Count at most this many muscles per joint in `size`, because further muscles add equations, but no
-# unknowns.
+#: enlarge layers and steps for a body with more joints and muscles (D + M) than this
+REFERENCE = 5 + 10
+#: divide a group of joints and muscles into parts, if possible, if D + M exceeds this multiple of
+#: REFERENCE
+LARGE = 2
+#: In the size D + M of a group, count at most this many muscles per joint: further muscles add
+#: equations, but no unknowns.
 COUNTED_MUSCLES = 2.5
 
-# Draw this fraction of samples with tensions beyond tension.limit, as payloads can cause. With
-# them, the estimator loses accuracy only gradually beyond the limit.
+#: Draw this fraction of samples with tensions beyond tension.limit, as payloads can cause. With
+#: them, the estimator loses accuracy only gradually beyond the limit.
 OVERLOAD_SHARE = 0.2
-# Let samples of θ exceed each joint limit by up to this fraction of the range. A network is least
-# accurate at the edge of its training data, and arms do rest at their limits.
+#: Let samples of θ exceed each joint limit by up to this fraction of the range. A network is least
+#: accurate at the edge of its training data, and arms do rest at their limits.
 POSTURE_MARGIN = 0.05
-# Draw each twin at this distance from its sample, in standard deviations of θ. Over this distance,
-# routes are almost linear, and float32 still resolves the difference.
+#: Draw the twin of a sample, by which the muscle Jacobian is trained, at this distance from it, in
+#: standard deviations of θ. Over this distance, routes are almost linear, and float32 still
+#: resolves the difference.
 TWIN_DISTANCE = 0.1
-# Standardise by no smaller standard deviation than this, in scaled units. A smaller one would
-# amplify the noise of a joint or muscle that hardly varies.
+#: Standardise by no smaller standard deviation than this, in scaled units. A smaller one would
+#: amplify the noise of a joint or muscle that hardly varies.
 LEAST_SPREAD = 1e-4
-RISE = 0.05  # let the step size rise during this fraction of the training
+RISE = 0.05  # let the step size rise during this first fraction of the training, then fall
 
 # -- size --------------------------------------------------------------------------------------
 
@@ -87,7 +92,7 @@ def grown(number: int, groups: Iterable[Group], power: float = 1.0) -> int:
 
 
 def size(group: Group) -> float:
-    """Return D + M of a group, counting at most COUNTED_MUSCLES muscles per joint."""
+    """Return the size D + M of a group, counting at most COUNTED_MUSCLES muscles per joint."""
     joints, muscles = map(len, group)
     return joints + min(muscles, COUNTED_MUSCLES * joints)
 
@@ -98,9 +103,11 @@ def default_steps(groups: Iterable[Group]) -> int:
 
 
 def divided(robot: Robot) -> tuple[tuple[Group, ...], tuple[int, ...]]:
-    """Return the groups that get a block of the network, and the index of each block's base.
+    """Return the groups into which a robot is divided: each gets a block of the network.
 
-    A block without a base has its own index as that of its base.
+    Returns:
+        The groups, and for each block the index of its base, whose inputs it uses as well, such as
+        that of the wrist for a finger. A block without a base has its own index.
     """
     result, bases = list[Group](), list[int]()
     for group in robot.groups:
@@ -112,7 +119,7 @@ def divided(robot: Robot) -> tuple[tuple[Group, ...], tuple[int, ...]]:
 
 
 def blocks(groups: Iterable[Group]) -> dict[Group, tuple[int, ...]]:
-    """Return the sizes of the hidden layers in the block of each group."""
+    """Return the blocks of the network: for each group, the sizes of its hidden layers."""
     return {group: tuple(grown(units, [group]) for units in LAYERS.hidden) for group in groups}
 
 
@@ -197,7 +204,10 @@ def train(
         robot: The geometric model.
         seed: Random seed of states, weights and order of the samples.
         steps: Number of mini-batches.
-        progress: Function that is called after every mini-batch; see `Progress`.
+        progress: Called after every mini-batch with step, loss, network and mini-batch; or None.
+
+    Returns:
+        The network, the loss of every mini-batch, and how the network was trained.
     """
     rng = np.random.default_rng(seed)
     samples = overload_states(robot, min(SAMPLES, steps * BATCH), rng).scaled()

@@ -13,7 +13,8 @@ from musculoskeletal_ae.mae.training import Progress, TrainedNetwork, random_sta
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
-HELD_OUT_STATES = 5000  # compute the first statistics from this many held-out states
+#: compute the residuals' first mean and covariance from this many states that were not trained on
+HELD_OUT_STATES = 5000
 
 
 class Trained(NamedTuple):
@@ -46,7 +47,7 @@ def initial_mae(
 
 
 def completed(robot: Robot, trained: TrainedNetwork, preset: str, seed: int) -> Trained:
-    """Return a trained network as a `Mae` with its history and anomaly statistics.
+    """Return a trained network completed to a `Mae`, with its history and anomaly statistics.
 
     The statistics are those of held-out states of the geometric model.
 

@@ -49,13 +49,13 @@ from musculoskeletal_ae.robot.groups import Group, union
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.signals.friction import Transmission
 
-#: (weight, bias) of one layer
-Layer = tuple[Array, Array]
+Layer = tuple[Array, Array]  # weight (out, in) and bias (out,) of one layer
 
 # Constants of the estimate with isolated muscles.
-ROUNDS = 15  # end the fit of θ after this many Gauss–Newton steps
-LENGTH_NOISE = 0.0003  # add sensor noise of this standard deviation to Σ [m]
-#: without anomaly statistics, assume this standard deviation of each length [m]
+ROUNDS = 15  # end the fit of a posture to lengths after this many Gauss–Newton steps
+#: add sensor noise of this standard deviation to the covariance Σ of the length residuals [m]
+LENGTH_NOISE = 0.0003
+#: assume this standard deviation of each length residual [m] if the checkpoint has no statistics
 LENGTH_SPREAD = 0.003
 
 
@@ -181,11 +181,13 @@ def _linear_slope(u: Singles, bias: Singles) -> tuple[Singles, Singles]:
     return u, np.ones(1, np.float32)
 
 
+#: activations by their names in a checkpoint
 ACTIVATIONS = {
     'tanh': Activation(_tanh, _tanh_slope, 1.0),
     'silu': Activation(_silu, _silu_slope, 0.5),
 }
-LINEAR = Activation(_linear, _linear_slope, 1.0)  # join two stacks by this at the latent layer
+#: no activation: join encoder and decoder by this, because the latent layer is linear
+LINEAR = Activation(_linear, _linear_slope, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,9 +267,14 @@ class Stack:
 def side_by_side(
     stacks: Sequence[Stack], into: Ints | None = None, out: Ints | None = None
 ) -> Stack:
-    """Combine stacks into a single one, which computes all of them with block-diagonal layers.
+    """Put stacks side by side: return one stack that computes all with block-diagonal layers.
 
-    `into` and `out` are the orders of inputs and outputs, as in `BlockDiagonal`.
+    Args:
+        stacks: The stacks; all have equally many layers.
+        into: Indices of the inputs of the stacks, one stack after another; None if the input
+            already has this order.
+        out: Indices that bring the outputs, one stack after another, into the order of the result;
+            None to keep them.
     """
     if len(stacks) == 1:
         return stacks[0]
@@ -402,7 +409,7 @@ class Mae:
         tension: Array | None = None,
         length: Array | None = None,
     ) -> Array:
-        """Return z (..., D+M) from θ [rad] (..., D), T [N] (..., M) and l [m] (..., M).
+        """Encode θ [rad] (..., D), T [N] (..., M) and l [m] (..., M) as z (..., D+M).
 
         Only the two quantities that the mask selects are used; the third may be None.
 
@@ -496,7 +503,7 @@ class Mae:
 
     @property
     def is_calibrated(self) -> bool:
-        """Whether the statistics come from enough messages and samples of the healthy arm."""
+        """Whether the anomaly detector was calibrated with enough messages of the healthy arm."""
         return self.anomaly is not None and self.anomaly.calibrated
 
     def without(self, isolated: Iterable[int]) -> Mae:
@@ -516,7 +523,12 @@ class Mae:
         return replace(self, isolated=isolated, anomaly=anomaly)
 
     def lengths(self, theta: Array, tension: Array) -> Array:
-        """Return the lengths l [m] (..., M) that the network restores from θ and T."""
+        """Return the muscle lengths l [m], (..., M), that the network computes from θ and T.
+
+        Args:
+            theta: Joint angles [rad], (..., D).
+            tension: Bone-side tensions [N], (..., M).
+        """
         return self.decode(self.encode(Mask.THETA_TENSION, theta, tension)).length
 
     def lengths_with_pullback(
@@ -542,9 +554,13 @@ class Mae:
         return Stack((*enter.layers, *leave.layers), (*before, LINEAR, *after))
 
     def muscle_jacobian(self, theta: Array, tension: Array) -> Array:
-        """Return the muscle Jacobian G = ∂l/∂θ [m/rad] (..., M, D) of `lengths` at (θ, T).
+        """Return the muscle Jacobian G = ∂l/∂θ [m/rad], (..., M, D), of `lengths` at (θ, T).
 
         The derivative is exact, without finite differences.
+
+        Args:
+            theta: Joint angles [rad], (..., D).
+            tension: Bone-side tensions [N], (..., M).
         """
         return self._lengths_and_jacobian(theta, tension)[1]
 
@@ -587,7 +603,10 @@ class Mae:
 
 
 def complete_bases(bases: Sequence[int], count: int) -> tuple[int, ...]:
-    """Return the index of the base of each of `count` blocks; () means that no block has one."""
+    """Complete the indices of the bases of `count` blocks: () means that no block has a base.
+
+    A block without a base has its own index.
+    """
     return tuple(bases) or tuple(range(count))
 
 

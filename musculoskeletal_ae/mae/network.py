@@ -21,6 +21,7 @@ from musculoskeletal_ae.mae.mae import Layer, Mae, complete_bases, latent_places
 from musculoskeletal_ae.mae.units import ActivationName, Mask, scale_vector, visible
 from musculoskeletal_ae.robot.groups import Group
 
+#: activations by their names in a checkpoint
 ACTIVATIONS: dict[str, type[nn.Module]] = {'tanh': nn.Tanh, 'silu': nn.SiLU}
 
 
@@ -182,7 +183,7 @@ def from_mae(mae: Mae) -> Network:
 
 
 class TorchLengths:
-    """Computes a network's muscle lengths and their gradients for simulation on a torch device."""
+    """Computes a network's muscle lengths and their gradients on a torch device, for simulation."""
 
     def __init__(self, mae: Mae, device: str = 'cpu') -> None:
         """Copy the weights of a network to the device."""

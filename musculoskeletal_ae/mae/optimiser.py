@@ -16,8 +16,8 @@ import torch
 from torch import Tensor, nn
 from torch.optim.adam import adam
 
-TINY = 1e-20  # keeps the root of a zero matrix finite
-MOMENTUM = 0.95  # multiply Muon's momentum by this in each step
+TINY = 1e-20  # add this to eigenvalues, so that the inverse root of a zero matrix is finite
+MOMENTUM = 0.95  # multiply Muon's momentum by this in each step, before the gradient is added
 # Coefficients (a, b, c) of the Newton–Schulz polynomials a x + b x³ + c x⁵. Applied one after the
 # other, they bring every singular value close to 1.
 POLYNOMIALS = (
@@ -32,12 +32,15 @@ POLYNOMIALS = (
 LARGE = 256
 #: raise eigenvalues to at least this multiple of the largest; float32 does not resolve smaller ones
 LEAST_EIGENVALUE = 1e-7
-#: use this multiple of Adam's step size, which biases have, as step size of the weight matrices
+#: train the weight matrices by Muon with a step size that is this multiple of the biases' (Adam)
 MATRIX_RATIO = 12.5
 
 
 def orthogonal(matrix: Tensor) -> Tensor:
-    """Return approximately U Vᵀ of a matrix U Σ Vᵀ; the zero matrix stays zero."""
+    """Return the nearest orthogonal matrix, approximately: U Vᵀ of a matrix U Σ Vᵀ.
+
+    The zero matrix stays zero.
+    """
     tall = matrix.shape[0] > matrix.shape[1]
     x = matrix / (matrix.norm() + 1e-7)
     if min(matrix.shape) > LARGE:

@@ -19,12 +19,14 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, State
 
-# Assume at least this standard deviation of a residual in scaled units: 0.02 N or 0.01 mm, which no
-# sensor resolves. It keeps the covariance invertible if a network restores some combination of its
-# inputs perfectly.
+#: Assume at least this standard deviation of a residual in scaled units: 0.02 N or 0.01 mm, which
+#: no sensor resolves. It keeps the covariance invertible if a network restores some combination of
+#: its inputs perfectly.
 FLOOR = 1e-4
-ANYTHING = 10.0  # give residuals that are ignored this standard deviation, in scaled units
-#: trust touch statistics only if they cover at least this duration of motion [s]
+#: give the residuals of an ignored muscle this standard deviation in scaled units, which is 2000 N
+#: or 1 m, so that they do not matter
+ANYTHING = 10.0
+#: detect contact only after the residual torque was measured during at least this much motion [s]
 LEAST_MOTION = 60.0
 
 
@@ -57,10 +59,10 @@ def anomaly(error: Array) -> Array:
 class AnomalyStatistics:
     """Mean and covariance of the residuals e = (T_est − T, l_est − l) over healthy data."""
 
-    mean: Array  # mean μ of e, (2M,)
-    covariance: Array  # covariance Σ of e, symmetric and positive definite, (2M, 2M)
+    mean: Array  # mean μ of the residuals e, (2M,)
+    covariance: Array  # their covariance Σ, symmetric and positive definite, (2M, 2M)
     calibrated: bool  # whether enough data of the real arm, in its present state, are included
-    samples: int  # number of residuals e from which mean and covariance were computed
+    samples: int  # number of messages from which mean and covariance were computed
     #: thresholds of the detectors, by name; all are finite
     thresholds: Mapping[str, float] = field(default_factory=dict)
     #: θ [rad] (K, D) of healthy postures far apart from each other; K may be 0
@@ -82,11 +84,11 @@ class AnomalyStatistics:
         return np.sqrt(squares)
 
     def without(self, muscles: Sequence[int]) -> AnomalyStatistics:
-        """Return the statistics for residuals that are always 0 for these muscles."""
+        """Return the statistics without these muscles, whose residuals are then always 0."""
         return self._with_spread(muscles, FLOOR)
 
     def ignoring(self, muscles: Sequence[int]) -> AnomalyStatistics:
-        """Return statistics in which any residual of these muscles counts as normal.
+        """Return statistics ignoring these muscles: any residual of theirs is normal.
 
         Their residuals then hardly change the result of `distances`.
         """
@@ -109,8 +111,8 @@ class TouchStatistics:
     #: root mean square of the estimated τ_ext of the healthy moving arm [N·m], (D,); positive
     spread: Array
     time: float = 0.0  # duration of the motion in which `spread` was measured [s]
-    #: γ, b [N] and F [N] of motor currents (`signals.friction.Transmission`), (3, M); None for
-    #: tension sensors
+    #: scale error γ, offset b [N] and friction F [N] of motor currents, (3, M), as
+    #: `signals.friction.Transmission` explains; None for tension sensors
     drive: Array | None = None
     #: covariances of γ, b and F, (M, 3, 3); None for tension sensors
     drive_covariance: Array | None = None

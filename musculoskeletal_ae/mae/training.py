@@ -20,7 +20,7 @@ from musculoskeletal_ae.mae.network import Network
 from musculoskeletal_ae.mae.units import Mask, State
 from musculoskeletal_ae.robot.robot import Robot
 
-TINY = 1e-12  # keeps the gradient of a norm finite at zero
+TINY = 1e-12  # add this to the square of a norm, so that its gradient is finite at zero
 
 #: called with (step, loss, network, mini-batch) after every mini-batch
 Progress = Callable[[int, float, Network, Array], None]
@@ -60,7 +60,11 @@ def shuffled(samples: Array, batch: int, rng: np.random.Generator) -> Iterator[A
 
 
 def check_device(device: str) -> None:
-    """Check that torch can use a device; raise a MusculoskeletalError otherwise."""
+    """Check that torch can use a device.
+
+    Raises:
+        MusculoskeletalError: If it cannot; the text names the remedy.
+    """
     try:
         # An available device may still fail to compute, so compute something.
         torch.ones(1, device=device).sum().item()
@@ -99,7 +103,7 @@ def one_thread() -> Iterator[None]:
 
 
 class TrainedNetwork(NamedTuple):
-    """Result of a preset's initial training."""
+    """A network after the initial training of a preset, with a record of the training."""
 
     network: Network
     losses: list[float]  # loss of every mini-batch
@@ -108,7 +112,7 @@ class TrainedNetwork(NamedTuple):
 
 # -- errors ------------------------------------------------------------------------------------
 
-#: each output with the unit of its errors and the factor from SI to this unit
+#: report the errors of each output in this unit, with this factor from SI units
 OUTPUTS = (('theta', 'rad', 1.0), ('tension', 'N', 1.0), ('length', 'mm', 1e3))
 
 
@@ -118,12 +122,15 @@ class PairError(NamedTuple):
     mask: Mask
     output: str  # 'theta', 'tension' or 'length'
     unit: str  # unit of `norm` and `elements`
-    norm: float  # mean over samples of the L2 norm
+    norm: float  # mean over the states of the error's Euclidean norm
     elements: Array  # mean absolute error of each joint or muscle, (D,) or (M,)
 
 
 def pair_errors(mae: Mae, states: State) -> list[PairError]:
-    """Return the mean errors over some states, for all nine pairs of mask and output."""
+    """Return the mean errors over N states, for all nine pairs of mask and output.
+
+    The states are true; the network restores each from the two quantities that a mask selects.
+    """
     result = []
     for mask in Mask:
         restored = mae.decode(mae.encode(mask, *states))

@@ -17,7 +17,7 @@ THETA_SCALE = 1.0  # scaled units per [rad]
 TENSION_SCALE = 1.0 / 200.0  # scaled units per [N]
 LENGTH_SCALE = 10.0  # scaled units per [m]; mm/100 = 10 · l[m]
 
-ActivationName = Literal['tanh', 'silu']
+ActivationName = Literal['tanh', 'silu']  # legal activations of the hidden layers
 
 UNITS = 'theta rad, tension N/200, length mm/100'  # scaled units, as checkpoints name them
 

@@ -39,6 +39,7 @@ from musculoskeletal_ae.paper.constants import (
 from musculoskeletal_ae.paper.latent_descent import StepSearch, Term, descend
 from musculoskeletal_ae.robot.robot import Robot
 
+#: search for step sizes in the descent of method `proposed` with these constants
 SEARCH = StepSearch(CONTROL_LARGEST_STEP, CONTROL_CANDIDATES, CONTROL_EPOCHS)
 
 
@@ -49,24 +50,27 @@ def geometric(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Arra
 
 
 def first(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:  # noqa: ARG001
-    """Return the length command by equation (7); `tension` is T_const [N], (M,)."""
+    """Return the length command of method `first`, equation (7) of the paper.
+
+    `tension` is T_const [N], (M,).
+    """
     length = mae.lengths(theta, tension) + msc_compensation(robot, tension)
     return Solution(length, tension, np.zeros(robot.joint_count))
 
 
 def second(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:
-    """Return the length command by equation (8); `tension` is T_current [N], (M,).
+    """Return the length command of method `second`, equation (8) of the paper.
 
-    This method runs after `first`.
+    `tension` is T_current [N], (M,). This method runs after `first`.
     """
     return first(robot, mae, theta, torque, tension)
 
 
 def proposed(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:
-    """Return the length command by equation (12); `tension` is T_current [N], (M,).
+    """Return the length command of method `proposed`, equation (12) of the paper.
 
-    The method does not enforce tension limits. The solution states a missing torque of 0 even if
-    the planned tensions do not produce τ_target.
+    `tension` is T_current [N], (M,). The method does not enforce tension limits. The solution
+    states a missing torque of 0 even if the planned tensions do not produce τ_target.
     """
     terms = control_loss(robot, mae, theta, torque, tension)
     z = descend(mae, mae.encode(Mask.THETA_TENSION, theta, tension), terms, SEARCH)
@@ -119,6 +123,7 @@ def muscle_jacobian(mae: Mae, theta: Array, tension: Array, step: float = JOINT_
     return difference.swapaxes(-1, -2)
 
 
+#: the paper's control methods by the name of the parameter `method`
 METHODS = {
     'geometric': LengthMethod(geometric),
     'first': LengthMethod(first, takes_tension=True),

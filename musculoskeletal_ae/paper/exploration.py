@@ -43,7 +43,7 @@ def three_steps(
         robot: The body; its isolated muscles carry no tension.
         rng: Random number generator of all draws.
         posture: Draws θ_target.
-        constant_tension: Draws T_const of the third step.
+        constant_tension: Draws T_const of the third step [N], (M,), for θ_target.
 
     Raises:
         RobotDescriptionError: If the arm can hold too few postures.

@@ -20,23 +20,23 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 
-TINY = 1e-12  # added to every norm that is a divisor, because a norm may be zero
+TINY = 1e-12  # add this to every norm that is a divisor, because a norm may be zero
 
 
 class Term(NamedTuple):
     """One term w_k ‖A_k y − b_k‖₂ of the loss, where y is scaled (θ, T, l)."""
 
-    weight: float  # w_k
-    matrix: Array  # A_k, (rows, D+2M)
-    target: Array  # b_k, (rows,)
+    weight: float  # w_k: weight of the term in the loss
+    matrix: Array  # A_k: rows that map y to the quantity of the term, (rows, D+2M)
+    target: Array  # b_k: target of this quantity, (rows,)
 
 
 class StepSearch(NamedTuple):
-    """Constants of the descent."""
+    """Constants of the search for a step size in the descent (equation 11 of the paper)."""
 
-    largest_step: float  # γ_max
-    candidates: int  # N, which the paper's list of constants calls C_batch
-    epochs: int  # C_epoch
+    largest_step: float  # γ_max: all step sizes are below this
+    candidates: int  # N: number of step sizes in each iteration; C_batch in the paper's list
+    epochs: int  # C_epoch: number of iterations
 
 
 class Loss:
@@ -46,7 +46,7 @@ class Loss:
     """
 
     def __init__(self, terms: Sequence[Term]) -> None:
-        """Stack the matrices and targets of all terms."""
+        """Prepare the loss: stack the matrices and targets of all terms."""
         rows = np.array([len(term.target) for term in terms])
         self._weights = np.array([term.weight for term in terms])
         self._matrix = np.concatenate([term.matrix for term in terms])

@@ -40,6 +40,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState
 from musculoskeletal_ae.simulation.load import Load
 
+#: search for step sizes in the descent of both simulations with these constants
 SEARCH = StepSearch(SIMULATION_LARGEST_STEP, SIMULATION_CANDIDATES, SIMULATION_EPOCHS)
 
 

@@ -24,7 +24,10 @@ def estimate(mae: Mae, tension: Array, length: Array) -> State:
 
 
 class AnomalyNorm(ResidualDistance):
-    """Detector that compares A alone with a threshold."""
+    """Reports the most suspect muscle if the anomaly score A exceeds its threshold.
+
+    This is the detector of the paper, which considers no covariance of the residuals.
+    """
 
     symbol, threshold_name = 'A', NORM
 

@@ -59,7 +59,10 @@ class DefaultPreset:
         return BodyUpdater(robot, mae, seed)
 
     def residual_detectors(self, robot: Robot) -> tuple[ResidualDistance, list[Detector]]:
-        """Return the detectors of large residuals, of slack tendons, and of idle modules."""
+        """Return the detectors of large residuals, of slack tendons, and of modules that fail.
+
+        The last one detects modules that do not follow their commands.
+        """
         from musculoskeletal_ae.estimation.detectors.module_following import (
             ModuleFollowing,
             PositionFollowing,

@@ -5,7 +5,7 @@ The names are separate, so that they can be imported without the presets, which 
 contains.
 """
 
-DEFAULT = 'default'
+DEFAULT = 'default'  # name of the preset with the most accurate methods of this project
 #: name of the preset that follows the paper, with which experiments compare other presets
 PAPER_PRESET = 'paper'
-PRESET_NAMES = DEFAULT, PAPER_PRESET
+PRESET_NAMES = DEFAULT, PAPER_PRESET  # legal values of parameters and options that name a preset

@@ -40,7 +40,7 @@ class PaperPreset:
         self._hidden = hidden
 
     def initial_steps(self, robot: Robot) -> int:  # noqa: ARG002
-        """Return the same number of mini-batches for any body (§III-B)."""
+        """Return the paper's number of mini-batches, which is the same for any body (§III-B)."""
         return INITIAL_STEPS
 
     def training_states(self, robot: Robot, count: int, rng: np.random.Generator) -> State:

@@ -56,7 +56,7 @@ class Preset(Protocol):
     # -- online learning ------------------------------------------------------------------------
 
     def make_updater(self, robot: Robot, mae: Mae, seed: int) -> Updater:
-        """Return the online updater, which starts from the network `mae`."""
+        """Return an updater for online learning, which starts from the network `mae`."""
 
     # -- anomalies ------------------------------------------------------------------------------
 

@@ -19,11 +19,11 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import MessageError
 
-#: Standard deviation of an offset that nothing has determined [m]. Offsets that are constructed
-#: without a trust count as known if their standard deviation is smaller.
+#: Give an offset that nothing has determined this standard deviation [m]. Offsets that are
+#: constructed without a trust are known if their standard deviation is smaller.
 UNKNOWN = 1.0
-MOST_OFFSET = 10.0  # reject messages with a larger offset of a length sensor [m]
-ROWS = 6  # number of rows in a message on `body_state`
+MOST_OFFSET = 10.0  # reject a body state with a larger offset of a length sensor than this [m]
+ROWS = 6  # expect this many rows in a message on `body_state` (`BodyState.of_rows`)
 
 
 class Trust(IntEnum):
@@ -51,7 +51,7 @@ class Anomaly(IntEnum):
     ENDED = 3  # the anomaly was ended by a verification or by `estimator/reset`
 
 
-#: stages in which an anomaly is present
+#: treat an anomaly as present, so that the arm is stopped, in these stages
 PRESENT = frozenset({Anomaly.FOUND, Anomaly.VERIFYING})
 
 
@@ -60,10 +60,10 @@ class LengthOffsets:
     """Length offsets, which are subtracted from sensor values, and whether they may be trusted.
 
     Attributes:
-        offset: o [m], (M,).
-        deviation: Standard deviation of o [m], (M,). An offset that was revoked keeps the one that
+        offset: Offset of each length sensor [m], (M,).
+        deviation: Standard deviation of each offset [m], (M,). A revoked offset keeps the one that
             it had.
-        trust: Value of `Trust` for each muscle, (M,).
+        trust: Value of `Trust` for each offset, (M,).
     """
 
     offset: Array
@@ -78,12 +78,12 @@ class LengthOffsets:
 
     @classmethod
     def none(cls, muscle_count: int) -> LengthOffsets:
-        """Return exactly known offsets of zero."""
+        """Return no offsets: all are 0 and exactly known, as those of absolute sensors."""
         return cls(np.zeros(muscle_count), np.zeros(muscle_count))
 
     @classmethod
     def unknown(cls, muscle_count: int) -> LengthOffsets:
-        """Return unknown offsets."""
+        """Return unknown offsets, which nothing has determined; they are 0 until then."""
         return cls(np.zeros(muscle_count), np.full(muscle_count, UNKNOWN))
 
     def __eq__(self, other: object) -> bool:
@@ -161,7 +161,7 @@ class BodyState:
 
     @cached_property
     def rows(self) -> Array:
-        """The content of a message on `body_state`, (6, M)."""
+        """Rows of the message on `body_state` that describes this state, (6, M)."""
         anomaly = np.zeros(self.muscle_count)
         if self.suspect is not None:
             anomaly[self.suspect] = self.anomaly
@@ -180,11 +180,11 @@ class BodyState:
 
     @property
     def has_anomaly(self) -> bool:
-        """Whether an anomaly is present."""
+        """Whether an anomaly is present, so that the arm is stopped."""
         return self.anomaly in PRESENT
 
     def with_isolated(self, muscles: Iterable[int]) -> BodyState:
-        """Return the state in which exactly these muscles are isolated."""
+        """Return the state in which exactly the muscles with these indices are isolated."""
         isolated = tuple(sorted({int(muscle) for muscle in muscles}))
         return self if isolated == self.isolated else replace(self, isolated=isolated)
 
@@ -193,7 +193,12 @@ class BodyState:
         return replace(self, offsets=offsets)
 
     def with_anomaly(self, anomaly: Anomaly, suspect: int | None = None) -> BodyState:
-        """Return the state with another anomaly, and the muscle that its finding names."""
+        """Return the state with another anomaly.
+
+        Args:
+            anomaly: What has become of the newest finding.
+            suspect: Index of the muscle that this finding names; None if there is no finding.
+        """
         return replace(self, anomaly=anomaly, suspect=suspect)
 
 

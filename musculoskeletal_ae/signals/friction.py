@@ -19,16 +19,18 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
-REVERSAL = 0.0004  # b: sliding distance over which friction reverses [m]
-#: noise of a length [m]; a mean deviation ē of this size (`FrictionDirection`) is as likely due to
-#: sliding as due to noise
+REVERSAL = 0.0004  # b: let friction reverse over this sliding distance [m]
+#: expect this noise of a length [m]; a mean deviation ē of this size (`FrictionDirection`) is as
+#: likely due to sliding as due to noise
 NOISE = 0.00013
-LATEST = 0.07  # give the newest deviation this weight a in the running mean ē
-SPIKE = 0.0002  # limit a reading to this distance outside the range of the last two [m]
-LARGEST_GAIN = 1.5  # limit |γ| of `Transmission` to this
-#: expect γ, b/T_limit and F/T_limit of a motor current to have these standard deviations, and
-#: F/T_limit to have this mean, before anything is learned; the means of γ and b are 0
+LATEST = 0.07  # give the newest deviation this weight a in the running mean ē (`FrictionDirection`)
+SPIKE = 0.0002  # clip a length that is further than this outside the range of the last two [m]
+#: limit the learned scale error |γ| of a motor current (`Transmission`) to this
+LARGEST_GAIN = 1.5
+#: before anything is learned, expect that scale error γ, offset b/T_limit and friction F/T_limit of
+#: a motor current (`Transmission`) have these standard deviations; the means of γ and b are 0
 DRIVE_SPREAD = 0.2, 0.05, 0.1
+#: before anything is learned, expect this mean of F/T_limit
 DRIVE_FRICTION_MEAN = 0.08
 
 
@@ -93,7 +95,7 @@ class Transmission:
 
         Args:
             read: Readings T_read [N], (..., M).
-            direction: Sliding directions s, (..., M).
+            direction: Last sliding directions s: 1 for winding in, −1 for paying out, (..., M).
         """
         if self.drive is None:
             return read
@@ -108,7 +110,7 @@ class Transmission:
 
         Args:
             read: Readings T_read [N], (M,).
-            direction: Sliding directions s, (M,).
+            direction: Last sliding directions s: 1 for winding in, −1 for paying out, (M,).
         """
         if self.drive is None or self.drive_covariance is None:
             return np.zeros_like(read)
@@ -123,7 +125,7 @@ class Transmission:
 
         Args:
             read: Readings T_read [N], (..., M).
-            direction: Sliding directions s, (..., M).
+            direction: Last sliding directions s: 1 for winding in, −1 for paying out, (..., M).
         """
         end: Array = self.motor(read, direction) * np.exp(-self.friction * direction)
         return end
@@ -133,7 +135,7 @@ class Transmission:
 
         Args:
             motor: Motor-side tensions T [N], (..., M).
-            direction: Sliding directions s, (..., M).
+            direction: Last sliding directions s: 1 for winding in, −1 for paying out, (..., M).
         """
         if self.drive is None:
             return motor
@@ -152,8 +154,8 @@ class FrictionDirection:
     gain g is low, and noise is averaged. While it slides, g rises, and L follows l without the
     delay of a low-pass filter.
 
-    The remaining noise of L must not count as sliding. A tendon therefore counts as sliding only
-    when L leaves a dead band of ±NOISE √(g / (2 − g)) [m], which then moves with L.
+    The remaining noise of L must not look like sliding. A tendon is therefore regarded as sliding
+    only when L leaves a dead band of ±NOISE √(g / (2 − g)) [m], which then moves with L.
 
     Outliers have little effect, because each reading is limited to the range of the two readings
     before it, extended by SPIKE on both sides.
@@ -199,6 +201,9 @@ class FrictionDirection:
 
 
 def directions(length: Array) -> Array:
-    """Return the sliding directions s, (N, M), for the lengths [m], (N, M), of N messages."""
+    """Return the sliding directions s, (N, M), for the lengths [m], (N, M), of N messages.
+
+    s is 1 after winding in and −1 after paying out.
+    """
     step = FrictionDirection().step
     return np.array([step(each) for each in length]).reshape(length.shape)

@@ -25,35 +25,47 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.robot.robot import Robot
 
-HELD = 60.0  # plan no tension that heats a winding too much when it is held for this time [s]
-MOMENT = 5.0  # command no tension that heats a winding too much when it is held for this time [s]
-EVERY = 1.0  # compute the winding temperatures again after this time [s]
-LONGEST = 10.0  # let one update cover at most this time [s]
-#: Attribute a larger change of a housing's temperature between two updates to the sensor or to
-#: another source of heat [°C], because the motor cannot cause it.
+HELD = 60.0  # plan no tension that overheats a winding when it is held for this time [s]
+MOMENT = 5.0  # command no tension that overheats a winding when it is held for this time [s]
+EVERY = 1.0  # compute the winding temperatures at this interval, from the means over it [s]
+#: after a longer gap between two messages than this, let the temperatures settle without learning
+#: the thermal constants [s]
+LONGEST = 10.0
+#: If a housing's temperature differs from the estimate by more than this [°C], adopt it without
+#: learning from it: the sensor or another source of heat is the cause, not the motor.
 JUMP = 2.0
-NOISE = 0.1  # expect this standard deviation of the mean of c₂ over EVERY [°C]
-RATIO = 0.4  # assumed ratio r: typical of small motors, which vary widely
+#: expect this standard deviation of the measured housing temperature, averaged over EVERY [°C]
+NOISE = 0.1
+#: assume this ratio r = R₁/R₂ of the thermal resistances from winding to housing and from housing
+#: to air; it is typical of small motors, which vary widely
+RATIO = 0.4
 #: at first, assume that holding T_limit makes the housing this much warmer than the air [°C]
 RISE = 80.0
 WINDING_TIME = 30.0  # at first, assume this time constant τ₁ of the winding [s]
 HOUSING_TIME = 800.0  # at first, assume this time constant τ₂ of the housing [s]
 AIR = 25.0  # at first, assume this air temperature c_a [°C]
-#: initial standard deviations of c₁ − c₂ [°C], c₂ [°C], log κ, log τ₁, log τ₂ and c_a [°C]
+#: start the filter with these standard deviations of its state: winding minus housing temperature
+#: c₁ − c₂ [°C], housing temperature c₂ [°C], log κ, log τ₁, log τ₂ and air temperature c_a [°C]
 SPREAD = np.array([5.0, 0.2, 0.7, 0.5, 0.5, 5.0])
-#: standard deviations of the process noise of the quantities of SPREAD, per √s
+#: let the six quantities of SPREAD drift with these standard deviations, per √s, so that the filter
+#: follows slow changes
 WALK = np.array([0.1, 0.02, 0.003, 0.002, 0.002, 0.02])
-FAR = 2.5  # let the logarithm of a constant depart from its initial estimate by at most this
-SLOPE = 1e-4  # compute numerical derivatives with this step
-LEARNED = 1200.0  # count a constant as known only after this time of learning [s]
-KNOWN = 0.2  # count a constant as known below this standard deviation of its logarithm
+#: limit the logarithms of the thermal constants κ, τ₁ and τ₂ to this distance from their initial
+#: estimates
+FAR = 2.5
+SLOPE = 1e-4  # compute the numerical derivatives of the filter with this step
+#: take the first reference of the thermal constants only after learning for this time [s]
+LEARNED = 1200.0
+#: take the first reference of the thermal constants only below this standard deviation of their
+#: logarithms
+KNOWN = 0.2
 REST_STEP = 30.0  # search for the end of a rest in steps of this [s]
-LONGEST_REST = 3600.0  # predict no longer rest than this [s]
-CHANGED = 1.5  # report a known constant once it has changed by this factor
+LONGEST_REST = 3600.0  # end this search here, and report a longer rest as 'more than 60 min' [s]
+CHANGED = 1.5  # report a module once a thermal constant differs from its reference by this factor
 
 
 def flow(state: Array, square: Array, dt: float) -> Array:
-    """Return the state of the thermal model after a time in which the tension is constant.
+    """Return the state to which the thermal model flows in a time dt of constant tension.
 
     Args:
         state: The state at the beginning, (6, ...): temperature of the winding minus that of the
@@ -77,14 +89,17 @@ def flow(state: Array, square: Array, dt: float) -> Array:
 
 
 def soon(seconds: float) -> str:
-    """Return when a rest of a predicted duration [s] ends, as a text for users."""
+    """Return how soon a rest of a predicted duration [s] ends, such as 'in about 3 min'."""
     if not math.isfinite(seconds):
         return f'in more than {LONGEST_REST / 60.0:.0f} min'
     return 'now' if seconds == 0.0 else f'in about {math.ceil(seconds / 60.0)} min'
 
 
 class Heat:
-    """Estimates temperatures and thermal constants of all modules, and their tension limits."""
+    """Estimates temperatures of all muscle modules, and the tensions that these permit.
+
+    The constants of the thermal model are estimated as well, because they differ between modules.
+    """
 
     def __init__(self, robot: Robot) -> None:
         self._tension, count = robot.tension, robot.muscle_count
@@ -176,10 +191,10 @@ class Heat:
         return self._rests[key]
 
     def step(self, tension: Array, housing: Array, dt: float) -> None:
-        """Process one measurement of all modules.
+        """Update the temperatures with one measurement of all modules.
 
         Args:
-            tension: T [N], (M,).
+            tension: Tensions T [N], (M,).
             housing: Temperatures of the housings [°C], (M,); unknown where not finite.
             dt: Time since the previous measurement [s].
         """

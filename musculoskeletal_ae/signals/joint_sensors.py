@@ -27,30 +27,32 @@ from musculoskeletal_ae.robot.joint_units import JointUnits
 from musculoskeletal_ae.robot.robot import Robot
 
 LEAST_MOTION = 0.05  # judge a joint only if the range of its θ is at least this [rad]
-#: Judge a sign only if |a_j| is at least this. On the emulated individuals 0–4 of two shipped arms
-#: and both emulator models, a_j of joints that moved enough is between 0.4 and 1.9.
+#: Judge the sign of a joint sensor only if its factor |a_j| (docstring of this module) is at least
+#: this. On the emulated individuals 0–4 of two shipped arms and both emulator models, a_j of
+#: joints that moved enough is between 0.4 and 1.9.
 LEAST_SCALE = 0.3
-BEYOND = 0.3  # let a correct θ exceed the joint limits by at most this [rad]
-#: Another unit, order or sign of θ (`_possible_faults`) is assumed if it reduces the misfit of l to
-#: less than this fraction.
+BEYOND = 0.3  # treat readings as impossible if they exceed the joint limits by more than this [rad]
+#: Assume another unit, order or sign of the joint angles (`_possible_faults`) if it reduces the
+#: misfit of the muscle lengths to less than this fraction.
 BETTER = 0.8
-MOST_SAMPLES = 600  # use at most this many messages, evenly distributed
-LEAST_SAMPLES = 20  # judge sensors only by at least this many messages
-STUCK_TIME = 5.0  # count a reading as stuck only if it repeats for at least this time [s]
-#: count a repeated reading as stuck if the lengths show that its joint moves by more than this
+MOST_SAMPLES = 600  # judge sensors by at most this many messages, evenly distributed
+LEAST_SAMPLES = 20  # judge no sensor by fewer messages than this
+STUCK_TIME = 5.0  # examine a repeated reading only if it lasts for at least this time [s]
+#: report a repeated reading as stuck if the lengths show that its joint moves by more than this
 #: [rad]
 STUCK_MOTION = 0.2
-#: count a repeated reading as stuck if the lengths show that its joint is further away from it than
-#: this [rad]
+#: report a repeated reading as stuck if the lengths show that its joint is further away from it
+#: than this [rad]
 STUCK_OFFSET = 0.5
-#: believe in a hidden motion or distance of a joint only if it leaves at most this fraction of the
-#: mean square of the misfit of l
+#: assume that a joint has moved unnoticed only if this leaves at most this fraction of the mean
+#: square of the length errors
 STUCK_EXPLAINED = 0.5
+#: kinds of faults: angles in degrees, a wrong sign, exchanged joints, a stuck reading
 DEGREES, SIGN, ORDER, STUCK = 'degrees', 'joint sign', 'joint order', 'joint stuck'
 
 
 class JointFault(NamedTuple):
-    """A fault of joint sensors."""
+    """A fault of one or several joint sensors."""
 
     kind: str  # DEGREES, SIGN, ORDER or STUCK
     joints: tuple[int, ...]  # indices of the joints
@@ -59,7 +61,7 @@ class JointFault(NamedTuple):
 
 
 def corrected(theta: Array, faults: Iterable[JointFault], units: JointUnits) -> Array:
-    """Return θ (N, D) as the joint sensors would publish it without these faults."""
+    """Return corrected angles θ [rad], (N, D), as the joint sensors without these faults."""
     theta = units.to_position(theta)  # the sensors publish positions
     for fault in faults:
         joints = list(fault.joints)
@@ -73,10 +75,10 @@ def corrected(theta: Array, faults: Iterable[JointFault], units: JointUnits) -> 
 
 
 class Judgement(NamedTuple):
-    """Faults of joint sensors, and the joints whose sign was found to be right."""
+    """Faults of joint sensors, and the joints whose sign is certainly right."""
 
     faults: list[JointFault]
-    right: tuple[int, ...]
+    right: tuple[int, ...]  # indices of the joints
 
 
 def judge(
@@ -91,10 +93,10 @@ def judge(
 
     Args:
         robot: The geometric model.
-        theta: Measured θ [rad], (N, D). Messages with NaN are not used.
-        length: l [m], (N, M).
-        tension: T [N], (N, M).
-        used: Muscles to judge by, (M,); None for all. The sign of their l must be right.
+        theta: Measured joint angles θ [rad], (N, D). Messages with NaN are not used.
+        length: Muscle lengths l [m], (N, M).
+        tension: Tensions T [N], (N, M).
+        used: Muscles to judge by, (M,); None for all. Their lengths must have the right sign.
         segments: Number of the segment to which each message belongs, (N,); None for one segment.
             Short segments reduce the effect of drifting lengths.
     """
@@ -132,7 +134,7 @@ def sign_notes(robot: Robot, right: Sequence[int], remedy: str) -> list[str]:
     Args:
         robot: The robot.
         right: Indices of the joints whose sign is right.
-        remedy: How to make the other joints move more.
+        remedy: A sentence on how to make the other joints move more; it ends the last note.
     """
     notes = []
     unknown = [name for j, name in enumerate(robot.joints) if j not in right]
@@ -164,9 +166,9 @@ def stuck_sensors(
     Args:
         robot: The geometric model.
         time: Times of the messages [s], (N,).
-        theta: Measured θ [rad], (N, D).
-        length: l [m], (N, M).
-        tension: T [N], (N, M).
+        theta: Measured joint angles θ [rad], (N, D).
+        length: Muscle lengths l [m], (N, M).
+        tension: Tensions T [N], (N, M).
         used: Muscles to judge by, (M,); None for all.
     """
     used = np.ones(robot.muscle_count, dtype=bool) if used is None else used
@@ -201,7 +203,7 @@ class _Signs(NamedTuple):
 
 
 class _Lengths:
-    """Muscle lengths of a moving arm, with which postures are compared."""
+    """Muscle lengths of a moving arm, which show whether measured joint angles are right."""
 
     def __init__(
         self, robot: Robot, length: Array, tension: Array, used: Bools, segments: Ints

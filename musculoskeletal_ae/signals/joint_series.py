@@ -36,28 +36,31 @@ from musculoskeletal_ae.signals.joint_stream import (
 )
 from musculoskeletal_ae.signals.limits import LIMITS
 
-#: a constant is false if at least this share of its appearances begins and ends with a jump
+#: treat a repeated value as false if at least this share of its appearances begins and ends with a
+#: jump
 INTERRUPTING = 0.5
-LEAST_REPEATED = 3  # count equal readings as a constant only if there are at least this many
-#: A constant that appears only once is false if the readings before and after it differ by less
-#: than this share of the jumps, if at least FOREIGN_SHARE of the joints jump at once, or if it
-#: lasts although at most the share NOISY of the other readings repeat the one before. Otherwise, a
-#: sensor may have slipped.
+LEAST_REPEATED = 3  # examine a repeated value only if it occurs at least this often
+#: Treat a value that appears in one uninterrupted run as false in three cases: the readings before
+#: and after the run differ by less than the share RETURNING of the jumps at its ends; at least
+#: FOREIGN_SHARE of the joints jump at once; or the run lasts although at most the share NOISY of
+#: the other readings repeat the one before. Otherwise, a sensor may have slipped.
 RETURNING, NOISY = 0.5, 0.1
-#: Assume that the unit, sign or zero of a joint is wrong, and blame no single reading, if more than
-#: this share of its readings is far outside its limits, or if more than this share of its steps
-#: over the limits is no jump. `joint_sensors.py` then finds the fault.
+#: Assume that the unit, sign or zero of a joint is wrong, and drop no single reading, if more than
+#: this share of its readings is far outside its limits, or if it crosses the limits without a jump
+#: in more than this share of the crossings. `joint_sensors.py` then finds the fault.
 WRONG_SCALE = 0.5
-#: Whole turns are subtracted from the readings of a joint if at least this share of those readings
-#: is then within the limits and continuous with the reading before
+#: subtract whole turns from readings of a joint only if at least this share of those readings is
+#: then within the limits and close to the reading before
 CONTINUOUS = 0.95
 #: report a smaller share of messages with false readings as a remark instead of a fault
 TOLERATED = 0.01
 MOST_NAMED = 6  # name at most this many kinds of false readings in a text
+#: advice for users if readings are false
 REMEDY = (
     'stop a second program that publishes joint_states, and let the driver leave out readings that '
     'failed'
 )
+#: advice for users if readings are off by whole turns
 TURN_REMEDY = (
     'let the driver subtract the whole turns that the encoder counts, so that θ is within the '
     'limits of robot.urdf'
@@ -68,10 +71,11 @@ class JointSeries(NamedTuple):
     """The usable readings of joint sensors in a series of N messages.
 
     Attributes:
-        theta: θ [rad], (N, D), without whole turns; NaN where a reading is unknown or not usable.
-        share: Share of the messages that have readings which are false.
-        text: What these readings are, for users; '' if there are none.
-        remedy: What to do about them.
+        theta: Joint angles θ without whole turns [rad], (N, D); NaN where a reading is unknown or
+            not usable.
+        share: Share of the messages with at least one false reading, in [0, 1].
+        text: Description of the false readings for users; '' if there are none.
+        remedy: What to do about them, for users.
     """
 
     theta: Array
@@ -81,12 +85,15 @@ class JointSeries(NamedTuple):
 
     @property
     def is_fault(self) -> bool:
-        """Whether the driver has to be mended; single glitches do no harm."""
+        """Whether false readings are so frequent that the driver has to be corrected.
+
+        Glitches in at most 1 % of the messages (TOLERATED) do no harm.
+        """
         return self.share > TOLERATED
 
     @property
     def advice(self) -> str:
-        """The text with the remedy."""
+        """Description of the false readings with the remedy, as a text for users."""
         return f'joint_states: {self.text}; {self.remedy}'
 
 
@@ -96,7 +103,7 @@ def judge_series(robot: Robot, time: Array, theta: Array) -> JointSeries:
     Args:
         robot: The robot.
         time: Times of the messages [s], (N,), in order.
-        theta: Measured θ [rad], (N, D), with NaN for joints that a message does not name.
+        theta: Measured joint angles θ [rad], (N, D); NaN for joints that a message does not name.
     """
     usable = theta.copy()
     turned = _subtract_turns(robot, time, usable)
@@ -140,7 +147,7 @@ def _subtract_turns(robot: Robot, time: Array, theta: Array) -> list[tuple[int, 
     Args:
         robot: The robot.
         time: Times of the messages [s], (N,).
-        theta: Measured θ [rad], (N, D), which is changed in place.
+        theta: Measured joint angles θ [rad], (N, D), which is changed in place.
 
     Returns:
         The number of changed readings of each joint, with a text about it.
@@ -181,7 +188,7 @@ def _drop_constants(robot: Robot, time: Array, theta: Array) -> list[tuple[int, 
     Args:
         robot: The robot.
         time: Times of the messages [s], (N,).
-        theta: Measured θ [rad], (N, D), which is changed in place.
+        theta: Measured joint angles θ [rad], (N, D), which is changed in place.
 
     Returns:
         The number of readings of each false constant, with a text about it.
@@ -218,7 +225,7 @@ def _has_wrong_scale(time: Array, theta: Array, is_outside: Bools) -> bool:
 
     Args:
         time: Times of the messages [s], (N,).
-        theta: Measured θ [rad], (N, D).
+        theta: Measured joint angles θ [rad], (N, D).
         is_outside: Which readings are far outside the limits, (N, D).
     """
     for j in np.flatnonzero(is_outside.any(axis=0)).tolist():
@@ -233,7 +240,7 @@ def _has_wrong_scale(time: Array, theta: Array, is_outside: Bools) -> bool:
 
 
 def _interrupting(which: Ints, readings: Array, largest: Array) -> list[int]:
-    """Return the constants that interrupt other readings.
+    """Return the numbers of the constants (repeated values) that interrupt other readings.
 
     Args:
         which: Number of the constant that each message has, (N,).

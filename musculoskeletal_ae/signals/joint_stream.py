@@ -36,11 +36,11 @@ from musculoskeletal_ae.signals.limits import LIMITS
 STEP = 0.1
 #: expect no joint to move faster [rad/s]; emulated arms reach 5.4 rad/s when a tendon slips
 SPEED = 10.0
-#: report a series of impossible readings that has lasted for this time [s]; a burst is shorter,
-#: even with the time in which the readings of a moving arm settle again
+#: report a series of impossible readings that has lasted for this time [s]; a burst of glitches is
+#: shorter, even together with the time after which new readings are accepted (`LIMITS.settled`)
 LASTING = 2.0
-MISSING = 1.0  # report a joint that has had no reading for this time [s]
-#: a series of impossible readings has ended if there was none for this time [s]
+MISSING = 1.0  # report a joint sensor that has stopped sending readings after this time [s]
+#: treat a series of impossible readings as ended when the last one is older than this [s]
 ENDED = 1.0
 #: Reject a whole message if at least this share of its readings is impossible. A single sensor
 #: never rejects the readings of others.
@@ -81,11 +81,11 @@ class ImpossibleSeries(NamedTuple):
         return self.is_present(now) and self.until - self.since > LASTING
 
 
-_NONE = ImpossibleSeries(-math.inf, -math.inf, 0, 0)
+_NONE = ImpossibleSeries(-math.inf, -math.inf, 0, 0)  # stands for no series so far
 
 
 class JointChannel:
-    """The readings of one joint sensor.
+    """Judges the readings of one joint sensor, and records series of impossible ones.
 
     Attributes:
         series: The newest series of impossible readings.
@@ -106,7 +106,7 @@ class JointChannel:
         self.reset()
 
     def reset(self) -> None:
-        """Discard all readings, but not whether the joint has a sensor."""
+        """Discard all readings, but remember whether the joint has a sensor."""
         # Time of the last reading within the limits [s], this reading, the last usable reading
         # [rad], and the time since which all readings have followed each other plausibly [s]; NaN
         # before the first.
@@ -114,7 +114,7 @@ class JointChannel:
         self.series = _NONE
 
     def judge(self, time: float, value: float) -> JointReading:
-        """Judge a reading [rad] received at `time` [s]."""
+        """Judge whether a reading [rad] received at `time` [s] is usable, by those before it."""
         if not math.isfinite(value):
             return JointReading.MISSING
         if not self._low <= value <= self._high:
@@ -202,16 +202,19 @@ class JointStream:
 
     @staticmethod
     def _is_foreign(kinds: list[JointReading]) -> bool:
-        """Return whether a message with these readings describes another posture."""
+        """Return whether at least half of the readings, and at least two, are impossible.
+
+        The message then describes another posture, such as that of a second publisher.
+        """
         usable = kinds.count(JointReading.USABLE)
         impossible = len(kinds) - usable - kinds.count(JointReading.MISSING)
         return impossible > 1 and impossible >= FOREIGN_SHARE * (impossible + usable)
 
     def pass_time(self, seconds: float) -> None:
-        """Let time pass [s] in which readings should have arrived.
+        """Let time pass [s] in which readings should have arrived, to notice missing sensors.
 
-        Pauses of the driver or of this process do not count. Callers therefore pass the time
-        between two messages that are not far apart.
+        Callers limit the time between two messages that are far apart: pauses of the driver or of
+        this process do not count.
         """
         self._passed += seconds
 

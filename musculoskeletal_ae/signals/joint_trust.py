@@ -32,7 +32,7 @@ class SensorTrust(IntEnum):
     IMPOSSIBLE = 3
 
 
-#: sensors whose readings are not used
+#: use no readings of a sensor with one of these values of the trust
 NOT_USED = frozenset({SensorTrust.DOUBTED, SensorTrust.IMPOSSIBLE})
 
 
@@ -44,8 +44,8 @@ class JointTrust:
         trust: Trust in each joint sensor, D values.
         since: Beginning of the newest time in which each sensor was not used [s], (D,); NaN if
             there was none.
-        deviation: By how much each sensor read too much at the newest doubt [rad], (D,), as the
-            muscle lengths show; 0 if there was no doubt.
+        deviation: Reading of each sensor minus the angle that the muscle lengths showed when the
+            newest doubt began [rad], (D,); 0 if there was no doubt.
     """
 
     ROWS: ClassVar[int] = 3  # number of rows of the published message
@@ -56,13 +56,13 @@ class JointTrust:
 
     @classmethod
     def full(cls, joint_count: int) -> JointTrust:
-        """Return the trust in sensors that have never been in doubt."""
+        """Return full trust: no sensor has ever been in doubt."""
         unknown = np.full(joint_count, np.nan)
         return cls((SensorTrust.TRUSTED,) * joint_count, unknown, np.zeros(joint_count))
 
     @cached_property
     def is_used(self) -> Bools:
-        """Which joint sensors are used, (D,)."""
+        """Which joint sensors are used, (D,): not in doubt, and without impossible readings."""
         return np.array([each not in NOT_USED for each in self.trust], dtype=bool)
 
     @cached_property

@@ -32,13 +32,14 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.limits import LENGTH_JUMPED, LIMITS, slack_tension
 
-#: count a change of more than this fraction of the legal change as a possible part of a jump
+#: remember a change of a length, as a possible part of a jump, if it exceeds this fraction of the
+#: largest legal change
 LARGE = 0.5
 
 
 @dataclass(frozen=True)
 class Change:
-    """Changes of lengths that were too large, or nearly so, in one message or in several.
+    """Sum of those changes of lengths, in one or several messages, that exceed half the legal one.
 
     The sum over several messages shows whether a length is still at another level. The length
     itself does not show this: a module whose length jumped winds in or pays out, which can bring
@@ -62,7 +63,7 @@ class Change:
 
     @property
     def is_jump(self) -> bool:
-        """Whether any of the changes was too large."""
+        """Whether any of the changes was larger than is legal."""
         return self.jumped_at > -math.inf
 
     @property
@@ -150,9 +151,9 @@ class LengthJumps:
     Attributes:
         displaced: Indices of the muscles whose lengths have jumped since their last length
             calibration; these lengths are not reliable.
-        newest: Those that are displaced since the last message.
-        count: Number of accepted jumps since the start.
-        is_unseen: Whether the last one was during a pause of the messages (`Change.is_unseen`).
+        newest: Indices of the muscles whose new level was accepted with the last message.
+        count: Number of jumps whose new level was accepted, since the start.
+        is_unseen: Whether the last of them was during a pause of the messages (`Change.is_unseen`).
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -176,7 +177,7 @@ class LengthJumps:
     def step(
         self, length: Array, tension: Array, used: Bools, now: float, delay: float = 0.0
     ) -> tuple[str, str] | None:
-        """Return reason and detail if a message is to be rejected because of its lengths, or None.
+        """Follow the lengths of a message, and decide whether to reject it because of a jump.
 
         Args:
             length: Lengths as measured [m], (M,).
@@ -184,6 +185,9 @@ class LengthJumps:
             used: Which muscles to check, (M,).
             now: Time of reception by a steady clock [s].
             delay: How late the message is (`Arrival.delay`) [s].
+
+        Returns:
+            Reason and detail of the rejection, for users; None if the message is accepted.
         """
         self.newest = ()
         if not self.follow(length, used, now, delay):
@@ -209,16 +213,19 @@ class LengthJumps:
             self.is_unseen = self._was_unseen
 
     def follow(self, length: Array, used: Bools, now: float, delay: float = 0.0) -> bool:
-        """Compare lengths with those before them; return False if there are none before them.
+        """Compare the lengths of a message with those of the previous one, and note large changes.
 
-        This is all that happens with a message that is rejected because of other values: its
-        lengths show how far the arm has moved until the next message.
+        A message that is rejected because of other values is followed as well, because its lengths
+        show how far the arm has moved until the next message.
 
         Args:
-            length: Lengths as measured [m], (M,). One that is not finite counts as unchanged.
+            length: Lengths as measured [m], (M,). One that is not finite is taken as unchanged.
             used: Which muscles to check, (M,).
             now: Time of reception by a steady clock [s].
             delay: How late the message is (`Arrival.delay`) [s].
+
+        Returns:
+            False for the first message, which cannot be compared.
         """
         last, pause = self._last, self._pause(now, delay)
         if last is not None:
@@ -254,7 +261,10 @@ class LengthJumps:
             self._jump, self._large = sum(later, first), []
 
     def jumping(self, used: Bools) -> tuple[int, ...]:
-        """Return the muscles in `used` (M,) with a jump after which no length is accepted yet."""
+        """Return indices of the muscles in `used` (M,) whose jump has not been accepted yet.
+
+        Messages are rejected meanwhile.
+        """
         if self._jump is None:
             return ()
         return tuple(np.flatnonzero(self._jump.remaining(used)).tolist())
@@ -269,9 +279,12 @@ class LengthJumps:
         return LENGTH_JUMPED, f'{self._robot.muscles[muscle]} by {1e3 * jump.change[muscle]:.0f} mm'
 
     def use_body(self, body: BodyState, is_calibrated: bool) -> None:
-        """Follow the body state: isolated muscles are not displaced.
+        """Use another body state: remove its isolated muscles from `displaced`.
 
-        If new length offsets have been calibrated, no muscle is, and no rupture is presumed.
+        Args:
+            body: The body state.
+            is_calibrated: Whether new length offsets have been calibrated. Then `displaced` is
+                emptied, and no rupture is presumed any more.
         """
         if is_calibrated:
             self._rupture.forget()

@@ -26,29 +26,34 @@ class Limits(NamedTuple):
     Nodes and tools that process muscle states or estimates all use these limits.
     """
 
-    #: largest excess of a measured angle over the joint's range, as a fraction of the range
+    #: reject a measured angle that exceeds the joint's range by more than this fraction of it
     joint_outside: float = 0.1
-    #: largest excess of an estimated angle over the joint's range, as a fraction of the range
+    #: treat an estimate as implausible if an angle exceeds the joint's range by more than this
+    #: fraction of the range
     estimate_outside: float = 0.5
-    lowest_tension: float = -0.1  # lowest tension, as a fraction of `tension.max`
-    highest_tension: float = 1.1  # highest tension, as a fraction of `tension.max`
-    #: lowest motor current, converted to a tension, as a fraction of `tension.max`; it is negative,
-    #: because a part of the current overcomes the friction of motor and gear
+    lowest_tension: float = -0.1  # reject a tension below this fraction of `tension.max`
+    highest_tension: float = 1.1  # reject a tension above this fraction of `tension.max`
+    #: reject a motor current that, converted to a tension, is below this fraction of `tension.max`;
+    #: it may be negative, because a part of the current overcomes the friction of motor and gear
     lowest_current: float = -1.0
-    #: highest motor current, converted to a tension, as a fraction of `tension.max`; it exceeds 1,
-    #: because the scale of currents is uncertain
+    #: reject a motor current that, converted to a tension, is above this fraction of `tension.max`;
+    #: the fraction exceeds 1, because the scale of currents is uncertain
     highest_current: float = 3.0
-    lowest_temperature: float = -40.0  # lowest temperature of a muscle module [°C]
-    highest_temperature: float = 200.0  # highest temperature of a muscle module [°C]
+    #: reject a temperature of a muscle module below this [°C]
+    lowest_temperature: float = -40.0
+    #: reject a temperature of a muscle module above this [°C]
+    highest_temperature: float = 200.0
     # A module's temperature changes by at most `temperature_step + temperature_rate · dt` in the
     # time dt since the last accepted temperature. The first temperature is accepted after later
     # readings have differed from it by at most `temperature_step` for the time `glitch`.
     temperature_step: float = 5.0  # constant part of the largest change of a temperature [°C]
     temperature_rate: float = 50.0  # largest rate of a temperature [°C/s]
-    #: largest excess of a length over its range within the joint limits [m]; lengths exceed this
-    #: range if tendons wrap, are wound in with slack, or are attached elsewhere than modelled
+    #: reject a length that exceeds the modelled range within the joint limits by more than this
+    #: [m]; healthy lengths exceed the range if tendons wrap, are wound in with slack, or are
+    #: attached elsewhere than modelled
     length_margin: float = 0.1
-    #: distance by which a slack tendon can be shorter than `length_margin` permits [m]
+    #: permit a slack tendon to be shorter than `length_margin` permits by this [m], because a
+    #: ruptured tendon can be wound in further than any posture requires
     slack_length_margin: float = 1.0
     # Between two messages, a length changes by at most `step + speed · dt`. dt is the time between
     # the messages, limited to `longest_step`. A length that has jumped is accepted after it has
@@ -57,23 +62,28 @@ class Limits(NamedTuple):
     speed: float = 1.0  # largest plausible speed of a muscle length [m/s]
     longest_step: float = 0.05  # upper limit of dt in this formula [s]
     settled: float = 1.0  # time after which a new level of a length is accepted [s]
-    #: time after which implausible messages are a fault instead of a glitch [s]
+    #: report implausible messages as a fault, not as a glitch, once they have lasted for this time
+    #: [s]
     glitch: float = 0.1
-    #: pause of the messages after which the direction of sliding is unknown [s]
+    #: after a longer pause of the messages than this, do not compare readings with earlier ones [s]
     pause: float = 0.5
 
 
-LIMITS = Limits()
-#: tension below which a tendon is slack, as a fraction of T_bias or of the demanded tension
+LIMITS = Limits()  # the limits that all nodes and tools use
+#: treat a tendon as slack below this fraction of T_bias or of the demanded tension
 SLACK_SHARE = 0.2
-POSTURES = 500  # search this many random postures for the extremes of `length_range`
+POSTURES = 500  # search this many random postures for the shortest and longest muscle lengths
 
-#: reason under which messages with a jump of a length are counted
+#: reason, for users, under which rejected messages with a jump of a length are counted
 LENGTH_JUMPED = 'length jumped'
 
 
 def slack_tension(of: Tension) -> Tension:
-    """Return the tensions below which tendons are slack [N], for T_bias or demanded tensions."""
+    """Return the tension below which a tendon is slack [N].
+
+    Args:
+        of: T_bias or the demanded tension of one muscle or of several [N].
+    """
     return SLACK_SHARE * of
 
 
@@ -157,7 +167,7 @@ class Persistence:
         self._problem, self._since, self._newest = '', math.inf, math.inf
 
     def note(self, problem: str, now: float) -> None:
-        """Note the fault of the newest message, '' if it has none."""
+        """Note the problem of the message received at `now` [s], as a text; '' if it has none."""
         self._since = min(self._since, now) if problem else math.inf
         self._problem, self._newest = problem, now
 

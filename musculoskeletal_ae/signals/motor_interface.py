@@ -24,11 +24,13 @@ from musculoskeletal_ae.message_reading import joint_names, read_array
 from musculoskeletal_ae.robot.motors import ARRAY, JOINT_STATE, NO_MOTORS, Motors
 from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Row
 
-STATES = 'muscle_states'
+STATES = 'muscle_states'  # topic of the readings of a robot with a driver
 
 
 class MotorInterface:
-    """Converts the messages of one arm; keep one object for each subscription.
+    """Converts the messages between the motors of one arm and its muscles.
+
+    Keep one object for each subscription, because each remembers the last stamp.
 
     Attributes:
         topics: Topics of the motors.
@@ -70,7 +72,7 @@ class MotorInterface:
         self._stamp = 0  # the last stamp [ns]; 0 before the first
 
     def reading(self, message: Any) -> Any:
-        """Return the rows of muscle_states that a message of `state_topic` states, (Q, M).
+        """Return the reading in a message of `state_topic`, as rows of muscle_states, (Q, M).
 
         Messages of muscle_states are returned unchanged.
 

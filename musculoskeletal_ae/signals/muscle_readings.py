@@ -34,9 +34,9 @@ class Quantity(NamedTuple):
     """A quantity that muscle modules report.
 
     Attributes:
-        name: Its name in messages to users, and that of its argument of `muscle_reading`.
-        unit: Its unit in messages to users.
-        reason: Reason under which messages with impossible values are counted.
+        name: Its name in texts for users, and as an argument of `muscle_reading`.
+        unit: Its unit in texts for users, such as 'N'.
+        reason: Reason, for users, under which messages with impossible values are counted.
         possible: Function of the robot that returns the lowest and the highest possible value of
             each muscle; each is a number, or an array (M,).
         presence: Which values a message may lack. Optional quantities come last.
@@ -58,6 +58,7 @@ def _possible_temperatures(_: Robot) -> tuple[float, float]:
     return LIMITS.lowest_temperature, LIMITS.highest_temperature
 
 
+#: the rows of a message of `muscle_states`, in this order
 QUANTITIES: tuple[Quantity, ...] = (
     Quantity('length', 'm', 'length beyond what the joints allow', _possible_lengths),
     Quantity('tension', 'N', 'tension beyond the maximum', reading_range),
@@ -69,7 +70,7 @@ QUANTITIES: tuple[Quantity, ...] = (
 
 
 class Row(IntEnum):
-    """Rows of the quantities that this package uses."""
+    """Index of each quantity's row in a message of `muscle_states`."""
 
     LENGTH = 0
     TENSION = 1

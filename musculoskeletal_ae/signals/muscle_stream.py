@@ -38,10 +38,10 @@ from musculoskeletal_ae.signals.plausibility import LevelCheck, TemperatureCheck
 
 
 class RejectionError(MessageError):
-    """A message is rejected.
+    """A message of the muscle modules is rejected because it is invalid or implausible.
 
     Attributes:
-        reason: Short text under which the message is counted.
+        reason: Short text for users under which rejected messages are counted.
         states: The raw readings, (Q, M); None if the message had another shape.
         pull: Lengths [m], with the length offset removed, and measured tensions [N], together
             (2, M). They are medians of the last messages, including rejected ones; −∞ where they
@@ -77,8 +77,9 @@ class MuscleSample:
         usable: Which muscles are not isolated.
         newest: The readings of the last message alone, without the median filter, (Q, M), with the
             length offset removed and motor-side tensions.
-        jumped: Muscles whose new level after a jump is accepted with this message; usually none.
-        missing: Isolated muscles whose length or tension is NaN in this message.
+        jumped: Indices of the muscles whose new length after a jump is accepted with this message;
+            usually none.
+        missing: Indices of the isolated muscles whose length or tension is NaN in this message.
         tension_spread: Standard deviation σ_T of T [N]; 0 for tension sensors and assumed tensions.
         delay: How late the message is, compared with the fastest one (`Arrival.delay`) [s].
     """
@@ -161,7 +162,7 @@ class MuscleStream:
         self._transmission = transmission
 
     def use_body(self, body: BodyState) -> None:
-        """Use another body state from now on."""
+        """Use the length offsets and isolated muscles of another body state from now on."""
         has_new_offsets = body.offsets != self.body.offsets
         is_calibrated = has_new_offsets and not body.offsets.revoked
         if has_new_offsets:  # the change of lengths is not a motion
@@ -171,12 +172,15 @@ class MuscleStream:
 
     @property
     def jumping(self) -> tuple[int, ...]:
-        """Muscles whose lengths have jumped, while the new level has not been accepted yet."""
+        """Indices of the muscles whose lengths have jumped to a level not yet accepted."""
         return self.jumps.jumping(self.body.used)
 
     @property
     def has_jumped(self) -> bool:
-        """Whether lengths were observed to jump after the last length calibration."""
+        """Whether a length has jumped since the last length calibration.
+
+        A jump during a pause of the messages does not count, because the arm may have moved.
+        """
         return bool(self.jumps.displaced) and not self.jumps.is_unseen
 
     def implausible(self, now: float) -> str:

@@ -26,7 +26,8 @@ class Paired(Generic[Message]):
         time: Time of reception of the message [s].
         message: The message as the caller passed it.
         dt: Time since the previous message [s]; 0 for the first.
-        theta: θ [rad], (D,), NaN for joints without a matching value; None if no joint has a match.
+        theta: Joint angles θ [rad], (D,); NaN for joints without a matching value. None if no joint
+            has one.
     """
 
     time: float
@@ -36,7 +37,7 @@ class Paired(Generic[Message]):
 
 
 class Pairing(Generic[Message]):
-    """Pairs each muscle message with the nearest posture θ.
+    """Pairs each muscle message with the posture θ that is nearest in time.
 
     The pair is complete, and is returned, when the next muscle message arrives.
     """

@@ -39,7 +39,7 @@ class LevelCheck:
         return plausible
 
     def problem(self, states: Array, used: Bools, lengths_known: bool) -> tuple[str, str] | None:
-        """Return reason and detail of the first implausible value, or None.
+        """Return reason and detail of the first implausible value, for users; None without one.
 
         Args:
             states: Readings, (Q, M), with the length offset removed; NaN is ignored.
@@ -69,8 +69,8 @@ class LevelCheck:
 class TemperatureCheck:
     """Accepts a temperature that the housing can have reached since the last accepted temperature.
 
-    A few messages with 199 °C have no effect. If a sensor continues to read 199 °C, the reading is
-    accepted some seconds later, because a hot module must stop the arm.
+    A glitch of a few messages, such as 199 °C, therefore has no effect. If a sensor continues to
+    read 199 °C, the reading is accepted some seconds later, because a hot module must stop the arm.
     """
 
     def __init__(self, muscle_count: int) -> None:

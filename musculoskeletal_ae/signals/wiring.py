@@ -39,14 +39,16 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 
-#: A fault is assumed if correcting it divides the misfit of the affected columns by at least this
-#: factor. The order of two columns is right if exchanging them multiplies it by at least this one.
+#: Assume a wrong order or sign of columns if correcting it divides their misfit by at least this
+#: factor. Conclude that the order of two columns is right if exchanging them multiplies their
+#: misfit by at least this factor.
 BETTER = 1.4
-#: A fault is assumed if correcting it divides the cost of all readings by at least this factor.
+#: assume a wrong order or sign if correcting it divides the cost of all readings by this factor
 COST_BETTER = 1.1
-#: add noise of this standard deviation to every misfit [m], so that an arm at rest proves nothing
+#: add noise of this standard deviation to every misfit [m]; an arm that hardly moves then shows
+#: neither a fault nor that the wiring is right
 NOISE = 0.0005
-MOST_SAMPLES = 400  # use at most this many messages, evenly distributed
+MOST_SAMPLES = 400  # judge the wiring by at most this many messages, evenly distributed
 
 #: computes the lengths [m], (N, M), for θ [rad], (N, D), and T [N], (N, M)
 Lengths = Callable[[Array, Array], Array]
@@ -55,12 +57,12 @@ Lengths = Callable[[Array, Array], Array]
 class Wiring(NamedTuple):
     """The muscle to which each column of the readings belongs, and the sign of its length."""
 
-    order: tuple[int, ...]
-    sign: tuple[int, ...]
+    order: tuple[int, ...]  # index of the muscle to which each column belongs
+    sign: tuple[int, ...]  # 1, or −1 if the length of the column has the wrong sign
 
     @classmethod
     def straight(cls, muscle_count: int) -> Wiring:
-        """Return the right order, with the right signs."""
+        """Return the wiring without a fault: the right order, with the right signs."""
         return cls(tuple(range(muscle_count)), (1,) * muscle_count)
 
     def exchanged(self, j: int, k: int) -> Wiring:
@@ -83,13 +85,16 @@ class Wiring(NamedTuple):
 
     @property
     def faulty(self) -> tuple[int, ...]:
-        """Columns in a wrong place or with a wrong sign."""
+        """Indices of the columns in a wrong place or with a wrong sign."""
         return tuple(
             j for j, (k, sign) in enumerate(zip(self.order, self.sign)) if j != k or sign < 0
         )
 
     def unsigned(self, columns: Array) -> Array:
-        """Return columns (..., M), such as tensions, in the order of the muscles."""
+        """Return columns (..., M) in the order of the muscles, without changing signs.
+
+        This is right for tensions, which have no sign.
+        """
         return columns[..., np.argsort(self.order)]
 
     def signed(self, columns: Array) -> Array:
@@ -113,7 +118,7 @@ class Wiring(NamedTuple):
 
 
 class WiringJudgement(NamedTuple):
-    """What the readings tell about the wiring.
+    """What the readings show about the wiring: faults, alternatives and certainly right columns.
 
     Attributes:
         wiring: The wiring that explains the readings best; straight unless a fault is certain.
@@ -190,7 +195,7 @@ def judge(
 
     Args:
         lengths: The lengths of a model.
-        theta: Measured θ [rad], (N, D). Messages with NaN are not used.
+        theta: Measured joint angles θ [rad], (N, D). Messages with NaN are not used.
         length: l as read [m], (N, M).
         tension: T as read [N], (N, M).
         segments: Number of the segment to which each message belongs, (N,); None for one segment.

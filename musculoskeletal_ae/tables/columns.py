@@ -22,7 +22,7 @@ from musculoskeletal_ae.tables.table import TableError
 
 
 class Kind(Enum):
-    """A kind of quantity, with its name in the option --units."""
+    """A kind of quantity in a column; the value is its name in the option --units."""
 
     ANGLE = 'angle'
     TRAVEL = 'travel'
@@ -31,8 +31,9 @@ class Kind(Enum):
     TIME = 'time'
 
 
-_METRES = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}
-#: size of each unit in SI units, by kind of quantity; the first unit is the default
+_METRES = {'m': 1.0, 'cm': 1e-2, 'mm': 1e-3}  # size of each unit of length [m]
+#: accept these units for each kind of quantity, with the size of each in SI units; the first one is
+#: the default
 UNITS: dict[Kind, dict[str, float]] = {
     Kind.ANGLE: {'rad': 1.0, 'deg': np.pi / 180.0, '°': np.pi / 180.0},
     Kind.TRAVEL: _METRES,
@@ -40,23 +41,26 @@ UNITS: dict[Kind, dict[str, float]] = {
     Kind.TENSION: {'N': 1.0, 'kN': 1e3, 'A': 1.0, 'mA': 1e-3},
     Kind.TIME: {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9},
 }
-CURRENTS = 'A', 'mA'  # units of motor currents, which only robots that measure currents can have
-#: words in headers that say what was measured
+#: accept these units of motor currents only for a robot with `tension_source: current`
+CURRENTS = 'A', 'mA'
+#: a header with the name of a joint may also contain one of these words
 POSITION_WORDS = 'angle', 'joint', 'position', 'theta'
+#: a header with the name of a muscle and one of these words states a length
 LENGTH_WORDS = ('length',)
+#: a header with the name of a muscle and one of these words states a tension
 TENSION_WORDS = 'tension', 'force', 'current'
-TIME_HEADERS = 'time', 't', 'timestamp', 'stamp'
+TIME_HEADERS = 'time', 't', 'timestamp', 'stamp'  # recognise the column of times by these headers
 
 
 class Key(NamedTuple):
-    """A quantity of one joint or muscle; the number of the time is 0."""
+    """The quantity in a column: its kind, and the joint or muscle to which it belongs."""
 
     kind: Kind
-    number: int
+    number: int  # index of the joint or muscle; 0 for the time
 
 
 class Column(NamedTuple):
-    """A column of a table."""
+    """A column of a file that is used, with its quantity and unit."""
 
     place: int  # index among the columns of the file
     key: Key
@@ -124,7 +128,7 @@ def _position_kind(robot: Robot, joint: int) -> Kind:
 
 
 def _chosen_keys(robot: Robot) -> dict[str, Key]:
-    """Return what the names of the option --columns mean."""
+    """Return the quantity that each legal name in the option --columns stands for."""
     keys = {'time': Key(Kind.TIME, 0)}
     keys |= {name: Key(_position_kind(robot, j), j) for j, name in enumerate(robot.joints)}
     for kind in (Kind.LENGTH, Kind.TENSION):
@@ -137,7 +141,7 @@ def _plain(text: str) -> str:
 
 
 def _names(robot: Robot) -> dict[str, Key]:
-    """Return what each plain header means, without its unit."""
+    """Return the quantity that each header stands for, by its text as `_plain` returns it."""
     names = {word: Key(Kind.TIME, 0) for word in TIME_HEADERS}
     for kind, words in ((Kind.LENGTH, LENGTH_WORDS), (Kind.TENSION, TENSION_WORDS)):
         for i, name in enumerate(map(_plain, robot.muscles)):
@@ -233,7 +237,14 @@ def _check_units(columns: Sequence[Column]) -> None:
 
 
 def gather(columns: Sequence[Column], cells: Array, kinds: Sequence[Kind], count: int) -> Array:
-    """Return the quantities of some kinds in SI units, (N, count); NaN where there is no column."""
+    """Gather the columns of some kinds in one array in SI units, (N, count).
+
+    Args:
+        columns: The columns that are used.
+        cells: All cells of the file as numbers, (N, columns of the file).
+        kinds: The kinds of quantities to gather.
+        count: Number of joints or muscles. Those without a column have NaN.
+    """
     values = np.full((len(cells), count), np.nan)
     for column in columns:
         if column.key.kind in kinds:

@@ -23,11 +23,14 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tables.columns import Column, Kind, find_columns, gather
 from musculoskeletal_ae.tables.table import Table, TableError
 
-LARGEST = 256 << 20  # size limit of a file [bytes]
-DELIMITERS = ';', '\t', ',', ' '  # the first one that the first line contains is used
-NOTHING = '', 'nan', 'na', 'n/a', 'null', 'none', '-'  # cells without a value, in lower case
-MOST_SHOWN = 40  # largest number of characters of a cell that an error shows
-#: Successive rows of a sequence differ by less than this share of the difference of random rows.
+LARGEST = 256 << 20  # refuse a larger file [bytes]
+#: separate cells by the first of these marks that the first line contains
+DELIMITERS = ';', '\t', ',', ' '
+#: read a cell with one of these texts, in upper or lower case, as a missing value
+NOTHING = '', 'nan', 'na', 'n/a', 'null', 'none', '-'
+MOST_SHOWN = 40  # show at most this many characters of a cell in an error
+#: conclude that rows are a sequence, as in a motion, if successive postures differ by less than
+#: this share of the difference of randomly ordered ones
 SEQUENCE_SHARE = 0.1
 
 
@@ -97,7 +100,7 @@ def _refusal(_: Path, problem: str) -> TableError:
 
 
 def _read_cells(file: Path) -> tuple[list[str], Array]:
-    """Return the headers, and the cells as numbers (N, columns), with NaN for missing values."""
+    """Read the headers, and the cells as numbers (N, columns), with NaN for missing values."""
     text = read_text(file, _refusal, LARGEST)
     first = next((line for line in text.splitlines() if _has_content(line)), '')
     delimiter = next((mark for mark in DELIMITERS if mark in first.strip()), ',')

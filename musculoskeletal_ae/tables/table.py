@@ -23,8 +23,8 @@ from musculoskeletal_ae.robot.robot import Robot
 #: blocks HELD_OUT out. Single rows between learned ones would be no test, because successive rows
 #: resemble each other.
 BLOCKS, HELD_OUT = 10, (2, 7)
-#: Successive readings closer to a learned one than this are neither learned nor held out [s], so
-#: that no rest is in both parts.
+#: leave readings of a motion that are closer than this to a learned reading out of the held-out
+#: part [s], so that no rest is in both parts
 MARGIN = 1.0
 
 
@@ -50,7 +50,7 @@ class Table:
 
     @classmethod
     def of_pairs(cls, pairs: Pairs) -> Table:
-        """Return a table with one row for each pair of a joint and a muscle message of a bag."""
+        """Return a table of the pairs in a bag: each row is a muscle message with joint angles."""
         return cls(pairs, False, np.zeros(len(pairs.time), dtype=int))
 
     @classmethod
@@ -65,7 +65,7 @@ class Table:
         """Return a table of arrays.
 
         Rows without any joint position, and rows in which a length, a measured tension or the time
-        is missing, are left out and counted.
+        is missing, are left out; `left_out` has their number.
 
         Args:
             robot: The robot, which gives the order of joints and muscles.
@@ -116,7 +116,10 @@ class Table:
                 usable &= ~missing
         if not usable.any():
             why = ', '.join(f'{reason}: {n} rows' for reason, n in left_out.items())
-            raise TableError(f'no row is usable ({why or "there is none"}); record the readings')
+            raise TableError(
+                f'no row is usable ({why or "the table is empty"}); a usable row has all lengths '
+                'and tensions, and at least one joint position'
+            )
         when = when[usable] - (0.0 if time is None else when[usable][0])
         if (back := np.flatnonzero(np.diff(when) < 0.0)).size:
             row = int(np.flatnonzero(usable)[back[0]]) + 1
@@ -140,7 +143,7 @@ class Table:
         return len(self.rows.time)
 
     def segments(self) -> Iterator[Pairs]:
-        """Yield the readings of each segment."""
+        """Yield the readings of each segment: rows that directly follow each other."""
         for number in np.unique(self.segment):
             yield self.rows.at(self.segment == number)
 

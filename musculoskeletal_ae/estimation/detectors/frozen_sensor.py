@@ -15,14 +15,19 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import slack_tension
 
 FROZEN_TIME = 1.0  # suspect a sensor whose reading has stayed the same for this long [s]
-#: conclude that a sensor has noise near T_bias if its reading changes in the share NOISY of the
-#: messages there, of which there must be at least ENOUGH
+#: report a constant tension near T_bias only if this sensor usually has noise there: more than the
+#: share NOISY of at least ENOUGH messages near T_bias differed from the message before
 NOISY, ENOUGH = 0.9, 1000
-MOVED = 0.006  # report a constant reading if the muscle should have moved by more than this [m]
+#: report a constant reading once the other muscles show that this muscle's length must have changed
+#: by more than this [m]
+MOVED = 0.006
 
 
 class FrozenSensor(Detector):
-    """Reports a muscle whose reading is constant although other muscles indicate its motion."""
+    """Reports a muscle whose length or tension reading is constant although the muscle moves.
+
+    The lengths of the other muscles show whether it moves.
+    """
 
     def __init__(self, robot: Robot) -> None:
         self._robot = self._complete_robot = robot
@@ -49,7 +54,7 @@ class FrozenSensor(Detector):
         self._stop_observing()
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report a muscle whose reading is constant while the other muscles indicate its motion.
+        """Report a muscle whose reading is constant although the muscle moves.
 
         The result is None if there is no such muscle.
         """
@@ -93,9 +98,9 @@ class FrozenSensor(Detector):
         self._longest = max(predicted, self._longest)
         if self._longest - self._shortest <= MOVED:
             return None
-        return Finding(
-            muscle, ConditionKind.SENSOR_FROZEN, 'a sensor is frozen while the arm moves'
-        )
+        quantity = 'length' if by_length[muscle] >= FROZEN_TIME else 'tension'
+        evidence = f'its {quantity} reading stays exactly the same while the arm moves'
+        return Finding(muscle, ConditionKind.SENSOR_FROZEN, evidence)
 
     def _stop_observing(self) -> None:
         self._reduced_mae = None

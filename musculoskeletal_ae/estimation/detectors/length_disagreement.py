@@ -36,19 +36,20 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import slack_tension
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-SPACING = 0.1  # compute g at this interval [s]
-COUNT = 10  # take the median of g over this many values
-LASTING = 1.0  # report lengths once Δ has exceeded its limits for this long [s]
+SPACING = 0.1  # compare measured and computed lengths at this interval [s]
+COUNT = 10  # take the median of this many comparisons, so that single outliers do not matter
+#: report lengths once their differences have exceeded the limits for this long [s]
+LASTING = 1.0
 
 
 class Largest(NamedTuple):
-    """Largest tolerated differences between measured lengths and those of the network.
+    """Largest tolerated differences between measured lengths and those that a network computes.
 
     A number applies to all muscles; an array has a value for each muscle, (M,).
     """
 
-    single: Array | float  # largest absolute value of a single muscle [m]
-    all: Array | float  # largest root mean square over the muscles in use [m]
+    single: Array | float  # largest difference of a single muscle [m]
+    all: Array | float  # largest root mean square of the differences of all muscles in use [m]
 
     def excess(self, change: Array, used: Bools) -> float:
         """Return the ratio of length differences to these limits; above 1, they are too large.
@@ -85,17 +86,27 @@ class Largest(NamedTuple):
 #     networks with a calibrated detector  Δ 0.013 m, 0.006 m     g 0.013 m, 0.006 m
 #
 # The limits for calibrated networks detect an error of 0.05 m of a single muscle in every posture.
-CHANGE_YOUNG = Largest(0.06, 0.028)  # limits of Δ with networks whose detector is not calibrated
-GAP_YOUNG = Largest(0.08, 0.045)  # limits of g with networks whose detector is not calibrated
-CHANGE_LEARNED = Largest(0.035, 0.016)  # limits of Δ with networks whose detector is calibrated
-GAP_LEARNED = Largest(0.035, 0.016)  # limits of g with networks whose detector is calibrated
-HEALTHY_SPACING = 1.0  # keep a healthy message for g_usual at this interval [s]
-HEALTHY_COUNT = 60  # compute g_usual from at most this many messages
-ENOUGH = 5  # compute g_usual from at least this many messages
-#: count a message as healthy if Δ is at most this multiple of its limits; the value is low, so that
-#: g_usual does not follow a drift
+#: with a network whose detector is not calibrated, tolerate this change Δ of the difference between
+#: measured and computed lengths
+CHANGE_YOUNG = Largest(0.06, 0.028)
+#: with such a network, tolerate this difference g itself while the usual one is not known
+GAP_YOUNG = Largest(0.08, 0.045)
+#: with a network whose detector is calibrated, tolerate this change Δ of the difference between
+#: measured and computed lengths
+CHANGE_LEARNED = Largest(0.035, 0.016)
+#: with a network whose detector is calibrated, tolerate this difference g itself while the usual
+#: one is not known
+GAP_LEARNED = Largest(0.035, 0.016)
+#: Store a healthy message at this interval [s]. The stored messages show the usual difference
+#: between measured and computed lengths.
+HEALTHY_SPACING = 1.0
+HEALTHY_COUNT = 60  # keep at most this many healthy messages, from about a minute
+ENOUGH = 5  # treat the usual difference as unknown with fewer healthy messages than this
+#: treat a message as healthy if no change Δ exceeds this multiple of its limit; the value is low,
+#: so that the usual difference does not follow a drift
 HEALTHY_EXCESS = 0.5
-#: blame the joint sensors only if an offset leaves at most this share of Δ unexplained
+#: blame the joint sensors only if an error of their angles leaves at most this share of the changes
+#: Δ unexplained
 UNEXPLAINED = 0.5
 
 
@@ -103,8 +114,8 @@ class LengthDisagreement(Detector):
     """Reports muscle lengths that contradict the joint sensors.
 
     Attributes:
-        gap: Measured minus computed length of each muscle [m], (M,); 0 for isolated muscles. None
-            without measurements of all joints.
+        gap: Measured minus computed length of each muscle [m], (M,), as the median over the last
+            second; 0 for isolated muscles. None without measurements of all joints.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -129,13 +140,13 @@ class LengthDisagreement(Detector):
         self._compute_usual()
 
     def reset(self) -> None:
-        """Reset the detector: discard the last messages, but keep the usual differences."""
+        """Reset the detector: discard the messages of the last second, keep the healthy ones."""
         self._recent: deque[Array] = deque(maxlen=COUNT)
         self._since, self._unmeasured, self._beyond = 0.0, 0.0, 0.0
         self.gap = None
 
     def forget(self) -> None:
-        """Forget the last messages and the usual differences, because length offsets changed."""
+        """Forget all messages, also the healthy ones, because the length offsets have changed."""
         self.reset()
         self._healthy.clear()
         self._compute_usual()
@@ -153,7 +164,7 @@ class LengthDisagreement(Detector):
 
     @property
     def agrees(self) -> bool:
-        """Whether the lengths agree with the measured posture; false without measurements."""
+        """Whether the lengths agree with the measured posture; False without joint sensors."""
         return self.gap is not None and self._excess(self.gap) <= 1.0
 
     def step(self, observation: Observation) -> Finding | None:
@@ -195,10 +206,10 @@ class LengthDisagreement(Detector):
             self._compute_usual()
 
     def _change(self, gap: Array) -> tuple[Array, Largest]:
-        """Return how far the lengths differ from what is usual on the healthy arm, and the limits.
+        """Return the change of each length difference since the arm was healthy, with its limits.
 
-        While it is not known what is usual for a muscle, a difference of 0 counts as usual, and its
-        limits are wider. A muscle that was isolated for a minute is such a muscle.
+        For a muscle without enough healthy messages, such as one that was isolated for a minute,
+        the healthy difference is assumed to be 0, and the limits are wider.
 
         Args:
             gap: Measured minus computed lengths [m], (M,).
@@ -239,7 +250,7 @@ class LengthDisagreement(Detector):
         by_muscle = np.delete(change, muscle)  # what stays unexplained if this length is wrong
         limit = min(UNEXPLAINED * np.linalg.norm(change), np.linalg.norm(by_muscle))
         if np.linalg.norm(unexplained) <= limit:
-            return None  # false joint sensors explain it, which `joint_check` judges
+            return None  # false joint sensors explain it; `joint_sensor_check.py` judges them
         is_alone = self._others_agree(muscle, change, largest)
         kind = ConditionKind.LENGTH_DISAGREES if is_alone else ConditionKind.LENGTHS_DISAGREE
         return Finding(muscle, kind, f'its {evidence}')
@@ -252,12 +263,12 @@ class LengthDisagreement(Detector):
     def _is_ruptured(
         self, muscle: int, sample: MuscleSample, change: Array, largest: Largest
     ) -> bool:
-        """Return whether a muscle has no tension, although it alone is shorter than computed.
+        """Return whether a tendon is ruptured: it alone is too short, and has no tension.
 
         Args:
             muscle: Index of the muscle whose length differs most.
             sample: The readings.
-            change: Difference of each length from what is usual [m], (M,).
+            change: Change of each length difference since the arm was healthy [m], (M,).
             largest: The limits of these differences.
         """
         lowest = slack_tension(self._robot.tension.bias[muscle])

@@ -14,7 +14,10 @@ class LengthJump(Detector):
     """Reports muscles whose lengths have jumped and have stayed at the new values."""
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report the muscles that the sample names as having jumped (`MuscleSample.jumped`)."""
+        """Report the muscles whose lengths have jumped (`MuscleSample.jumped`), or return None.
+
+        Nothing is reported while the length offsets are unknown.
+        """
         jumped = observation.sample.jumped
         if not jumped or not observation.lengths_known:
             return None

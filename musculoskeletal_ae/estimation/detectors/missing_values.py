@@ -18,7 +18,7 @@ SILENT = 0.15  # report a muscle once it alone has reported NaN for this long [s
 
 
 class MissingValues(Detector):
-    """Reports a muscle that has been the only one to report NaN for some time."""
+    """Reports a muscle that alone has reported NaN for 0.15 s (SILENT)."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot

@@ -41,26 +41,36 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import slack_tension
 
-FAULTY = 1.0  # report a module after this time of evidence [s]
-SMOOTHING = 0.1  # smooth differences and speeds with this time constant [s]
-#: expect no more of a winch that turns at this share of its largest speed, if that is known
+FAULTY = 1.0  # report a module once the evidence against it amounts to this time [s]
+#: smooth differences from the command, and winding speeds, with this time constant [s]
+SMOOTHING = 0.1
+#: reduce the evidence while the winch turns at more than this share of its largest speed, if that
+#: is known: it can hardly correct faster
 FULL_SPEED = 0.5
 #: expect a healthy module to correct a difference of T_limit at least this fast [m/s]
 CORRECTING = 0.2
 #: tolerate a difference T − T_ref of this share of T_limit, plus this share of T_ref for errors of
 #: the sensor's gain and of the module's stiffness
 ALLOWED, ALLOWED_SHARE = 0.04, 0.1
-#: let the evidence grow fastest once e exceeds the tolerance by this share of T_limit
+#: let the evidence grow at its fastest rate once the unexplained difference e exceeds the tolerance
+#: by this share of T_limit
 CLEAR = 0.05
-SURE = 2.0  # tolerate this many standard deviations of an uncertain tension
-BEHIND = 0.005  # tolerate this |l − l_target| of a position-controlled module [m]
-CLEARLY_BEHIND = 0.005  # let the evidence grow fastest once e exceeds BEHIND by this [m]
-LAG = 0.6  # expect a healthy position-controlled module to lag by at most this [s]
-FULL = 0.9  # expect no more of a position-controlled module above this share of T_max
+#: tolerate in addition this many standard deviations of a tension that a motor current shows; a
+#: tension sensor has none
+SURE = 2.0
+BEHIND = 0.005  # tolerate this distance of a position-controlled module from its target length [m]
+#: let the evidence grow at its fastest rate once a position-controlled module is further behind
+#: than BEHIND by this [m]
+CLEARLY_BEHIND = 0.005
+#: expect a healthy position-controlled module to lag behind its command by at most this time [s]
+LAG = 0.6
+#: reduce the evidence against a position-controlled module above this share of T_max, because it
+#: cannot pull harder
+FULL = 0.9
 
 
 class ModuleFollowing(Detector):
-    """Reports a module that has not followed its commands for some time."""
+    """Reports a module whose tension does not follow the tension that its command demands."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = self._complete_robot = robot
@@ -75,11 +85,11 @@ class ModuleFollowing(Detector):
         count = self._complete_robot.muscle_count
         self._evidence: Array = np.zeros(count)  # time of evidence [s]
         self._length: Array | None = None  # l in the previous message [m]
-        self._difference: Array | None = None  # smoothed difference from the command
+        self._difference: Array | None = None  # smoothed difference from the command [N or m]
         self._speed: Array = np.zeros(count)  # smoothed dl/dt [m/s]
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report the module with the most evidence; None if there is less than 1 s of it."""
+        """Report the module with the most evidence against it; None if that is less than 1 s."""
         difference = self._differences(observation)
         if difference is None or not observation.lengths_known:
             self.reset()
@@ -108,7 +118,10 @@ class ModuleFollowing(Detector):
         return Finding(muscle, ConditionKind.MODULE_NOT_FOLLOWING, text, others)
 
     def _differences(self, observation: Observation) -> Array | None:
-        """Return tension minus demanded tension T − T_ref [N], (M,); None without a command."""
+        """Return the differences T − T_ref between measured and demanded tensions [N], (M,).
+
+        The result is None without a command.
+        """
         if observation.demand is None:
             return None
         difference: Array = observation.sample.motor_tension - self._reference(observation.demand)
@@ -119,7 +132,9 @@ class ModuleFollowing(Detector):
         return np.minimum(demand, self._complete_robot.tension.max)
 
     def _growth(self, observation: Observation, away: Array, correcting: Array) -> Array:
-        """Return how fast the evidence grows, not limited to ±1, (M,).
+        """Return the growth of the evidence against each module [s/s], (M,).
+
+        The values are not yet limited to ±1.
 
         Args:
             observation: The message.
@@ -147,10 +162,13 @@ class ModuleFollowing(Detector):
 
 
 class PositionFollowing(ModuleFollowing):
-    """Reports a position-controlled module that has not followed its target length."""
+    """Reports a position-controlled module whose length does not follow the target length."""
 
     def _differences(self, observation: Observation) -> Array | None:
-        """Return length minus commanded length l − l_target [m], (M,); None without a command."""
+        """Return the differences l − l_target between measured and target lengths [m], (M,).
+
+        The result is None without a command.
+        """
         if observation.command is None:
             return None
         return observation.sample.length - observation.command

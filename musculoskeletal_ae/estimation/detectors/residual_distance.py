@@ -21,8 +21,8 @@ likely are named as well, because in one posture, muscles that span the same joi
 anomaly equally well. If tendons are slack, only they can be suspect.
 
 Slack. While a slack tendon is being wound in, its measured length is longer than the restored
-length, and messages do not count. The measured length of a ruptured tendon is shorter than the
-restored length, so its messages do count.
+length, and messages are no evidence. The measured length of a ruptured tendon is shorter than the
+restored length, so its messages are evidence.
 """
 
 import math
@@ -40,16 +40,17 @@ from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import slack_tension
 
-DISTANCE = 'distance'  # name of the threshold of d in a checkpoint
-NORM = 'norm'  # name of the threshold of A in a checkpoint
+DISTANCE = 'distance'  # name under which a checkpoint stores the threshold of the distance d
+NORM = 'norm'  # name under which a checkpoint stores the threshold of the anomaly score A
 
-#: name a muscle as well if d without it is below the threshold, and at most this multiple of d
-#: without the suspect
+#: name a further muscle besides the suspect if d without that muscle is below the threshold, and at
+#: most this multiple of d without the suspect
 EQUALLY_LIKELY = 1.5
 IN_A_ROW = 5  # report the suspect after this many consecutive messages above the threshold
-#: raise the threshold at this distance from the nearest calibrated posture [joint ranges]
+#: raise the threshold if the posture is further than this from the nearest calibrated one [joint
+#: ranges], because the network is less accurate there
 NEAR = 0.25
-WIDEST = 3.0  # raise the threshold by no larger factor than this
+WIDEST = 3.0  # multiply the threshold by at most this factor, so that ruptures are still detected
 
 
 class Reading(NamedTuple):
@@ -65,10 +66,10 @@ class ResidualDistance(Detector):
     A subclass may use a statistic of the residual other than d.
 
     Attributes:
-        symbol: Symbol of the statistic, for messages.
-        threshold_name: Name of its threshold in the checkpoint.
-        threshold: Threshold in the checkpoint; ∞ if it is not calibrated.
-        reading: Results of the last message; None before the first.
+        symbol: Symbol of the statistic in messages to users, such as 'd'.
+        threshold_name: Name under which the checkpoint stores the threshold of the statistic.
+        threshold: Threshold of the statistic; ∞ if the checkpoint has no calibrated one.
+        reading: Distance and most suspect muscle of the last message; None before the first.
     """
 
     symbol, threshold_name = 'd', DISTANCE
@@ -78,8 +79,8 @@ class ResidualDistance(Detector):
 
         Args:
             robot: The nominal body.
-            slack: The detector that knows which slack tendons are being wound in. Meanwhile,
-                messages do not count. If it is None, all messages count.
+            slack: The detector that knows which slack tendons are being wound in. Messages from
+                this time are ignored. With None, no message is ignored.
         """
         self._robot = self._complete_robot = robot
         self._slack = slack
@@ -160,9 +161,9 @@ class ResidualDistance(Detector):
     def unfamiliarity(self, theta: Array) -> float:
         """Return how far a posture is from the nearest one in which the detector was calibrated.
 
-        The result is 1 if every joint differs by a quarter of its range; in between, the root sum
-        square over the joints decides. Above 1, the posture is unfamiliar. Without calibrated
-        postures, the result is 0.
+        The distance is the root sum square of the joints' differences, each divided by the joint's
+        range. It is divided by 0.25 (NEAR), so that a posture is unfamiliar above 1. Without
+        calibrated postures, the result is 0.
 
         Args:
             theta: Joint angles [rad], (D,).
@@ -192,13 +193,13 @@ class ResidualDistance(Detector):
     def _evidence(
         self, observation: Observation, distance: float, has_slack: bool, waits: bool
     ) -> str:
-        """Count messages above the threshold; return a text after five in a row, otherwise ''.
+        """Return the evidence for users after five messages in a row above the threshold, else ''.
 
         Args:
             observation: The message.
             distance: Residual distance d of the message.
             has_slack: Whether a tendon is slack, so that the threshold does not grow.
-            waits: Whether the message does not count, because a slack tendon is being wound in.
+            waits: Whether the message is ignored, because a slack tendon is being wound in.
         """
         if not self.is_calibrated:
             return ''

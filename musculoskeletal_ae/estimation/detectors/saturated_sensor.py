@@ -28,24 +28,30 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.robot.robot import Robot
 
-#: report a module that winds in if its reading has stayed the same for this long [s]
+#: report a module that winds in if its tension reading has stayed the same for this long [s], and
+#: the module has wound in by WOUND meanwhile
 WINDING_TIME = 0.5
-WOUND = 0.005  # report a module whose reading stays the same once it has wound in by this [m]
-LASTING = 0.15  # count a visit to a value after the reading has stayed exactly there this long [s]
-VISITS = 2  # report a muscle after this number of visits at the same value
-SAME = 2e-3  # two visits are at the same value if they differ by less than this share of it
-BELOW = 0.1  # count another visit only after the reading was lower by this share of the value
-#: forget a value after the reading has been higher for this long [s]; a spike is shorter
+WOUND = 0.005  # see WINDING_TIME [m]
+#: record that a reading has been clipped at a value (a visit) once it has stayed exactly there for
+#: this long [s]
+LASTING = 0.15
+VISITS = 2  # report a muscle once its reading has been clipped this often at the same value
+SAME = 2e-3  # treat two tension readings as the same value if they differ by less than this share
+#: record that a reading has been clipped again only after it has been lower by this share
+BELOW = 0.1
+#: forget a value, because the sensor does not saturate there, once the reading has been higher for
+#: this long [s]; a spike is shorter
 BEYOND = 0.05
-#: check a sensor only if more than this share of its readings below the highest ones differ from
-#: the previous one
+#: Check a sensor only if more than this share of its readings, below the highest ones, differ from
+#: the reading before. Otherwise, a repeated reading is no sign of saturation.
 VARYING = 0.5
 MEMORY = 10.0  # average the share of differing readings over this time (time constant) [s]
-LEAST = 1.5  # check only readings above this multiple of T_bias
+#: check only readings above this multiple of T_bias: an ideal module may hold exactly T_bias
+LEAST = 1.5
 
 
 class SaturatedSensor(Detector):
-    """Reports a muscle whose tension readings pile up at one highest value below the limit."""
+    """Reports a muscle whose tension readings are clipped at a value below T_limit."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, count = robot, robot.muscle_count
@@ -57,19 +63,22 @@ class SaturatedSensor(Detector):
         self.reset()
 
     def reset(self) -> None:
-        """Reset the detector: forget all visits."""
+        """Reset the detector: forget at which values readings were clipped."""
         count = self._robot.muscle_count
         self._before: Array = np.full(count, np.nan)  # reading of the previous message [N]
         self._unchanged: Array = np.zeros(count)  # time without a change of the reading [s]
         self._length: Array = np.zeros(count)  # l when the reading changed last [m]
         self._beyond: Array = np.zeros(count)  # time for which the reading has been higher [s]
-        self._value: Array = np.full(count, np.nan)  # value of the last visit [N]
+        self._value: Array = np.full(count, np.nan)  # value at which the reading was clipped [N]
         self._visits: Ints = np.zeros(count, dtype=np.int64)
-        self._has_visits = False  # whether any muscle has visited a value
-        self._has_left = np.ones(count, dtype=bool)  # whether readings fell since the last visit
+        self._has_visits = False  # whether the reading of any muscle has been clipped
+        self._has_left = np.ones(count, dtype=bool)  # whether readings have fallen since then
 
     def step(self, observation: Observation) -> Finding | None:
-        """Report a muscle whose reading was clipped often enough, or while its module winds in."""
+        """Report a muscle whose tension reading is clipped, or return None.
+
+        It must have been clipped twice at the same value, or while its module winds in.
+        """
         sample, dt, value = observation.sample, observation.dt, self._value
         reading = sample.newest[1]
         is_same = reading == self._before

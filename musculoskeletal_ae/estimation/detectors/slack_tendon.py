@@ -41,14 +41,16 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 #: report a tendon without tension if its stretch exceeds the expected one by this many standard
 #: deviations
 SIGMAS = 3.0
-#: Count a tendon as taut if its tension exceeds T_slack by this many standard deviations. Those of
-#: motor currents are known; that of a sensor counts as 0.
+#: Treat a tendon as taut if its tension exceeds T_slack by this many standard deviations. Tensions
+#: from motor currents are uncertain; the standard deviation of a tension sensor is taken as 0.
 SURE = 2.0
 #: Take the stretch of a taut tendon from the first of this many consecutive messages in which it
 #: was taut: that message certainly came before the tendon began to lose its tension.
 RECENT = 5
-SLACK_LENGTH = 0.06  # wait until a muscle module has wound in this much slack [m]
-SLACK_SPEED = 0.005  # count a muscle module as stationary below this winding speed [m/s]
+#: while a muscle module winds in slack, wait until it has wound in this length before the muscle is
+#: reported [m]
+SLACK_LENGTH = 0.06
+SLACK_SPEED = 0.005  # wait no longer for a muscle module that winds in more slowly than this [m/s]
 DEAD_TIME = 0.5  # report a muscle that has had no tension for this long [s]
 
 
@@ -56,7 +58,7 @@ class SlackTendon(Detector):
     """Reports a muscle whose tendon has been slack for some time and is not being wound in.
 
     Attributes:
-        is_winding_in: Whether each tendon is slack and being wound in, (M,).
+        is_winding_in: Which tendons are slack and still being wound in, (M,).
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -70,7 +72,7 @@ class SlackTendon(Detector):
         self.is_winding_in: Bools = np.zeros(muscle_count, dtype=bool)
 
     def use(self, mae: Mae) -> None:
-        """Use another network: monitor the muscles that are not isolated in it."""
+        """Use another network, and monitor the muscles that are not isolated in it."""
         self._mae = mae
         self._robot = self._complete_robot.without(mae.isolated)
 
@@ -112,11 +114,9 @@ class SlackTendon(Detector):
         if not is_dead.any():
             return None
         muscle = int(np.argmax(np.where(is_dead, self._slack_time, 0.0)))
-        return Finding(
-            muscle,
-            ConditionKind.SLACK_TENDON,
-            'it shows no tension although the command demands tension',
-        )
+        shown, demanded = round(float(tension[muscle])), round(float(demand[muscle]))
+        evidence = f'its tension is {shown} N, but {demanded} N are demanded'
+        return Finding(muscle, ConditionKind.SLACK_TENDON, evidence)
 
     def _demand(self, observation: Observation) -> Array | None:
         """Return the demanded tension [N] (M,), or None if it is unknown.
@@ -188,11 +188,13 @@ class StretchedTendon(SlackTendon):
         if self._slack_time.max() < DEAD_TIME - 1e-9:
             return None
         muscle = int(self._slack_time.argmax())
-        return Finding(muscle, ConditionKind.SLACK_TENDON, 'it is stretched, but has no tension')
+        shown = round(float(sample.motor_tension[muscle]))
+        evidence = f'it is so short that it should have tension, but its tension is {shown} N'
+        return Finding(muscle, ConditionKind.SLACK_TENDON, evidence)
 
     @property
     def _slack_tension(self) -> Array:
-        """Tension below which each tendon counts as slack [N], (M,)."""
+        """Tension below which each tendon is regarded as slack [N], (M,): SLACK_SHARE · T_bias."""
         return slack_tension(self._complete_robot.tension.bias)
 
     def _is_stretched(self, sample: MuscleSample, is_slack: Bools, start: Array) -> Bools:

@@ -12,7 +12,9 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.signals.heat import Heat
 
-COOL = 60.0  # report changed modules only if their windings are hotter than this [°C]
+#: stop the arm because of a changed module only if its winding is hotter than this [°C]; a cooler
+#: one is only reported in /diagnostics
+COOL = 60.0
 
 
 class ThermalDrift(Detector):

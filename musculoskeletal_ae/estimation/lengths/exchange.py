@@ -11,12 +11,12 @@ putting the columns back makes their lengths continue those before the silence. 
 and no sign does this for several lengths, and the readings do not fit the learned body, then these
 lengths have lost their offsets.
 
-Anomaly score. If muscles are exchanged, putting the two columns back restores the usual A in all
-recent messages (`signals/wiring.py`). A network that has learned the arm is exact enough for this.
-With any other network, the length calibration judges the order, because the arm moves meanwhile.
-Shortly after a silence, wrong signs are judged in this way as well: a length near 0 changes by
-little when its sign is reversed. Without a silence, no driver has restarted, and a length offset
-that has been lost could look like a wrong sign.
+Anomaly score. If muscles are exchanged, putting the two columns back restores the usual anomaly
+score A in all recent messages (`signals/wiring.py`). A network that has learned the arm is exact
+enough for this. With any other network, the length calibration judges the order, because the arm
+moves meanwhile. Shortly after a silence, wrong signs are judged in this way as well: a length near
+0 changes by little when its sign is reversed. Without a silence, no driver has restarted, and a
+length offset that has been lost could look like a wrong sign.
 """
 
 import math
@@ -35,27 +35,34 @@ from musculoskeletal_ae.signals.limits import slack_tension
 from musculoskeletal_ae.signals.muscle_readings import Row
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement, decide, single_faults
 
-SPACING = 0.25  # keep one message in this time [s]
-USUAL_COUNT = 120  # take the median A of this many messages as the usual one
-ENOUGH = 20  # know the usual A only from at least this many messages
+SPACING = 0.25  # store at most one message in this time [s]
+#: take the median anomaly score A of at most this many stored messages as the usual one
+USUAL_COUNT = 120
+ENOUGH = 20  # judge no finding before this many messages have been stored
 RECENT = 20  # judge a finding by this many of the newest messages
-ANOMALOUS = 2.0  # judge only by messages whose A is above this multiple of the usual A
-#: assume an exchange only if A after putting the columns back is below this multiple of the usual A
+#: judge a finding only by recent messages whose anomaly score A exceeds this multiple of the usual
+#: one, because the others are from before the fault
+ANOMALOUS = 2.0
+#: assume an exchange only if the anomaly score, with the columns put back, is below this multiple
+#: of the usual one
 USUAL = 1.5
-#: Assume an exchange only if putting the columns back divides A by at least this factor. In moments
-#: of two learned arms, USUAL and BETTER together blamed an exchange for 3 of 475 shifts of one or
-#: two lengths, and recognised 194 of 229 exchanges.
+#: Assume an exchange only if putting the columns back divides the anomaly score by at least this
+#: factor. On messages of two learned arms, USUAL and BETTER together blamed an exchange for 3 of
+#: 475 shifts of one or two lengths, and recognised 194 of 229 exchanges.
 BETTER = 3.0
 #: assume that the driver may have restarted after a pause of all messages of this length [s]
 SILENT = 0.3
-#: judge a finding by the lengths around a silence for this time after it [s]
+#: for this time after such a pause, compare the lengths before and after it to explain a finding
+#: [s]
 RESTARTED = 5.0
-#: a length that has changed by more than this during a silence may belong to another muscle [m]
+#: suspect that a column belongs to another muscle, or has lost its offset, if its length has
+#: changed by more than this during the pause [m]
 DISCONTINUOUS = 0.02
-#: assume another wiring only if it divides the change of its lengths during the silence by at least
-#: this factor, and if that change exceeds the change of all other lengths by this factor
+#: Assume that columns are exchanged or reversed since a pause of the messages only if correcting
+#: this divides their change over the pause by this factor, and if they had changed more than all
+#: other lengths by this factor.
 CONTINUOUS = 3.0
-#: kinds of findings to which an exchange can lead
+#: look for exchanged muscles only after a finding of one of these kinds, to which an exchange leads
 EXPLAINED = frozenset(
     {
         ConditionKind.LENGTHS_JUMPED,
@@ -64,12 +71,16 @@ EXPLAINED = frozenset(
         ConditionKind.RESIDUAL_DISTANCE,
     }
 )
-#: kinds that the lengths around a silence may explain
+#: compare the lengths before and after a pause of the messages only after a finding of one of these
+#: kinds
 EXPLAINED_BY_SILENCE = EXPLAINED | {ConditionKind.LENGTH_JUMP}
 
 
 class ExchangeCheck:
-    """Replaces a finding by the fault of the driver that explains it: order, sign or offsets."""
+    """Checks whether a fault of the driver explains a finding, and then reports that fault instead.
+
+    The fault is a wrong order of the muscles, a wrong sign of a length, or lost length offsets.
+    """
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
@@ -89,7 +100,7 @@ class ExchangeCheck:
         self._mae = mae
 
     def read(self, states: Array, now: float) -> None:
-        """Read the raw l of a message, accepted or not, and note whether a silence has ended.
+        """Read the raw lengths of a message, accepted or not, to notice a pause of the driver.
 
         Args:
             states: The raw readings, (Q, M).
@@ -103,7 +114,7 @@ class ExchangeCheck:
         self._newest = now, length
 
     def note(self, observation: Observation) -> None:
-        """Note a message at regular intervals, while the length offsets are known."""
+        """Note a message, at most one in 0.25 s, while the length offsets are known."""
         self._since += observation.dt
         if self._since < SPACING - 1e-9:
             return
@@ -116,10 +127,11 @@ class ExchangeCheck:
             self._messages.append((sample.bone_tension, sample.length_read))
 
     def explain(self, finding: Finding | None, observation: Observation) -> Finding | None:
-        """Return a finding of exchanged muscles or a reversed length if it explains `finding`.
+        """Explain a finding: return the finding of the driver's fault that explains it, if any.
 
-        If neither does, and `finding` only states that the readings do not fit the learned body,
-        several lengths that have changed in a recent silence explain it: they have lost their
+        Exchanged muscles or a reversed length are considered first. If neither explains `finding`,
+        and `finding` only states that the readings do not fit the learned body, several lengths
+        that have changed in a recent pause of the messages explain it: they have lost their
         offsets. Otherwise, the result is `finding`.
         """
         if finding is None or finding.kind not in EXPLAINED_BY_SILENCE:
@@ -141,16 +153,17 @@ class ExchangeCheck:
 
     @property
     def _may_have_restarted(self) -> bool:
-        """Whether a silence has ended recently, in which the driver may have restarted."""
+        """Whether all messages paused recently, so that the driver may have restarted."""
         if self._silence is None or self._newest is None:
             return False
         return self._newest[0] - self._silence[0] <= RESTARTED
 
     def _jumped_in_silence(self) -> Finding | None:
-        """Return the finding of lengths that a recent silence has changed; None for fewer than two.
+        """Return the finding of several lengths that jumped in a recent pause of the messages.
 
-        A driver that counts lengths from 0 again changes all of them. An arm that has moved in the
-        silence changes them as well, but that leads to no finding that could be explained here.
+        The result is None if fewer than two lengths have changed. A driver that counts lengths from
+        0 again changes all of them. An arm that has moved in the pause changes them as well, but
+        that leads to no finding that could be explained here.
         """
         if not self._may_have_restarted or self._silence is None or self._mae is None:
             return None
@@ -161,7 +174,10 @@ class ExchangeCheck:
         return finding_of(changed) if len(changed) > 1 else None
 
     def _judge_silence(self) -> WiringJudgement | None:
-        """Judge which wiring makes lengths continue over the last silence; None if unknown."""
+        """Judge which order and signs make the lengths continue over the last pause of messages.
+
+        The result is None if no pause has been observed, or without a network.
+        """
         if self._silence is None or self._mae is None:
             return None
         _, before, after = self._silence
@@ -169,7 +185,7 @@ class ExchangeCheck:
         straight = Wiring.straight(self._robot.muscle_count)
 
         def change(wiring: Wiring, columns: Bools) -> float:
-            """Return how far lengths change over the silence with this wiring (RMS)."""
+            """Return the root mean square change of lengths over the pause with this wiring [m]."""
             gap = wiring.signed(after) - before
             return float(np.sqrt(np.square(gap[columns]).mean())) if columns.any() else 0.0
 
@@ -187,7 +203,11 @@ class ExchangeCheck:
         return WiringJudgement(best, tuple(wiring for _, wiring in explaining), (), least)
 
     def _judge(self, observation: Observation) -> WiringJudgement | None:
-        """Judge which wiring restores the usual A; return None if that cannot be judged."""
+        """Judge which order and signs restore the usual anomaly score; None if that is unclear.
+
+        It is unclear if the network is not calibrated, if there are too few messages, or if a
+        tendon is slack.
+        """
         mae, sample = self._mae, observation.sample
         if mae is None or not mae.is_calibrated:
             return None
@@ -215,7 +235,7 @@ class ExchangeCheck:
         tension, length = tension[is_anomalous], length[is_anomalous]
 
         def cost(wiring: Wiring) -> float:
-            """Return the median A, or infinity if it is not healthy."""
+            """Return the median anomaly score under a wiring; ∞ if it stays unusually high."""
             value = float(np.median(scores(wiring)))
             return value if value < USUAL * usual else math.inf
 

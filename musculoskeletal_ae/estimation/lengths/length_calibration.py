@@ -11,7 +11,7 @@ is therefore judged (`signals/wiring.py`), and a wrong one is refused with the n
 A standing arm does not show the wiring.
 
 If an arm stands still, some offsets explain its readings even if it does not stand in the stated
-posture. They count as known only if the joint sensors, where there are any, measure that posture.
+posture. They are known only if the joint sensors, if there are any, measure that posture.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import UNKNOWN, LengthOffsets
 from musculoskeletal_ae.signals.wiring import WiringJudgement, judge
 
-ENOUGH_WITH_ANGLES = 20.0  # require this duration of gentle motion with measured joint angles [s]
-ENOUGH = 38.0  # require this duration of gentle motion without measured joint angles [s]
-STANDING = 1.0  # require an arm to stand in a stated posture for this long [s]
+ENOUGH_WITH_ANGLES = 20.0  # with joint sensors, require gentle motion for this long [s]
+ENOUGH = 38.0  # without joint sensors, require gentle motion for this long [s]
+STANDING = 1.0  # require the arm to stand still in a posture stated by the user for this long [s]
 #: begin the first fit after this time, and fits of an arm that stands at this interval [s]
 FIRST_FIT = 0.5
 FIT_INTERVAL = 2.0  # begin later fits of a moving arm at this interval [s]
-#: A fit consists of short pieces of work, each of which takes 1 to 2 ms. At each message, one piece
-#: is done for every PIECE_TIME [s] since the previous message, but at least one and at most
-#: MOST_PIECES. A fit therefore takes equally long with messages at 50 to 200 Hz.
+#: Do one piece of a fit, which takes 1 to 2 ms, for every PIECE_TIME [s] since the last message.
+#: Do at least one piece and at most MOST_PIECES at each message. A fit therefore takes equally long
+#: with messages at 50 to 200 Hz.
 PIECE_TIME = 0.005
-MOST_PIECES = 4  # do at most this many pieces of work at one message
+MOST_PIECES = 4  # do at most this many pieces of a fit at one message, so that none is delayed
 #: reject a fit with a larger median residual of a length [m]; correct offsets leave 0.0003 m
 LARGEST_RESIDUAL = 0.02
 #: reject a fit with a larger cost per residual: correct offsets cost 0.2 to 0.5, offsets of a wrong
@@ -55,13 +55,16 @@ CORRECT_DRIVER = Step.CORRECT_WIRING, Step.CALIBRATE_LENGTHS
 OTHER_WAY = (
     'provide joint sensors; or set zero_posture, hold the arm there, and call estimator/zero'
 )
-CORRELATED = 10.0  # count this many successive moments as one independent moment
-SHIFTED = 0.02  # use another estimate if it differs by more than this from the one in use [m]
+#: treat this many successive moments (means over 0.25 s) as one independent measurement, when the
+#: standard deviation of an offset is computed
+CORRELATED = 10.0
+#: during the calibration, use a newer estimate of the offsets only if one of them differs by more
+#: than this from the one in use [m]
+SHIFTED = 0.02
 #: Reject a stated posture if a joint sensor differs by more than this [rad]. A larger difference is
 #: due to a wrong posture or a faulty sensor.
 STATED_ERROR = 0.2
-#: compare the stated posture with the median of this number of measured postures, at least and at
-#: most
+#: compare the stated posture with the median of at least LEAST and at most MOST measured postures
 LEAST, MOST = 10, 100
 BEYOND_STOP = 0.01  # let a stated joint angle exceed a limit by this share of the joint's range
 #: multiply a median absolute deviation by this to get the standard deviation
@@ -72,9 +75,10 @@ class LengthCalibration:
     """Collects readings and fits the offsets, with a small amount of work at every message.
 
     Attributes:
-        posture: The stated posture, as the constructor gets it.
-        wiring: What the newest fit tells about the order and the signs of the columns; None before
-            they have been judged.
+        posture: Positions of the joints at which the arm stands, as the user has stated them [rad
+            or m], (D,); () if it moves gently.
+        wiring: Whether muscles are exchanged or lengths have a wrong sign, according to the newest
+            fit; None before that has been judged.
     """
 
     def __init__(self, robot: Robot, mae: Mae | None, posture: tuple[float, ...] = ()) -> None:
@@ -122,7 +126,7 @@ class LengthCalibration:
 
     @property
     def is_done(self) -> bool:
-        """Whether the offsets are known."""
+        """Whether the offsets are known, which ends the calibration."""
         return self._estimate is not None and self._estimate.known and not self._problem
 
     @property
@@ -140,7 +144,7 @@ class LengthCalibration:
 
     @property
     def enough(self) -> float:
-        """Required duration of gentle motion, or of standing [s]."""
+        """Duration of gentle motion, or of standing, that is enough [s]."""
         if self.is_standing:
             return STANDING
         return ENOUGH_WITH_ANGLES if self._has_angles else ENOUGH
@@ -154,7 +158,7 @@ class LengthCalibration:
 
     @property
     def problem(self) -> str:
-        """Why the calibration does not end although it has enough data, or ''."""
+        """Why the calibration does not end although it has enough data, for users; '' otherwise."""
         if self._collector.has_moved_away:
             return 'the arm moved away; hold it still and call estimator/zero again'
         return self._problem
@@ -166,7 +170,7 @@ class LengthCalibration:
 
     @property
     def remedy(self) -> tuple[Step, ...]:
-        """What a user must do before the lengths can be calibrated; () if the wiring is right."""
+        """Steps by which a user corrects the driver before a calibration; () if none are needed."""
         return CORRECT_DRIVER if self.wiring is not None and self.wiring.is_faulty else ()
 
     def step(
@@ -181,8 +185,8 @@ class LengthCalibration:
             theta: Measured joint angles [rad], (D,), or None without joint sensors.
 
         Returns:
-            CALIBRATING if `offsets` are to be used from now on, CALIBRATED if they also count as
-            known, which ends the calibration, or None.
+            CALIBRATING if `offsets` are to be used from now on; CALIBRATED if they are also known,
+            which ends the calibration; None if nothing changes.
         """
         has_failed = self.is_standing and (self._problem or self._collector.has_moved_away)
         if has_failed:
@@ -204,7 +208,7 @@ class LengthCalibration:
         return None
 
     def _posture_problem(self) -> str:
-        """Return why the arm does not stand in the stated posture, as a text for users, or ''."""
+        """Return for users why the arm does not stand in the stated posture; '' if it does."""
         if self._stated is None or len(self._measured) < LEAST:
             return ''
         measured = np.median(self._measured, axis=0)

@@ -44,7 +44,7 @@ from musculoskeletal_ae.mae.units import LENGTH_SCALE
 from musculoskeletal_ae.robot.model_errors import ELASTIC, length_variances
 from musculoskeletal_ae.robot.robot import Robot
 
-POSTURES = 300  # average variances over this many random postures
+POSTURES = 300  # average the variances of length errors over this many random postures
 SENSOR_NOISE = 0.0003  # assume this noise of a length (standard deviation) [m]
 #: Correlate errors over this share of the joint ranges (width of ρ). The learner finds similar
 #: widths for tendons that wrap round bones (b in `body_model/remainder.py`).
@@ -57,11 +57,11 @@ class Prediction(NamedTuple):
     theta: Array  # the fitted posture [rad], (D,)
     excess: Array  # d, predicted minus measured length [m], (M,)
     variance: Array  # s², variance of d [m²], (M,)
-    shares: Array  # A, how errors of the lengths change d, (M, M)
-    elastic: Array  # ε, standard deviation of the elongations [m], (M,)
+    shares: Array  # A, derivative of d with respect to errors of all lengths, (M, M)
+    elastic: Array  # ε, standard deviation of each muscle's elongation [m], (M,)
 
     def limit(self, muscle: int, sigmas: float) -> float:
-        """Return the limit of one muscle's `excess` [m]: `sigmas` standard deviations."""
+        """Return the limit of one muscle's `excess` [m]: `sigmas` times its standard deviation."""
         return sigmas * math.sqrt(self.variance[muscle])
 
 

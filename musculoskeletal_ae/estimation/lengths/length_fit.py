@@ -26,20 +26,22 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement, decide, single_faults
 
 # Constants of the search for initial values.
-DRAWN_POSTURES = 3200  # compare the torques of this many random postures at the first moment
+#: draw this many random postures, and compare how well their torques balance at the first moment
+DRAWN_POSTURES = 3200
 FITTED_POSTURES = 400  # fit this many of the best drawn postures coarsely to the lengths
-COMPARED_FITS = 30  # compare this many of the best coarse fits also by torque
+COMPARED_FITS = 30  # compare this many of the best coarse fits by torque as well
 REFINED_FITS = 6  # refine this many of the best coarse fits
-FEW_MOMENTS = 24  # search on this many moments
-BATCH = 20  # fit this many postures during one message
+FEW_MOMENTS = 24  # compare initial values on this many moments (means over 0.25 s), not on all
+BATCH = 20  # fit this many postures in one piece of work, which runs between two messages
 COARSE_LENGTH = 0.01  # assume this standard deviation of a length in coarse fits [m]
 COARSE_TORQUE = 2.0  # assume this standard deviation of a torque in coarse fits [N·m]
 #: assume this standard deviation of the excess over joint limits in coarse fits [rad]
 COARSE_ANGLE = 0.1
 
 # Constants of the judgement of the wiring.
-LIKELY = 3  # fit this many of the likeliest wirings to all moments
-MOST_FAULTS = 3  # search for at most this many exchanges and reversed signs
+#: after all possible wirings have been fitted to a few moments, fit this many of the best to all
+LIKELY = 3
+MOST_FAULTS = 3  # search for at most this many exchanged pairs and reversed signs in total
 
 FARTHEST = 0.3  # prefer drawn postures that imply no larger offset than this [m]
 ROUNDS = 20  # end the fit after this many Gauss–Newton steps
@@ -63,11 +65,12 @@ class Fit(NamedTuple):
     theta: Array
 
 
-Steps = Generator[None, None, Fit]  # yields after each short piece of work, and returns a fit
+#: a fit in steps: yields after each short piece of work, and finally returns the fit
+Steps = Generator[None, None, Fit]
 
 
 class LengthFit:
-    """Fits length offsets with one network.
+    """Fits the length offsets of all muscles to readings, with the lengths of one network.
 
     Attributes:
         used: Whether each muscle is used, that is, not isolated, (M,).
@@ -97,7 +100,8 @@ class LengthFit:
 
         Args:
             moments: The moments.
-            before: An earlier fit, from whose constants the fit starts a second time, or None.
+            before: An earlier fit, or None. The new fit also starts from its constants, and the
+                better result is returned.
         """
         few = moments.rows(_few(moments))
         guesses = yield from self._guesses(moments, few)
@@ -177,7 +181,7 @@ class LengthFit:
     # -- search for a start ---------------------------------------------------------------------
 
     def _best(self, guesses: list[Array], moments: Moments, rounds: int) -> Steps:
-        """Refine each guess of the constants, and return the best fit."""
+        """Refine each guess of the constants by up to `rounds` steps; return the best fit."""
         fits = list[Fit]()
         for constants in guesses:
             length = moments.length - constants[: self._robot.muscle_count]
@@ -246,7 +250,7 @@ class LengthFit:
 
 
 def _few(moments: Moments) -> Ints:
-    """Return the indices of FEW_MOMENTS moments, evenly distributed."""
+    """Return the indices of at most FEW_MOMENTS evenly distributed moments."""
     last = len(moments.length) - 1
     few: Ints = np.unique(np.linspace(0, last, FEW_MOMENTS).astype(np.int64))
     return few

@@ -26,32 +26,39 @@ from musculoskeletal_ae.gauss_newton import Equations, RightSides, SolvedStep, s
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-LENGTH_NOISE = 0.0004  # assume this error of the network's lengths (standard deviation) [m]
-#: assume this error of the network's joint torques, apart from friction (standard deviation) [N·m]
+#: assume that the lengths of the network have errors of this standard deviation [m]
+LENGTH_NOISE = 0.0004
+#: assume that the joint torques of the network have errors of this standard deviation [N·m], apart
+#: from friction
 TORQUE_NOISE = 0.4
 LIMIT_NOISE = 0.05  # let joint angles exceed their limits by this much (standard deviation) [rad]
 NOISE_FACTORS = 0.3, 5.0  # multiply LENGTH_NOISE of a single muscle by a factor within these limits
-#: weigh the length of an isolated muscle by this, relative to that of a used muscle
+#: weigh the length of an isolated muscle by this, relative to that of a used muscle, so that it has
+#: no influence
 ISOLATED_WEIGHT = 1e-6
 #: expect that a stop may carry torque within this distance from the joint limit [rad]
 AT_STOP = 0.03
 
 # Prior of the constants; the mean is 0 except for FRICTION.
-OFFSET = 0.1  # expect a length offset of this size (σ) [m]
-FRICTION = 0.05  # expect this friction coefficient μ of a tendon, with σ of the same size
-#: expect a tension sensor's offset of this size (σ) [N]; it covers the error of the gain
+OFFSET = 0.1  # expect length offsets with this standard deviation [m]
+FRICTION = 0.05  # expect tendon friction μ with this mean and this standard deviation
+#: expect offsets of the tension sensors with this standard deviation [N], which also covers errors
+#: of their gains
 TENSION_OFFSET = 1.5
-#: expect a Coulomb torque of each joint of this size (σ), relative to the weight's largest torque
+#: expect Coulomb friction torques of the joints with this standard deviation, relative to the
+#: largest torque of the arm's weight
 JOINT_FRICTION = 0.03
 
 #: after a reversal, let the friction of a joint change its sign over this motion [rad]
 STICKING = 0.003
-#: assume at least this largest torque of the weight, relative to that of the muscles at T_bias
+#: relate joint friction to a torque of at least this share of that of the muscles at T_bias: a
+#: joint with a vertical axis carries no weight
 LEAST_WEIGHT = 0.1
 
-STEP = 1e-3  # step of numerical derivatives, of θ [rad] and of μ
+STEP = 1e-3  # compute numerical derivatives with steps of this size, of θ [rad] and of μ
 LARGEST_STEP = 0.3  # change an angle by at most this in a Gauss–Newton step [rad]
-SMALL = 1e-6  # add this to the diagonals of A, so that A is positive definite
+#: add this to the diagonals of the normal matrices, so that these are positive definite
+SMALL = 1e-6
 
 
 class LengthModel:
@@ -61,7 +68,8 @@ class LengthModel:
         used: Whether each muscle is used, that is, not isolated, (M,).
         prior_mean: Prior mean of the constants, (3M + D,).
         prior_spread: Prior standard deviation of the constants, (3M + D,).
-        noise: Standard deviations of the residuals, (M + 2D,).
+        noise: Standard deviations of the residuals, (M + 2D,): of the lengths [m], then of the
+            torques [N·m], then of the excess over the joint limits [rad].
     """
 
     def __init__(self, robot: Robot, mae: Mae, rng: np.random.Generator) -> None:
@@ -160,7 +168,7 @@ class LengthModel:
 
 
 class LengthPoint(NamedTuple):
-    """Values of the unknowns, and the residuals at these values."""
+    """A point of the fit: values of the unknowns, and the residuals at these values."""
 
     #: length offset, friction and tension offset of each muscle, then friction of each joint,
     #: (3M + D,)
@@ -183,7 +191,7 @@ class MomentFit:
         self._by_constants: Array  # ∂residual/∂constants, (K, M + 2D, 3M + D)
 
     def point(self, constants: Array, theta: Array) -> LengthPoint:
-        """Return these values of the unknowns with their residuals."""
+        """Return the point of the fit with these values of constants and postures."""
         (value,) = self._model.residuals(constants, theta, self._moments, self._turning)
         return LengthPoint(constants, theta, value)
 
@@ -206,7 +214,7 @@ class MomentFit:
         return float(self._precision @ deviation**2)
 
     def equations(self, point: LengthPoint) -> Equations:
-        """Return the normal equations at a point."""
+        """Return the normal equations of a Gauss–Newton step from a point."""
         _, self._by_theta, self._by_constants = self._model.residuals(
             point.constants, point.theta, self._moments, self._turning, derivatives=True
         )
@@ -218,7 +226,7 @@ class MomentFit:
         return Equations(by_theta + SMALL * np.eye(by_theta.shape[-1]), mixed, common)
 
     def right_sides(self, point: LengthPoint) -> RightSides:
-        """Return the right sides of the normal equations."""
+        """Return the right sides of the normal equations of a Gauss–Newton step from a point."""
         weighted = self._weight * point.residual
         by_prior = self._precision * (self._model.prior_mean - point.constants)
         return RightSides(
@@ -227,7 +235,7 @@ class MomentFit:
         )
 
     def moved(self, point: LengthPoint, step: SolvedStep) -> LengthPoint:
-        """Return the unknowns after a step of the solver, with their residuals."""
+        """Return the point to which a step of the solver leads; LARGEST_STEP limits the angles."""
         turned = np.clip(step.samples, -self._largest_step, self._largest_step)
         return self.point(point.constants + step.common, point.theta + turned)
 

@@ -2,9 +2,9 @@
 """Collects the readings for a length calibration: means over short windows, called moments.
 
 Tendon friction changes its sign with the direction of motion. The moments therefore have to cover
-many postures, reached from different sides. A moment of a moving arm counts only if the arm has
-moved since the previous moment, but not so fast that inertial forces matter. The moments of an arm
-that stands in a stated posture count until the arm moves.
+many postures, reached from different sides. A moment of a moving arm is kept only if the arm has
+moved since the previous moment, but not so fast that inertial forces matter. If the arm is to stand
+in a stated posture, moments are kept until it moves.
 """
 
 from __future__ import annotations
@@ -16,11 +16,13 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
-WINDOW = 0.25  # average the readings of a moment over this time [s]
-MOVED = 0.002  # count the arm as moved if a muscle's length has changed by more than this [m]
+WINDOW = 0.25  # average readings over this time; the mean is called a moment [s]
+#: conclude that the arm has moved since the last moment if a length has changed by more than this
+#: [m]
+MOVED = 0.002
 #: skip moments in which a muscle is faster, because inertial forces matter then [m/s]
 FASTEST = 0.05
-MOST = 240  # keep at most this many moments
+MOST = 240  # keep at most this many of the newest moments, which bounds the time of a fit
 
 
 class Moments(NamedTuple):

@@ -46,14 +46,15 @@ class Evidence(Enum):
 class Transition(NamedTuple):
     """How evidence changes the trust in the offset of a muscle."""
 
-    before: frozenset[Trust]  # values of the trust that change; evidence in any other is ignored
-    after: Trust
+    before: frozenset[Trust]  # apply the evidence only if the present trust is one of these
+    after: Trust  # the trust that follows from it
 
 
 _ANY, _UNKNOWN = frozenset(Trust), frozenset({Trust.UNKNOWN})
 _KNOWN, _REVOKED = frozenset({Trust.KNOWN}), frozenset({Trust.REVOKED})
 
-#: change the trust as each evidence demands; nothing leads back to the assumption of the start
+#: change the trust in an offset as each evidence declares; ASSUMED, the evidence at the start, is
+#: no key, because nothing leads back to it
 TRANSITIONS = {
     Evidence.NOT_CALIBRATED: Transition(_ANY, Trust.UNKNOWN),
     Evidence.RESTARTED: Transition(_ANY, Trust.UNKNOWN),
@@ -91,7 +92,7 @@ class LengthTrust:
         muscles: Iterable[int] | None = None,
         found: LengthOffsets | None = None,
     ) -> bool:
-        """Take new evidence; return whether it has changed an offset or a trust.
+        """Take new evidence; return whether it has changed an offset or the trust in one.
 
         Args:
             evidence: The evidence, or the kind of a finding that revokes length offsets.

@@ -34,37 +34,45 @@ from musculoskeletal_ae.robot.robot import Robot
 # Limits relative to joint sensors. A good learned network differed from joint sensors by 0.29 rad
 # although the network before it differed by 0.18 rad. Lengths of good learned networks differed by
 # up to 0.03 m.
-ANGLE_FLOOR = 0.35  # permit this error of a joint in any case [rad]
-LENGTH_FLOOR = 0.06  # permit this error of a length in any case [m]
-ANGLE_WORSE = 1.5  # permit this multiple of the error of the network in use
+ANGLE_FLOOR = 0.35  # never reject a network for a smaller error of a joint angle than this [rad]
+LENGTH_FLOOR = 0.06  # never reject a network for a smaller error of a length than this [m]
+#: above these errors, reject a network whose error exceeds that of the network in use by this
+#: factor
+ANGLE_WORSE = 1.5
 #: call a network that a user has chosen worse than the one in use only from this error on [rad]
 ANGLE_CLEAR = 0.1
 # Limits relative to the network in use. The first update of an initial network changed θ by up to
 # 0.56 rad and lengths by up to 0.05 m; an update of a learned network changed θ by up to 0.31 rad.
-ANGLE_MOVED = 0.45  # permit this difference of θ from a learned network [rad]
-ANGLE_MOVED_INITIAL = 0.8  # permit this difference of θ from an initial network [rad]
-LENGTH_MOVED = 0.07  # permit this difference of a length from a network of either kind [m]
+#: while a learned network is in use, reject candidates whose θ differs from its θ by more [rad]
+ANGLE_MOVED = 0.45
+#: while an initial network is in use, reject candidates whose θ differs from its θ by more [rad]
+ANGLE_MOVED_INITIAL = 0.8
+#: reject candidates one of whose lengths differs from that of the network in use by more [m]
+LENGTH_MOVED = 0.07
 # A minute of learning changed the shape of initial networks by 0.32 and of learned networks by
 # 0.18. Multiplying all lengths by 1.5 changes it by 0.5.
-SHAPE_MOVED = 0.3  # permit this relative difference in shape from a learned network
-SHAPE_MOVED_INITIAL = 0.42  # permit this relative difference in shape from an initial network
+#: while a learned network is in use, reject a candidate if the changes of its lengths from posture
+#: to posture differ by more than this share from those of the network in use
+SHAPE_MOVED = 0.3
+#: the same limit as SHAPE_MOVED, but while an initial network is in use
+SHAPE_MOVED_INITIAL = 0.42
 
-BY_SENSORS = 'joint sensors'  # name joint sensors so, as the source of a reference
-BY_NETWORK = 'the network in use'  # name the network in use so, as the source of a reference
+BY_SENSORS = 'joint sensors'  # text for users if joint sensors are the reference
+BY_NETWORK = 'the network in use'  # text for users if the network in use is the reference
 
 
 class Agreement(NamedTuple):
     """How much one quantity of a candidate network differs from its reference."""
 
-    name: str
-    owners: tuple[str, ...]  # joint or muscle of each entry
+    name: str  # name of the quantity for users, such as 'θ'
+    owners: tuple[str, ...]  # joint or muscle of each error
     #: error of each joint [rad or m] or muscle [m], or the relative error of all lengths
     error: Array
-    limit: Array  # largest permitted error of each entry
-    source: str  # source of the reference
+    limit: Array  # largest permitted value of each error
+    source: str  # what the candidate is compared with: BY_SENSORS or BY_NETWORK
 
     def faults(self) -> Iterator[str]:
-        """Yield one text on the error that exceeds its limit most, or nothing if none does."""
+        """Yield a text for users on the error that exceeds its limit most; nothing if none does."""
         excess = self.error / self.limit
         if not excess.max() <= 1.0:
             worst = int(excess.argmax())
@@ -98,7 +106,10 @@ class AgreementCheck:
         self._has_learned = in_use.covariance is not None
 
     def comparisons(self, mae: Mae) -> list[Agreement]:
-        """Compare a candidate with the joint sensors, or else with the network in use."""
+        """Return comparisons of a candidate with joint sensors, or else with the network in use.
+
+        There is one for each quantity: angles, lengths and, if needed, the change of lengths.
+        """
         if not self._messages.are_enough:
             theta, tension = self._postures.theta, self._postures.tension
             length = self._in_use.lengths(theta, tension)

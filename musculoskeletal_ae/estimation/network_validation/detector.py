@@ -18,14 +18,17 @@ from musculoskeletal_ae.estimation.network_validation.recent_messages import LEA
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, residuals
 
-#: require at least this ratio with a ruptured muscle; the muscle with the largest ratio counts
+#: reject a network if no imitated rupture raises d to at least this share of its threshold
 LEAST_RUPTURED = 0.1
-#: raise an inherited threshold to at least this multiple of the largest d of the messages
+#: raise a detector's threshold that a candidate inherits to at least this multiple of the largest
+#: residual distance d in recent messages, so that the candidate reports nothing on a healthy arm
 WIDENED = 3.5
 
 
 def measures(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> Iterator[float]:
-    """Yield ratios of the residual distance d to its threshold, each as the median over messages.
+    """Yield measures of a detector: ratios of the residual distance d to its threshold.
+
+    Each ratio is the median over the recent messages.
 
     The first ratio is that of the messages as they are. Each following ratio is that of the same
     messages with one muscle ruptured, which is imitated by setting its tension to 0.

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks how exactly a candidate network restores the readings of recent messages.
 
-Three errors are compared: those of the tensions and lengths that the network restores from both
-(mask ②), and that of the lengths that it computes at the joint angles estimated by ② (mask ①).
-The limit of the median error of each muscle is WORSE times that of the network in use, but at least
-FLOOR.
+Three errors are compared. With mask ②, the network estimates joint angles from tensions and
+lengths, and restores both: two errors. With mask ①, it computes the lengths at these joint angles:
+the third error. The median error of each muscle over the messages must be below WORSE times that
+of the network in use, or below FLOOR.
 """
 
 from collections.abc import Iterable, Iterator
@@ -15,10 +15,13 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.network_validation.recent_messages import RecentMessages
 from musculoskeletal_ae.mae.mae import Mae
 
-WORSE = 2.0  # permit this multiple of the error of the network in use
-#: permit these errors of T [N] and l [m] in any case
+#: reject a network whose error exceeds the one of the network in use by this factor
+WORSE = 2.0
+#: never reject a network for errors of tensions T [N] and lengths l [m] smaller than these; ① and ②
+#: are the masks with which the network computes them
 FLOOR = {'T by ②': 40.0, 'l by ②': 0.06, 'l by ① at θ of ②': 0.06}
-#: call a network worse than the one in use only from this error of a length on [m]
+#: warn that a network chosen by a user is worse than the one in use only if its error of a length
+#: exceeds this [m]
 CLEAR = 0.01
 
 

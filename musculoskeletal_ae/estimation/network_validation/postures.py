@@ -39,10 +39,12 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.robot import Robot
 
-POSTURES = 64  # check a network on this many fixed states
-SCALE = 'scale of l by ①'  # name of the error of the common factor
+POSTURES = 64  # check a network on this many fixed random states of the geometric model
+#: name of the error of the scale: the factor by which all route lengths differ from the model's
+SCALE = 'scale of l by ①'
 
-#: permit these relative errors; healthy networks have smaller ones (`python -m bench gate`)
+#: reject a network with a larger relative error than these; healthy networks have smaller ones
+#: (`python -m bench gate`)
 LIMITS = {
     'θ by ①': 0.6,
     'T by ①': 1.35,  # permit less than √2, the error after an exchange of two muscles
@@ -58,20 +60,24 @@ LIMITS = {
     'mean θ by ①': 0.6,
     'mean θ by ③': 0.7,
 }
-LEAST_SPREAD = 0.04  # divide errors of lengths by at least this standard deviation [m]
-LEAST_ARM = 0.01  # divide errors of G by moment arms of at least this size [m]
-# Fit the elongation as that of the model times a factor between these two. The constants of a real
-# elastic element may be e^±1.5 times those of the model.
+#: divide the error of a length by at least this standard deviation [m], so that a small error of a
+#: muscle that hardly changes its length is no large relative error
+LEAST_SPREAD = 0.04
+LEAST_ARM = 0.01  # divide errors of the muscle Jacobian by moment arms of at least this size [m]
+#: before comparing lengths, multiply the modelled elongation of each muscle by a factor between
+#: these two: the constants of a real elastic element may be e^±1.5 times those of the model
 STIFFEST, SOFTEST = 0.2, 4.5
-INELASTIC = 1e-12  # divide a slope by at least this, for muscles without elongation [m²]
-#: permit this multiple of the best affine map's error at a poorly determined joint
+#: use at least this sum of squared elongations as a divisor [m²]; a muscle without elongation has 0
+INELASTIC = 1e-12
+#: for a joint that the muscles determine poorly, permit this multiple of the error that the best
+#: affine map from tensions and lengths to angles makes
 UNDETERMINED = 1.2
 #: fit the affine map to this many states, and measure its error on as many others
 AFFINE = 1000
 
 
 class PostureCheck:
-    """Fixed random states of one robot, and the errors of networks on them.
+    """Checks networks on fixed random states of the geometric model of one robot.
 
     Attributes:
         theta: Joint angles [rad], (N, D).

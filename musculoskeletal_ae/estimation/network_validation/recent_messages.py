@@ -9,21 +9,24 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 
-SPAN = 10.0  # keep messages that are no older than this [s]
-SPACING = 0.1  # keep one message in this time [s]
-LEAST = 20  # validate a network on at least this many messages
+SPAN = 10.0  # drop messages that are older than this [s]
+SPACING = 0.1  # store at most one message in this time [s]
+LEAST = 20  # skip the checks on recent messages if there are fewer than this
 
 
 class _Message(NamedTuple):
     time: float  # time on the steady clock [s]
-    tension: Array  # T [N], (M,)
-    length: Array  # l [m], (M,)
+    tension: Array  # tensions as read [N], (M,)
+    length: Array  # muscle lengths [m], (M,)
     sliding: Array  # s: direction in which each tendon slid last, (M,)
     theta: Array  # measured θ [rad], NaN if it was not measured, (D,)
 
 
 class RecentMessages:
-    """The healthy messages of the last 10 s, at most one in 0.1 s, by a steady clock [s]."""
+    """Stores the healthy messages of the last 10 s, at most one in 0.1 s.
+
+    All times are of one steady clock [s].
+    """
 
     def __init__(self, joint_count: int) -> None:
         self._unmeasured = np.full(joint_count, np.nan)

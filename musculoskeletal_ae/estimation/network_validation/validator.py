@@ -49,8 +49,10 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 
-PROOF = 10.0  # count a network as proven after this time in use without an anomaly [s]
-MOST_USED = 20  # keep at most this many networks for a rollback
+#: after an anomaly, return to a network that had been in use for at least this long without an
+#: anomaly [s]
+PROOF = 10.0
+MOST_USED = 20  # keep at most this many networks to which the estimator can return
 RELEARNING_TIME = 600.0  # expect that a muscle may be relearned for this long after its repair [s]
 
 
@@ -96,7 +98,10 @@ class CheckpointValidator:
     # -- decisions ------------------------------------------------------------------------------
 
     def decide(self, mae: Mae, now: float) -> None:
-        """Use a candidate of the learner, or reject it; `propose` does the same in steps."""
+        """Decide on a candidate of the learner: use it, or call `rejected` with the reason.
+
+        Nothing is decided if it is the network in use. `propose` does the same in steps.
+        """
         if self.is_in_use(mae):
             return
         try:
@@ -106,7 +111,9 @@ class CheckpointValidator:
             self.rejected(mae, str(error))
 
     def propose(self, mae: Mae, clock: Callable[[], float]) -> Iterator[None]:
-        """Decide in steps of some milliseconds, between which a node can do other work.
+        """Propose a candidate of the learner: decide on it as `decide` does, but in steps.
+
+        Each step takes some milliseconds, so that a node can do other work in between.
 
         Args:
             mae: The candidate. Nothing is decided if it is the network in use.
@@ -126,10 +133,14 @@ class CheckpointValidator:
             raise
 
     def choose(self, mae: Mae, now: float) -> None:
-        """Use a network that a user has chosen, and find out whether it fits this arm worse.
+        """Use a network that a user has chosen, and set `unsuitable_because`.
+
+        Args:
+            mae: The network.
+            now: Time on the steady clock [s].
 
         Raises:
-            CheckpointError: If it is refused.
+            CheckpointError: If a check rejects it; the network in use then stays.
         """
         self.check(mae, is_chosen=True)
         self._accept(mae, now, unsuitable_because=self._weakness(mae))
@@ -178,13 +189,14 @@ class CheckpointValidator:
         )
 
     def _weakness(self, mae: Mae) -> str:
-        """Say in what a network is clearly worse on recent messages than a learned one in use.
+        """Return in what a network is clearly worse than the learned one in use, for users.
 
-        Joint sensors tell, or else the lengths that each network computes at its own estimate.
+        On recent messages, the errors of estimated joint angles are compared, if joint sensors
+        measured them, or else those of the lengths that each network computes at its estimate.
 
         Returns:
-            The quantity, its error and that of the network in use; '' if it is not clearly worse,
-            or if nothing is known about it.
+            The quantity, its error and that of the network in use; '' if the network is not clearly
+            worse, or if there are too few messages.
         """
         if self.mae is None or self.mae.covariance is None or not self._messages.are_enough:
             return ''
@@ -241,9 +253,9 @@ class CheckpointValidator:
             raise GateError(f'{error}{self._likely_cause}') from error
 
     def trial(self, mae: Mae, is_chosen: bool = False) -> Iterator[None]:
-        """Check a network in steps of some milliseconds, between which a node can do other work.
+        """Try a network: check it as `check` does, but in steps of some milliseconds.
 
-        `check` describes the arguments and the error.
+        A node can do other work between the steps. `check` describes the arguments and the error.
         """
         faults, steps = list[str](), self._steps(mae.without(self.isolated), is_chosen)
         while True:
@@ -264,7 +276,7 @@ class CheckpointValidator:
         self._repaired_at |= dict.fromkeys(muscles, now)
 
     def take(self, mae: Mae, now: float) -> None:
-        """Take this network as the one in use from the time `now` [s] on."""
+        """Take this network as the one in use from the time `now` [s] on, without any check."""
         self._used.append((now, mae))
         while len(self._used) > 1 and now - self._used[1][0] >= PROOF:
             del self._used[0]
@@ -347,6 +359,6 @@ class CheckpointValidator:
 
     @cached_property
     def _likely_cause(self) -> str:
-        """Text on a property of the robot that may cause a rejection; '' if there is none."""
+        """Text on a property of the robot that may cause a rejection; '' if it has none."""
         warning = jump_warning(self._robot)
         return f' ({warning})' if warning else ''
