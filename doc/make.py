@@ -112,7 +112,7 @@ Parameters marked * can be set while the node runs. To empty a list of names, us
 unknown parameter and a value outside the legal range are refused, with the legal set."""
 COMMAND_LINE_INTRODUCTION = """\
 `python doc/make.py` writes this page from `--help`. `ros2 run musculoskeletal_ae NAME` and
-`$bin/NAME` run the same executable ([which to use](../howto/install.md#use-it-in-another-terminal)).
+`$bin/NAME` run the same executable ([which](../howto/install.md#use-it-in-another-terminal)).
 Nodes take no options of their own, only `--ros-args`; [Parameters](parameters.md) lists their
 parameters. `check_driver`, `record`, `render`, `replay` and `view` also take `--ros-args` after
 their own options, such as `--ros-args -r __ns:=/left_arm -r TOPIC:=OTHER`. `-h` prints the help.
