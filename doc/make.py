@@ -113,9 +113,10 @@ unknown parameter and a value outside the legal range are refused, with the lega
 COMMAND_LINE_INTRODUCTION = """\
 `python doc/make.py` writes this page from `--help`. `ros2 run musculoskeletal_ae NAME` and
 `$bin/NAME` run the same executable ([which](../howto/install.md#use-it-in-another-terminal)).
-Nodes take no options of their own, only `--ros-args`; [Parameters](parameters.md) lists their
-parameters. `check_driver`, `record`, `render`, `replay` and `view` also take `--ros-args` after
-their own options, such as `--ros-args -r __ns:=/left_arm -r TOPIC:=OTHER`. `-h` prints the help.
+Nodes take no options of their own, only `--ros-args`: see [Parameters](parameters.md) and
+[Topics and services](topics_and_services.md). `check_driver`, `record`, `render`, `replay` and
+`view` also take `--ros-args` after their own options, such as `--ros-args -r __ns:=/left_arm -r
+TOPIC:=OTHER`. `-h` prints the help.
 
 On Ctrl-C (SIGINT) and SIGTERM, a node ends with exit status 0. `record` and `replay` also end with
 0, because this is the usual way to end them. Any other tool ends with 130 and prints one line,
@@ -229,6 +230,10 @@ def command_line() -> str:
         text = _printed([sys.executable, '-c', code, '--help'])
         for repeated in REPEATED:
             text = re.sub(repeated, '', text)
+        if text.startswith('The node '):  # the page on topics says the rest
+            text = text.partition('\n\n')[0]
+        if name == 'combined':
+            text = 'The nodes `estimator` and `controller` in one process.'
         lines += [
             f'## {name}',
             '',
