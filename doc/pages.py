@@ -111,10 +111,10 @@ def conditions() -> str:
     """Return the table of all conditions, except those that only the page on stops lists."""
     rows = [
         (f'`{kind.identifier}`', kind.owner, kind.level, kind.when, _consequence(kind),
-         _sentence(kind.steps))
+         _listed(step.identifier for step in kind.steps) or '–')
         for kind in ConditionKind if kind.stop is None or kind.owner != 'controller'
     ]  # fmt: skip
-    heads = ('identifier', 'reported by', 'level', 'present when', 'reaction', 'remedy')
+    heads = ('identifier', 'reported by', 'level', 'present when', 'reaction', 'steps')
     return _table(heads, rows)
 
 
