@@ -174,7 +174,9 @@ def api() -> str:
     for file, names in MODULES.items():
         tree = ast.parse((PACKAGE / file).read_text(encoding='utf-8'))
         module = f'musculoskeletal_ae.{file.removesuffix(".py").replace("/", ".")}'
-        lines += [f'## {module}', '', _first(tree), '']
+        lines += [f'## {module}', '']
+        if len(names) > 1:  # the summary of a single class says the same
+            lines += [_first(tree), '']
         nodes = {node.name: node for node in tree.body if hasattr(node, 'name')}
         for name in names:
             node = nodes[name]
