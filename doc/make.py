@@ -16,6 +16,7 @@
 import ast
 import json
 import os
+import re
 import subprocess
 import sys
 from functools import partial
@@ -111,13 +112,22 @@ Parameters marked * can be set while the node runs. To empty a list of names, us
 unknown parameter and a value outside the legal range are refused, with the legal set."""
 COMMAND_LINE_INTRODUCTION = """\
 `python doc/make.py` writes this page from `--help`. `ros2 run musculoskeletal_ae NAME` and
-`install/musculoskeletal_ae/lib/musculoskeletal_ae/NAME` run the same executable. Nodes take no
-options of their own, only `--ros-args`; [Parameters](parameters.md) lists their parameters.
+`$bin/NAME` run the same executable ([which](../howto/install.md#use-it-in-another-terminal)).
+Nodes take no options of their own, only `--ros-args`: see [Parameters](parameters.md) and
+[Topics and services](topics_and_services.md). `check_driver`, `record`, `render`, `replay` and
+`view` also take `--ros-args` after their own options, such as `--ros-args -r __ns:=/left_arm -r
+TOPIC:=OTHER`. `-h` prints the help.
 
 On Ctrl-C (SIGINT) and SIGTERM, a node ends with exit status 0. `record` and `replay` also end with
 0, because this is the usual way to end them. Any other tool ends with 130 and prints one line,
 which states whether its result was written. In this case, `train --from-bag` saves what it has
 learned to `NAME.interrupted.safetensors` beside the file of `--out`."""
+
+#: parts of every --help that the page states once
+REPEATED = (
+    r'(?m)^  -h, --help +show this help message and exit\n',
+    r'\s+Options\s+of\s+ROS\s+follow\s+--ros-args,\s+such\s+as\s+--ros-args[^.]+\.',
+)
 
 
 def _first(node: ast.AST) -> str:
@@ -164,7 +174,9 @@ def api() -> str:
     for file, names in MODULES.items():
         tree = ast.parse((PACKAGE / file).read_text(encoding='utf-8'))
         module = f'musculoskeletal_ae.{file.removesuffix(".py").replace("/", ".")}'
-        lines += [f'## {module}', '', _first(tree), '']
+        lines += [f'## {module}', '']
+        if len(names) > 1:  # the summary of a single class says the same
+            lines += [_first(tree), '']
         nodes = {node.name: node for node in tree.body if hasattr(node, 'name')}
         for name in names:
             node = nodes[name]
@@ -218,6 +230,12 @@ def command_line() -> str:
             continue
         code = f'from musculoskeletal_ae.executables import {name} as run; raise SystemExit(run())'
         text = _printed([sys.executable, '-c', code, '--help'])
+        for repeated in REPEATED:
+            text = re.sub(repeated, '', text)
+        if text.startswith('The node '):  # the page on topics says the rest
+            text = text.partition('\n\n')[0]
+        if name == 'combined':
+            text = 'The nodes `estimator` and `controller` in one process.'
         lines += [
             f'## {name}',
             '',

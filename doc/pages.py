@@ -3,21 +3,25 @@
 
 from collections.abc import Iterable
 
-from musculoskeletal_ae.conditions import ConditionKind, stop_causes
+from musculoskeletal_ae.conditions import (
+    Clears,
+    ConditionKind,
+    FindingReaction,
+    Revokes,
+    stop_causes,
+)
 from musculoskeletal_ae.control import status, supervisor
 from musculoskeletal_ae.remedy import Step
 
 STOPS = """\
 # Why the arm stops, and how to continue
 
-`python doc/make.py` writes this page from the code.
-
 The controller reports a *mode*. While the arm is *running*, the mode states what the arm does: \
-{activities}. Otherwise the mode is one of {states}. Programs should compare these identifiers and \
-the identifiers of the causes. The latched topic `controller_mode` contains the mode. If there is \
-a stop cause, it follows the mode, as in `stopped:operator_stop`. The values `mode` and `stop \
-cause` of the controller in `/diagnostics` contain the same identifiers, and its `conditions` list \
-every cause that keeps the arm stopped.
+{activities}. Otherwise, it is one of {states}. Programs compare these identifiers and those of \
+the causes. The latched topic `controller_mode` contains the mode and, after a colon, the cause \
+that began the stop, as in `stopped:operator_stop`. In `/diagnostics`, the values `mode` and \
+`stop cause` of the controller repeat both, and `conditions` lists every cause that keeps the arm \
+stopped. [Recover from faults](../howto/recover_from_faults.md) has the commands.
 
 ## Modes
 
@@ -27,8 +31,6 @@ every cause that keeps the arm stopped.
 
 ## Causes
 
-The table names the action with which each cause stops the arm:
-
 - `hold` keeps the last command, because the cause may clear. After `hold_time`, it pays \
 out the muscles as `release` does.
 - `release` keeps the last command for `hold_time` in any case. Then it pays out all muscles until \
@@ -36,7 +38,8 @@ each exerts T_bias. Modules that follow positions are paid out until their measu
 T_bias, or by `release` of muscles.yaml where no tension is known.
 - `release at once` does not wait for `hold_time`.
 
-If several causes begin together, the first one in this table is reported.
+Every cause lasts until `controller/reset`, except that some end earlier. If several \
+begin together, the first one in this table is reported. Each remedy ends with `controller/reset`.
 
 {table}
 
@@ -49,7 +52,15 @@ while these are present, except for the reset:
 {consequences}
 
 {steps}
+
+`python doc/make.py` writes this page from the code.
 """
+
+EARLY_ENDS = {
+    Clears.CONDITION: 'if the condition clears within `hold_time`',
+    Clears.VERIFICATION: 'when a verification of the suspect muscle ends',
+    Clears.RESET: '–',
+}
 
 
 def stops() -> str:
@@ -61,8 +72,8 @@ def stops() -> str:
             f'`{kind.identifier}`',
             kind.when,
             kind.action.name.lower().replace('_', ' '),
-            kind.clears.value,
-            _sentence(kind.steps),
+            EARLY_ENDS[kind.clears],
+            _sentence(step for step in kind.steps if step is not Step.RESET_CONTROLLER),
         )
         for kind in stop_causes()
     ]
@@ -70,7 +81,7 @@ def stops() -> str:
         activities=_listed(activity.value for activity in supervisor.Activity),
         states=_listed(states),
         diagram=supervisor.diagram(),
-        table=_table(('cause', 'condition', 'action', 'ends', 'remedy'), causes),
+        table=_table(('cause', 'condition', 'action', 'ends earlier', 'remedy'), causes),
         consequences='\n'.join(
             f'- from `{first.identifier}`: {_listed(kind.identifier for kind in others)}'
             for first, others in status.CONSEQUENCES.items()
@@ -85,14 +96,25 @@ def stops() -> str:
     )
 
 
+#: the column "reaction" of the table of conditions, explained above the table in diagnostics.md
+REVOKED = {Revokes.ONE: 'revokes its offset', Revokes.ALL: 'revokes all offsets'}
+REACTIONS = {
+    FindingReaction.WARN: 'reports',
+    FindingReaction.STOP: 'stops',
+    FindingReaction.ISOLATE: 'stops or isolates',
+    FindingReaction.ISOLATE_AT_ONCE: 'stops or isolates at once',
+    FindingReaction.ISOLATE_ONLY: 'isolates at once',
+}
+
+
 def conditions() -> str:
-    """Return the table of all conditions."""
+    """Return the table of all conditions, except those that only the page on stops lists."""
     rows = [
         (f'`{kind.identifier}`', kind.owner, kind.level, kind.when, _consequence(kind),
-         _sentence(kind.steps))
-        for kind in ConditionKind
+         _listed(step.identifier for step in kind.steps) or '–')
+        for kind in ConditionKind if kind.stop is None or kind.owner != 'controller'
     ]  # fmt: skip
-    heads = ('identifier', 'reported by', 'level', 'present when', 'consequence', 'remedy')
+    heads = ('identifier', 'reported by', 'level', 'present when', 'reaction', 'steps')
     return _table(heads, rows)
 
 
@@ -100,11 +122,11 @@ def _consequence(kind: ConditionKind) -> str:
     """Return what a node does about a condition, besides reporting it."""
     parts = []
     if kind.stop is not None:
-        parts.append('[stops the arm](stops.md)')
+        parts.append('[stops](stops.md)')
     if kind.reaction is not None:
-        parts.append(f'the estimator {kind.reaction}')
+        parts.append(REACTIONS[kind.reaction])
     if kind.revokes is not None:
-        parts.append(f'revokes length offsets: {kind.revokes.value}')
+        parts.append(REVOKED[kind.revokes])
     return '; '.join(parts) or '–'
 
 

@@ -106,7 +106,8 @@ def text(results: Results, folder: Path) -> str:
         if not (folder / f'{name}.png').is_file():
             return ''
         caption = captions.get((experiment, f'{plot}.png'), '').replace('`', '')
-        return f'![{caption}]({folder.name}/{name}.png)\n\n{caption}\n'
+        title = name.replace('_', ' ').capitalize()
+        return f'![{title}]({folder.name}/{name}.png)\n\n{caption}\n'
 
     return environment.get_template(TEMPLATE).render(
         results=results,
