@@ -10,9 +10,9 @@ computes the commands (`follower`, `ramps`, `torque`, `exploration`, `calibratin
 passes the limiter before it is published.
 
 Plans assume that isolated muscles have no tension, and the modules of isolated muscles are
-commanded to keep the tendons slack. While the estimator verifies a suspect, the arm is stopped, and
-the suspect is wound in slightly. The arm resumes when the verification has ended the anomaly,
-unless another stop cause needs a reset.
+commanded to keep the tendons slack. While the estimator verifies a suspect, which is a muscle that
+may be faulty, the arm is stopped and the suspect is wound in slightly. The arm resumes when the
+verification has ended the anomaly, unless another stop cause needs a reset.
 
 `now` is the time of a steady clock [s], and `time` is the time of the messages' clock [s].
 """
@@ -64,10 +64,11 @@ GUIDED = (
 #: stop the arm if the lengths have jumped and the estimator has not revoked the length offsets
 #: within this time [s]
 REACTION_TIME = 1.0
-#: count the estimate as stale only if a length calibration brings none within this time [s]; if
-#: messages arrive at 10 Hz, it needs 3.5 s
+#: after a length calibration has begun, wait this long for its first estimate before the estimate
+#: counts as stale [s]; if messages arrive at 10 Hz, a calibration needs 3.5 s
 FIRST_ESTIMATE = 5.0
-#: let an arm with isolated muscles that falls start towards its target again at most this often
+#: after an arm with isolated muscles has fallen away from its trajectory, plan a new trajectory to
+#: the same target at most this many times, because it may fall again
 APPROACHES = 3
 
 
@@ -165,21 +166,21 @@ class Controller:
         seed: int = 0,
         clock: AwakeClock | None = None,
     ) -> None:
-        """Start without messages.
+        """Create a controller that has no target and has received no message.
 
         Args:
-            robot: The robot.
+            robot: The robot to control.
             settings: The settings; None for the defaults.
             seed: Random seed of the exploration.
-            clock: Measures the ages of messages without the pauses of the process; each control
-                step ticks it. None for a clock of this object alone.
+            clock: Clock that excludes pauses of the process from the ages of messages; each control
+                step ticks it. None to create one.
         """
         self.robot, self.settings = robot, settings or Settings()
         check_settings(robot, self.settings)
         self.mae: Mae | None = None
         self.stream = MuscleStream(robot, window=WINDOW)
         self.sample: MuscleSample | None = None
-        #: `RejectionError.pull` of the newest message if it was rejected, else None
+        #: l [m] and T [N], (2, M), of the newest message if it was rejected, else None
         self.rejected_pull: Array | None = None
         #: Estimated θ [rad], (D,), computed with the present length offsets. None while there is no
         #: such estimate, for example after the start of a length calibration; the arm then does not
@@ -410,7 +411,7 @@ class Controller:
 
         Args:
             pose: The pose.
-            whole: Whether the orientation counts, too; otherwise only the position.
+            whole: True to reach position and orientation, False for the position alone.
             now: Present time [s].
 
         Raises:
@@ -424,10 +425,10 @@ class Controller:
         self._follow(self.planner.to_pose(mae, start, pose, whole, now))
 
     def twist(self, twist: Array) -> None:
-        """Move the end effector for a short time by a twist in the axes of the root link.
+        """Move the end effector at a given velocity for `hand.TWIST_TIMEOUT` seconds.
 
         Args:
-            twist: Linear [m/s] and angular [rad/s] velocity, (6,).
+            twist: Linear [m/s] and angular [rad/s] velocity in the axes of the root link, (6,).
 
         Raises:
             MessageError: If the twist is refused; nothing is changed then.
@@ -523,7 +524,7 @@ class Controller:
         return ''
 
     def step(self, now: float, time: float | None = None) -> Command | None:
-        """Advance all parts to `now`, and return the command to publish; None before the first.
+        """Advance all parts to `now`, and return the command to publish; None to publish nothing.
 
         Args:
             now: Time of the steady clock [s].
@@ -562,7 +563,11 @@ class Controller:
 
     @property
     def _held_posture(self) -> Array | None:
-        """The posture [rad], (D,), that the arm claims to hold; None while it claims none."""
+        """Posture [rad], (D,), at which the arm should rest now; None if no posture is demanded.
+
+        The arm is not required to rest while it moves or is stopped, or while its target contains
+        a torque in addition to gravity compensation.
+        """
         activity, target = self.supervisor.activity, self.target_state
         control = self.activities.of(activity, self.settings)
         is_holding = activity in (Activity.HOLDING, Activity.TORQUE) and self.supervisor.is_running

@@ -68,8 +68,8 @@ from musculoskeletal_ae.robot.model_errors import LARGEST
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-POSTURES = 200  # find the longest muscle lengths in this many random postures
-LONGEST_INTERVAL = 0.05  # assume dT/dt = 0 after a longer interval between two messages [s]
+POSTURES = 200  # sample this many random postures to find the longest length of each muscle
+LONGEST_INTERVAL = 0.05  # assume dT/dt = 0 if two messages are further apart than this [s]
 CONFIDENCE = 2.0  # lower the tension limit by this many standard deviations of the measured tension
 #: gain of the tension feedback r [1/s]; its time constant of 0.2 s is long compared with the lag of
 #: a module, which is about 30 ms

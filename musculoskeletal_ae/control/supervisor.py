@@ -121,7 +121,7 @@ class Supervisor:
 
     @property
     def may_wind_suspect(self) -> bool:
-        """Whether a suspect may be wound in: while it is verified, unless an operator stopped."""
+        """Whether a suspect may be wound in to verify its fault; never after an operator's stop."""
         return self.state is StopState.VERIFYING and ConditionKind.OPERATOR not in self._causes
 
     @property

@@ -56,14 +56,14 @@ class ControlSteps:
     """
 
     def __init__(self, clock: AwakeClock) -> None:
-        """Tick `clock` in each step."""
+        """Begin to measure steps with `clock`, which each step ticks."""
         self._clock = clock
         self._time = math.nan  # time of the messages' clock at the last step [s]
         self.stepped_at = -math.inf
         self.pace = 1.0
 
     def allowed_age(self, max_age: float) -> float:
-        """Return `max_age` [s], extended accordingly if the messages' clock runs slowly."""
+        """Return `max_age` [s], divided by the pace of the messages' clock while this is slow."""
         return max_age / min(max(self.pace, SLOWEST), 1.0)
 
     def clock_jumped_back(self) -> None:
@@ -219,7 +219,7 @@ class Watchdog:
     """
 
     def __init__(self, robot: Robot, settings: Settings, clock: AwakeClock | None = None) -> None:
-        """Start without data; `clock` is as in `Controller`."""
+        """Start without data; `clock` excludes pauses of the process from the ages of data."""
         clock = clock or AwakeClock()
         self.steps = ControlSteps(clock)
         self.muscle_states, self.estimate = Arrival(clock), Arrival(clock)

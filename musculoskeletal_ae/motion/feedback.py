@@ -13,14 +13,15 @@ from musculoskeletal_ae.control.command import Pull
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-#: Plan again if a tension limit changes by more than this, and a planned tension is nearer to the
-#: limit than this [N].
+#: plan again if a tension limit has changed by more than this [N], and a planned tension is nearer
+#: to the limit than this
 REPLAN = 5.0
-CORRECTION = 0.3  # correct no joint by more than this [rad]
-#: Do not correct smaller estimated errors [rad]. This is about the error of the estimate itself.
-#: Without this dead band, an arm with friction would never rest.
+CORRECTION = 0.3  # correct no joint by more than this [rad], because the estimate may be wrong
+#: treat smaller posture errors as 0 [rad]: they are about as large as the error of the estimate,
+#: and an arm with friction would otherwise never come to rest
 DEADBAND = 0.03
-RELIEF_INTERVAL = 0.1  # compute the needless tension at intervals of at least this time [s]
+#: compute which tension is needless at intervals of at least this [s]
+RELIEF_INTERVAL = 0.1
 PROPORTIONAL = 0.7  # proportional gain k_p in motion
 INTEGRAL = 4.0  # integral gain k_i in motion [1/s]
 #: count the arm as resting once the feedback in motion has been off for this time [s]
@@ -92,7 +93,7 @@ class RestFeedback:
         self.relief: Array = np.zeros(self._robot.muscle_count)
 
     def moving(self) -> None:
-        """Interrupt the integration at rest until the arm has settled again."""
+        """Record that the arm moves, which interrupts the integration until it has settled."""
         self._rested = self._unsolved = 0.0
 
     def step(

@@ -25,14 +25,14 @@ from musculoskeletal_ae.motion.trajectory import STOPPING, Setpoint, Trajectory
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-#: end the search of the inverse kinematics within these distances [m] and angles [rad]: for a whole
-#: pose, and for a position only, with which any orientation is legal
+#: end the search of the inverse kinematics within these distances [m] and angles [rad]: WHOLE for
+#: position and orientation, POSITION for the position alone, with which any orientation is legal
 WHOLE, POSITION = np.repeat([2e-4, 2e-3], 3), np.repeat([2e-4, 100.0], 3)
-FAR = 0.005  # a pose is unreachable if the hand remains further away than this [m]
-TURNED = 0.05  # a pose is unreachable if the hand's orientation differs by more than this [rad]
+FAR = 0.005  # treat a pose as unreachable if the hand remains further away than this [m]
+TURNED = 0.05  # treat a pose as unreachable if the orientation differs by more than this [rad]
 HAND_SPEED = 0.25  # move the hand to a single pose no faster than this [m/s]
 SHORTEST = 0.3  # take at least this time for a movement to a single pose [s]
-PEAK = 1.875  # ratio of peak to mean speed of a minimum-jerk motion
+PEAK = 1.875  # peak speed of a minimum-jerk motion, as a multiple of its mean speed
 PATH_INTERVAL = 0.25  # count poses as a path if they arrive within this time of each other [s]
 #: count poses as a path only if the hand needs no more than this speed between them [m/s]
 PATH_SPEED = 1.0
@@ -63,7 +63,7 @@ class Hand:
         Args:
             mae: The network in use.
             pose: The pose in the root link's frame.
-            whole: Whether the orientation counts.
+            whole: True to reach position and orientation, False for the position alone.
             start: Posture from which the search starts [rad], (D,).
             nearest: Whether to return another posture, as `unreachable: nearest` demands, if the
                 hand cannot reach or hold the pose.
@@ -93,7 +93,7 @@ class Hand:
         return theta, reason
 
     def towards(self, start: Setpoint, theta: Array, now: float) -> Trajectory:
-        """Return the trajectory to a received pose.
+        """Return the trajectory that moves the hand towards a received pose.
 
         If poses arrive in quick succession, the trajectory continues the path of the earlier ones.
 
@@ -129,7 +129,7 @@ class Hand:
         return Trajectory.to(start, theta, max(SHORTEST, PEAK * distance / HAND_SPEED))
 
     def again(self, now: float) -> None:
-        """Record that the last pose was received again at `now` [s]."""
+        """Record that the last pose was received again at `now` [s], so that its path continues."""
         if self._last is not None:
             self._last = now, *self._last[1:]
 

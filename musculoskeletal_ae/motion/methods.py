@@ -40,7 +40,7 @@ SOLVES = 2
 # can reduce a muscle's tension by this margin before it falls to T_bias, where the muscle is stiff
 # in one direction only.
 MARGINS = (40.0, 30.0, 20.0, 10.0, 0.0)
-ITERATIONS = 6  # stop Gauss–Newton and Frank–Wolfe after this many iterations
+ITERATIONS = 6  # end the search for tensions of a desired stiffness after this many iterations
 # Weigh the distance from the initial tensions (at first the least tensions) by this, relative to
 # the stiffness error. A reachable stiffness is missed by about this share.
 LEAST_TENSION_SHARE = 1e-3
@@ -75,19 +75,19 @@ class Solution(NamedTuple):
 
 
 class LengthCommand(Protocol):
-    """Computes one length command for a target."""
+    """Interface of the functions that compute one length command for a target."""
 
     def __call__(
         self, robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array, /
     ) -> Solution:
-        """Return the command.
+        """Return the length command and the tension that it should produce.
 
         Args:
             robot: The body, in which isolated muscles have no tension.
             mae: The network.
-            theta: θ_target [rad], (D,).
-            torque: τ_target [N·m], (D,).
-            tension: T_const, or the measured T at the start of the method [N], (M,).
+            theta: Target posture θ_target [rad], (D,).
+            torque: Torque that the muscles should exert there, τ_target [N·m], (D,).
+            tension: T_const, or the measured T at the start of the movement [N], (M,).
         """
 
 
@@ -96,9 +96,9 @@ class LengthMethod(NamedTuple):
 
     Attributes:
         command: Computes the command.
-        takes_tension: Whether the command leads to the tension that is passed to it. If so, the
-            tension is limited before it is passed.
-        follows_first: Whether the method `first` moves the arm before this method does.
+        takes_tension: Whether the command produces the tension that is passed to it. The caller
+            then limits this tension first.
+        follows_first: Whether the arm first moves to the target by the method `first`.
     """
 
     command: LengthCommand
@@ -110,10 +110,10 @@ def first_command(robot: Robot, mae: Mae, theta: Array, tension: Array) -> Array
     """Return length commands [m], (..., M), for target postures and tensions.
 
     Args:
-        robot: The body.
-        mae: The network.
-        theta: θ_target [rad], (..., D).
-        tension: T [N], (..., M).
+        robot: Provides T_bias and K_stiff of the muscle modules.
+        mae: The network that predicts the muscle lengths.
+        theta: Target postures θ_target [rad], (..., D).
+        tension: Tensions T that the commands should produce [N], (..., M).
     """
     return mae.lengths(theta, tension) + msc_compensation(robot, tension)
 
@@ -140,7 +140,7 @@ def proposed(
 
 
 class StiffnessModel(NamedTuple):
-    """Joint stiffness around one posture according to the network."""
+    """How the joint stiffness around one posture depends on the tensions, by the network."""
 
     jacobian: Array  # G [m/rad], (M, D)
     hessian: Array  # ∂²l/∂θ² [m/rad²], (M, D, D)
@@ -150,7 +150,10 @@ class StiffnessModel(NamedTuple):
 
     @classmethod
     def read(cls, robot: Robot, mae: Mae, theta: Array, tension: Array) -> StiffnessModel:
-        """Read the model from the network at the posture θ [rad], (D,), and T [N], (M,)."""
+        """Read the model from the network's lengths around the posture θ [rad] and T [N].
+
+        θ has the shape (D,), and T the shape (M,).
+        """
 
         def jacobian(postures: Array) -> Array:
             return mae.muscle_jacobian(postures, np.tile(tension, (len(postures), 1)))
@@ -268,8 +271,9 @@ def _approach(
 ) -> Array:
     """Return tensions whose joint stiffness is close to `desired`, by Gauss–Newton iterations.
 
-    Only joints with `desired` > 0 count. Each step is a quadratic programme, because the tensions
-    have to balance the torque within their limits. The module `gauss_newton` cannot do that.
+    Joints with `desired` = 0 are unconstrained. Each iteration is a quadratic programme, because
+    the tensions have to balance the torque within their limits. The module `gauss_newton` solves
+    problems without such constraints only.
     """
     chosen, start = desired > 0.0, tension
     for _ in range(ITERATIONS if chosen.any() else 0):

@@ -29,10 +29,10 @@ from musculoskeletal_ae.motion.feedback import depends_on_limit
 from musculoskeletal_ae.motion.methods import Solution
 from musculoskeletal_ae.robot.robot import Robot
 
-# Change the command in this fraction of a movement's duration. In the remaining time, the arm
-# settles and is sampled.
+# Ramp the command during this fraction of a movement's duration. In the remaining time, the arm
+# comes to rest and provides a rest sample.
 RAMP_SHARE = 0.6
-PEAK = 1.5  # ratio of peak to mean speed of a ramp
+PEAK = 1.5  # peak speed of a ramp, as a multiple of its mean speed
 FIRST = 'first'  # the method that uses T_const
 SECOND = 'second'  # the method that uses the measured T
 

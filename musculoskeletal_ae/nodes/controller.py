@@ -56,7 +56,9 @@ from musculoskeletal_ae.ros.messages import (
 from musculoskeletal_ae.ros.second_publishers import AUTHORS
 from musculoskeletal_ae.signals.limits import LIMITS
 
-OVERDUE = 1.5  # compute a command after this number of periods without an estimate
+#: compute a command after this number of periods without an estimate, so that stale messages stop
+#: the arm
+OVERDUE = 1.5
 
 
 class ControllerNode(Shell):

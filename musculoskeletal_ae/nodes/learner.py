@@ -35,7 +35,8 @@ from musculoskeletal_ae.ros.second_publishers import SEVERAL, LinkSensors, publi
 IMU = 'imu'  # topic of the accelerometers
 MOST_DIGITS = 15  # reject a version of a network with more digits
 POLL_PERIOD = 0.05  # check the training process at this interval [s]
-LEAST_PERIOD = 0.01  # pair joint angles at most as narrowly as if messages had this period [s]
+#: assume at least this period of muscle_states when pairing them with joint angles [s]
+LEAST_PERIOD = 0.01
 JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
 
 

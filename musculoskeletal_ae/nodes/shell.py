@@ -357,7 +357,8 @@ class Shell(Node):
         """Return the network in a file; None if the path is empty.
 
         Raises:
-            CheckpointError: If it does not belong to this robot, or does not explain it.
+            CheckpointError: If the network belongs to another robot, or its predictions are
+                implausible for this one.
         """
         if not path:
             return None
@@ -467,7 +468,7 @@ class Shell(Node):
         return '; '.join(filter(None, problems))
 
     def on_intruders(self, intruders: str) -> None:
-        """Called ten times a second with the value of the property `intruders`."""
+        """React to intruding nodes; called ten times a second with the property `intruders`."""
 
     def follow_muscles(
         self,

@@ -104,7 +104,7 @@ class StopRecording:
         self._writing.start()
 
     def close(self) -> None:
-        """Wait until a recording has been written."""
+        """Wait until a recording that is being written is complete."""
         if self._writing is not None:
             self._writing.join()
 

@@ -43,8 +43,8 @@ JOINTS = 'joint_states'
 DISCOVERY_TIME = 1.0  # wait this long for other nodes to be discovered [s]
 COUNTDOWN = 10.0  # state the remaining time at this interval [s]
 TICK = 0.02  # tick at this interval [s]; a late tick shows that this process was paused
-#: count a longer time between two ticks as a pause [s]; it is shorter than that of the nodes,
-#: because gaps of 0.2 s between messages are judged
+#: treat a longer time between two ticks as a pause of this process [s]; the limit is lower than
+#: that of the nodes, because check_driver judges gaps of 0.2 s between messages
 LONGEST_TICK = 0.07
 
 

@@ -96,7 +96,7 @@ class Lockstep:
         return not is_in_step or self._messages >= MOST_MESSAGES
 
     def count(self) -> None:
-        """Count a message that was published."""
+        """Count a published message; a question is due after MOST_MESSAGES of them."""
         self._messages += 1
 
     def ask(self) -> None:

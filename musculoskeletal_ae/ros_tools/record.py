@@ -35,7 +35,7 @@ from musculoskeletal_ae.ros_tools.ros_tool import (
     start_ros,
 )
 
-#: write to disk at this interval [s]; a killed recorder loses the messages since the last write
+#: write to disk at this interval [s]; a killed recorder loses the messages since the last writing
 FLUSH_PERIOD = 0.5
 #: QoS whose queue holds at least a second of the fastest topic, in case the disk is busy
 LIVE = QoSProfile(depth=1000)
@@ -47,7 +47,7 @@ CONNECTION_TIME = 2.0  # wait at most this long for connections to the discovere
 
 
 class Record(Node):
-    """Writes messages to a bag, in their serialized form."""
+    """Writes the messages of all recorded topics to a bag, in their serialized form."""
 
     def __init__(self, writer: BagWriter, topics: dict[str, Topic]) -> None:
         super().__init__('record')
