@@ -37,7 +37,9 @@ from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement
 
 #: report a fault if a larger share of the messages repeats the previous message exactly
 MOST_REPEATED = 0.2
-QUIET = 3  # count sensors that show at most this many different values as free of noise
+#: treat sensors with at most this many different values as free of noise: repeated readings of an
+#: arm at rest are then no fault
+QUIET = 3
 TEMPERATURES = -20.0, 130.0  # count temperatures outside this range as impossible [°C]
 #: let l exceed its range by this distance, with and without length calibration [m]
 BEYOND = 0.1, 1.0
@@ -144,7 +146,7 @@ class Listening:
         """Record a message of muscle_states, or of the motors.
 
         Args:
-            message: The message.
+            message: The message, which is not checked yet.
             now: Time of reception [s].
             sent: Source time by the driver's clock [s]; NaN if unknown.
             number: Sequence number; 0 if unknown.

@@ -22,10 +22,11 @@ from musculoskeletal_ae.signals.joint_sensors import corrected, judge, sign_note
 from musculoskeletal_ae.signals.muscle_readings import Row
 from musculoskeletal_ae.signals.wiring import WiringJudgement
 
-RELEASE = 0.6  # wait this long after a release [s]
+#: time for paying out a released muscle, and for settling after a target has moved back [s]
+RELEASE = 0.6
 MEAN = 0.3  # average readings over this time [s]
 SETTLE = 1.5  # give the arm this time to come to rest after a motion [s]
-HOLD = 0.5  # hold a demand for this time [s]
+HOLD = 0.5  # judge the response to a command after holding it for this time [s]
 SPEED = 0.01  # move a target further inwards at this speed [m/s]
 RELEASE_SPEED = 0.03  # move a target back at this speed [m/s]
 ABOVE_BIAS = 40.0  # by default, test up to this tension above T_bias [N]
@@ -128,7 +129,7 @@ class MotionTest(ABC):
 
     @abstractmethod
     def _try(self, m: int) -> Wait:
-        """Try muscle m, and check its responses."""
+        """Move muscle m, and check how its readings respond."""
 
     @abstractmethod
     def _run_away(self, states: Array, start: Array) -> RunAwayError | None:
@@ -154,7 +155,7 @@ class MotionTest(ABC):
     # -- common parts ---------------------------------------------------------------------------
 
     def _sequence(self) -> Wait:
-        """Run the whole test."""
+        """Run the test: hold the arm, move each muscle, then judge the joint sensors."""
         try:
             yield from self._hold()
             for m in self._muscles:

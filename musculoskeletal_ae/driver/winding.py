@@ -53,7 +53,7 @@ from musculoskeletal_ae.report import distinct
 #: demand at least this above T_bias, because noise hides the response to less [N]
 LEAST_ABOVE_BIAS = 20.0
 FURTHEST = 0.025  # wind a muscle in by at most this [m]
-SLACK = 0.01  # set l_target this far beyond l after winding in [m]
+SLACK = 0.01  # after winding in, set l_target this far beyond l, so that the law demands T_bias [m]
 RUN_AWAY = 0.05  # release a muscle that shortens by more than this [m]
 #: accept an error of T up to the larger of these: [N], and relative to the demand
 TENSION_TOLERANCE, TENSION_SHARE = 10.0, 0.1
@@ -323,7 +323,7 @@ class Winding(MotionTest):
         """Move the command of muscle m inwards, and return the muscle whose tension rises first.
 
         Args:
-            m: The muscle.
+            m: Index of the muscle.
             clear: Target at which no muscle pulls [m].
 
         Returns:
@@ -405,7 +405,7 @@ class Winding(MotionTest):
         demand or the distance FURTHEST is reached.
 
         Args:
-            m: The muscle.
+            m: Index of the muscle.
             level: The demanded tension [N].
             home: l before the test [m]; limits how far the muscle is wound in.
             latency: Receives the time to the response [s], unless noise could hide it.
@@ -560,7 +560,7 @@ class Winding(MotionTest):
         """Find out why a muscle did not respond to winding in, and record the fault.
 
         Args:
-            m: The muscle.
+            m: Index of the muscle.
             home: The reading before the test.
             pulled: Increase of T of all muscles when muscle m was wound in [N], (M,).
             wound: Decrease of l of all muscles when muscle m was wound in [m], (M,).

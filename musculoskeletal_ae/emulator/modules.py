@@ -37,6 +37,7 @@ STEP = 0.001  # simulate in steps of this duration [s]
 SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 
 # The following values are chosen by hand, because those of Musashi are not public.
+# let a module in the safe state change its tension towards T_bias at this rate [N/s]
 #: let a module in the safe state approach T_bias at this rate [N/s]
 RELEASE_RATE = 100.0
 MOTOR_GAIN = 0.004  # wind in at this speed for each newton of missing tension [m/s/N]
@@ -46,8 +47,8 @@ TAKE_UP_SPEED = 0.03
 POSITION_LAG = 0.02  # let a position-controlled module follow with this time constant [s]
 # Heat. Each motor is sized for its muscle: constant T_limit heats the average module to 85 °C at
 # the housing and 105 °C in the winding.
-AMBIENT = 25.0  # temperature of the surroundings [°C]
-LOSS = 20.0  # let a motor at T_limit lose this power as heat [W]
+AMBIENT = 25.0  # temperature of the surroundings, to which all modules cool down [°C]
+LOSS = 20.0  # heat that a motor produces at T_limit [W]
 WINDING_CAPACITY, HOUSING_CAPACITY = 20.0, 150.0  # heat capacities of an average module [J/K]
 WINDING_RESISTANCE, HOUSING_RESISTANCE = 1.0, 3.0  # thermal resistances of that module [K/W]
 #: draw LOSS, capacities and resistances with this standard deviation of their logarithms
@@ -65,8 +66,9 @@ CURRENT_NOISE, CURRENT_RESOLUTION = 1.0, 2.0**-3  # of a motor current, as a ten
 #: draw errors of a motor current as a measure of tension: standard deviation of the scale's
 #: logarithm, standard deviation of the offset [N], and mean drive friction as a share of T_limit
 CURRENT_SCALE, CURRENT_ZERO, DRIVE_FRICTION = 0.15, 5.0, 0.1
-ACCELERATION_NOISE = 0.05  # of each axis of an accelerometer [m/s²]
-MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # of a marker's position [m] and orientation [rad]
+ACCELERATION_NOISE = 0.05  # standard deviation of the noise of each axis of an accelerometer [m/s²]
+#: standard deviations of the noise of a marker's position [m] and orientation [rad]
+MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01
 
 
 def joint_gear(kinematics: Kinematics) -> Array:
@@ -87,13 +89,13 @@ class Modules(NamedTuple):
     stiffness: Array  # K of muscle stiffness control [N/m]
     follows_position: Array  # 1 for position-controlled modules
     speed: Array  # largest speed [m/s]
-    tension_bias: Array  # [N]
-    tension_max: Array  # [N]
-    loss: Array  # k [W/N²]
-    winding_capacity: Array  # C₁ [J/K]
-    housing_capacity: Array  # C₂
-    winding_resistance: Array  # R₁ [K/W]
-    housing_resistance: Array  # R₂
+    tension_bias: Array  # tension bias T_bias [N]
+    tension_max: Array  # tension maximum T_max [N]
+    loss: Array  # heat per squared tension k [W/N²]
+    winding_capacity: Array  # heat capacity C₁ of the winding [J/K]
+    housing_capacity: Array  # heat capacity C₂ of the housing [J/K]
+    winding_resistance: Array  # thermal resistance R₁ between winding and housing [K/W]
+    housing_resistance: Array  # thermal resistance R₂ between housing and surroundings [K/W]
 
 
 class Command(NamedTuple):
@@ -115,9 +117,9 @@ class MuscleState(NamedTuple):
     tension: Array  # true motor-side T [N]
     end_tension: Array  # true bone-side T_end [N]
     sliding: Array  # friction state s in [−1, 1]
-    winding: Array  # c₁ [°C]
-    housing: Array  # c₂ [°C]
-    reference: Array  # T_ref of the module [N]
+    winding: Array  # temperature c₁ of the winding [°C]
+    housing: Array  # temperature c₂ of the housing [°C]
+    reference: Array  # tension T_ref that the control law of the module demands [N]
     ruptured: Array  # 1 for a ruptured tendon
 
 
@@ -257,7 +259,8 @@ class Arm(ABC):
         self._drive_friction: Array = share * robot.description.tension.limit
         self._mount = self.faults.mount  # present turn of the base
         self._wrench = np.zeros(6)
-        self._friction_factor = 1.0  # present friction, as a multiple of the individual's own
+        #: present friction of tendons or joints, as a multiple of the individual's own
+        self._friction_factor = 1.0
         self._command = Command(
             np.zeros(robot.muscle_count), length_bias.copy(), self.faults.stuck,
             self.faults.slack, self.faults.zero, self.faults.hot, self.faults.ceiling,
@@ -390,7 +393,7 @@ class Arm(ABC):
     @property
     @abstractmethod
     def _varying_friction(self) -> Array:
-        """The friction that `set_friction` changes in place."""
+        """The friction coefficients that `set_friction` changes in place."""
 
     def set_friction(self, factor: float) -> None:
         """Set the friction of the tendons (`kin`) or of the joints (`foreign`).

@@ -41,8 +41,8 @@ from musculoskeletal_ae.robot.robot import Robot
 POSTURES = 1000  # compare the model and the network in this many postures
 #: multiply this damping by the `joint_gear` of a joint [N·m·s/rad]; chosen for a stable simulation
 DAMPING = 0.05
-THIN = 0.008  # draw bones as capsules of this radius [m]
-TIMESTEP = 0.002  # let the exported model advance by this time in a step [s]
+THIN = 0.008  # radius of the capsules that represent bones [m]
+TIMESTEP = 0.002  # time step of the exported model [s]
 LEGEND = """\
 length      standard deviation of the difference of lengths
 moment arm  difference of dl/dq (norm over all joints, root mean square over the postures), and the
@@ -112,7 +112,7 @@ def export_into(robot: Robot, mae: Mae, file: Path, out: Path, seed: int = 0) ->
     Args:
         robot: The robot that was imported from the file.
         mae: The network that learned an arm of this robot.
-        file: The file.
+        file: Path of the user's MJCF file.
         out: A new or empty directory.
         seed: Seed of the fit.
 

@@ -48,7 +48,7 @@ class AdaptedModel:
     """The text of `model.xml`, adapted from the user's model.
 
     Attributes:
-        root: The root element.
+        root: Root element of the XML tree.
     """
 
     def __init__(

@@ -95,7 +95,7 @@ def import_robot(
     """Import a file as a robot directory.
 
     Args:
-        file: The file.
+        file: Path of the file to import.
         out: A new or empty directory.
         loaded: Function that gets the new robot before the comparison with the source, which takes
             long.

@@ -49,7 +49,7 @@ COUNTS = {
     'body': 'nbody', 'joint': 'njnt', 'tendon': 'ntendon', 'actuator': 'nu', 'equality': 'neq',
 }  # fmt: skip
 RANGE_POSTURES = 200  # measure the range of a tendon's length in this many postures
-LEAST_REACH = 1e-3  # a far end has to be at least this far from the origin of its body [m]
+LEAST_REACH = 1e-3  # ignore a far end that is closer than this to the origin of its body [m]
 #: ignore a larger force of an actuator [N]: MuJoCo computes it for muscles without an initial
 #: moment arm
 STRONGEST = 1e6

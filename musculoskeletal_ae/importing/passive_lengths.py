@@ -14,8 +14,8 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 
 ACCURACY = 5e-3  # accept a polynomial if its slope is wrong by at most this share
-HIGHEST = 9  # try no higher degree
-MOST_TERMS = 130  # try no polynomial with more terms
+HIGHEST = 9  # try polynomials up to this degree
+MOST_TERMS = 130  # try no polynomial with more terms than this
 SAMPLES = 600  # fit a polynomial in this many postures, and compare it in as many others
 
 

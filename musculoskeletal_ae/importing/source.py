@@ -35,7 +35,7 @@ ARM_POSTURES = 200  # compare moment arms in this many postures
 PROBES = 20  # search the joints that change the length of a passive tendon in this many postures
 MOVED = 1e-8  # count a joint as moving a tendon if it changes the length by at least this [m]
 WRONG_LENGTH = 5e-5  # report a passive tendon whose polynomial is wrong by at least this [m]
-TURN = 1e-5  # step of the numerical derivatives that give moment arms [rad]
+TURN = 1e-5  # step of the numerical derivatives of the lengths, which give moment arms [rad]
 SHORT_ARM = 1e-3  # do not compare the sign of a shorter moment arm [m]
 LISTED = 12  # list at most this many names in a message
 # The largest tension that the source states for a muscle becomes its tension.limit.
@@ -46,9 +46,10 @@ BIAS_SHARE = 0.01
 # If tendons do not stretch in the source, give the muscles elastic elements that are as stiff as
 # the emulated modules can regulate, but no stiffer than needed.
 RIGID_STIFFNESS = 1e5  # make no element stiffer than this at tension.max [N/m]
-#: let a rigid element stretch by this at the limit, which counts as nothing [m]
+#: let an element that stands for a rigid tendon stretch by this at tension.limit [m], which is
+#: negligible
 RIGID_ELONGATION = 5e-4
-EARTH = 9.81  # gravity of the earth [m/s²]
+EARTH = 9.81  # standard gravity of the earth, which replaces another gravity of the source [m/s²]
 #: give a joint without limits ± these, by whether it is prismatic: [rad] or [m]
 UNLIMITED = {False: np.pi, True: 0.5}
 
@@ -346,7 +347,7 @@ def cut(
     with a note. Muscles that move no joint are removed as well.
 
     Args:
-        source: The source.
+        source: The source, which is changed in place.
         joints: Joints that stay movable; by default all. If `end` is given, joints that move
             neither it nor a coupled joint on the path to it are held fixed as well.
         muscles: Muscles that stay; by default all.

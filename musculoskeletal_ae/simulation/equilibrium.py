@@ -41,9 +41,10 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import REVERSAL
 from musculoskeletal_ae.simulation.load import Load, LoadTree, hold
 
-#: use this l_target for muscles without a command [m]; MSC then holds T_bias, and modules that
+#: value of l_target for muscles without a command [m]; MSC then holds T_bias, and modules that
 #: follow positions hold their length
 PAID_OUT = np.inf
+# K_stiff that represents a position-controlled module [N/m]; 400 N move such a module by 1 mm
 #: give position-controlled modules this K_stiff [N/m]; 400 N move such a module by a millimetre
 RIGID = 4e5
 #: Multiply Σ_i |∂l_i/∂θ| by this to get B without the dampers [N·s/rad]. Motions then take as long
@@ -165,7 +166,7 @@ def add_slopes(
     """Write G, and add Σ T_i ∂²l_i/∂θ² to `curvature`, from the cubics of all limbs (see `Slopes`).
 
     Args:
-        limbs: The cubics.
+        limbs: The fitted cubics of all limbs.
         theta: θ [rad], (D, N).
         tension: T [N], (M, N).
         jacobian: Output, overwritten with G [m/rad], (M, D, N).

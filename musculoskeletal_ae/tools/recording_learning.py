@@ -54,7 +54,7 @@ from musculoskeletal_ae.tables.table import Table, TableError
 from musculoskeletal_ae.tools.model_training import prepare, train_on_model
 from musculoskeletal_ae.tools.network_cache import network_file
 
-LEAST_OFFSET = 0.002  # do not show a smaller joint-sensor offset [rad]
+LEAST_OFFSET = 0.002  # do not report a smaller joint-sensor offset [rad]
 #: Warn that a held-out recording repeats what was learned if more than REPEATED_SHARE of its
 #: postures are closer than REPEATED [rad] to a learned one. Between two explorations of a neck of
 #: two joints with the same seed, 70 % of the postures were; with different seeds, 2 %.
@@ -75,7 +75,7 @@ class TableSource(NamedTuple):
 
     @property
     def use(self) -> str:
-        """How it is used, as a text for users."""
+        """Text for users that says whether the recording is held out or learned from."""
         return 'held out' if self.is_held_out else 'learned from'
 
 
@@ -479,8 +479,8 @@ def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
     """Read the paired messages of a bag; print progress, and warnings about unused messages.
 
     Args:
-        path: The bag.
-        robot: The recorded robot.
+        path: Path of the bag.
+        robot: The robot that the bag should fit.
         namespace: The namespace of the arm; required only if the bag has several.
 
     Raises:

@@ -25,9 +25,13 @@ from musculoskeletal_ae.robot.routes import ARC
 
 LARGEST_MESH = 50_000_000  # refuse a larger mesh file [bytes]
 FORMATS = ('.stl', '.obj', '.ply', '.glb')
-POSTURES = 50  # draw this many random postures of each kind in `space`
-DASHES = 5  # draw each straight piece of a muscle as this many tubes; only dashed muscles have gaps
-#: red, green, blue at T_bias and at T_limit
+#: find the space in which the arm moves from this many postures with arbitrary joint angles, and
+#: from as many with all joints at their limits
+POSTURES = 50
+#: draw each straight piece of a muscle as this many tubes; only dashed muscles have gaps between
+#: them
+DASHES = 5
+#: colours of a muscle at T_bias (LOOSE) and at T_limit (TIGHT): red, green, blue
 ENDS = LOOSE, TIGHT = np.array([0, 114, 178]), np.array([230, 97, 0])
 
 
@@ -40,7 +44,8 @@ class DrawnState(IntEnum):
     RUPTURED = 3
 
 
-MARKS = ('', '? ', '⊘ ', '✂ ')  # text before the name of a muscle, by kind
+#: mark that precedes the name of a muscle on the page, by its `DrawnState`
+MARKS = ('', '? ', '⊘ ', '✂ ')
 #: red, green, blue of muscles that are not coloured by tension
 COLOURS = {
     DrawnState.SUSPECT: (200, 0, 130),

@@ -47,7 +47,7 @@ BUTTONS = {
 }
 #: exert this force on the hand per distance by which the mouse drags it [N/m]
 PUSH_STIFFNESS = 200.0
-MOST_PUSH = 60.0  # exert at most this force by a push with the mouse [N]
+MOST_PUSH = 60.0  # limit the force of a push with the mouse to this [N]
 MOST_PAYLOAD = 5.0  # let visitors choose payloads of up to this mass [kg]
 #: requests after which values that are still being entered are not sent
 COMMANDS = (

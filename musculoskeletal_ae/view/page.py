@@ -25,11 +25,11 @@ from musculoskeletal_ae.view.visits import checked_visits
 
 #: show one panel in a window narrower than this, because two would hide the arm [pixels]
 NARROW = 900
-HOT = 80.0  # temperature at the right end of a bar [°C]
+HOT = 80.0  # temperature at the right end of a muscle's temperature bar [°C]
 
 
 class Page:
-    """One page, for any number of visitors.
+    """The web page of one arm, which any number of visitors may open at once.
 
     Attributes:
         looked_at: Event that is set while the page has visitors.
@@ -103,7 +103,7 @@ class Page:
             self.looked_at.clear()
 
     def close(self) -> None:
-        """Stop serving the page."""
+        """Stop serving the page, which ends all visits."""
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 

@@ -22,7 +22,7 @@ HTML: Any = ENVIRONMENT.get_template('page.html.jinja').module  # macros
 DURATION = 60.0  # show curves of this duration [s]
 GREEN, BLUE = {'stroke': '#009e73', 'width': 2}, {'stroke': '#0072b2', 'width': 2}
 DASHED = {'stroke': '#c80082', 'width': 2, 'dash': [6, 4]}
-HEIGHT = 84  # height of a plot [pixels]
+HEIGHT = 84  # height of a plot of the curves [pixels]
 TIME_AXIS = {'incrs': [0.25 * DURATION], 'space': 30, 'size': 26}
 #: `incrs` lists the possible distances between ticks. uPlot takes the smallest one that covers at
 #: least `space` pixels, which is half of any `scale_top`. The same axes serve all scales, because

@@ -31,12 +31,12 @@ ARMATURE, DAMPING = 0.005, 0.4
 LENGTH_SPREAD, TURN_SPREAD = 0.005, np.radians(2.0)
 #: change logarithms of masses, and their centres [m], by these σ times `Effects.links`
 MASS_SPREAD, CENTRE_SPREAD = 0.15, 0.02
-THICKEST = 0.045  # permit no larger radius of the head of a bone, or of a muscle [m]
+THICKEST = 0.045  # limit the radius of the head of a bone, or of the belly of a muscle, to this [m]
 POSTURES = 300  # fit the radii of heads and muscles in this many random postures
 # Couple joints with this constraint stiffness (solimp). MuJoCo's default disregards the ratio of a
 # coupling: a prismatic joint that follows a revolute one would lag by centimetres.
 STIFF = [0.9999, 0.9999, 0.001, 0.5, 2.0]
-SPRING = 'spring'  # begin the names of springs that couple joints with this word
+SPRING = 'spring'  # first word of the names of springs that couple joints
 
 Place = tuple[int, Array]  # joint, and position in its frame [m]
 Obstacle = tuple[int, Array, Array]  # joint, and centre [m] and axis in its frame
@@ -49,7 +49,7 @@ def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
     """Return the compiled MuJoCo model of one individual of a robot directory.
 
     Args:
-        robot: The robot.
+        robot: The robot whose directory describes the body.
         draw: The random draws of the individual.
         again: How often the deviations of each muscle's route points are redrawn, (M,).
     """
@@ -135,7 +135,7 @@ def _add_springs(robot: Robot, springs: JointElasticity, spec: Any) -> None:
     Each of them acts along the coordinate v · q of the joint positions q.
 
     Args:
-        robot: The robot.
+        robot: The robot that has the springs.
         springs: The springs in the units of the joints.
         spec: The MjSpec, to which the springs are added.
     """
@@ -167,7 +167,7 @@ def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[An
     The objects are those of the description, and heads of bones or bellies of other muscles.
 
     Args:
-        robot: The robot.
+        robot: The robot whose directory describes the routes.
         draw: The random draws of the individual.
         again: How often the deviations of each muscle's route points are redrawn, (M,).
         spec: The MjSpec, to which tendons, sites and objects are added.

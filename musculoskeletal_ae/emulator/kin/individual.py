@@ -17,7 +17,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.wrapping import WrapObjects
 
-THICKEST_BONE = 0.04  # permit no larger radius of a bone's head [m]
+THICKEST_BONE = 0.04  # limit the radius of a bone's head to this [m]
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Spread:
     spring_rest: float = 0.05
 
 
-#: make a body that equals the geometric model, without friction
+#: sizes with which an individual equals the geometric model and has no friction
 NOMINAL = Spread(**{field.name: 0.0 for field in fields(Spread)})
 
 
