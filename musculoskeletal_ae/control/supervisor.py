@@ -22,9 +22,9 @@ RESUME = 0.2  # continue a paused arm after this time without a cause [s]
 class Activity(Enum):
     """What the arm does when nothing stops it."""
 
-    IDLE = 'idle'  # no target yet
+    IDLE = 'idle'  # the arm has no target yet
     HOLDING = 'holding'
-    MOVING = 'moving'  # along a trajectory
+    MOVING = 'moving'  # the arm follows a trajectory
     EXPLORING = 'exploring'
     CALIBRATING = 'calibrating'  # exploring gently while the length offsets are unknown
     TORQUE = 'torque'  # commanding tensions (method `tension`)

@@ -88,7 +88,7 @@ class Modules(NamedTuple):
     length_high: Array  # longest motor-side length that the motor can reach [m]
     stiffness: Array  # K of muscle stiffness control [N/m]
     follows_position: Array  # 1 for position-controlled modules
-    speed: Array  # largest speed [m/s]
+    speed: Array  # largest speed at which the module can wind [m/s]
     tension_bias: Array  # tension bias T_bias [N]
     tension_max: Array  # tension maximum T_max [N]
     loss: Array  # heat per squared tension k [W/N²]

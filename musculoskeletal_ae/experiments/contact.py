@@ -16,12 +16,15 @@ from musculoskeletal_ae.motion.explored_postures import TRIES, holdable_postures
 from musculoskeletal_ae.robot.robot import Robot
 
 CONTACT_STREAM = 7000
-#: push twice in this many resting postures, make this many collisions, and test `float` this often
+#: numbers of postures in which the resting arm is pushed twice, of collisions, and of tests of
+#: method `float`
 POSTURES, COLLISIONS, FLOATS = 15, 20, 4
 #: try each collision at most this often; a try fails if the arm hardly moves, or if a contact is
 #: detected before the push
 TRIES_PER_COLLISION = 20
-HEALTHY = 3600.0  # explore without contact for this time, shared by the individuals [s]
+#: explore without contact for this time, shared by the individuals, and count detected contacts as
+#: false [s]
+HEALTHY = 3600.0
 LEAST, MOST = 10.0, 50.0  # push with forces in this range [N]
 LIGHT, FIRM = 15.0, 20.0  # guide an arm in method `float` with forces in this range [N]
 MOVE = 4.0  # move to a posture in this time [s]
@@ -31,8 +34,8 @@ APART = 3.0  # wait at most this long between collisions [s]
 WARM_UP = 5.0  # explore for this time before contacts of the healthy arm are counted [s]
 FLOATING = 30.0  # test the drift for this time [s]
 MOVED = 1.0  # push for this time in a collision, and to guide the hand [s]
-SOON = 0.1  # a collision should be detected within this time [s]
-INSIDE = 0.1  # keep postures away from the joint limits by this fraction of the joint ranges
+SOON = 0.1  # report the share of collisions that are detected within this time [s]
+INSIDE = 0.1  # keep random postures away from the joint limits by this fraction of the joint ranges
 
 
 class ContactLoop(ClosedLoop):

@@ -47,7 +47,7 @@ class Phase(NamedTuple):
     """One phase of the experiment: its duration, and the force and constraint that act."""
 
     name: str
-    duration: float  # [s]
+    duration: float  # duration of the phase [s]
     force: tuple[float, float, float] = (0.0, 0.0, 0.0)  # external force on the hand [N]
     forced: bool = False  # whether the shoulder is forced to `FORCED`
 

@@ -82,7 +82,7 @@ METHODS = {
 #: control methods of a shortened run; all but OURS are only measured in motions of DURATIONS[0]
 QUICK_METHODS = OURS, 'tension', 'second'
 RADIUS, SPEED = 0.05, 0.1  # radius of a circle [m], and speed of the hand along it [m/s]
-EVERY = 2  # send a pose with every second message
+EVERY = 2  # send a pose of the hand with every second message, which makes 50 poses a second
 NEAR = 0.002  # count a pose as reachable if the hand comes this close [m]
 #: maps a time [s] to the desired pose of the hand
 Place = Callable[[float], pin.SE3]
@@ -175,8 +175,9 @@ def follow(
 class Approach(NamedTuple):
     """How the arm approached one target."""
 
-    settling: float  # time until it stayed within WITHIN of it, at most SETTLING_TIME [s]
-    distance: float  # ‖θ_target − θ‖ after ARRIVING [rad]
+    #: time until the arm stays within WITHIN of the target, at most SETTLING_TIME [s]
+    settling: float
+    distance: float  # distance ‖θ_target − θ‖ after the time ARRIVING [rad]
 
 
 def approach(loop: ClosedLoop, goal: Array, duration: float) -> Approach:

@@ -62,7 +62,8 @@ from musculoskeletal_ae.presets.names import DEFAULT, PAPER_PRESET
 from musculoskeletal_ae.presets.registry import PRESETS, preset_named
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
-CURVE_STRIDE = 10  # every tenth held-out message is evaluated after each update
+#: after each update, evaluate only every tenth message of the held-out motion, to save time
+CURVE_STRIDE = 10
 #: use the mean error over this first part of a run as the initial guess of b in the exponential fit
 #: [s]
 FIRST_ERRORS = 10.0
@@ -72,7 +73,8 @@ PUBLISHED = (0.324, 0.154)  # the paper's fit at the start and after ten minutes
 #: validation rejects the network of preset `paper`
 QUICK_STEPS = {PAPER_PRESET: 600, DEFAULT: 300}
 NOTE_EVERY = 25  # record the training errors after every 25th mini-batch
-TEST_STATES = 1000  # test a network on this many states
+#: test a network of the initial training on this many states of the geometric model
+TEST_STATES = 1000
 COLOURS = {PAPER_PRESET: plots.AS_PRINTED, 'default': plots.AFTER}
 
 #: function that returns the θ [rad] (D,) that the learner receives, or None. Its arguments are the

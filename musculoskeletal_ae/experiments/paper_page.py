@@ -51,7 +51,7 @@ PICTURES = {
 LARGEST = 60_000  # shrink a picture to at most this size [bytes]
 WIDEST = 1000  # shrink a picture to at most this width [pixels]
 COLOURS = 128  # reduce pictures to this many colours; a small palette makes small files
-SMALLER = 0.9  # multiply the width of a picture by this until the file is small enough
+SMALLER = 0.9  # multiply the width of a picture repeatedly by this until its file is small enough
 
 
 def update_page(page: Path, measured: Path | None = None) -> list[Path]:

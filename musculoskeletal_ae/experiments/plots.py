@@ -27,7 +27,7 @@ LEGENDS: dict[str, dict[str, Any]] = {
     'below': {'loc': 'upper center', 'bbox_to_anchor': (0.5, -0.16), 'ncols': 2},
 }
 MARGIN = 0.03  # leave this free space around an arm [m]
-HEADER = 0.9  # height of the titles [inch]
+HEADER = 0.9  # leave this height above the pictures for the titles [inch]
 VIEW = (12.0, -35.0)  # elevation and azimuth of the camera [deg]: mainly from the front
 STYLES: dict[str, dict[str, Any]] = {
     'bones': {'linewidth': 6.0, 'solid_capstyle': 'round', 'zorder': 1},

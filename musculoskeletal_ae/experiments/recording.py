@@ -45,10 +45,10 @@ class Recording(NamedTuple):
     theta_sensor: Array  # joint-sensor readings [rad], (N, D)
     length: Array  # measured lengths [m], (N, M)
     tension: Array  # measured tensions T_read [N], (N, M)
-    command: Array  # l_target [m], (N, M)
+    command: Array  # length commands l_target [m], (N, M)
 
     def part(self, rows: slice | Ints) -> Recording:
-        """Return a part of the samples."""
+        """Return the rows of the recording that `rows` selects."""
         return Recording(*(column[rows] for column in self))
 
 
@@ -65,7 +65,7 @@ class ClosedLoop:
     Each message passes through sense → estimate → control → command.
 
     Attributes:
-        arm: The arm.
+        arm: The emulated arm.
         estimator: The core of the estimator.
         core: The core of the controller.
         mae: The network in use.
@@ -159,7 +159,7 @@ class ClosedLoop:
             raise MusculoskeletalError(f'control stopped: {condition.text}')
 
     def target(self, theta: Array) -> None:
-        """Set the target θ [rad] (D,)."""
+        """Set the target θ [rad] (D,) of the controller, without an additional torque."""
         self.core.target(dict(zip(self.arm.robot.joints, ((t, 0.0) for t in theta.tolist()))))
 
     def wait(self, duration: float) -> None:
@@ -187,7 +187,7 @@ def record(
     muscle is paid out instead.
 
     Args:
-        arm: The arm.
+        arm: The emulated arm, which is moved.
         mae: The network that computes the commands.
         stream: Random seed of the exploration steps, or the steps themselves.
         duration: Duration [s], rounded up to whole steps.

@@ -43,7 +43,8 @@ from musculoskeletal_ae.motion.explored_postures import TRIES
 from musculoskeletal_ae.motion.progress import FALLEN
 from musculoskeletal_ae.robot.tension import holding_tension
 
-EVERY = 10  # every tenth message of the held-out motion is evaluated
+#: evaluate only every tenth message of the held-out motion, because it is estimated very often
+EVERY = 10
 TARGETS = 2  # approach this many targets without each muscle
 MOVING = 12.0  # explore for this time before a fault [s]
 #: wait at most this long after a fault for the end of the first verification [s]
@@ -63,10 +64,10 @@ class IsolatingLoop(ClosedLoop):
     """A closed loop that isolates faulty muscles, and notes verdicts and errors."""
 
     def __init__(self, arm: Arm, mae: Mae, seed: int = 0) -> None:
-        """Connect an arm at rest."""
+        """Connect an arm at rest to an estimator that isolates suspect muscles."""
         #: isolated muscles and the reason, after each verification
         self.verdicts: list[tuple[tuple[int, ...], str]] = []
-        self.error = np.nan  # ‖θ_est − θ‖ at the last message [rad]
+        self.error = np.nan  # distance ‖θ_est − θ‖ at the last message [rad]
         super().__init__(arm, mae, Settings(), seed, on_anomaly='isolate')
 
     @property
@@ -100,7 +101,7 @@ def run_with_fault(
     Args:
         study: Options of the run.
         seed: Seed of the individual and of its exploration.
-        muscle: Index of the muscle.
+        muscle: Index of the muscle that fails.
         sensor: 'length' or 'tension' for a sensor that fails; '' for a rupture.
 
     Returns:
@@ -165,7 +166,8 @@ def measure_reach(
     for theta in held[:targets]:
         try:
             loop.target(theta)
-            rest_time, before = 0, loop.arm.theta  # [s]
+            #: time at rest so far [s], and the posture one second ago
+            rest_time, before = 0, loop.arm.theta
             for _ in range(LONGEST_APPROACH):
                 if rest_time == SETTLING:
                     break

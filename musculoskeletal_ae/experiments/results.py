@@ -37,9 +37,11 @@ ALARMS = ('false_contacts', 'false_alarms', 'false_alarms_beside_cuts')
 ISOLATIONS = ('wrong_isolations', 'acquittals')
 MOTIONS = ('approaches', 'missed', 'stuck')
 TOTALS = (*ALARMS, *ISOLATIONS, *MOTIONS, 'healthy_s', 'healthy_touch_s', 'counted_cuts')
-BEGIN, END = '<!-- results -->', '<!-- /results -->'  # markers around the results table
+#: lines of a page between which the results table is written
+BEGIN, END = '<!-- results -->', '<!-- /results -->'
 KEPT = Path('doc/results')
-TEMPLATE = 'report.html.jinja'  # a file in the folder of this module
+#: name of the template of report.html, a file in the folder of this module
+TEMPLATE = 'report.html.jinja'
 NOTHING = '–'
 
 

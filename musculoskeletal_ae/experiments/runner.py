@@ -48,7 +48,7 @@ class Part(NamedTuple):
 
     @property
     def weight(self) -> float:
-        """Relative duration."""
+        """Relative duration of the part; longer parts start first."""
         return 1.0 if self.seed is None else EXPERIMENTS[self.name].weight
 
     @property
@@ -66,7 +66,7 @@ class Outcome(NamedTuple):
 
     part: Part
     failure: str = ''  # '' if the result is in the folder of the run
-    seconds: float = 0.0  # processor time [s]; 0 if the part was not measured in this run
+    seconds: float = 0.0  # processor time of the part [s]; 0 if it was not measured in this run
 
 
 def stages(study: Study, names: Sequence[str]) -> tuple[list[Part], ...]:

@@ -106,11 +106,11 @@ class Study:
             kept.write(self._stream_file(seed, name), values)
 
     def stream(self, seed: int, name: str) -> Recording:
-        """Load a saved stream."""
+        """Load a saved stream of an individual: `exploring` or `held_out`."""
         return Recording(**self._load(seed, name, Recording._fields))
 
     def rests(self, seed: int) -> RestSamples:
-        """Load the saved rest samples."""
+        """Load the rest samples that the learner of an individual stored."""
         return RestSamples(**self._load(seed, 'rests', RestSamples._fields))
 
     def _stream_file(self, seed: int, name: str) -> Path:

@@ -24,7 +24,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.process_signals import interrupts_blocked
 
 Call = tuple[Any, ...]  # the arguments of a function
-PATIENCE = 10  # refuse a scheduler that has not answered after this time [s]
+PATIENCE = 10  # refuse a scheduler that does not answer within this time [s]
 
 
 class WorkerKilledError(MusculoskeletalError):
@@ -38,7 +38,7 @@ class WorkerKilledError(MusculoskeletalError):
 
 
 class Workers(ABC):
-    """Processes that run calls of a function."""
+    """Processes that run calls of a function in parallel."""
 
     @abstractmethod
     def as_they_end(

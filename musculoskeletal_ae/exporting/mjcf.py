@@ -216,9 +216,9 @@ def _write(robot: Robot, mae: Mae, out: Path) -> ExportReport:
 class SpringTable(NamedTuple):
     """Linear springs that represent M muscles; each field has the shape (M,)."""
 
-    tension: Array  # T_mid [N]
+    tension: Array  # tension T_mid in the middle between T_bias and T_limit [N]
     elongation: Array  # elongation at T_mid [m]
-    stiffness: Array  # [N/m]
+    stiffness: Array  # stiffness of the linear spring [N/m]
     error: Array  # largest error of the elongation between T_bias and T_limit [m]
 
 

@@ -22,8 +22,8 @@ SAMPLES = 600  # fit a polynomial in this many postures, and compare it in as ma
 class Polynomial(NamedTuple):
     """Length of one tendon: Σ_r coefficient_r Π_j (q_j − centre_j)^power_rj."""
 
-    powers: Array  # (R, joints)
-    coefficient: Array  # [m/rad^p], (R,)
+    powers: Array  # powers of the joint positions in the R terms, (R, joints)
+    coefficient: Array  # factor of each term [m/rad^p], (R,)
     error: float  # root mean square error of the length in other postures [m]
     degree: int
 

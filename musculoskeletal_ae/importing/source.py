@@ -73,9 +73,9 @@ class Spring(NamedTuple):
     The torque along x is −k (x − x_0).
     """
 
-    shares: dict[str, float]  # by joint
-    stiffness: float  # k [N·m/rad]
-    rest: float  # x_0 [rad]
+    shares: dict[str, float]  # share of each joint's position in x, by joint
+    stiffness: float  # spring constant k [N·m/rad]
+    rest: float  # value x_0 of x at which the spring exerts no torque [rad]
     name: str  # name in the source
 
 
@@ -86,9 +86,9 @@ class PassiveTendon(NamedTuple):
     """
 
     name: str
-    stiffness: float  # k [N/m]
+    stiffness: float  # spring constant k [N/m]
     slack: tuple[float, float]  # x_low and x_high [m]
-    damping: float  # d [N·s/m]
+    damping: float  # damping d of the tendon's length [N·s/m]
 
 
 @dataclass
@@ -108,7 +108,8 @@ class Source:
     #: whether tendons do not stretch in the source; otherwise, nobody stated their elasticity
     is_rigid: bool = False
     springs: list[Spring] = field(default_factory=list)
-    damping: dict[str, float] = field(default_factory=dict)  # by joint [N·m·s/rad]
+    #: damping of the joints [N·m·s/rad], by joint
+    damping: dict[str, float] = field(default_factory=dict)
     passive: list[PassiveTendon] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     lengths: Lengths | None = None
@@ -684,7 +685,7 @@ def _coupling(slave: str, coupling: Coupling) -> dict[str, Any]:
 class Comparison(NamedTuple):
     """Differences between the lengths of an imported robot and those of its source, by muscle."""
 
-    lengths: dict[str, float]  # largest error [m]
+    lengths: dict[str, float]  # largest error of the length [m]
     arms: dict[str, float]  # largest error of a moment arm [m]
     #: share of postures with a moment arm of the wrong sign, at the joint where it is largest
     flips: dict[str, float]

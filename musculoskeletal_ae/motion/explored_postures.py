@@ -39,7 +39,7 @@ class ExplorationStep(NamedTuple):
     """One step of the exploration."""
 
     method: str  # length method of the preset: 'first' or 'second'
-    theta: Array  # θ_target [rad], (D,)
+    theta: Array  # target posture θ_target [rad], (D,)
     #: T_const of the method `first` [N], (M,). For the method `second`, which uses the present
     #: tension instead, this is the tension that the geometric model expects.
     tension: Array

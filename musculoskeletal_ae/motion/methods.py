@@ -68,8 +68,8 @@ class JointStiffness(NamedTuple):
 class Solution(NamedTuple):
     """A command with its expected tension, missing torque and stiffness."""
 
-    length: Array  # l_target [m], (M,)
-    tension: Array  # T [N], (M,)
+    length: Array  # length command l_target [m], (M,)
+    tension: Array  # tension T that the command should produce [N], (M,)
     missing_torque: Array  # torque that no tensions within their limits provide [N·m], (D,)
     stiffness: JointStiffness | None = None  # only for the method `stiffness`
 

@@ -48,7 +48,8 @@ class Stiffening:
     def reset(self) -> None:
         """Discard the present solution; the next step computes a new one."""
         self.solution: Solution | None = None  # the solution that T_K approaches
-        self._near: Array = self._robot.tension.bias  # T_K [N], (M,)
+        #: present tensions T_K [N], (M,), which approach `solution`
+        self._near: Array = self._robot.tension.bias
         self._solved = 0.0  # age of the solution [s]
 
     def step(
@@ -111,7 +112,8 @@ class TensionPlan:
         self.effort: Array = np.zeros(robot.joint_count)
         self.tension = PlannedTension.at_bias(robot)
         self._limit: Array = robot.tension.limit  # tension limit of the present plan [N], (M,)
-        self._friction: Array = np.full(robot.muscle_count, FRICTION)  # μ, (M,)
+        #: friction coefficient μ of each tendon, (M,)
+        self._friction: Array = np.full(robot.muscle_count, FRICTION)
         #: sliding direction s of each tendon, (M,)
         self._sliding: Array = np.zeros(robot.muscle_count)
         self._stiffening = Stiffening(robot, settings)

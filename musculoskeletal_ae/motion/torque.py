@@ -13,8 +13,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
 # Gains of the method `tension`; K_p holds the arm near its target, and K_d damps its motion.
-POSITION_GAIN = 10.0  # K_p [N·m/rad]
-VELOCITY_GAIN = 0.5  # K_d [N·m·s/rad]
+POSITION_GAIN = 10.0  # gain K_p of the posture error [N·m/rad]
+VELOCITY_GAIN = 0.5  # gain K_d of the joint velocity [N·m·s/rad]
 SMOOTHING = 0.05  # smooth the noisy estimate with this time constant [s]
 
 # Method `float`, which compensates gravity, adds these springs and dampers to the holding torque:

@@ -69,7 +69,7 @@ class Trajectory:
     """A piecewise polynomial curve from `start` through points."""
 
     start: Setpoint
-    points: TrajectoryPoints  # the remaining points
+    points: TrajectoryPoints  # points that were still ahead at the start of the trajectory
     time: Array  # times of the knots [s], (K,); the first time is 0
     coefficients: Array  # coefficients of each piece, (K−1, 6, D)
     end: Array  # posture that is held after the last point [rad], (D,)

@@ -35,7 +35,7 @@ class Winches:
         self._since = self._last = 0.0
         self._delay = 0.0  # delay of the last message [s]
         self._length: Array | None = None
-        self._speed: Array = np.zeros(robot.muscle_count)  # dl/dt [m/s], (M,)
+        self._speed: Array = np.zeros(robot.muscle_count)  # speed of each muscle, dl/dt [m/s], (M,)
 
     def use(self, robot: Robot) -> None:
         """Use another robot description; its isolated muscles are ignored."""

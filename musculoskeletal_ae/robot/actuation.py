@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Choice = TypeVar('Choice')
 Kinded = tuple[str, Array]  # kind and value of a command
 
-LENGTH, TENSION = 'length', 'tension'  # kinds of commands
+LENGTH, TENSION = 'length', 'tension'  # kinds of commands: target lengths, or target tensions
 
 DESIRED_SHARE = 0.3  # assume and prefer tensions of this share of T_limit, as in a well-tensed arm
 #: let rest feedback pay out a needlessly tense muscle under stiffness control by at most this [m];

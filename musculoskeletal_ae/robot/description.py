@@ -52,8 +52,9 @@ OTHER_JOINTS = {1: 'continuous', 3: 'planar', 6: 'floating'}
 #: an eigenvalue slightly negative
 LEAST_EIGENVALUE = -1e-9
 
-TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # tensions [N]
-STIFFNESS_DEFAULT = 10000.0  # K_stiff [N/m]
+#: T_bias, T_limit and T_max of a muscle whose entry states none [N]
+TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}
+STIFFNESS_DEFAULT = 10000.0  # K_stiff of a muscle whose entry states none [N/m]
 SPEED_DEFAULT = 0.1  # assume this speed of a position-controlled module that states none [m/s]
 #: scale of a motor current in `with_modules` [N per A]: 0.03 N·m/A, gear of 20, spool of 10 mm
 NEWTON_PER_AMPERE = 60.0
@@ -84,7 +85,7 @@ class Wrap(NamedTuple):
 
     link: str
     xyz: Array  # centre, or the point of a pulley at which the tendon enters it [m]
-    radius: float  # [m]
+    radius: float  # radius of the object [m]
     #: unit vector along a cylinder, or along the tendon where it enters a pulley; None for a sphere
     axis: Array | None
     #: point on the side where the tendon passes [m]; a point inside the object makes it a ring
@@ -144,7 +145,7 @@ class RobotDescription:
     #: K_stiff of muscle stiffness control [N/m], (M,); infinite for position-controlled modules
     stiffness: Array
     tension: TensionRange
-    actuation: str  # STIFFNESS or POSITION
+    actuation: str  # kind of the muscle modules: STIFFNESS or POSITION
     tension_source: TensionSource
     speed: Array  # speed of position-controlled modules [m/s], (M,); infinite for others
     #: length that a stop pays out if tensions are unknown [m], (M,); NaN for the default

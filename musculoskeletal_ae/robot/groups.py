@@ -18,8 +18,8 @@ from musculoskeletal_ae.arrays import Bools, Ints
 class Group(NamedTuple):
     """Joints and the muscles that cross them, such as a limb; no muscle crosses two groups."""
 
-    joints: tuple[int, ...]  # indices in θ
-    muscles: tuple[int, ...]  # indices in T and l
+    joints: tuple[int, ...]  # indices of the joints in θ
+    muscles: tuple[int, ...]  # indices of the muscles in T and l
 
     @classmethod
     def whole(cls, joints: int, muscles: int) -> Group:

@@ -26,7 +26,7 @@ from musculoskeletal_ae.robot.robot import Robot
 SPREADS = np.repeat([0.002, 0.01], 3)
 #: standard deviations that leave the orientation free
 POSITION_ONLY = np.repeat([0.002, 100.0], 3)
-ROUNDS = 30  # take at most this many steps
+ROUNDS = 30  # end the search after this many steps
 #: damp each step by this prior standard deviation, so that joints that the pose does not determine
 #: hardly move [rad]
 STEP_SPREAD = 0.1
@@ -36,10 +36,11 @@ LEAST_GAIN = 1.0  # end the search once a step reduces the minimised sum by less
 class Posture(NamedTuple):
     """A solution of the inverse kinematics, with its remaining errors."""
 
-    theta: Array  # θ [rad], (D,)
+    theta: Array  # joint angles θ of the solution [rad], (D,)
     distance: float  # remaining error of the position [m]
     angle: float  # remaining error of the orientation [rad]
-    observed_theta: Array  # θ, with NaN for joints that do not move the end effector, (D,)
+    #: θ, with NaN for joints that do not move the end effector and therefore remain unknown, (D,)
+    observed_theta: Array
 
 
 def inverse_kinematics(
@@ -48,7 +49,7 @@ def inverse_kinematics(
     """Return the posture that brings the end effector nearest to a pose.
 
     Args:
-        robot: The geometric model.
+        robot: The geometric model, whose joint limits bound the solution.
         pose: The pose in the root link's frame.
         start: Joint angles at which the search starts [rad], (D,).
         spreads: Standard deviations of the measured position [m] and orientation [rad], (6,).

@@ -32,7 +32,7 @@ class JointElasticity:
 
     stiffness: Array  # K [N·m/rad], symmetric, (D, D)
     preload: Array  # b = K θ_0, the torque of the springs at θ = 0 [N·m], (D,)
-    damping: Array  # d [N·m·s/rad], (D,)
+    damping: Array  # damping d of each joint [N·m·s/rad], (D,)
     tendons: PassiveTendons = field(default_factory=lambda: PassiveTendons.none(0))
 
     def __post_init__(self) -> None:

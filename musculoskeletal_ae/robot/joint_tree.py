@@ -52,7 +52,7 @@ class Coupling(NamedTuple):
 
     master: str  # after `resolved`, a joint that is not coupled itself
     ratio: float
-    offset: float  # [rad] or [m]
+    offset: float  # position of the joint where its master is at 0 [rad or m]
     higher: tuple[float, ...] = ()  # coefficients of the second and all higher powers
 
     @classmethod

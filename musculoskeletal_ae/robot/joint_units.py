@@ -26,7 +26,8 @@ if TYPE_CHECKING:  # slow imports, which the parameters of the nodes do not need
     from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 
 PRISMATIC = ('JointModelPX', 'JointModelPY', 'JointModelPZ', 'JointModelPrismaticUnaligned')
-#: count this travel of a prismatic joint as one radian [m]: the radius of the assumed pinion
+#: let θ of a prismatic joint rise by 1 rad when the joint moves by this distance [m]: the radius of
+#: an assumed pinion
 RACK = 0.06
 
 
@@ -146,7 +147,7 @@ class JointUnits:
         """Return the means of `mean_errors` as text, such as '0.0123 rad and 1.20 mm', or ''.
 
         Args:
-            means: The means, (2,).
+            means: Mean errors of the revolute and of the prismatic joints [rad], (2,).
             form: Format of the number in [rad].
         """
         turn, slide = means
@@ -155,7 +156,7 @@ class JointUnits:
         return ' and '.join(parts)
 
     def error_text(self, error: Array, form: str = '.4f') -> str:
-        """Return the mean size of errors of θ as text; arguments as of the two methods above."""
+        """Return the mean size of errors of θ [rad], (N, D) or (D,), as text; see `errors_text`."""
         return self.errors_text(self.mean_errors(error), form)
 
     @property

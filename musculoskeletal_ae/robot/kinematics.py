@@ -38,7 +38,7 @@ def reduced(model: pin.Model, locked: Sequence[int], at: Array) -> pin.Model:
     up by name and would reject or confuse such frames, so all frames get unique names meanwhile.
 
     Args:
-        model: The model.
+        model: The model, which is not changed.
         locked: Indices of the joints to fix.
         at: Positions of all joints, at which these joints are fixed.
     """

@@ -103,10 +103,11 @@ class Motors:
     topics: MotorTopics
     joints: tuple[str, ...]  # the joint of ros2_control that is the motor of each muscle
     command_order: tuple[str, ...]  # these joints in the order of the command controller
-    spool_radius: Array  # [m]
-    direction: Array  # 1 or −1
+    spool_radius: Array  # radius of the spool, or 1 for a linear motor [m]
+    direction: Array  # 1 if the position rises as the motor pays out, −1 if it falls
     zero: Array
-    tension_per_effort: Array  # [N]
+    #: tension per unit of effort; negative if the effort falls as the motor pulls [N]
+    tension_per_effort: Array
     effort_zero: Array
 
 
@@ -124,7 +125,7 @@ def read_motors(directory: Path, muscles: Sequence[str]) -> Motors | None:
     """Return how motors are connected to muscles; None if the directory has no motors.yaml.
 
     Args:
-        directory: The robot directory.
+        directory: The robot directory, which may contain a motors.yaml.
         muscles: Names of the muscles.
 
     Raises:

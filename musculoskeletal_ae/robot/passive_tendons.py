@@ -28,9 +28,9 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 class Passive(NamedTuple):
     """T passive tendons of D joints as arrays, for compiled code."""
 
-    centre: Array  # θ̄ [rad], (D,)
+    centre: Array  # joint angles θ̄ from which the polynomials count [rad], (D,)
     power: Ints  # powers p of all R terms, (R, D)
-    coefficient: Array  # c [m/rad^p], (R,)
+    coefficient: Array  # factor c of each term [m/rad^p], (R,)
     first: Ints  # index of the first term of each tendon, then R, (T+1,)
     law: Array  # k [N/m], x_low and x_high [m] of each tendon, (T, 3)
 

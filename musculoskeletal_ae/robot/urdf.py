@@ -26,7 +26,8 @@ MOST_PARTS = 2000
 DEEPEST = 500
 #: elements below <robot> that xacro understands only with its prefix
 PREPROCESSED = 'include', 'macro', 'property'
-XACRO = 'http://www.ros.org/wiki/xacro'  # namespace of the elements of xacro
+#: namespace of the elements of xacro, a preprocessor of URDFs
+XACRO = 'http://www.ros.org/wiki/xacro'
 EXPAND = 'expand it to a new file first:  xacro FILE > NEW.urdf'
 #: refuse any number of a larger absolute value, except efforts and velocities [SI units]
 LARGEST = 1e6

@@ -51,7 +51,7 @@ class WrapObjects(NamedTuple):
     """The sphere or cylinder of each of S segments, in the frame of the joint that carries it."""
 
     joint: Ints  # joint of the tree that carries the object, (S,)
-    centre: Array  # [m], (S, 3)
+    centre: Array  # centre of each object [m], (S, 3)
     axis: Array  # unit vector of a cylinder, zero for a sphere, (S, 3)
     #: side point [m], (S, 3); NaN if there is none. It is relative to the centre if the object and
     #: the side point have the same joint, otherwise in the frame of `side_joint`.

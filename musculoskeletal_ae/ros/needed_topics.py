@@ -36,7 +36,8 @@ class NeededTopics:
         """
         self._node, self._full_name, self._reception = node, full_name, reception
         self._topics: list[str] = []
-        self._expected_rates = dict[str, float]()  # [Hz], by topic
+        #: rates that the topics should have [Hz], by topic
+        self._expected_rates = dict[str, float]()
         self._slow_reports = Counter[str]()  # successive reports with a low rate, by topic
         self._waiting = ''  # the missing topics, as last logged
 

@@ -75,12 +75,12 @@ class ArmState(NamedTuple):
 class Body(NamedTuple):
     """Constants of muscles (M,) and joints (D,) for the compiled code."""
 
-    stiffness: Array  # K_stiff [N/m]
+    stiffness: Array  # control stiffness K_stiff of the module [N/m]
     bias: Array  # T at l = l_target [N]: T_bias, or 0 for position-controlled modules
-    most: Array  # T_max [N]
+    most: Array  # tension maximum T_max [N]
     span: Array  # distance of l_target below l at which T reaches T_max [m]
     loose: Array  # distance of l_target above l beyond which T no longer changes [m]
-    friction: Array  # tendon friction μ
+    friction: Array  # friction coefficient μ of the tendon
     speed: Array  # largest speed of the module [m/s]; infinite if it is not stated
     # constants of the series elastic elements, as in `SeriesElastic`
     force: Array

@@ -18,7 +18,8 @@ from musculoskeletal_ae.view import body
 LEFT_PANEL = 350  # width of the left panel [pixels]
 ARMS = {'measured': (176, 180, 186), 'estimated': (0, 158, 115), 'simulated': (148, 103, 189)}
 ENVIRONMENT = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
-HTML: Any = ENVIRONMENT.get_template('page.html.jinja').module  # macros
+#: the macros of the template, which write the HTML of the panel
+HTML: Any = ENVIRONMENT.get_template('page.html.jinja').module
 DURATION = 60.0  # show curves of this duration [s]
 GREEN, BLUE = {'stroke': '#009e73', 'width': 2}, {'stroke': '#0072b2', 'width': 2}
 DASHED = {'stroke': '#c80082', 'width': 2, 'dash': [6, 4]}
