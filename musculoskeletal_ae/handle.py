@@ -21,7 +21,7 @@ class HandleType(types.StructRef):  # type: ignore[misc]
 class Handle(structref.StructRefProxy):  # type: ignore[misc]
     """Passes tuples of arrays to compiled code as one argument, without copying the arrays."""
 
-    held: Any  # only compiled code may read it
+    held: Any  # the arrays, which only compiled code may read
 
 
 structref.define_proxy(Handle, HandleType, ['held'])

@@ -23,20 +23,22 @@ from musculoskeletal_ae.robot.joint_units import JointUnits
 from musculoskeletal_ae.robot.tension_source import TENSION_SENSOR, TensionSource
 from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Presence, Row
 
-#: largest legal number of entries of an array in a message, or of joints × points in a trajectory;
-#: far more than any arm needs
+#: reject a message with more entries in an array, or a trajectory with more joints × points; no arm
+#: needs nearly as many
 MOST_ENTRIES = 10_000
-#: largest force [N] and torque [N·m] of a wrench, for each axis
+#: reject a wrench whose force [N] or torque [N·m] exceeds this along any axis
 MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)
-#: largest commanded linear [m/s] and angular velocity [rad/s] of the end effector, for each axis
+#: reject a twist whose linear [m/s] or angular [rad/s] velocity exceeds this along any axis
 MOST_TWIST = np.array([5.0] * 3 + [20.0] * 3)
-#: range of plausible accelerometer readings on an arm [m/s²]
+#: reject accelerometer readings outside this range [m/s²]; a sensor at rest measures 9.81
 LEAST_GRAVITY, MOST_GRAVITY = 3.0, 30.0
-LAST_VELOCITY = 1e-6  # highest velocity at the end of a trajectory [rad/s]
-MOST_EFFORT = 1000.0  # highest torque or force that may be requested of one joint [N·m or N]
-#: largest value of an isolated muscle that is kept; much larger values could overflow when squared
+#: reject a trajectory with a higher velocity at its end [rad/s], because the arm holds its last
+#: point
+LAST_VELOCITY = 1e-6
+MOST_EFFORT = 1000.0  # reject a request for a higher torque or force of one joint [N·m or N]
+#: replace larger values of isolated muscles by NaN, because they could overflow when squared
 MOST_ISOLATED = 1e6
-UNIT_TOLERANCE = 0.01  # largest deviation of a quaternion's norm from 1
+UNIT_TOLERANCE = 0.01  # reject a quaternion whose norm deviates further from 1
 
 
 def read_array(message: Any, rows: int, columns: int, owner: str = 'muscle') -> Array:
@@ -287,11 +289,13 @@ def _not_finite(what: str, values: Array) -> MessageError:
 class TrajectoryPoints(NamedTuple):
     """K points of some joints in a JointTrajectory."""
 
-    joints: Ints  # indices in θ, (J,)
-    time: Array  # times from the start [s], (K,)
-    position: Array  # [rad], (K, J)
-    velocity: Array | None  # [rad/s], (K, J)
-    acceleration: Array | None  # [rad/s²], (K, J)
+    joints: Ints  # indices of the named joints in θ, (J,)
+    time: Array  # times of the points, relative to the start [s], (K,)
+    position: Array  # positions of the named joints at each point [rad], (K, J)
+    #: velocities at each point [rad/s], (K, J); None if the message states none
+    velocity: Array | None
+    #: accelerations at each point [rad/s²], (K, J); None if the message states none
+    acceleration: Array | None
 
     def later(self, slower: float) -> TrajectoryPoints:
         """Return the points slowed by the factor `slower`."""

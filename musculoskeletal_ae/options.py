@@ -23,8 +23,8 @@ from musculoskeletal_ae.presets.names import DEFAULT, PRESET_NAMES
 from musculoskeletal_ae.process_signals import INTERRUPTED
 from musculoskeletal_ae.robot.directories import shipped_robots
 
-DEFAULT_ROBOT = 'musashi_left_arm'
-DEFAULT_SEED = 0  # default of --seed
+DEFAULT_ROBOT = 'musashi_left_arm'  # robot that a command uses without --robot
+DEFAULT_SEED = 0  # random seed that a command uses without --seed
 #: exit status after the reader of the output has closed it, as of other tools: 128 + SIGPIPE
 CLOSED = 141
 PICTURES = ('.png', '.svg', '.pdf', '.jpg')
@@ -61,7 +61,7 @@ def _listed(text: str) -> list[str]:
 
 not_negative = _type(float, lambda value: 0.0 <= value < math.inf, 'a number of at least 0')
 positive = _type(float, lambda value: 0.0 < value < math.inf, 'a number above 0')
-minutes = number(0.2, 600.0)  # duration in robot time [min]
+minutes = number(0.2, 600.0)  # argparse type for a duration of the emulated arm [min]
 seed = whole(0, 2**63 - 1)
 # `seeds`, `numbers` and `names` are lists separated by commas.
 seeds = _type(

@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, TextIO
 if TYPE_CHECKING:
     from typing_extensions import Buffer
 
-#: standard input, output and error
-_DESCRIPTORS = range(3)
-#: longest wait until a terminal in non-blocking mode takes more text [s]
+_DESCRIPTORS = range(3)  # file descriptors of standard input, output and error
+#: wait at most this long until a terminal in non-blocking mode takes more text [s]
 _LONGEST_WAIT = 1.0
 
 

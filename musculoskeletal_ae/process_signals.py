@@ -18,7 +18,8 @@ from types import ModuleType
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 INTERRUPTED = 130  # exit status of an interrupted tool
-GRACE = 2  # time from the signal to the exit under `Reaction.EXIT_SOON` [s]
+#: under `Reaction.EXIT_SOON`, end the process at the latest this long after the signal [s]
+GRACE = 2
 
 
 class Reaction(Enum):

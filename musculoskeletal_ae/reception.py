@@ -12,7 +12,7 @@ from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 
 LONGEST_TEXT = 500
-SHOWN = 10.0  # report refusals and internal errors for this time [s]
+SHOWN = 10.0  # report a refusal or an internal error for this time after it happened [s]
 
 
 class Reception:
