@@ -42,7 +42,8 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: explore and learn for EXPLORED, and then measure in a held-out motion of HELD_OUT [s]
 EXPLORED, HELD_OUT = 300.0, 60.0
-TARGETS, HELD = 5, 4.0  # move to this many targets, and by default stay at each for this time [s]
+#: numbers of targets to which an arm moves, and default time for each of them [s]
+TARGETS, HELD = 5, 4.0
 RUPTURES = 3  # rupture this many muscles, one after another
 MOVING = 4.0  # explore for this time before a rupture [s]
 LATEST = 10.0  # wait at most this long for an isolation after a rupture [s]
@@ -67,10 +68,10 @@ class Result(NamedTuple):
     before: float
     after: float
     control: float
-    isolated: float  # fraction of the ruptures after which a muscle was isolated
-    named: float  # fraction of the ruptures after which only the ruptured muscle was isolated
+    isolated: float  # share of the ruptures after which a muscle was isolated
+    named: float  # share of the ruptures after which only the ruptured muscle was isolated
     finding_time: float  # mean time from a rupture to the first isolation, LATEST without one [s]
-    highest: float  # highest tension, relative to tension.limit
+    highest: float  # highest tension, as a multiple of tension.limit
     wrong: float
     samples: float
 
@@ -87,7 +88,7 @@ class Watched:
         self._arm, self.highest = arm, 0.0
 
     def note(self) -> None:
-        """Raise `highest` if a present tension exceeds it."""
+        """Record the present tensions: raise `highest` if one of them exceeds it."""
         share = self._arm.tension / self._arm.robot.tension.limit
         self.highest = max(self.highest, float(share.max()))
 

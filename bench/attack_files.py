@@ -26,8 +26,8 @@ from robots import chain
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
-LONGEST = 5.0  # report a file that takes more CPU time [s]
-MOST_MEMORY = 300  # report a file that adds more to the peak memory of the process [MB]
+LONGEST = 5.0  # report a file whose reading takes more CPU time [s]
+MOST_MEMORY = 300  # report a file whose reading raises the peak memory of the process by more [MB]
 NASTY: tuple[object, ...] = (
     0.0, -1.0, 1e-300, 1e300, -1e300, float('nan'), float('inf'), 2**70, '', '\x1b[2J', [], {},
 )  # fmt: skip
@@ -148,7 +148,7 @@ class Reader:
     """Writes hostile files of every kind to a folder, and reads them as the package does."""
 
     def __init__(self, folder: Path) -> None:
-        """Write the valid files that are damaged later."""
+        """Write the valid files, of which damaged copies are read later."""
         from musculoskeletal_ae.learning.samples import Sample, SampleStore
         from musculoskeletal_ae.learning.state import NEWEST, StateStore
         from musculoskeletal_ae.mae import checkpoint

@@ -69,11 +69,11 @@ OWN = QoSProfile(depth=1000)
 JUDGE_PERIOD = 0.25  # check the status line at this interval [s]
 PATIENCE = 90.0  # wait at most this long for an expected event [s]
 COOLING = 900.0  # wait at most this much longer for overheated windings to cool [s]
-WARM = 40.0  # reset the emulated arm if a winding is warmer [°C]
+WARM = 40.0  # reset the emulated arm before an attack if a winding is warmer than this [°C]
 LENGTH, TENSION = 'muscle_length_command', 'muscle_tension_command'
 
 FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-300, 1e9, -1e9, 1e308, -1e308, math.nan, math.inf, -math.inf)
-#: values that no parameter accepts
+#: values that every parameter must refuse
 ILLEGAL = (math.nan, math.inf, -math.inf, 1e308, -1e308, -1e12)
 TEXTS = ('', 'torso', '\x1b[2J', '\x9b1m', 'ö' * 300, '/dev/zero', 'a\nb', '*' * 3000)
 LENGTHS = (0, 1, 2, 6, 18, 1000)
@@ -110,7 +110,7 @@ class Process:
             self.memory.append((time.monotonic() - self.started, memory(self.process.pid)))
 
     def kill(self) -> None:
-        """Kill the process by SIGKILL."""
+        """Kill the process by SIGKILL, which gives it no time to save anything."""
         self.process.kill()
         self.process.wait()
 

@@ -26,7 +26,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: kill a child no later than this after its start [s]; by then, it has started, trained and saved
 LONGEST = 6.0
-SPACING = 0.02  # accept a sample at this interval [s]
+SPACING = 0.02  # let the learner accept a sample at this interval [s]
 #: train for this many steps in an update; they are few, so that a kill interrupts many saves
 STEPS = 20
 DEADLINE = 60.0  # wait at most this long for a child to start [s]

@@ -29,7 +29,7 @@ from musculoskeletal_ae.ros.messages import LATCHED, array_message, bytes_messag
 from musculoskeletal_ae.signals.body_state import Anomaly, BodyState, LengthOffsets
 
 MOMENTS = 'holding', 'exploring'
-LASTING = 4.0  # attack for this time [s]
+LASTING = 4.0  # let an attack last for this time [s]
 #: report a violation if the status line says OK this long after a problem has begun [s]
 REPORT_TIME = 2.0
 #: steps that end the faults of the emulated arm
@@ -44,7 +44,7 @@ REPAIRS = {
     Step.CHECK_JOINT_SENSOR,
     Step.REPAIR_SENSOR,
 }
-OFFSET = 0.08  # publish false length offsets of this absolute value [m]
+OFFSET = 0.08  # absolute value of the false length offsets that are published [m]
 
 
 class Scene:

@@ -59,12 +59,14 @@ from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
 
-ROBOT = 'musashi_left_arm'  # the emulated arm
-EXPLORED, HELD_OUT = 300.0, 60.0  # explore for EXPLORED, and test on a motion of HELD_OUT [s]
-THINNED = 10  # use every tenth message of the test
+ROBOT = 'musashi_left_arm'  # robot that the emulated cases use
+#: let an emulated arm explore for EXPLORED, and test on a held-out motion of HELD_OUT [s]
+EXPLORED, HELD_OUT = 300.0, 60.0
+THINNED = 10  # use only every tenth message of the held-out motion for the test
 MOST_ROWS = 1500  # test on at most this many rows
-COUPLING = 0.006  # add a coupling of this standard deviation to each length [m]
-MOST_FITTED = 150  # fit at most this many test rows by least squares
+#: standard deviation of the coupling of joints that `+coupled` adds to each length [m]
+COUPLING = 0.006
+MOST_FITTED = 150  # fit at most this many test rows by least squares, because each fit is slow
 #: constants of least squares: step of finite differences [rad], typical step as a share of the
 #: joint ranges, and number of iterations after which it ends
 DIFFERENCE, USUAL_STEP, ROUNDS = 1e-4, 0.1, 15
@@ -82,7 +84,7 @@ class Case(NamedTuple):
 
 
 class Never(Trainer):
-    """A trainer that never updates."""
+    """A trainer that never updates the network, so that the bench decides when to update."""
 
     ready = False
 

@@ -34,7 +34,8 @@ from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
-DRAWN = 'visual', 'collision'  # elements of a link that do not affect muscle lengths
+#: elements of a link that are left out, because they do not affect muscle lengths
+DRAWN = 'visual', 'collision'
 HEAD = (
     'model', 'joints', 'muscles', 'wrap', 'max error [mm]', 'median [mm]', 'moment arm [mm]',
     'wrong signs', 'check_robot',

@@ -42,12 +42,12 @@ from musculoskeletal_ae.learning.state import StateStore
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.signals.body_state import BodyState
 
-CORES = 2  # simulate a computer with this many cores
+CORES = 2  # number of cores of the simulated computer
 #: let a process wait for the processor for this mean time, for each process per core [s]
 WAIT = 0.0008
 STALL_EVERY = 10.0  # stall a process at this mean interval [s]
 STALL = 0.015  # let a stall take this mean time, for each process per core [s]
-HANDLING = 0.0005  # let a node handle a message in this time [s]
+HANDLING = 0.0005  # time in which a node handles a message [s]
 QUEUE = 10  # let at most this many messages wait in a subscription; drop older ones
 #: set the publisher's clock ahead of the steady clock by this time [s]; no node may depend on it
 AHEAD = 1.7e9
@@ -143,12 +143,12 @@ class Wire:
     """
 
     def __init__(self) -> None:
-        """Start without faults."""
+        """Start with a healthy wire, which changes nothing."""
         self.reading_faults: list[ReadingFault] = []
         self.command_faults: list[CommandFault] = []
 
     def clear(self) -> None:
-        """Clear all faults."""
+        """Clear all faults, so that readings and commands pass unchanged."""
         self.reading_faults.clear()
         self.command_faults.clear()
 

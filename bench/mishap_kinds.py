@@ -75,9 +75,9 @@ SOFTWARE = frozenset({
     Step.CHANGE_TARGET,
 })  # fmt: skip
 
-SHOWN_ANGLE = 0.1  # count a wrong joint angle as visible from this error on [rad]
-SHOWN_LENGTH = 0.02  # count a wrong length as visible from this error on [m]
-SHOWN_TENSION = 20.0  # count a wrong tension as visible from this error on [N]
+SHOWN_ANGLE = 0.1  # a wrong joint angle can be noticed from this error on [rad]
+SHOWN_LENGTH = 0.02  # a wrong length can be noticed from this error on [m]
+SHOWN_TENSION = 20.0  # a wrong tension can be noticed from this error on [N]
 
 
 def _at_once(_: Lab) -> bool:
@@ -381,7 +381,7 @@ def changed(
 
 
 def bias(value: float, size: float) -> float:
-    """Return a value with an offset, not below 0 for a tension sensor."""
+    """Return a value with an offset, at least 0 as the reading of a tension sensor."""
     return max(value + size, 0.0)
 
 
@@ -391,7 +391,7 @@ def gain(value: float, size: float) -> float:
 
 
 def nothing(_: float, __: float) -> float:
-    """Return NaN."""
+    """Return NaN instead of a value, as a sensor without a signal does."""
     return math.nan
 
 

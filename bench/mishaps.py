@@ -68,20 +68,22 @@ from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.robot.robot import Robot
 
-LEARNING = 180.0  # let an individual learn for this time before its mishaps [s]
+LEARNING = 180.0  # let an individual explore and learn for this time before its mishaps [s]
 #: learn for this time with the individual of this seed, whose network serves as the wrong one [s]
 OTHER_LEARNING, OTHER_SEED = 90.0, 990
 LOOK = 0.1  # read the statements at this interval [s]
 GOAL = 5.0  # count a true statement as in time within this time after the first effect [s]
 PATIENCE = 30.0  # let a person find an unstated fault this long after its first effect [s]
 LONGEST_WAIT = 75.0  # wait at most this long for the first effect and PATIENCE together [s]
-REACTION = 5.0  # let the operator act this long after a node has first advised a step [s]
+REACTION = 5.0  # let the operator react this long after a node has first advised a step [s]
 BETWEEN = 0.5  # take the steps of a remedy at this interval [s]
 SETTLING = 4.0  # read the statements again this long after the steps of a remedy [s]
-QUIET = 3.0  # count the arm as well once it has explored without a condition for this time [s]
+QUIET = 3.0  # call the arm well once it has explored without any condition for this time [s]
 CALIBRATION = 60.0  # wait at most this long for a length calibration [s]
 COOLING = 240.0  # wait at most this long for motors to cool, in all [s]
 AFTER = 20.0  # measure the true error over this time [s]
+# a case has not ended well if the error has grown to more than this multiple, and by more than this
+# much [rad]
 #: count a case as not well if the error has grown to more than this multiple, and by more than this
 #: much [rad]
 WELL, WELL_RAD = 1.5, 0.02

@@ -21,7 +21,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-PERIOD = 0.01  # take a reading at this interval [s]
+PERIOD = 0.01  # interval between two readings [s]
 TENSIONS = 40.0, 120.0  # draw the tensions at the postures from this range [N]
 
 
@@ -31,8 +31,8 @@ def record(
     """Record an arm that moves to random postures; return the recording.
 
     Args:
-        robot: The geometric model.
-        reality: The emulator model.
+        robot: The geometric model, which commands the lengths.
+        reality: The emulator model of the individual.
         seed: Seed of the emulated individual.
         seconds: Duration of the recording [s].
         motion: Duration of each motion [s].

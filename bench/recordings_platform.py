@@ -29,8 +29,8 @@ ENTRY = np.array([[a, b, 1.839] for a, b in ((1.068, -1.155), (1.068, 1.155))])
 ENTRY = np.vstack([ENTRY, ENTRY[::-1] * [-1.0, 1.0, 1.0]])
 ATTACHED = np.array([[0.075, b, 0.28] for b in (-0.075, 0.075)])
 ATTACHED = np.vstack([ATTACHED, ATTACHED[::-1] * [-1.0, 1.0, 1.0]])
-PULLEY = 0.03  # radius of the pulleys [m]
-STILL = 0.002  # count a length as at rest if it changes by less than this in SPAN [m]
+PULLEY = 0.03  # radius of the swivelling pulleys [m]
+STILL = 0.002  # treat a length as at rest if it changes by less than this within SPAN rows [m]
 SPAN = 5  # average this many rows (0.5 s) in a rest sample
 
 

@@ -49,7 +49,7 @@ class Run:
     """The readings of one recorded run, in which the payload is constant."""
 
     name: str
-    load: float  # payload [kg]
+    load: float  # mass of the payload [kg]
     #: l, length of tendon paid out since the start [m], (N, M); `continuum_stand` scales it by 10
     length: Array
     effort: Array  # effort of the motors in units of the recording, (N, M); (N, 0) if it is unknown
@@ -100,7 +100,7 @@ class SoftLink:
     radius: tuple[float, ...]  # distance of each tendon from the middle [m]
     height: float  # length of the link [m]
     mass: float  # mass of the tip of the link [kg]
-    limit: float  # largest bend [rad]
+    limit: float  # limit of both joints that represent the bend [rad]
 
     def write(self, directory: Path, tension_source: str = 'none') -> Path:
         """Write the robot directory and return its path; the muscle modules regulate positions."""
@@ -133,7 +133,7 @@ class Recording:
 class Repository:
     """A public repository with recordings."""
 
-    name: str  # owner/name on GitHub
+    name: str  # name of the repository on GitHub: OWNER/NAME
     recording: str  # name of the link; the results are stored under it
     licence: str
     robot: str  # one line about the robot and its sensors

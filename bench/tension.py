@@ -48,7 +48,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: Report a tension that exceeds ALLOWED times tension.limit for longer than LONGEST [s].
 ALLOWED, LONGEST = 1.1, 0.5
-EXPLORED = 60.0  # explore for this time [s]
+EXPLORED = 60.0  # let each individual explore for this time [s]
 #: move to this many targets with each method, and stay at each for this time [s]
 TARGETS, HELD = 4, 4.0
 HELD_OUT = 60.0  # measure the error on a held-out motion of this duration [s]
