@@ -206,7 +206,7 @@ def measure(
 
 
 def line(reality: str, seed: str, kind: str, result: Result) -> str:
-    """Return a line of the table."""
+    """Return a line of the table: results of an individual, or means, with one kind of module."""
     return (
         f'{reality:<8} {seed:>4} {kind:<18} {result.before:>7.3f} {result.after:>7.3f} '
         f'{result.control:>8.3f} {result.isolated:>9.2f} {result.named:>6.2f} '

@@ -101,7 +101,7 @@ class Process:
         self.memory: list[tuple[float, float]] = []  # age [s] and resident memory [MB]
 
     def alive(self) -> bool:
-        """Whether the process still runs."""
+        """Return whether the process still runs."""
         return self.process.poll() is None
 
     def look(self) -> None:
@@ -182,7 +182,7 @@ class Attack:
         rclpy.try_shutdown()
 
     def start(self, name: str) -> None:
-        """Start a node."""
+        """Start a node of the attacked system, with the parameters of the bench."""
         self.processes[name] = self.process(name)
         self.levels.pop(name, None)
         self.life += name == 'controller'
@@ -415,7 +415,7 @@ class Attack:
         return self._services
 
     def publish(self, topic: str, kind: str) -> None:
-        """Publish one hostile message."""
+        """Publish one hostile message of the type `kind` on a topic."""
         if topic not in self.publishers:
             # `episode` destroys latching publishers after a burst, and thereby their last message.
             qos = LATCHED if topic.endswith(LATCHING) else OWN
@@ -495,7 +495,7 @@ class Attack:
         self.tried['faults'] += 1
 
     def kill(self) -> None:
-        """Kill a node and restart it."""
+        """Kill a random node of the system and restart it."""
         name = self.rng.choice(NODES)
         self.processes[name].kill()
         self.tried['kills'] += 1

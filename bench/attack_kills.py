@@ -78,10 +78,10 @@ def live(robot: Robot, directory: Path, initial: Path, life: int) -> None:
 
 
 class Child:
-    """One child process and its reports."""
+    """A process that runs a learner, and what it has reported so far."""
 
     def __init__(self, robot: Path, directory: Path, initial: Path, life: int) -> None:
-        """Start the process."""
+        """Start the process, which continues from the state that earlier ones have saved."""
         words = [sys.executable, '-m', 'bench.attack_kills', str(robot), str(directory)]
         words += [str(initial), str(life)]
         self._process = subprocess.Popen(
@@ -102,7 +102,7 @@ class Child:
                     self.up.set()
 
     def kill(self) -> None:
-        """Kill the process by SIGKILL."""
+        """Kill the process by SIGKILL, which gives it no time to save anything."""
         self._process.kill()
         self._process.wait()
         self._reader.join()

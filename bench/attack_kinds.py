@@ -214,15 +214,15 @@ class Scene:
             self.attack.spin(LASTING)
 
     def set(self, node: str, name: str, value: Any) -> None:
-        """Set a parameter."""
+        """Set a parameter of a node, as any program on the graph may."""
         self.attack.call(SetParameters, f'{node}/set_parameters', set_request(name, value))
 
     def pause(self, name: str) -> None:
-        """Suspend a node."""
+        """Suspend the process of a node, so that it no longer reacts to anything."""
         self.attack.processes[name].process.send_signal(signal.SIGSTOP)
 
     def resume(self, name: str) -> None:
-        """Resume a suspended node."""
+        """Resume the suspended process of a node."""
         self.attack.processes[name].process.send_signal(signal.SIGCONT)
 
     def genuine(self, topic: str) -> Any:
@@ -253,30 +253,30 @@ def zeros_unknown_then_false(scene: Scene) -> None:
 
 
 def zeros_false(scene: Scene) -> None:
-    """Publish false length offsets."""
+    """Publish false length offsets in place of those of the estimator."""
     scene.latch('body_state', _body(scene, OFFSET, 1e-3))
 
 
 def zeros_alternating(scene: Scene) -> None:
-    """Publish alternating length offsets."""
+    """Publish length offsets that change their signs again and again."""
     pair = [_body(scene, OFFSET, 1e-3), _body(scene, -OFFSET, 1e-3)]
     scene.latch('body_state', *pair * 10)
 
 
 def isolate_most(scene: Scene) -> None:
-    """Isolate most muscles."""
+    """Publish that most muscles are isolated, so that the controller must not use them."""
     most = range(scene.attack.robot.muscle_count - 1)
     scene.latch('body_state', _body(scene, isolated=most))
 
 
 def isolate_all(scene: Scene) -> None:
-    """Isolate all muscles."""
+    """Publish that all muscles are isolated, so that no muscle can hold the arm."""
     muscles = range(scene.attack.robot.muscle_count)
     scene.latch('body_state', _body(scene, isolated=muscles))
 
 
 def isolate_in_turns(scene: Scene) -> None:
-    """Isolate changing sets of muscles."""
+    """Publish for one muscle after the other that it alone is isolated."""
     each = [_body(scene, isolated=[m]) for m in range(scene.attack.robot.muscle_count)]
     scene.latch('body_state', *each, _body(scene))
 
@@ -463,7 +463,7 @@ def stop_a_verification(scene: Scene) -> None:
 
 
 def random_event(scene: Scene) -> None:
-    """Trigger one random event."""
+    """Trigger one random event: a target, a service, a fault, a suspended node or a false state."""
     attack, rng = scene.attack, scene.rng
     robot = attack.robot
     name = rng.choice(NODES)

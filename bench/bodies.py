@@ -303,7 +303,7 @@ def read_case(text: str, clones: Path | None, cache: Path) -> Case:
 
 
 def main(argv: list[str]) -> None:
-    """Print one line for each case."""
+    """Learn each case that the command line names, and print a line with its errors."""
     parser = Parser('bodies', (__doc__ or '').partition('\n')[0])
     parser.add_argument('cases', nargs='+', metavar='CASE', help='NAME[:COUNT[:DRAW]]')
     parser.add_argument('--clones', type=Path, help='directory with clones of the recordings')

@@ -95,7 +95,7 @@ background() {{ # SCRIPT COMMAND
 
 
 class Command(NamedTuple):
-    """One command of a page."""
+    """One command of a page, and how the bench has to run it."""
 
     line: str
     is_background: bool

@@ -41,7 +41,7 @@ class Result(NamedTuple):
     samples: int  # number of samples that the learner took
 
     def line(self, seed: int) -> str:
-        """Return a line of the table."""
+        """Return the results of the individual `seed` as a line of the table."""
         return (
             f'{seed:>5} {self.seconds:>8.0f} {self.pauses:>7} {self.lost:>8} '
             f'{1000.0 * self.delay:>9.0f} {self.samples:>7}  {self.problem}'

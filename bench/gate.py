@@ -72,7 +72,7 @@ class Spread:
     """The largest value of each measure over networks, and the refused networks."""
 
     def __init__(self) -> None:
-        """Begin without any measured network."""
+        """Start without a measured network."""
         self.most: defaultdict[str, float] = defaultdict(float)
         #: largest d among the ruptured muscles of a network, as a multiple of the detection
         #: threshold; the smallest of these values over all networks

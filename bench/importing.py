@@ -133,7 +133,7 @@ def row(file: Path, out: Path) -> list[str]:
 
 
 def main(argv: list[str]) -> None:
-    """Print the table."""
+    """Import the files that the command line names, and print a row for each."""
     parser = Parser('importing', 'Imports public models that you have downloaded.')
     parser.add_argument(
         'files', nargs='+', type=Path, metavar='FILE', help='model to import as a robot'

@@ -173,7 +173,7 @@ class Body:
         self.end_effectors.append(prefix + 'hand')
 
     def add_neck(self) -> None:
-        """Add a neck and a head."""
+        """Add a neck of three joints, a head, and the twelve tendons of the neck."""
         parts = list(ET.fromstring(NECK))  # noqa: S314
         self.urdf.extend(parts)
         self.joints += [part.get('name', '') for part in parts if part.tag == 'joint']

@@ -306,7 +306,7 @@ def module_fault(kind: str, low: float = 0.0, high: float = 0.0) -> Callable[[La
 
 
 def hot_motor(lab: Lab, rng: Rng) -> Case:
-    """A motor becomes hot."""
+    """A module becomes at least 88 to 100 °C hot, whatever its muscle exerts."""
     _, name = _any(rng, lab.arm.robot.muscles)
     size = rng.uniform(88.0, 100.0)
     lab.arm.set_faults([f'overheat:{name}:{size:.0f}'])
@@ -386,7 +386,7 @@ def bias(value: float, size: float) -> float:
 
 
 def gain(value: float, size: float) -> float:
-    """Return a value times a factor."""
+    """Return a value multiplied by a factor, as an amplifier with a wrong gain would."""
     return value * size
 
 

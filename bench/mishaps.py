@@ -136,7 +136,7 @@ class Course:
     """The course of one mishap: watches statements and tensions, and plays the operator."""
 
     def __init__(self, lab: Lab, mishap: Mishap) -> None:
-        """Prepare a mishap of this laboratory."""
+        """Prepare a mishap, which `play` will let happen in the laboratory."""
         self.lab, self.mishap, self.case = lab, mishap, Case('', lambda _: None)
         self.begun_at = math.inf  # time at which the mishap begins [s]
         self.effect_at: float | None = None  # time of the first effect [s]

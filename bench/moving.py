@@ -75,7 +75,7 @@ def measure(robot: Robot, mae: Mae, reality: str, seed: int, seconds: float) -> 
 
 
 def main(argv: list[str]) -> int:
-    """Print the errors for each individual."""
+    """Record, learn and test each individual, and print its errors."""
     parser = Parser('moving', 'Learns emulated recordings with and without rests.')
     parser.add_robot(default='arm26')
     parser.add_reality()

@@ -338,7 +338,7 @@ def model_rows(
 
 
 def main(argv: list[str]) -> None:
-    """Print the table, row by row."""
+    """Learn the models that the command line names, and print a row for each individual."""
     parser = Parser('mujoco', 'Learns MuJoCo models that you have fetched.')
     text = (
         'name and MJCF file of a model, and the part of it to import: joints=…, muscles=…, '

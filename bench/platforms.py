@@ -74,7 +74,7 @@ class Site:
 
     @property
     def clone(self) -> Path:
-        """The clone of the repository."""
+        """Path of the platform's clone of the repository."""
         return self.folder / 'clone'
 
     @property

@@ -29,7 +29,7 @@ STARTS = 3.0, 1.0
 
 
 def baselines(training: Run, with_effort: bool) -> Iterator[tuple[str, Model]]:
-    """Yield each baseline with its name."""
+    """Yield each model that knows nothing of the robot, with its name in the results."""
     polynomials = [
         partial(polynomial, degree=degree, with_effort=with_effort, ridge=ridge)
         for degree, ridge in product(DEGREES, RIDGES)

@@ -85,7 +85,7 @@ class Body(Protocol):
 
     @property
     def name(self) -> str:
-        """Name of the robot."""
+        """Name of the recorded robot, which its URDF states."""
 
     def write(self, directory: Path, tension_source: str = 'none') -> Path:
         """Write the robot directory and return its path."""
@@ -123,7 +123,7 @@ class SoftLink:
 
 @dataclass(frozen=True)
 class Recording:
-    """The runs of a repository."""
+    """All runs that one repository contains, and the robot that was recorded."""
 
     link: Body
     runs: list[Run]
@@ -131,7 +131,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Repository:
-    """A public repository with recordings."""
+    """A public repository with recordings of a robot, and how to read it."""
 
     name: str  # name of the repository on GitHub: OWNER/NAME
     recording: str  # name of the link; the results are stored under it
@@ -141,7 +141,7 @@ class Repository:
 
 
 class Files:
-    """The files of a clone."""
+    """The files of a clone, read from its working tree or from git."""
 
     def __init__(self, path: Path) -> None:
         """Open a working tree or a git directory.

@@ -42,7 +42,7 @@ class Scaling:
         self._mean, self._spread = inputs.mean(axis=0)[self._varies], spread[self._varies]
 
     def __call__(self, inputs: Array) -> Array:
-        """Return scaled inputs."""
+        """Return inputs (N, K), scaled like the training inputs."""
         scaled: Array = (inputs[:, self._varies] - self._mean) / self._spread
         return scaled
 

@@ -177,7 +177,7 @@ def run(bodies: list[str], minutes: float, out: Path) -> None:
 
 
 def main(argv: list[str]) -> None:
-    """Run the bench."""
+    """Measure the bodies that the command line names, and print the table."""
     parser = Parser('scaling', 'Measures accuracy, time and memory over the size of the body.')
     text = f'bodies to measure, of {", ".join((SMALLEST, *BODIES))}'
     parser.add_argument('--bodies', type=names, default=[SMALLEST, *BODIES], help=text)

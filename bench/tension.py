@@ -144,7 +144,7 @@ def go(arm: Arm, initial: Mae, seed: int, method: str, targets: int) -> tuple[Ex
 
 
 def line(seed: int, what: str, excess: Excess, stops: int, rest: str = '') -> str:
-    """Return a line of the table."""
+    """Return a line of the table: what an individual did, and how far it exceeded its limits."""
     return (
         f'{seed:>5} {what:<12} {excess.highest:>9.3f} {excess.longest:>8.2f} '
         f'{excess.allowed:>7.2f} {excess.limit:>7.2f} {stops:>5}{rest}'

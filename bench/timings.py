@@ -427,7 +427,7 @@ def measure(robot: Robot, preset: str, device: str | None = None) -> list[Timed]
 
 
 def show(robot: Robot, preset: str, device: str | None = None) -> None:
-    """Print the table."""
+    """Measure all steps, and print the table of their times."""
     name = robot.description.directory.name
     print(f'{name}, preset {preset}: median time of one call [µs]; torch uses one thread')
     print(f'{"":<64}{"ours":>10}{"torch eager":>14}{"bound":>10}')

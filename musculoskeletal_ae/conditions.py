@@ -39,7 +39,7 @@ class Action(IntEnum):
 
 
 class Clears(Enum):
-    """How a stop ends."""
+    """How a stop may end: by itself, by a verification, or only by a reset."""
 
     #: auto-recoverable until the arm is released; afterwards only by a reset
     CONDITION = 'when the condition clears within hold_time, else on controller/reset'
@@ -89,7 +89,7 @@ class Revokes(Enum):
 
 
 class Declaration(NamedTuple):
-    """Declaration of a kind of condition."""
+    """Declaration of a kind of condition: its texts for users, its remedy and its consequences."""
 
     identifier: str  # stable name, by which programs recognise the kind
     owner: str  # names of the nodes that report the kind

@@ -156,7 +156,7 @@ class RightSides(NamedTuple):
 
 
 class SolvedStep(NamedTuple):
-    """A solution of the normal equations."""
+    """A step of the unknowns that solves the normal equations."""
 
     samples: Array  # step Δθ of the unknowns of single samples, (N, D)
     common: Array  # step Δw of the shared unknowns, (P,)
@@ -236,7 +236,7 @@ class Problem(Protocol[Point]):
         ...
 
     def moved(self, point: Point, step: SolvedStep) -> Point:
-        """Return the point after a step."""
+        """Return the point that is reached from `point` by a step."""
         ...
 
 

@@ -15,7 +15,7 @@ from numba.experimental import structref
 
 @structref.register
 class HandleType(types.StructRef):  # type: ignore[misc]
-    """The numba type of a `Handle`."""
+    """The type by which numba recognises a `Handle` in compiled code."""
 
 
 class Handle(structref.StructRefProxy):  # type: ignore[misc]

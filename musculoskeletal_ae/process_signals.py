@@ -23,7 +23,7 @@ GRACE = 2
 
 
 class Reaction(Enum):
-    """Effect of a stop signal."""
+    """What a process does when it receives a stop signal (SIGINT or SIGTERM)."""
 
     #: End the process at once. Used during imports, because extension modules turn a
     #: KeyboardInterrupt during their initialisation into other errors.

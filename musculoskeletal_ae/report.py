@@ -34,7 +34,7 @@ class Report(NamedTuple):
 
     @property
     def level(self) -> Level:
-        """Level of the most urgent condition."""
+        """Level of the most urgent condition; 'ok' if no condition is present."""
         return worst(self.conditions)
 
     @property

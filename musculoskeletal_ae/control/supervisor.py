@@ -116,7 +116,7 @@ class Supervisor:
 
     @property
     def is_latched(self) -> bool:
-        """Whether the stop is latched."""
+        """Whether the arm is in a latched stop, which only a reset or a verification ends."""
         return self.state in (StopState.STOPPED, StopState.VERIFYING, StopState.RESUMING)
 
     @property

@@ -163,7 +163,7 @@ class Listening:
             self._read.append((states[: len(Row)], len(self._angles_read)))
 
     def joints(self, message: object) -> None:
-        """Record a message of joint_states."""
+        """Record a message of joint_states, whose angles are then compared with the lengths."""
         with self._rejecting('joint_states'):
             self._not_finite.update(joints_not_finite(message, self._robot.joints))
             theta = read_posture(message, self._robot.units, some=True)

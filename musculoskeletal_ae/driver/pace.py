@@ -46,7 +46,7 @@ class Pace:
 
     @property
     def count(self) -> int:
-        """Number of messages."""
+        """Number of messages that were received so far."""
         return len(self._messages)
 
     def message(self, came: float, sent: float, number: int) -> None:

@@ -27,7 +27,7 @@ BURST_TIME, BURST_PAUSE = 0.3, 3.0  # let bursts and the pauses before them last
 
 
 class FaultKind(NamedTuple):
-    """Properties of a kind of fault."""
+    """What a kind of fault does, and which sizes, muscles and quantities its line may state."""
 
     meaning: str
     size: float = 0.0  # size of the fault if its line states none, in the unit `unit`
@@ -74,7 +74,7 @@ LEGAL = 'KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]; kinds: ' + ', '.join(KINDS)
 
 
 class Readings(NamedTuple):
-    """One sample of the arm's sensors."""
+    """What all sensors of an arm read at one moment."""
 
     theta: Array  # joint angles [rad], (D,)
     length: Array  # muscle lengths [m], (M,)
@@ -96,7 +96,7 @@ SENSED = tuple(quantity.name for quantity in QUANTITIES if quantity.name in SIZE
 
 
 class EmulatedFault(NamedTuple):
-    """One fault, parsed from a line."""
+    """One fault, as a line describes it: its kind, the parts that it affects, and its size."""
 
     kind: str
     quantities: tuple[str, ...]
@@ -163,7 +163,7 @@ def read_fault(line: str, robot: Robot) -> EmulatedFault:
 
 
 class Faults:
-    """All active faults of one arm."""
+    """All active faults of one arm; changes the readings of its sensors accordingly."""
 
     def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
         """Start without faults."""

@@ -18,7 +18,7 @@ LEGAL = f'joints, marker[:RATE] (above 0 to {HIGHEST_RATE:g} Hz) and imu:LINK, e
 
 
 class Sensors(NamedTuple):
-    """The sensors of an emulated arm."""
+    """The sensors that an emulated arm has besides those of its muscle modules."""
 
     joints: bool = False  # whether there are joint sensors
     marker_rate: float = 0.0  # rate of the marker's pose [Hz]; 0: there is no marker

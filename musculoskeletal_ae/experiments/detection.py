@@ -144,7 +144,7 @@ def grasp_and_release(arm: Arm, time: float) -> None:
 
 
 class DetectorOutput(NamedTuple):
-    """The detector's outputs for N messages."""
+    """What estimator and detector report for each of N messages."""
 
     theta: Array  # estimated joint angles θ [rad], (N, D)
     anomaly: Array  # anomaly A [scaled units], (N,)

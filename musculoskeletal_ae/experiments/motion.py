@@ -173,7 +173,7 @@ def follow(
 
 
 class Approach(NamedTuple):
-    """How the arm approached one target."""
+    """How fast, and how closely, the arm approached one target of `proposed`."""
 
     #: time until the arm stays within WITHIN of the target, at most SETTLING_TIME [s]
     settling: float

@@ -96,7 +96,7 @@ class About(Strict, frozen=True):
 
 
 class Plot(Strict, frozen=True):
-    """A plot file beside result.json."""
+    """A picture beside result.json, with the caption that the report shows."""
 
     file: str
     caption: str

@@ -95,7 +95,7 @@ class AdaptedModel:
         compiler.set('texturedir', str(folder / spec.compiler.texturedir))
 
     def text(self) -> str:
-        """Return the text of the file."""
+        """Return the adapted model as the text of an MJCF file."""
         self.root.insert(0, ET.Comment(NOTE))
         ET.indent(self.root)
         return ET.tostring(self.root, encoding='unicode') + '\n'

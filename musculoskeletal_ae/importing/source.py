@@ -59,7 +59,7 @@ Lengths = Callable[[dict[str, Array]], dict[str, Array]]
 
 
 class SourceError(MusculoskeletalError):
-    """A file that cannot be imported."""
+    """A file cannot be imported; the text names the file, the problem and the legal values."""
 
 
 def refuse(file: Path, problem: str) -> SourceError:

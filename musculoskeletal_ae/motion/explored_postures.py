@@ -36,7 +36,7 @@ PRESSES = 10  # draw this many random T_const, and use the one that presses most
 
 
 class ExplorationStep(NamedTuple):
-    """One step of the exploration."""
+    """One step of the exploration: a target posture, and the command that leads to it."""
 
     method: str  # length method of the preset: 'first' or 'second'
     theta: Array  # target posture θ_target [rad], (D,)

@@ -202,7 +202,7 @@ class RampedTarget(ActivityControl):
         self.ramps.pursue(self._goals())
 
     def step(self, inputs: Inputs) -> Command | None:
-        """Return the next command."""
+        """Advance by one control step and return the next length command."""
         return self.ramps.step(inputs)
 
     def leave(self) -> None:

@@ -59,7 +59,7 @@ def nodes_in_graph(node: RosNode) -> set[str]:
 
 
 class NodeReport(NamedTuple):
-    """The last report of one node."""
+    """What a node has last reported on /diagnostics."""
 
     values: dict[str, str]  # its values, by name
     conditions: tuple[Condition, ...]
@@ -223,12 +223,12 @@ class Situation:
 
     @property
     def is_stopped(self) -> bool:
-        """Whether the controller is stopped."""
+        """Whether the controller reports that it is stopped."""
         return self.values('controller').get('mode') == StopState.STOPPED.value
 
     @property
     def has_learner(self) -> bool:
-        """Whether a learner has reported."""
+        """Whether a learner has reported, so that the arm may learn."""
         return 'learner' in self._reports
 
     def number(self, node: str, key: str) -> float:

@@ -434,7 +434,7 @@ class PositionControl(Actuation):
         return LENGTH, self.length_for(length, measured, goal)
 
     def unchanging_length(self, length: Array, tension: Array) -> Array:  # noqa: ARG002
-        """Return the present lengths [m], (M,)."""
+        """Return the present lengths [m], (M,), which position-controlled modules hold."""
         return length.copy()
 
     def present_tension(self, length: Array, command: Array, tension: Array) -> Array:  # noqa: ARG002
@@ -442,7 +442,7 @@ class PositionControl(Actuation):
         return np.maximum(tension, self._bias)
 
     def is_pulling(self, length: Array, command: Array) -> Bools:  # noqa: ARG002
-        """Return True for every module, (M,)."""
+        """Return True for every module, (M,), because each follows its target length."""
         return np.ones(np.shape(length), dtype=bool)
 
     def tension_of_lag(self, lag: float, speed: Array) -> Array:  # noqa: ARG002

@@ -70,7 +70,7 @@ BY_CURRENT = (
 
 
 class RoutePoint(NamedTuple):
-    """A via point of the tendon."""
+    """A point of a link through which a tendon runs."""
 
     link: str
     xyz: Array  # position in the link's frame [m], (3,)

@@ -71,13 +71,13 @@ CONSTANTS = {
 
 
 class MotorEntry(Constants, frozen=True):
-    """The motor of one muscle."""
+    """The entry of motors.yaml that describes the motor of one muscle."""
 
     joint: Name | UnsetType = UNSET  # joint of ros2_control; by default, the name of the muscle
 
 
 class MotorFile(Constants, frozen=True, kw_only=True):
-    """The content of motors.yaml."""
+    """The content of motors.yaml: topics, common constants, and the motor of each muscle."""
 
     state_topic: Name
     command_topic: Name | None = None
@@ -88,7 +88,7 @@ class MotorFile(Constants, frozen=True, kw_only=True):
     )
 
     def __post_init__(self) -> None:
-        """Check the names of the topics."""
+        """Check that the topics have legal names."""
         super().__post_init__()
         for key, name in (('state_topic', self.state_topic), ('command_topic', self.command_topic)):
             if name is not None and not TOPIC_NAME.fullmatch(name):

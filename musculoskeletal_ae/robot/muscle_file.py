@@ -203,7 +203,7 @@ class PassiveTendonEntry(Strict, frozen=True):
 
 
 class MuscleFile(Strict, frozen=True):
-    """The content of muscles.yaml."""
+    """The content of muscles.yaml: joints, muscles, and constants that all muscles share."""
 
     joints: Names
     muscles: Annotated[tuple[MuscleEntry, ...], Meta(min_length=1, max_length=LONGEST_LIST)]

@@ -44,7 +44,7 @@ class PassiveTendons:
 
     @classmethod
     def none(cls, joint_count: int) -> PassiveTendons:
-        """Return no passive tendons."""
+        """Return the passive tendons of a robot that has none."""
         powers, first = np.zeros((0, joint_count), np.int64), np.zeros(1, np.int64)
         centre = np.zeros(joint_count)
         return cls((), Passive(centre, powers, np.zeros(0), first, np.zeros((0, 3))))

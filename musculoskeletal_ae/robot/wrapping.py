@@ -195,19 +195,19 @@ def _round(a: complex, b: complex, r: float, side: complex) -> tuple[bool, float
 
 @njit(cache=True)
 def dot(a: Vector, b: Vector) -> float:
-    """Return a · b."""
+    """Return the dot product a · b of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @njit(cache=True)
 def cross(a: Vector, b: Vector) -> Vector:
-    """Return a × b."""
+    """Return the cross product a × b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @njit(cache=True)
 def plus(a: Vector, b: Vector, scale: float = 1.0) -> Vector:
-    """Return a + scale · b."""
+    """Return the vector a + scale · b."""
     return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]
 
 

@@ -53,7 +53,7 @@ class NeededTopics:
         self._expected_rates[topic] = rate
 
     def remove(self, topic: str) -> None:
-        """Stop reporting a topic."""
+        """Remove a topic, which is then no longer reported as missing, silent or slow."""
         self._topics = [other for other in self._topics if other != topic]
 
     def check_rates(self) -> None:

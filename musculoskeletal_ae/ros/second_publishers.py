@@ -72,7 +72,7 @@ NAMELESS = 'a node that has not announced its name yet'
 
 
 class Publisher(NamedTuple):
-    """One publisher in the ROS graph."""
+    """One publisher of a topic, as the ROS graph shows it."""
 
     node: str  # full name, or NAMELESS
     identity: bytes

@@ -219,7 +219,7 @@ def _record(options: Namespace, arguments: list[str]) -> int:
 
 
 def parse(arguments: list[str]) -> Namespace:
-    """Return the options of `record`."""
+    """Parse the command line of `record`, and return its options."""
     what = 'Records the topics of this package to a bag that `ros2 bag` can read. Ctrl-C ends it. '
     parser = Parser('record', what + ROS_HELP)
     add = parser.add_argument

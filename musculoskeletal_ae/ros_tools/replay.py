@@ -376,7 +376,7 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
 
 
 def parse(arguments: list[str]) -> Namespace:
-    """Return the options of `replay`."""
+    """Parse the command line of `replay`, and return its options."""
     parser = Parser(
         'replay',
         'Plays a recorded bag onto the topics, with the recorded spacing. ' + ROS_HELP,

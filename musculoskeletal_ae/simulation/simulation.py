@@ -44,7 +44,7 @@ TENSION_MARGIN = 1.0  # let `limits` name a muscle that is nearer to T_max than 
 
 
 class Simulation:
-    """N simulated arms of one robot."""
+    """Simulates N arms with the learned body of one robot, in compiled code."""
 
     mae: Mae  # the learned body
     state: ArmState  # the arms now; assign an earlier state to return to it

@@ -187,7 +187,7 @@ class Page:
             self.controls.offer(nodes, explores)
 
     def follow(self, payload: float, played: Sequence[float] | None) -> None:
-        """Update the controls; see `Controls.follow`."""
+        """Update the sliders from the payload [kg] and the replay; see `Controls.follow`."""
         if self.controls is not None:
             self.controls.follow(self.scene.posture.get('estimated'), payload, played)
 
