@@ -98,7 +98,8 @@ class Process:
         with log.open('ab') as stream:
             self.process = subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT)
         self.started = time.monotonic()
-        self.memory: list[tuple[float, float]] = []  # age [s] and resident memory [MB]
+        #: resident memory of the process over time: age [s] and memory [MB]
+        self.memory: list[tuple[float, float]] = []
 
     def alive(self) -> bool:
         """Return whether the process still runs."""
@@ -138,11 +139,13 @@ class Attack:
         self.processes: dict[str, Process] = {}
         self.publishers: dict[str, Any] = {}
         self.clients: dict[str, Any] = {}
-        self.sent: set[int] = set()  # digests of the hostile messages
+        #: digests of the hostile messages, by which they are told from genuine ones
+        self.sent: set[int] = set()
         self.genuine: dict[str, Any] = {}  # last message that the system itself sent, by topic
         self.commands: list[Command] = []
         self.life = 0
-        self.loads: list[tuple[float, Array]] = []  # time [s] and measured T [N] (M,)
+        #: measured tensions T over time: time [s] and T [N] (M,)
+        self.loads: list[tuple[float, Array]] = []
         self.levels: dict[str, tuple[float, DiagnosticStatus]] = {}
         self.silences: dict[str, float] = {}  # longest time between two reports of a node [s]
         self.tried: Counter[str] = Counter()
@@ -152,7 +155,8 @@ class Attack:
         self.status: list[
             tuple[float, str, str]
         ] = []  # time [s], level and text of the status line
-        self.modes: list[tuple[float, str]] = []  # time [s], mode of the controller
+        #: mode of the controller over time: time [s] and mode
+        self.modes: list[tuple[float, str]] = []
         self.foreign: list[
             tuple[float, float]
         ] = []  # intervals in which other nodes may send commands [s]

@@ -194,9 +194,9 @@ class Lab:
         self.controller = Controller(robot, seed=EXPLORATION_STREAM + seed)
         self.learner = Learner(robot, initial, seed=seed, steps=STEPS, trainer=Seldom)
         self._connect_networks()
-        self.rejected_networks: list[str] = []  # why the estimator rejected networks
+        self.rejected_networks: list[str] = []  # reasons for which the estimator rejected networks
         self._candidate: Mae | None = None  # newest network that the learner published
-        #: reliable messages that wait for controller and learner, and estimates and command
+        #: reliable messages that wait for the controller until it runs
         self._to_controller: list[Callable[[], object]] = []
         self._to_learner: list[Callable[[], object]] = []
         self._estimates: list[Array] = []

@@ -147,7 +147,8 @@ class Course:
         self.mended_at: float | None = None
         self.is_found_by_advice = False
         self.false: dict[str, dict[str, Any]] = {}  # the first of each false statement
-        self.later: dict[str, str] = {}  # statements after the mending
+        #: false statements that came only after the fault was mended
+        self.later: dict[str, str] = {}
         self.stated: dict[str, Any] = {}  # all different statements, with time and judgement
         self.taken: list[str] = []  # steps that the operator took, and refusals
         self.peak = 0.0  # highest tension, in multiples of tension.limit

@@ -30,7 +30,8 @@ INITIAL_STEPS, STEPS, UPDATES = 1000, 400, 8
 #: efforts in the training data. Tensions are proportional to efforts.
 STRONG = 40.0
 
-Model = Callable[[Run], Array]  # returns θ [rad], (N, D)
+#: a model: returns the estimated θ [rad], (N, D), of the N rows of a run
+Model = Callable[[Run], Array]
 
 
 def error(model: Model, run: Run) -> float:

@@ -157,7 +157,7 @@ def _named(estimator: Estimator, text: str) -> set[int]:
 class Case(NamedTuple):
     """One restart of a driver, with what has changed in it."""
 
-    what: str  # 'exchange', 'sign' or 'healthy'
+    what: str  # what changes in the driver: 'exchange', 'sign' or 'healthy'
     wiring: Wiring
     has_sensors: bool
 

@@ -27,8 +27,9 @@ class Activity(Enum):
     MOVING = 'moving'  # the arm follows a trajectory
     EXPLORING = 'exploring'
     CALIBRATING = 'calibrating'  # exploring gently while the length offsets are unknown
-    TORQUE = 'torque'  # commanding tensions (method `tension`)
-    GRAVITY_COMPENSATION = 'gravity_compensation'  # hand guiding (method `float`)
+    TORQUE = 'torque'  # the arm is controlled by commanded tensions (method `tension`)
+    #: the arm is guided by hand, and only its weight is compensated (method `float`)
+    GRAVITY_COMPENSATION = 'gravity_compensation'
 
 
 class StopState(Enum):
@@ -36,7 +37,7 @@ class StopState(Enum):
 
     RUNNING = 'running'
     PAUSED = 'paused'  # stopped by an auto-recoverable cause
-    STOPPED = 'stopped'  # stopped until a reset or a verification
+    STOPPED = 'stopped'  # stopped until a reset, or until the verification of a suspect begins
     VERIFYING = 'verifying'  # stopped; a suspect muscle is wound in
     RESUMING = 'resuming'  # the suspect is verified; the arm continues once no cause is present
 
@@ -102,7 +103,7 @@ class Supervisor:
         self.condition: Condition | None = None
         #: the latching causes since the stop began, with their newest details
         self._causes: dict[ConditionKind, Condition] = {}
-        self._clear_for = 0.0  # time without a cause [s]
+        self._clear_for = 0.0  # time for which no cause of the stop has been present [s]
 
     @property
     def mode(self) -> str:

@@ -110,7 +110,8 @@ class Overload:
         #: time of sending of the message with which each muscle's overload began [s]; ∞ without an
         #: overload
         self._since: Array = np.full(robot.muscle_count, math.inf)
-        self._received_at = self._sent_at = -math.inf  # times of the newest message [s]
+        #: times of reception and of sending of the newest message [s]
+        self._received_at = self._sent_at = -math.inf
 
     def take(self, tension: Array, now: float, delay: float) -> None:
         """Record which filtered tensions of a message exceed the permitted level.

@@ -54,7 +54,8 @@ USUAL = 10.0, 60.0
 #: T is in another unit if all muscles, converted from that unit to N, are within this fraction of
 #: T_bias
 UNIT_TOLERANCE = 0.3
-TENSION_UNITS = {'kgf': 9.80665, 'lbf': 4.44822, 'kN': 1000.0}  # other units of tension [N]
+#: units in which a driver may publish tensions by mistake, each in newtons
+TENSION_UNITS = {'kgf': 9.80665, 'lbf': 4.44822, 'kN': 1000.0}
 #: doubt the unit of a higher temperature of modules without commands [°C]; modules above 13 °C
 #: exceed this value if their temperature is published in °F
 HOTTEST_AT_REST = 55.0
@@ -122,7 +123,8 @@ class Listening:
         #: times [s] of the joint messages, which are those of the muscles before them, and θ (D,)
         self._angles_read: list[tuple[float, Array]] = []
         self._now = 0.0  # time of the newest message of the muscles [s]
-        self._rejected: dict[tuple[str, str], list[MessageError]] = {}  # by topic and reason
+        #: errors of the rejected messages, by topic and reason
+        self._rejected: dict[tuple[str, str], list[MessageError]] = {}
         #: lowest and highest possible values of each quantity, (Q, M)
         self._low, self._high = (each[: len(Row)] for each in possible_readings(robot))
         (low, high), beyond = length_range(robot), BEYOND[not zeroed]

@@ -24,7 +24,7 @@ from musculoskeletal_ae.signals.wiring import WiringJudgement
 
 #: time for paying out a released muscle, and for settling after a target has moved back [s]
 RELEASE = 0.6
-MEAN = 0.3  # average readings over this time [s]
+MEAN = 0.3  # average the readings of the last part of a wait, of this duration [s]
 SETTLE = 1.5  # give the arm this time to come to rest after a motion [s]
 HOLD = 0.5  # judge the response to a command after holding it for this time [s]
 SPEED = 0.01  # move a target further inwards at this speed [m/s]
@@ -39,7 +39,8 @@ LATEST = 0.1  # report a longer time from a command to the first response [s]
 LONGEST_ADVANCE = 0.05
 RESPONSE = 4.0, 0.0006  # count changes of T [N] and l [m] above noise by this as a response
 
-Wait = Generator[None, None, None]  # each step takes one message
+#: a part of a test that takes time; each of its steps takes one message
+Wait = Generator[None, None, None]
 
 
 class RunAwayError(Exception):
@@ -81,7 +82,8 @@ class MotionTest(ABC):
         self._is_verified: Bools = np.zeros(robot.muscle_count, dtype=bool)
         self._now = 0.0
         self._recent: deque[tuple[float, Array]] = deque()
-        self._target: Array = np.full(robot.muscle_count, np.nan)  # NaN before l is known
+        #: target lengths of the muscles [m], (M,); NaN before l is known
+        self._target: Array = np.full(robot.muscle_count, np.nan)
         #: last time at which each muscle was within its limits [s]
         self._tame_at: Array = np.zeros(robot.muscle_count)
         #: θ (D,), states (3, M) and tested muscle of each message, −1 while the arm is held

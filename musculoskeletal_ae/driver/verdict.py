@@ -51,7 +51,7 @@ class Fault(NamedTuple):
     muscles: tuple[int, ...]  # indices of the affected muscles; all for a fault of the whole driver
     observation: str
     change: str  # what to change in the driver
-    name: str  # its name in FAULTS
+    name: str  # name of the fault in FAULTS
 
     @property
     def is_of_joints(self) -> bool:

@@ -441,7 +441,8 @@ class Winding(MotionTest):
 
     def _try(self, m: int) -> Wait:
         robot, verdict, home = self._robot, self.verdict, self._mean()
-        half, whole = list[float](), list[float]()  # times to the response [s]
+        #: times to the response, for half and for the whole demand [s]
+        half, whole = list[float](), list[float]()
         # The demand at home may exceed T_bias, because the muscle carries the arm's weight.
         rise = (self._highest - self._bias)[m]
         self._most = self._highest.copy()

@@ -50,19 +50,22 @@ POSITION_LAG = 0.02  # let a position-controlled module follow with this time co
 AMBIENT = 25.0  # temperature of the surroundings, to which all modules cool down [°C]
 LOSS = 20.0  # heat that a motor produces at T_limit [W]
 WINDING_CAPACITY, HOUSING_CAPACITY = 20.0, 150.0  # heat capacities of an average module [J/K]
-WINDING_RESISTANCE, HOUSING_RESISTANCE = 1.0, 3.0  # thermal resistances of that module [K/W]
+#: thermal resistances of winding and housing of an average module [K/W]
+WINDING_RESISTANCE, HOUSING_RESISTANCE = 1.0, 3.0
 #: draw LOSS, capacities and resistances with this standard deviation of their logarithms
 HEAT_SPREAD = 0.15
 
 # Sensors. The values are chosen by hand. Each reading gets noise of this standard deviation, and is
 # rounded to this resolution, a power of two as of an A/D converter.
-ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # of joint angles [rad]
-LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # of muscle lengths [m]
-TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # of tensions [N]
+ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # noise and resolution of joint angles [rad]
+LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # noise and resolution of muscle lengths [m]
+TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # noise and resolution of tensions [N]
 #: limit the noise of a tension sensor to this share of T_bias: sensors of weak muscles are finer
 TENSION_NOISE_SHARE = 0.1
-TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3  # of housing temperatures [°C]
-CURRENT_NOISE, CURRENT_RESOLUTION = 1.0, 2.0**-3  # of a motor current, as a tension [N]
+#: noise and resolution of housing temperatures [°C]
+TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3
+#: noise and resolution of a motor current, expressed as a tension [N]
+CURRENT_NOISE, CURRENT_RESOLUTION = 1.0, 2.0**-3
 #: draw errors of a motor current as a measure of tension: standard deviation of the scale's
 #: logarithm, standard deviation of the offset [N], and mean drive friction as a share of T_limit
 CURRENT_SCALE, CURRENT_ZERO, DRIVE_FRICTION = 0.15, 5.0, 0.1
@@ -87,11 +90,11 @@ class Modules(NamedTuple):
     length_low: Array  # shortest motor-side length that the motor can reach [m]
     length_high: Array  # longest motor-side length that the motor can reach [m]
     stiffness: Array  # K of muscle stiffness control [N/m]
-    follows_position: Array  # 1 for position-controlled modules
+    follows_position: Array  # 1 for a position-controlled module, 0 for muscle stiffness control
     speed: Array  # largest speed at which the module can wind [m/s]
     tension_bias: Array  # tension bias T_bias [N]
     tension_max: Array  # tension maximum T_max [N]
-    loss: Array  # heat per squared tension k [W/N²]
+    loss: Array  # heat per squared tension, k [W/N²]
     winding_capacity: Array  # heat capacity C₁ of the winding [J/K]
     housing_capacity: Array  # heat capacity C₂ of the housing [J/K]
     winding_resistance: Array  # thermal resistance R₁ between winding and housing [K/W]
@@ -103,10 +106,10 @@ class Command(NamedTuple):
 
     value: Array  # target lengths [m] or tensions [N]
     length_error: Array  # reading of the length sensor minus the true l [m]
-    stuck: Array  # relative loss of motor speed
+    stuck: Array  # share of its speed that each motor loses; 1 for a jammed one
     slack: Array  # excess length of the tendon [m]
     zero: Array  # additional offset of the length sensor [m]
-    hot: Array  # minimum temperature of the housing [°C]
+    hot: Array  # lowest temperature of each housing that a fault imposes [°C]
     ceiling: Array  # highest reading of the tension sensor [N]
 
 

@@ -72,7 +72,7 @@ DURATIONS = Durations(5.0, 8.0, 5.0, 2.0)
 class Approaches(NamedTuple):
     """Results of approaching P targets from S starts each, with every control method."""
 
-    target: Array  # θ_eval [rad], (P, D)
+    target: Array  # target postures θ_eval [rad], (P, D)
     bound: Array  # least ‖T‖ with which the true body holds each target [N], (P,)
     offset: dict[str, Array]  # θ − θ_eval at the end of each approach [rad], (P, S, D)
     tension: dict[str, Array]  # ‖T‖ at the end of each approach [N], (P, S)

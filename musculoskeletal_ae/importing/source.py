@@ -76,7 +76,7 @@ class Spring(NamedTuple):
     shares: dict[str, float]  # share of each joint's position in x, by joint
     stiffness: float  # spring constant k [N·m/rad]
     rest: float  # value x_0 of x at which the spring exerts no torque [rad]
-    name: str  # name in the source
+    name: str  # name of the spring in the source
 
 
 class PassiveTendon(NamedTuple):
@@ -87,7 +87,8 @@ class PassiveTendon(NamedTuple):
 
     name: str
     stiffness: float  # spring constant k [N/m]
-    slack: tuple[float, float]  # x_low and x_high [m]
+    #: lengths x_low and x_high between which the tendon exerts no force [m]
+    slack: tuple[float, float]
     damping: float  # damping d of the tendon's length [N·s/m]
 
 
@@ -97,7 +98,7 @@ class Source:
 
     name: str
     model: pin.Model = field(default_factory=pin.Model)
-    links: list[str] = field(default_factory=list)  # the root comes first
+    links: list[str] = field(default_factory=list)  # names of the links; the root comes first
     rest: dict[str, float] = field(default_factory=dict)  # rest positions of joints; 0 if missing
     fixed: list[str] = field(default_factory=list)  # joints that are fixed in the source
     couplings: dict[str, Coupling] = field(default_factory=dict)

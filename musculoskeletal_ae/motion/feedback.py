@@ -22,8 +22,9 @@ CORRECTION = 0.3  # correct no joint by more than this [rad], because the estima
 DEADBAND = 0.03
 #: compute which tension is needless at intervals of at least this [s]
 RELIEF_INTERVAL = 0.1
-PROPORTIONAL = 0.7  # proportional gain k_p in motion
-INTEGRAL = 4.0  # integral gain k_i in motion [1/s]
+#: gain k_p of the feedback in motion: shift of the desired posture per posture error
+PROPORTIONAL = 0.7
+INTEGRAL = 4.0  # gain k_i of the feedback in motion, which removes lasting posture errors [1/s]
 #: count the arm as resting once the feedback in motion has been off for this time [s]
 SETTLING = 0.5
 

@@ -66,8 +66,8 @@ HELD_BACK = 1e-4
 class HeldPosture(NamedTuple):
     """The plan with which the follower holds the end of a trajectory; it is computed only once."""
 
-    length: Array  # l_target without feedback [m], (M,)
-    jacobian: Array  # G [m/rad], (M, D)
+    length: Array  # length command l_target without feedback [m], (M,)
+    jacobian: Array  # muscle Jacobian G at the end of the trajectory [m/rad], (M, D)
 
 
 class Follower(ActivityControl):

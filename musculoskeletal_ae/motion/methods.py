@@ -142,8 +142,8 @@ def proposed(
 class StiffnessModel(NamedTuple):
     """How the joint stiffness around one posture depends on the tensions, by the network."""
 
-    jacobian: Array  # G [m/rad], (M, D)
-    hessian: Array  # ∂²l/∂θ² [m/rad²], (M, D, D)
+    jacobian: Array  # muscle Jacobian G [m/rad], (M, D)
+    hessian: Array  # second derivatives ∂²l/∂θ² of the lengths [m/rad²], (M, D, D)
     compliance: Array  # ∂L_e/∂T [m/N] as polynomials of T, highest power first, (3, M)
     module: Array  # stiffness K_stiff of the modules [N/m], (M,)
     springs: Array  # stiffness of springs and passive tendons [N·m/rad], (D, D)

@@ -33,8 +33,8 @@ from musculoskeletal_ae.robot.robot import Robot
 # comes to rest and provides a rest sample.
 RAMP_SHARE = 0.6
 PEAK = 1.5  # peak speed of a ramp, as a multiple of its mean speed
-FIRST = 'first'  # the method that uses T_const
-SECOND = 'second'  # the method that uses the measured T
+FIRST = 'first'  # name of the length method that uses the given tension T_const
+SECOND = 'second'  # name of the length method that uses the measured tension T
 
 
 class Ramp:
@@ -181,7 +181,8 @@ class RampedTarget(ActivityControl):
 
     def __init__(self, ramps: LengthRamps, robot: Robot, settings: Settings) -> None:
         self.ramps = ramps
-        self._target: tuple[Array, Array] | None = None  # θ [rad] and effort [N·m], (D,) each
+        #: target posture θ [rad] and additional torque [N·m], (D,) each
+        self._target: tuple[Array, Array] | None = None
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:

@@ -40,7 +40,8 @@ class TorqueControl(ActivityControl):
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self._missing_torque: Array = np.zeros(robot.joint_count)
-        self._target: tuple[Array, Array] | None = None  # θ [rad] and effort [N·m], (D,) each
+        #: target posture θ [rad] and additional torque [N·m], (D,) each
+        self._target: tuple[Array, Array] | None = None
         self._command: Array = robot.tension.bias  # last tension command [N], (M,)
         self._smooth: Array | None = None  # low-pass-filtered θ [rad], (D,)
         self.use(robot, settings)

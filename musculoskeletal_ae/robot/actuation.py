@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.robot.robot import Robot
 
 Choice = TypeVar('Choice')
-Kinded = tuple[str, Array]  # kind and value of a command
+#: a command: its kind (LENGTH or TENSION), and target lengths [m] or tensions [N]
+Kinded = tuple[str, Array]
 
 LENGTH, TENSION = 'length', 'tension'  # kinds of commands: target lengths, or target tensions
 

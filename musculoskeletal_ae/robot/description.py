@@ -137,7 +137,7 @@ class RobotDescription:
 
     directory: Path
     urdf: str
-    model: pin.Model  # model of the whole URDF
+    model: pin.Model  # pinocchio's model of the whole URDF
     joints: tuple[str, ...]  # names of the joints, in the order of θ
     muscles: tuple[str, ...]  # names of the muscles, in the order of T and l
     routes: tuple[Route, ...]  # one route for each muscle

@@ -37,8 +37,8 @@ class Posture(NamedTuple):
     """A solution of the inverse kinematics, with its remaining errors."""
 
     theta: Array  # joint angles θ of the solution [rad], (D,)
-    distance: float  # remaining error of the position [m]
-    angle: float  # remaining error of the orientation [rad]
+    distance: float  # distance of the end effector from the pose [m]
+    angle: float  # angle between its orientation and that of the pose [rad]
     #: θ, with NaN for joints that do not move the end effector and therefore remain unknown, (D,)
     observed_theta: Array
 

@@ -57,7 +57,7 @@ class WrapObjects(NamedTuple):
     #: the side point have the same joint, otherwise in the frame of `side_joint`.
     side: Array
     side_joint: Ints  # joint of the tree that carries the side point, (S,)
-    radius: Array  # [m], (S,); 0 for a segment without an object
+    radius: Array  # radius of each object [m], (S,); 0 for a segment without an object
     #: whether it is a swivelling pulley, with its entry as centre and f as axis, (S,)
     swivels: Bools
 

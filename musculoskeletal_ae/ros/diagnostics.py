@@ -14,7 +14,7 @@ from musculoskeletal_ae.remedy import sentence
 from musculoskeletal_ae.report import Report
 
 MANY_REPORTS = QoSProfile(depth=50)  # QoS of /diagnostics, on which all nodes of the graph report
-PERIOD = 1.0  # report at this interval [s]
+PERIOD = 1.0  # publish a report of each node at this interval [s]
 NODE_SILENCE = 2.0  # treat a node as ended or hanging if it has not reported for this time [s]
 
 

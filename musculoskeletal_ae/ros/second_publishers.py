@@ -74,7 +74,7 @@ NAMELESS = 'a node that has not announced its name yet'
 class Publisher(NamedTuple):
     """One publisher of a topic, as the ROS graph shows it."""
 
-    node: str  # full name, or NAMELESS
+    node: str  # full name of the publisher's node, or NAMELESS
     identity: bytes
 
     @property

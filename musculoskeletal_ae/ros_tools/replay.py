@@ -108,7 +108,8 @@ class Replay(Node):
         self._clock_period = max(CLOCK_PERIOD / max(options.rate, 1.0), SHORTEST_CLOCK_PERIOD)
         # Times of the next /clock message, service round and report on the steady clock [s].
         self._next_tick = self._next_service = self._next_report = 0.0
-        self._sought: int | None = None  # recorded time to seek to [ns]
+        #: recorded time at which playback shall continue after a seek [ns]; None without a seek
+        self._sought: int | None = None
         self._rate, self._skips_pauses = options.rate, options.skip_pauses
         self._printed = ''  # names of the nodes for which the replay waits, as last printed
         # Steady time and recorded time of the last report, and steady time of the last seek [s].

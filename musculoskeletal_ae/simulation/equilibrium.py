@@ -50,7 +50,8 @@ RIGID = 4e5
 #: Multiply Σ_i |∂l_i/∂θ| by this to get B without the dampers [N·s/rad]. Motions then take as long
 #: as on the emulated arm; values from 8 to 20 do equally well.
 VISCOSITY = 12.0
-JACOBIAN_POSTURES = 100  # average |∂l_i/∂θ| over this many postures
+#: average |∂l_i/∂θ| over this many random postures to get the viscous resistance B
+JACOBIAN_POSTURES = 100
 LEAST_VISCOSITY = 0.1  # use at least this B, such as at a joint that no muscle crosses [N·m·s/rad]
 #: move no joint faster than this [rad/s] or [m/s]; this limits each step, and so the effect of
 #: network errors
@@ -64,9 +65,9 @@ POSTURES_PER_COEFFICIENT = 10  # fit a cubic to this many postures per coefficie
 class ArmState(NamedTuple):
     """State of N arms after a step."""
 
-    theta: Array  # θ_sim [rad], (N, D)
-    tension: Array  # T_sim [N], (N, M)
-    length: Array  # l_sim [m], (N, M)
+    theta: Array  # simulated joint angles [rad], (N, D)
+    tension: Array  # simulated motor-side tensions [N], (N, M)
+    length: Array  # simulated muscle lengths [m], (N, M)
     followed: Array  # command that the muscle modules have reached [m], (N, M)
     holding: Array  # torque of a stop or an external hold on each joint [N·m], (N, D)
     slid: Array  # s, direction in which each tendon slid last, in [−1, 1], (N, M)

@@ -54,7 +54,7 @@ class LoadTree(NamedTuple):
     effector: Array  # position of the end effector in the frame of that joint [m], (3,)
     springs: Array  # stiffness K of the joints' springs [N·m/rad], (D, D)
     preload: Array  # preload b of the joints' springs [N·m], (D,)
-    passive: Passive  # the passive tendons
+    passive: Passive  # passive tendons of the joints
 
 
 @njit(cache=True)

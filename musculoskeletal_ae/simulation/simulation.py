@@ -48,7 +48,7 @@ class Simulation:
 
     mae: Mae  # the learned body
     state: ArmState  # the arms now; assign an earlier state to return to it
-    command: Array  # l_target [m], (N, M)
+    command: Array  # length commands l_target [m], (N, M)
     wrench: Array  # wrench on the end effectors in axes of the root link [N, N·m], (N, 6)
     fixed: Array  # angles that joints are forced to [rad], (N, D); NaN for a free joint
 

@@ -23,7 +23,7 @@ from musculoskeletal_ae.robot import drawing
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.routes import ARC
 
-LARGEST_MESH = 50_000_000  # refuse a larger mesh file [bytes]
+LARGEST_MESH = 50_000_000  # draw no mesh whose file is larger [bytes]
 FORMATS = ('.stl', '.obj', '.ply', '.glb')
 #: find the space in which the arm moves from this many postures with arbitrary joint angles, and
 #: from as many with all joints at their limits

@@ -31,7 +31,7 @@ from musculoskeletal_ae.robot.robot import Robot
 GUIDES_EVERY = 5
 #: reject delays of sensors that exceed this many steps of 1 ms, which is the length of the history
 HISTORY = 64
-HOUR = 3600.0  # one hour [s]
+HOUR = 3600.0  # one hour in seconds
 BEDDING_TIME = 2.0 * HOUR  # time constant with which a new tendon lengthens under load [s]
 NUDGE = 1e-7  # change the joint angles by this if MuJoCo's wrapping returns NaN in a posture [rad]
 SLIP_TIME = 5.0 * HOUR  # mean time between two slips of a tendon on its spool [s]
