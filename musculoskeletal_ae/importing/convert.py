@@ -115,7 +115,7 @@ def import_robot(
         write(source, out)
         robot = Robot.load(out)
         if held := held_ranges(robot):
-            # discard the notes of the first `write`, because the second one repeats them
+            # Discard the notes of the first `write`, because the second one repeats them.
             source.notes = notes
             for part in held:
                 source.reduce_range(*part)

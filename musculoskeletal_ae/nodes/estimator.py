@@ -120,7 +120,7 @@ class EstimatorNode(Shell):
 
     def _accepted(self, mae: Mae) -> None:
         self.candidates.publish(mae)
-        # the calibration waits for the first network
+        # The calibration waits for the first network.
         if Evidence.NOT_CALIBRATED in self.core.trust.evidence:
             self.core.calibrate_lengths(self.posture)
             self._publish_body()

@@ -178,7 +178,7 @@ class PassiveTendonEntry(Strict, frozen=True):
     stiffness: Positive  # spring constant of the tendon [N/m]
     slack: tuple[Number, Number]  # the lengths between which it exerts no force [m]
     joints: Names
-    # joint positions from which the polynomial of the length counts [rad or m]
+    #: joint positions from which the polynomial of the length counts [rad or m]
     centre: Annotated[tuple[Number, ...], Meta(max_length=LONGEST_LIST)]
     #: terms of its length [m]: the coefficient, and the power of each joint's distance to `centre`
     length: Annotated[
