@@ -117,7 +117,7 @@ class Overload:
         """Record which filtered tensions of a message exceed the permitted level.
 
         Args:
-            tension: T [N], (M,). Where it is not finite, nothing changes.
+            tension: Tensions T [N], (M,). Where it is not finite, nothing changes.
             now: Time of reception by the steady clock [s].
             delay: How late the message is (`Arrival.delay`) [s].
         """

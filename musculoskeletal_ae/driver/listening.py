@@ -377,9 +377,9 @@ class Listening:
 
         Args:
             verdict: Receives the results.
-            theta: θ [rad], (N, D).
-            length: l [m], (N, M).
-            tension: T [N], (N, M).
+            theta: Joint angles θ [rad], (N, D).
+            length: Muscle lengths l [m], (N, M).
+            tension: Tensions T [N], (N, M).
         """
         lengths_verdict = Verdict(self._robot)
         misfit = self._judge_lengths(lengths_verdict, theta, length, tension)
@@ -444,7 +444,7 @@ class Listening:
 
         Args:
             verdict: The faults of the lengths.
-            theta: θ [rad], (N, D).
+            theta: Joint angles θ [rad], (N, D).
         """
         are_places = all(fault.name == 'place' for fault in verdict.faults)
         return bool(self._moved(theta).any()) and are_places and len(verdict.faults) > 2
@@ -461,9 +461,9 @@ class Listening:
 
         Args:
             verdict: Receives the results.
-            theta: θ [rad], (N, D).
-            length: l [m], (N, M). No fault of lengths was found.
-            tension: T [N], (N, M).
+            theta: Joint angles θ [rad], (N, D).
+            length: Muscle lengths l [m], (N, M). No fault of lengths was found.
+            tension: Tensions T [N], (N, M).
         """
         if self._stated or not self._moved(theta).any():
             return
@@ -532,9 +532,9 @@ class Listening:
 
         Args:
             verdict: Receives the results.
-            theta: θ [rad], (N, D).
-            length: l [m], (N, M).
-            tension: T [N], (N, M).
+            theta: Joint angles θ [rad], (N, D).
+            length: Muscle lengths l [m], (N, M).
+            tension: Tensions T [N], (N, M).
 
         Returns:
             The differences between l and the model [m], summed over the muscles, after exchanging

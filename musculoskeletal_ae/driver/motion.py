@@ -138,7 +138,7 @@ class MotionTest(ABC):
         """Return the error of a muscle that runs away, or None.
 
         Args:
-            states: l [m], T [N] and temperature [°C] of the newest message, (3, M).
+            states: Lengths [m], tensions [N] and temperatures [°C] of the newest message, (3, M).
             start: The newest message when the present wait began, (3, M).
         """
 

@@ -50,8 +50,8 @@ def wrong_side(
     Args:
         robot: The geometric model.
         theta: Measured θ [rad], (N, D). Messages with NaN are not used.
-        length: l [m], (N, M).
-        tension: T [N], (N, M).
+        length: Muscle lengths l [m], (N, M).
+        tension: Tensions T [N], (N, M).
         segments: Number of the segment to which each message belongs, (N,).
         winds: The column that responded to each command, by muscle.
         joint_faults: Faults that would explain the lengths if the readings are right. Exchanged

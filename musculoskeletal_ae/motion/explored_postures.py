@@ -62,7 +62,7 @@ def pressing_tension(robot: Robot, theta: Array, rng: np.random.Generator) -> Ar
 
     Args:
         robot: The robot.
-        theta: θ [rad], (D,).
+        theta: Joint angles θ [rad], (D,).
         rng: Generator of the random tensions.
 
     Returns:

@@ -36,7 +36,7 @@ def depends_on_limit(tension: Array, before: Array, limit: Array) -> bool:
     an unnecessary new plan would discard the corrections of the feedback.
 
     Args:
-        tension: Planned T [N], (M,).
+        tension: Planned tensions T [N], (M,).
         before: Limit at the time of planning [N], (M,).
         limit: Present limit [N], (M,).
     """
@@ -103,8 +103,8 @@ class RestFeedback:
         """Integrate the errors over dt [s] if the arm rests; return whether this was done.
 
         Args:
-            error: θ_target − θ_estimated [rad], (D,).
-            jacobian: G at the target [m/rad], (M, D).
+            error: Posture error θ_target − θ_estimated [rad], (D,).
+            jacobian: Muscle Jacobian G at the target [m/rad], (M, D).
             pull: Tensions of the muscles.
             limit: Highest tension that may be planned [N], (M,).
             gain: Integral gain [1/s]; 0 for no feedback.
@@ -155,7 +155,7 @@ class MotionFeedback:
         """Return the angles [rad], (D,), by which to shift the desired posture.
 
         Args:
-            error: Desired − estimated θ [rad], (D,).
+            error: Posture error, desired − estimated θ [rad], (D,).
             is_held_back: Whether the limiter holds a muscle back (`Follower._is_held_back`).
             dt: Time since the last call [s].
         """

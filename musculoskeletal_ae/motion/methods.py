@@ -126,7 +126,7 @@ def proposed(
     Args:
         robot: The body, in which isolated muscles have no tension.
         mae: The network.
-        theta: θ_target [rad], (D,).
+        theta: Target posture θ_target [rad], (D,).
         torque: τ_target = g(θ_target) + effort [N·m], (D,).
         tension: T_current, from which the search starts [N], (M,).
         limit: Highest tension that may be planned [N], scalar or (M,).
@@ -228,8 +228,8 @@ def stiffness_command(
     Args:
         robot: The body, in which isolated muscles have no tension.
         mae: The network.
-        theta: θ_target [rad], (D,).
-        torque: τ_target [N·m], (D,).
+        theta: Target posture θ_target [rad], (D,).
+        torque: Target torque τ_target [N·m], (D,).
         desired: Desired diagonal entries of K_θ [N·m/rad], (D,). 0 leaves an entry unconstrained;
             values beyond the reachable range of a joint are clipped to it.
         limit: Highest tension that may be planned [N], scalar or (M,).

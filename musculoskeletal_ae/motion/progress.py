@@ -31,7 +31,7 @@ class Progress:
         over: Time since the end of the trajectory [s]; 0 before its end.
         lost_time: Time [s] for which the error of some joint has been larger than LOST.
         desired: The present setpoint.
-        error: Desired − estimated θ [rad], (D,).
+        error: Posture error, desired − estimated θ [rad], (D,).
     """
 
     def __init__(self, robot: Robot) -> None:

@@ -66,7 +66,7 @@ class Goal(NamedTuple):
 
     Attributes:
         method: One of the preset's length methods.
-        theta: θ_target [rad], (D,).
+        theta: Target posture θ_target [rad], (D,).
         effort: Torque in addition to gravity compensation [N·m], (D,).
         duration: Duration of the movement [s].
         tension: T_const [N], (M,); None to use T_current at the start of the goal.

@@ -122,7 +122,7 @@ class ReachLimits:
         """Return the lowest and the highest bone-side tension [N] that may be used, (M,) each.
 
         Args:
-            jacobian: G [m/rad], (M, D).
+            jacobian: Muscle Jacobian G [m/rad], (M, D).
             direction: Direction in which the joints move, (D,); 0 at rest. The length of this
                 vector has no effect.
             resistance: Tension by which the lowest tension is raised [N], (M,).
@@ -135,7 +135,7 @@ class ReachLimits:
         """Return the largest missing torque [N·m] at one instant of a motion.
 
         Args:
-            jacobian: G [m/rad], (M, D).
+            jacobian: Muscle Jacobian G [m/rad], (M, D).
             at: The setpoint at this instant.
             lag: Time λ by which the muscle modules lag behind their commands [s].
             slower: Factor by which the motion is slowed; ∞ for a very slow motion.

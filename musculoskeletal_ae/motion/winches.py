@@ -57,8 +57,8 @@ class Winches:
         """Update the lag λ and the speeds of the muscles.
 
         Args:
-            length: l [m], (M,).
-            tension: T [N], (M,).
+            length: Muscle lengths l [m], (M,).
+            tension: Tensions T [N], (M,).
             command: Length command at the time of l and T [m], (M,).
             dt: Time since the previous call [s].
             delay: How late the message with l and T is (`Arrival.delay`) [s].

@@ -174,8 +174,8 @@ class Kinematics:
 
         Args:
             theta: Joint angles θ [rad], (D,).
-            velocity: θ̇ [rad/s], (D,).
-            acceleration: θ̈ [rad/s²], (D,).
+            velocity: Joint velocities θ̇ [rad/s], (D,).
+            acceleration: Joint accelerations θ̈ [rad/s²], (D,).
         """
         tree, rates = self.tree, np.array([velocity, acceleration])[:, self.tree.theta_index[1:]]
         if tree.is_geared:

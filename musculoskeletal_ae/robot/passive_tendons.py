@@ -74,7 +74,7 @@ class PassiveTendons:
         """Return torques that hold the joints, and their derivatives.
 
         Args:
-            theta: θ [rad], (..., D).
+            theta: Joint angles θ [rad], (..., D).
 
         Returns:
             Torques [N·m], (..., D), and their derivatives with respect to θ [N·m/rad],

@@ -109,7 +109,7 @@ def holding_tension(
         theta: Joint angles θ of the posture [rad], (D,).
         desired: Desired tension [N], scalar or (M,). Of all tensions that hold the posture, the one
             nearest to it is returned.
-        jacobian: G [m/rad], (M, D); by default computed by the geometric model.
+        jacobian: Muscle Jacobian G [m/rad], (M, D); by default computed by the geometric model.
 
     Raises:
         InfeasibleError: If no tension within the limits holds the posture, or if an entry is not

@@ -130,7 +130,7 @@ def follow(
     """Follow a command: return the length [m] that a muscle module has reached on the way.
 
     Args:
-        command: l_target [m].
+        command: Length commands l_target [m].
         followed: The length that the module had reached before this step [m].
         length: Muscle length [m].
         span: Distance of the command below `length` at which the tension reaches T_max [m].
@@ -168,8 +168,8 @@ def add_slopes(
 
     Args:
         limbs: The fitted cubics of all limbs.
-        theta: θ [rad], (D, N).
-        tension: T [N], (M, N).
+        theta: Joint angles θ [rad], (D, N).
+        tension: Tensions T [N], (M, N).
         jacobian: Output, overwritten with G [m/rad], (M, D, N).
         curvature: Input and output, (D, D, N). Σ T_i ∂²l_i/∂θ² [N·m/rad] is added to the lower
             triangle; the upper triangle is not changed.
@@ -285,7 +285,7 @@ def advance(
         h: Duration of the step [s].
         passed: Fraction of the tension that reaches the bone despite friction, T_end / T, (M, N).
         pulled: The network's Gᵀ T_end [N·m], (D, N).
-        command: l_target [m], (M, N).
+        command: Length commands l_target [m], (M, N).
         wrench: Wrench on the end effectors [N, N·m], (6, N).
         fixed: Angles that joints are forced to [rad], (D, N); NaN for a free joint.
     """

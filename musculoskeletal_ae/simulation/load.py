@@ -225,7 +225,7 @@ class Load:
         """Return the load [N·m] (N, D) and its gradient [N·m/rad] (N, D, D).
 
         Args:
-            theta: θ [rad], (N, D).
+            theta: Joint angles θ [rad], (N, D).
             wrench: Wrench on the end effectors in axes of the root link [N, N·m], (N, 6), or None.
         """
         wrench = np.zeros((len(theta), 6)) if wrench is None else wrench

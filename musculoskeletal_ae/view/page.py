@@ -134,7 +134,7 @@ class Page:
         Args:
             lines: Lines of status text.
             alarm: Text of the alarm box; '': no box.
-            states: T [N] and temperatures [°C], (2, M), for the bars; NaN where unknown.
+            states: Tensions T [N] and temperatures [°C], (2, M), for the bars; NaN where unknown.
             now: Time of `values` [s].
             values: Values of the curves: estimation error [rad], the measures A and d that detect
                 an anomaly, and the threshold of d; NaN where unknown.
