@@ -257,7 +257,7 @@ class CommandLimiter:
         tension is too high has to follow the jump. For all other muscles, the bound is −∞.
 
         Args:
-            rejected: Muscle lengths l [m] and tensions T [N], (2, M); −∞ where they are implausible.
+            rejected: Lengths l [m] and tensions T [N], (2, M); −∞ where they are implausible.
             sample: The last accepted muscle states.
             limit: Tension limit [N], (M,).
         """
