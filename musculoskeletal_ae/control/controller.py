@@ -367,7 +367,9 @@ class Controller:
         robot, state = self.robot, self.target_state
         kept = self.estimate if state.theta is None else state.theta
         if kept is None and len(joints) < robot.joint_count:
-            raise MessageError('no posture yet', 'name all joints, or wait for an estimate')
+            raise MessageError(
+                'no posture estimated yet', 'name all joints, or wait for an estimate'
+            )
         before = zip(np.zeros(robot.joint_count) if kept is None else kept, state.effort)
         theta, effort = np.array([joints.get(*pair) for pair in zip(robot.joints, before)]).T
         goal = np.clip(theta, robot.lower, robot.upper)
@@ -747,7 +749,7 @@ class Controller:
         """
         self._refuse_gravity_compensation()
         if self.estimate is None or self.mae is None:
-            raise MessageError('no posture yet', 'wait for an estimate and a checkpoint')
+            raise MessageError('no posture estimated yet', 'wait for an estimate and a checkpoint')
         present = self.stop_conditions(self.watchdog.steps.stepped_at)
         condition = self.supervisor.condition or next(iter(present), None)
         if condition is not None:

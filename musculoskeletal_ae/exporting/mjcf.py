@@ -133,7 +133,8 @@ def export_into(robot: Robot, mae: Mae, file: Path, out: Path, seed: int = 0) ->
     own = {place_of(p) for r in robot.description.routes for p in r if isinstance(p, RoutePoint)}
     if own.isdisjoint(places):
         raise refuse(
-            file, f'no site is at a route point of {robot.description.directory}; import it'
+            file,
+            f'no site is at a route point of {robot.description.directory}; import this file again',
         )
     with new_directory(out, refuse):
         robot = robot.with_elasticity(mae.elasticity)

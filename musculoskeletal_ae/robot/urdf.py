@@ -71,7 +71,7 @@ def read_urdf(file: Path, text: str) -> pin.Model:
     for part in parts:
         where = f'{file}: {part.tag} {part.get("name")!r}'
         if printable(name := part.get('name', '')) != name:
-            raise RobotDescriptionError(f'{where}: expected printable characters only')
+            raise RobotDescriptionError(f'{where}: expected a name of printable characters only')
         if part.tag == 'joint' and name == 'universe':
             raise RobotDescriptionError(
                 f'{where}: pinocchio reserves this name for the world; rename the joint'

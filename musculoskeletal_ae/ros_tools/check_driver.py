@@ -252,7 +252,7 @@ def _check(options: Namespace, arguments: list[str]) -> int:
         if verdict.allows_motion or not options.wait:
             break
         _say(
-            'fix the driver before moving the arm; still listening'
+            'correct the faults of the driver before the arm moves; still listening'
             if faults
             else f'{verdict.obstacle}; still listening'
         )
@@ -263,7 +263,11 @@ def _check(options: Namespace, arguments: list[str]) -> int:
             new = [remark for remark in verdict.remarks if remark not in remarks]
             _say('\n'.join(['after the motion test:', verdict.table, *new]))
         else:
-            reason = 'fix the faults above first' if verdict.faults else verdict.obstacle
+            reason = (
+                'the driver has the faults above; correct them first'
+                if verdict.faults
+                else verdict.obstacle
+            )
             _say(f'motion test skipped: {reason}')
     _say(verdict.conclusion)
     was_skipped = options.move and bool(verdict.obstacle)

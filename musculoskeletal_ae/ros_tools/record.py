@@ -213,7 +213,11 @@ def _record(options: Namespace, arguments: list[str]) -> int:
         print(f'warning: no message was recorded of {"; ".join(missing)}', file=sys.stderr)
         return 1
     if not writer.message_count:
-        print('warning: nothing was recorded: no message arrived on any topic', file=sys.stderr)
+        print(
+            'warning: nothing was recorded, because no message arrived on any topic; check the '
+            'namespace and ROS_DOMAIN_ID',
+            file=sys.stderr,
+        )
         return 1
     return 0
 
