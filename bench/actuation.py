@@ -106,7 +106,7 @@ def learn(
 
 
 def estimate(arm: Arm, mae: Mae, seed: int, seconds: float, watched: Watched) -> tuple[float, int]:
-    """Explore for a time [s]; return the mean estimation error [rad] and the number of mistakes.
+    """Estimate θ in an exploration [s]; return the mean error [rad] and the number of mistakes.
 
     Each isolation of a muscle is a mistake, because the arm is healthy. A stop that lasts at the
     end is another one.
@@ -126,7 +126,7 @@ def estimate(arm: Arm, mae: Mae, seed: int, seconds: float, watched: Watched) ->
 def control(
     arm: Arm, mae: Mae, seed: int, targets: int, held: float, watched: Watched
 ) -> tuple[float, int]:
-    """Move to `targets` random holdable postures, with `held` seconds for each of them.
+    """Control an arm to `targets` random holdable postures, with `held` seconds for each.
 
     Returns:
         The mean distance between the target and the posture that the arm reached [rad], and the

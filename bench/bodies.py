@@ -179,7 +179,7 @@ def emulated(name: str, count: int, draw: int, cache: Path) -> Case:
 
 
 def _explored(robot: Robot, driver: Mae, reality: str, seed: int) -> Iterator[tuple[str, Array]]:
-    """Record an individual, and yield the fields of its samples with their names."""
+    """Let an individual explore, and yield the name and values of each field of its samples."""
     stream = EXPLORATION_STREAM + seed
     exploring = record(make_arm(robot, seed, reality), driver, stream, EXPLORED)
     held = record(make_arm(robot, seed, reality), driver, HELD_OUT_STREAM, HELD_OUT)

@@ -122,7 +122,7 @@ def measure(
     minutes: float,
     scale: float,
 ) -> dict[str, Honesty]:
-    """Let an individual learn; return how honest its covariance is, by source of joint angles."""
+    """Let an individual learn; return how well its covariance fits its errors, by source of θ."""
     steps = Exploration(robot, EXPLORATION_STREAM + seed, exploration)
     exploring = record(make_arm(robot, seed, reality), driver, steps, 60.0 * minutes)
     held_out = record(make_arm(robot, seed, reality), driver, HELD_OUT_STREAM, HELD_OUT)

@@ -122,7 +122,7 @@ def explore(
 
 
 def go(arm: Arm, initial: Mae, seed: int, method: str, targets: int) -> tuple[Excess, int]:
-    """Move to random targets with one control method and hold them.
+    """Go to random targets with one control method, and hold them.
 
     Returns:
         How tensions exceeded their limit, and the number of stops.

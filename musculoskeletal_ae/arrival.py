@@ -129,7 +129,7 @@ class Arrival:
         number: int = 0,
         is_from_one: Callable[[], bool] = lambda: True,
     ) -> bool:
-        """Record a message, unless it repeats or precedes an earlier one; return whether it is new.
+        """Receive a message: record it if it is new, and return whether it is.
 
         A message is old if neither its time of sending nor its sequence number is later than that
         of the message before. Both are checked, because only the numbers keep rising when the clock
@@ -159,7 +159,7 @@ class Arrival:
         self._sent = self.number = 0
 
     def use(self, now: float) -> None:
-        """Record that a message was used, perhaps later than it was received."""
+        """Record the use of a message, which may be later than its reception."""
         self._used_at, self.was_used = self._clock.at(now), True
         self._count += 1
 
@@ -172,7 +172,7 @@ class Arrival:
         return max(self._clock.at(now) - self._used_at, 0.0)
 
     def measure_rate(self, now: float) -> None:
-        """Set `rate` to the rate since the last call; it stays NaN until a message is used."""
+        """Measure `rate` since the last call; it stays NaN until a message is used."""
         awake = self._clock.at(now)
         elapsed = awake - self._measured_at
         if elapsed <= 0.0:  # this process has just continued after a pause

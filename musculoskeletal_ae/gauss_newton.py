@@ -261,7 +261,7 @@ Work = Generator[None, None, Result[Point]]  # yields before each short piece of
 
 
 def minimise(problem: Problem[Point], start: Point, rounds: int, enough: float) -> Result[Point]:
-    """Fit a problem, beginning at a point.
+    """Minimise the cost of a problem, beginning at a point.
 
     Args:
         problem: The problem to fit.
@@ -285,7 +285,7 @@ def minimise(problem: Problem[Point], start: Point, rounds: int, enough: float) 
 def minimise_in_pieces(
     problem: Problem[Point], start: Point, rounds: int, enough: float
 ) -> Work[Point]:
-    """Fit a problem like `minimise`, and yield before every evaluation of a new point."""
+    """Minimise as `minimise` does, but yield before every evaluation of a new point."""
     fit = Result(start)
     for _ in range(rounds):
         problem.weigh(fit.point)

@@ -46,7 +46,7 @@ class _Output(io.FileIO):
 
 
 def secure_output() -> None:
-    """Make stdout and stderr never raise an error.
+    """Secure stdout and stderr, so that writing to them never raises an error.
 
     Characters that the encoding of the terminal lacks are shown as "?". A descriptor that was
     closed when the process started leads to /dev/null from now on, because the next file that is

@@ -109,7 +109,7 @@ class Activities:
         self.entered: ActivityControl | None = None
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings.
+        """Use another robot description and other settings from the next step on.
 
         `robot` must already describe isolated muscles as muscles without tension.
         """
@@ -205,7 +205,7 @@ class Controller:
     # -- settings and messages ------------------------------------------------------------------
 
     def configure(self, settings: Settings) -> None:
-        """Apply new settings.
+        """Configure all parts with new settings.
 
         If the method or the preset changes while the arm has a target, the arm moves to this
         target anew, starting from the present tensions.
@@ -293,7 +293,7 @@ class Controller:
         self.estimate = theta
 
     def use_body(self, body: BodyState) -> None:
-        """Apply a body state: length offsets, isolated muscles and the anomaly."""
+        """Use a body state: its length offsets, isolated muscles and anomaly."""
         before = self.stream.body
         if body.offsets != before.offsets:
             self._use_offsets(body)
@@ -335,7 +335,7 @@ class Controller:
         self.supervisor.on_offsets(is_known)
 
     def _use_parts(self) -> None:
-        """Pass robot and settings to all parts."""
+        """Let all parts use the present robot and settings."""
         for part in (self.watchdog, self.planner, self.activities, self.limiter, self.stopping):
             part.use(self.robot, self.settings)
 

@@ -49,7 +49,7 @@ class SafeStop:
         self.leave()
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings."""
+        """Use another robot description and other settings from the next step on."""
         self._robot, self._settings = robot, settings
 
     def enter(self) -> None:

@@ -230,7 +230,7 @@ class Watchdog:
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings."""
+        """Use another robot description and other settings from the next step on."""
         self._robot, self._settings = robot, settings
 
     def take_sample(self, sample: MuscleSample, now: float) -> None:

@@ -91,7 +91,7 @@ class Follower(ActivityControl):
         self._desired: Array | None = None  # the last desired command [m], (M,)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings.
+        """Use another robot description and other settings from the next step on.
 
         `robot` must already describe isolated muscles as muscles without tension.
         """

@@ -57,7 +57,7 @@ class Planner:
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings.
+        """Use another robot description and other settings from the next step on.
 
         `robot` must already describe isolated muscles as muscles without tension.
         """

@@ -98,7 +98,7 @@ class LengthRamps:
         self.solution: Solution | None = None
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings.
+        """Use another robot description and other settings from the next step on.
 
         `robot` must already describe isolated muscles as muscles without tension.
         """
@@ -186,7 +186,7 @@ class RampedTarget(ActivityControl):
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings."""
+        """Use another robot description and other settings from the next step on."""
         self._robot, self._settings = robot, settings
 
     def set_target(self, theta: Array, effort: Array) -> None:

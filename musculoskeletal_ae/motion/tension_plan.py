@@ -42,7 +42,7 @@ class Stiffening:
         self.reset()
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings."""
+        """Use another robot description and other settings from the next step on."""
         self._robot, self._settings = robot, settings
 
     def reset(self) -> None:
@@ -119,7 +119,7 @@ class TensionPlan:
         self._stiffening = Stiffening(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings."""
+        """Use another robot description and other settings from the next step on."""
         self._robot, self._settings = robot, settings
         self._stiffening.use(robot, settings)
 

@@ -443,7 +443,7 @@ class Shell(Node):
         return take
 
     def _subscribe_anew(self, topic: str) -> None:
-        """Resubscribe to a latched topic to receive its value again."""
+        """Subscribe anew to a latched topic, to receive its value again."""
         subscription, subscribe = self._latched[topic]
         self.destroy_subscription(subscription)
         self._latched[topic] = subscribe(), subscribe

@@ -61,7 +61,7 @@ def nodes_in_graph(node: RosNode) -> set[str]:
 class NodeReport(NamedTuple):
     """What a node has last reported on /diagnostics."""
 
-    values: dict[str, str]  # its values, by name
+    values: dict[str, str]  # values that the node has reported, by name
     conditions: tuple[Condition, ...]
     message: str
     heard_at: float  # time of arrival, excluding pauses of this process [s]

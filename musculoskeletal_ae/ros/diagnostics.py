@@ -36,7 +36,7 @@ class Diagnostics:
         self.identity = secrets.token_hex(8)
 
     def tell(self, report: Report) -> None:
-        """Publish a report, with the rate at which the node uses the messages of each topic."""
+        """Tell the state of the node: publish a report, and the rate of each topic that it uses."""
         rejected, rates = self._reception.rejected, self._reception.rates
         values = {'doing': report.doing} if report.doing else {}
         values |= {**report.values, 'identity': self.identity}

@@ -67,7 +67,7 @@ class Lockstep:
         ]
 
     def start(self, spinner: Spinner, on_wait: Callable[[], object]) -> None:
-        """Wait until all nodes run and answer.
+        """Start the lockstep: wait until all nodes run and answer.
 
         Args:
             spinner: Runs the callbacks of the asking node.

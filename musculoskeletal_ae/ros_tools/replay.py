@@ -142,7 +142,7 @@ class Replay(Node):
         self._spinner = Spinner(self)
 
     def get_ready(self, longest: float) -> None:
-        """Wait until messages are received, then offer services.
+        """Get ready to play: wait until messages can be received, then offer services.
 
         In lockstep, wait for the nodes. Otherwise wait at most `longest` [s] until every topic has
         a subscriber.

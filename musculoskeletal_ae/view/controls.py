@@ -233,7 +233,7 @@ class Controls:
                 self._set(key, self._settled[key])
 
     def follow(self, theta: Array | None, payload: float, played: Sequence[float] | None) -> None:
-        """Update the controls.
+        """Follow the arm, the emulator and the replay: update the controls to their state.
 
         Args:
             theta: The estimated θ [rad] (D,). The sliders show it when the arm rests, until a

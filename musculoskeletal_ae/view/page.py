@@ -129,7 +129,7 @@ class Page:
         values: Sequence[float],
         is_urgent: bool = True,
     ) -> None:
-        """Show texts, bars and curves.
+        """Tell visitors the state of the arm by texts, bars and curves.
 
         Args:
             lines: Lines of status text.

@@ -38,8 +38,9 @@ POSTURES = 300  # fit the radii of heads and muscles in this many random posture
 STIFF = [0.9999, 0.9999, 0.001, 0.5, 2.0]
 SPRING = 'spring'  # first word of the names of springs that couple joints
 
-Place = tuple[int, Array]  # joint, and position in its frame [m]
-Obstacle = tuple[int, Array, Array]  # joint, and centre [m] and axis in its frame
+Place = tuple[int, Array]  # a place on a link: its joint, and the position in its frame [m]
+#: an object around which tendons wrap: its joint, and its centre [m] and axis in that joint's frame
+Obstacle = tuple[int, Array, Array]
 
 check_mujoco()
 mujoco.set_mju_user_warning(lambda _: None)  # the default writes a file to the current directory
