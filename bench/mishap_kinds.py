@@ -221,7 +221,7 @@ def rupture_under_load(lab: Lab, rng: Rng) -> Case:
 
 
 def rupture_at_rest(lab: Lab, rng: Rng) -> Case:
-    """A tendon ruptures while it has the tension bias; seen when it should carry load."""
+    """A tendon ruptures while it has the tension bias; noticed when it should carry load."""
     pull, bias = lab.arm.tension, lab.arm.robot.tension.bias
     idle = np.flatnonzero(pull < bias + 3.0)
     muscle = int(rng.choice(idle)) if len(idle) else int((pull - bias).argmin())
@@ -319,7 +319,7 @@ LENGTH, TENSION, TEMPERATURE = 0, 1, 2
 
 
 def frozen(row: int) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which one reading is frozen; it is seen when the value should change."""
+    """Return a mishap by which one reading freezes; its effect begins when the value should change."""
 
     def begin(lab: Lab, rng: Rng) -> Case:
         muscle, name = _any(rng, lab.arm.robot.muscles)

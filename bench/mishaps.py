@@ -82,10 +82,8 @@ QUIET = 3.0  # call the arm well once it has explored without any condition for 
 CALIBRATION = 60.0  # wait at most this long for a length calibration [s]
 COOLING = 240.0  # wait at most this long for motors to cool, in all [s]
 AFTER = 20.0  # measure the true error over this time [s]
-# a case has not ended well if the error has grown to more than this multiple, and by more than this
-# much [rad]
-#: count a case as not well if the error has grown to more than this multiple, and by more than this
-#: much [rad]
+#: a case has not ended well if the error has grown to more than this multiple, and by more than
+#: this [rad]
 WELL, WELL_RAD = 1.5, 0.02
 HOLDABLE = 4  # choose the posture to hold among this many holdable ones
 #: individuals and emulator models of the complete table

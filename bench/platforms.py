@@ -32,7 +32,6 @@ ROS_REQUIREMENTS = ROOT / '.ci' / 'requirements-ros.txt'
 #: packages that `--node` installs: all that the core and the estimator import
 NODE_REQUIREMENTS = ('numpy', 'pin', 'safetensors', 'msgspec', 'PyYAML')
 #: versions that Ubuntu 24.04 ships, which the emulated system must contain
-#: package versions of Ubuntu 24.04
 UBUNTU = ('numpy==1.26.4', 'scipy==1.11.4', 'matplotlib==3.8.4', 'PyYAML==6.0.1', 'lark==1.1.9')
 #: a pinocchio compiled for NumPy 1, like the one of apt
 APT_PINOCCHIO = ('pin==2.7.0', 'numpy==1.26.4')

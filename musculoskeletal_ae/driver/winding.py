@@ -443,7 +443,7 @@ class Winding(MotionTest):
         robot, verdict, home = self._robot, self.verdict, self._mean()
         #: times to the response, for half and for the whole demand [s]
         half, whole = list[float](), list[float]()
-        # The demand at home may exceed T_bias, because the muscle carries the arm's weight.
+        # The demand before the test may exceed T_bias, because the muscle carries the arm's weight.
         rise = (self._highest - self._bias)[m]
         self._most = self._highest.copy()
         self._most[m] = home.demand[m] + rise

@@ -37,8 +37,7 @@ STEP = 0.001  # simulate in steps of this duration [s]
 SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 
 # The following values are chosen by hand, because those of Musashi are not public.
-# let a module in the safe state change its tension towards T_bias at this rate [N/s]
-#: let a module in the safe state approach T_bias at this rate [N/s]
+#: let a module in the safe state change its tension towards T_bias at this rate [N/s]
 RELEASE_RATE = 100.0
 MOTOR_GAIN = 0.004  # wind in at this speed for each newton of missing tension [m/s/N]
 #: Wind in a slack tendon at this speed [m/s], which falls to 0 at half of T_bias. Weak muscles need

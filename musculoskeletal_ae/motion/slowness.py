@@ -18,7 +18,6 @@ from musculoskeletal_ae.robot.robot import Robot
 SHARE = 0.7
 #: evaluate the network at no more instants of a trajectory than this, so that no command is late;
 #: each piece between two points still contains an instant, even of a trajectory of 10 000 points
-#: still contains at least one instant, even of a trajectory of 10 000 points
 MOST_MOMENTS = 12_500
 
 #: slow a motion by the smallest of these factors with which the tensions suffice
