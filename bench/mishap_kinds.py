@@ -319,7 +319,7 @@ LENGTH, TENSION, TEMPERATURE = 0, 1, 2
 
 
 def frozen(row: int) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which one reading freezes; its effect begins when the value should change."""
+    """Return a mishap by which one reading freezes, with an effect once the value changes."""
 
     def begin(lab: Lab, rng: Rng) -> Case:
         muscle, name = _any(rng, lab.arm.robot.muscles)

@@ -16,7 +16,7 @@ from enum import Enum
 from musculoskeletal_ae.conditions import Action, Clears, Condition, ConditionKind
 from musculoskeletal_ae.remedy import Step
 
-RESUME = 0.2  # continue a paused arm after this time without a cause [s]
+RESUME = 0.2  # let a paused arm continue once no cause has been present for this time [s]
 
 
 class Activity(Enum):

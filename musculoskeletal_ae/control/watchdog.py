@@ -30,7 +30,8 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 #: steps of a stopped arm then follow the steady clock
 SLOWEST = 0.05
 PACE_SPAN = 1.0  # average the pace of the messages' clock with this time constant [s]
-OVERHEATED = 20.0  # stop the arm if a winding is this far above temperature_limit [°C]
+#: stop the arm if a winding is hotter than the parameter temperature_limit by this [°C]
+OVERHEATED = 20.0
 #: stop the arm if a tension exceeds this multiple of tension.limit for OVERLOAD_TIME; meanwhile,
 #: the limiter pays out the muscle
 OVERLOAD = 1.1

@@ -40,11 +40,13 @@ MOST_REPEATED = 0.2
 #: treat sensors with at most this many different values as free of noise: repeated readings of an
 #: arm at rest are then no fault
 QUIET = 3
-TEMPERATURES = -20.0, 130.0  # count temperatures outside this range as impossible [°C]
+TEMPERATURES = -20.0, 130.0  # treat temperatures outside this range as impossible [°C]
 #: let l exceed its range by this distance, with and without length calibration [m]
 BEYOND = 0.1, 1.0
 BEYOND_JOINT = 0.3  # report a fault if θ exceeds the joint limits by more than this [rad]
-BEYOND_SHARE = 0.95  # judge θ by the excess that this share of the messages does not exceed
+#: compare the excess of θ over its limits that this share of the messages does not exceed with
+#: BEYOND_JOINT
+BEYOND_SHARE = 0.95
 #: report a fault if |T − T_bias| exceeds the smaller of these while nothing is commanded, [N] and
 #: relative to T_bias; they cover errors of the sensor and of its zero
 RESTING_TENSION, RESTING_SHARE = 15.0, 0.5
@@ -71,7 +73,7 @@ MOVED = 0.04  # check sign and slope of l only if its range is larger than this 
 #: otherwise, blame the lengths
 JOINTS_BETTER = 0.8
 MOVED_JOINT = 0.2  # check the sign of θ only if its range is larger than this [rad]
-MOST_SAMPLES = 400  # compare at most this many messages with the model
+MOST_SAMPLES = 400  # compare at most this many messages with the model, to save time
 #: units in which values may have been published by mistake, in SI units or °C
 UNITS = {
     'length': {'mm': 1e-3, 'cm': 1e-2},

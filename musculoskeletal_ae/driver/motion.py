@@ -25,19 +25,21 @@ from musculoskeletal_ae.signals.wiring import WiringJudgement
 #: time for paying out a released muscle, and for settling after a target has moved back [s]
 RELEASE = 0.6
 MEAN = 0.3  # average the readings of the last part of a wait, of this duration [s]
-SETTLE = 1.5  # give the arm this time to come to rest after a motion [s]
+#: let the arm come to rest for this time after a motion, before its readings are judged [s]
+SETTLE = 1.5
 HOLD = 0.5  # judge the response to a command after holding it for this time [s]
-SPEED = 0.01  # move a target further inwards at this speed [m/s]
-RELEASE_SPEED = 0.03  # move a target back at this speed [m/s]
-ABOVE_BIAS = 40.0  # by default, test up to this tension above T_bias [N]
+SPEED = 0.01  # let the target length of the tested muscle move inwards at this speed [m/s]
+RELEASE_SPEED = 0.03  # let the target length of the tested muscle move back at this speed [m/s]
+ABOVE_BIAS = 40.0  # without --tension, test muscles up to this tension above T_bias [N]
 #: release a muscle whose tension exceeds the highest or the demanded tension by this [N]
 RUN_AWAY_TENSION = 60.0
 MOMENT = 0.1  # let a muscle exceed a limit for this time, for example because the arm falls [s]
-LATEST = 0.1  # report a longer time from a command to the first response [s]
+LATEST = 0.1  # report a fault if a module takes longer to respond to a command [s]
 #: let a moving target advance for at most this time between two messages, so that it does not jump
 #: after a gap [s]
 LONGEST_ADVANCE = 0.05
-RESPONSE = 4.0, 0.0006  # count changes of T [N] and l [m] above noise by this as a response
+#: a change of T [N] or l [m] that exceeds the noise by this counts as a response to a command
+RESPONSE = 4.0, 0.0006
 
 #: a part of a test that takes time; each of its steps takes one message
 Wait = Generator[None, None, None]

@@ -20,11 +20,13 @@ from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.report import is_overloaded
 
-RATE_TOLERANCE = 0.2  # tolerate this relative error of the rate
+RATE_TOLERANCE = 0.2  # accept a rate that deviates from the expected one by this share
 #: Begin the motion test only at this rate or above [Hz], unless the expected rate is lower. A
 #: muscle that runs away is then noticed within 33 ms, and `motion.MEAN` averages 9 readings.
 LEAST_RATE = 30.0
-LONGEST_STALL = 1.0  # blame the driver for any longer gap, even if this computer is overloaded [s]
+#: report a longer gap between messages as a fault of the driver, even if this computer is
+#: overloaded [s]
+LONGEST_STALL = 1.0
 LEAST_LOST = 0.05  # report a loss of more than this fraction of the messages
 
 

@@ -54,7 +54,7 @@ from musculoskeletal_ae.report import distinct
 LEAST_ABOVE_BIAS = 20.0
 FURTHEST = 0.025  # wind a muscle in by at most this [m]
 SLACK = 0.01  # after winding in, set l_target this far beyond l, so that the law demands T_bias [m]
-RUN_AWAY = 0.05  # release a muscle that shortens by more than this [m]
+RUN_AWAY = 0.05  # release all muscles, and end the test, if one shortens by more than this [m]
 #: accept an error of T up to the larger of these: [N], and relative to the demand
 TENSION_TOLERANCE, TENSION_SHARE = 10.0, 0.1
 #: expect errors of l of up to this: two standard deviations of noise and resolution [m]
@@ -70,7 +70,9 @@ MIRROR_TOLERANCE = 0.008
 #: ALARM; both are fractions of the range from T_bias to the highest test tension. Healthy emulated
 #: arms that still swing reach 0.81. If K is large, T is noisy, and ALARM is raised by the excess.
 HELD, ALARM = 0.5, 0.9
-OSCILLATES = 6  # count T as oscillating if it crosses its mean more often than this within MEAN
+#: treat T as oscillating, and release all muscles, if it crosses its mean more often than this in
+#: MEAN seconds
+OSCILLATES = 6
 #: start a release with l_target this far beyond l [m], and increase the distance at this speed
 #: [m/s]; it is small at first, because commands of wrong sign wind in
 PAY_OUT = 0.003, 0.3

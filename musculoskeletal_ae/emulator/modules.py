@@ -31,19 +31,21 @@ from musculoskeletal_ae.robot.joint_units import SLIDE
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-STEP = 0.001  # simulate in steps of this duration [s]
+STEP = 0.001  # duration of a simulation step [s]
 
 # modes of a module
+#: modes of a module: safe state, following a target length, following a target tension
 SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 
 # The following values are chosen by hand, because those of Musashi are not public.
 #: let a module in the safe state change its tension towards T_bias at this rate [N/s]
 RELEASE_RATE = 100.0
-MOTOR_GAIN = 0.004  # wind in at this speed for each newton of missing tension [m/s/N]
+MOTOR_GAIN = 0.004  # speed at which a module winds in for each newton of missing tension [m/s/N]
 #: Wind in a slack tendon at this speed [m/s], which falls to 0 at half of T_bias. Weak muscles need
 #: it: MOTOR_GAIN alone would wind in at 2 mm/s with a T_bias of 0.5 N.
 TAKE_UP_SPEED = 0.03
-POSITION_LAG = 0.02  # let a position-controlled module follow with this time constant [s]
+#: time constant with which a position-controlled module follows its target length [s]
+POSITION_LAG = 0.02
 # Heat. Each motor is sized for its muscle: constant T_limit heats the average module to 85 °C at
 # the housing and 105 °C in the winding.
 AMBIENT = 25.0  # temperature of the surroundings, to which all modules cool down [°C]

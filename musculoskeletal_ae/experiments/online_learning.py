@@ -68,7 +68,7 @@ CURVE_STRIDE = 10
 #: [s]
 FIRST_ERRORS = 10.0
 PUBLISHED_MINUTES = 10.0
-PUBLISHED = (0.324, 0.154)  # the paper's fit at the start and after ten minutes [rad]
+PUBLISHED = (0.324, 0.154)  # errors that the paper fits at the start, and after ten minutes [rad]
 #: numbers of steps of a shortened initial training, by preset; after fewer steps, checkpoint
 #: validation rejects the network of preset `paper`
 QUICK_STEPS = {PAPER_PRESET: 600, DEFAULT: 300}

@@ -30,7 +30,7 @@ from musculoskeletal_ae.experiments.results import (
 from musculoskeletal_ae.files import read_table, write_whole
 from musculoskeletal_ae.presets.names import PAPER_PRESET
 
-TEMPLATE = 'paper.md.jinja'  # a file in the folder of this module
+TEMPLATE = 'paper.md.jinja'  # name of the page's template, a file in the folder of this module
 #: rows of the tables, by the name of the table in the template
 TABLES = read_table(__file__, 'paper.yaml', dict[str, tuple[ResultRow, ...]])
 #: pictures of the page: file name, and the plot of an experiment that it shows

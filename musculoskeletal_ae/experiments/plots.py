@@ -18,7 +18,7 @@ BEFORE, AFTER, AS_PRINTED, TRUE, MARK = '#D55E00', '#009E73', '#CC79A7', '#22222
 #: colours of results before and after learning
 WHEN = {'before': BEFORE, 'after': AFTER}
 DPI = 110
-POINTS = 1500  # draw a line with at most this many points
+POINTS = 1500  # draw at most this many points of a line, which keeps the files small
 
 #: positions of legends that never hide data
 LEGENDS: dict[str, dict[str, Any]] = {

@@ -45,19 +45,19 @@ from musculoskeletal_ae.robot.tension import holding_tension
 
 #: evaluate only every tenth message of the held-out motion, because it is estimated very often
 EVERY = 10
-TARGETS = 2  # approach this many targets without each muscle
-MOVING = 12.0  # explore for this time before a fault [s]
+TARGETS = 2  # number of targets that the arm approaches without each muscle
+MOVING = 12.0  # let the arm explore for this time before a fault [s]
 #: wait at most this long after a fault for the end of the first verification [s]
 LATEST_VERDICT = 10
-AFTERWARDS = 6.0  # continue for this time after the wait for the first verification [s]
+AFTERWARDS = 6.0  # let the arm continue for this time after the wait for the first verification [s]
 #: wait at most this long for the arm to reach a target [s]; this allows for slow winches, and for
 #: further approaches if the arm falls
 LONGEST_APPROACH = 60
 SETTLING = 4  # count the arm as arrived after this time at rest [s]
 STILL = 0.02  # count the arm as at rest if no joint moves more than this in a second [rad]
 HEALTHY_TIME = 18_000.0  # let healthy arms explore for this time, shared by the individuals [s]
-PUSH_EVERY = 10.0  # push at this interval [s]
-PUSH = (10.0, 30.0)  # push with forces in this range [N]
+PUSH_EVERY = 10.0  # push the hand of a healthy arm at this interval [s]
+PUSH = (10.0, 30.0)  # range of the forces of these pushes [N]
 
 
 class IsolatingLoop(ClosedLoop):

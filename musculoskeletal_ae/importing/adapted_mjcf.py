@@ -26,7 +26,7 @@ from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.importing.source import Source
 from musculoskeletal_ae.robot.urdf import parse_xml
 
-#: write this comment at the top of the file
+#: comment at the top of a file that the import has written
 NOTE = ' written by import_robot for the robot directory in which it lies '
 HAND = 'hand of the emulator'  # name of the body at the end effector
 #: for each tag, the attributes by which other elements refer to an element of this kind

@@ -48,7 +48,8 @@ check_mujoco()
 COUNTS = {
     'body': 'nbody', 'joint': 'njnt', 'tendon': 'ntendon', 'actuator': 'nu', 'equality': 'neq',
 }  # fmt: skip
-RANGE_POSTURES = 200  # measure the range of a tendon's length in this many postures
+#: number of random postures in which the range of a tendon's length is measured
+RANGE_POSTURES = 200
 LEAST_REACH = 1e-3  # ignore a far end that is closer than this to the origin of its body [m]
 #: ignore a larger force of an actuator [N]: MuJoCo computes it for muscles without an initial
 #: moment arm

@@ -30,16 +30,18 @@ from musculoskeletal_ae.robot.kinematics import link_placement, reduced
 from musculoskeletal_ae.robot.robot import Robot
 
 KINDS = REVOLUTE + PRISMATIC
-POSTURES = 1000  # compare lengths in this many postures
-ARM_POSTURES = 200  # compare moment arms in this many postures
-PROBES = 20  # search the joints that change the length of a passive tendon in this many postures
+POSTURES = 1000  # number of random postures in which lengths are compared with those of the source
+#: number of random postures in which moment arms are compared with those of the source
+ARM_POSTURES = 200
+#: number of postures in which the joints are searched that change the length of a passive tendon
+PROBES = 20
 MOVED = 1e-8  # count a joint as moving a tendon if it changes the length by at least this [m]
 WRONG_LENGTH = 5e-5  # report a passive tendon whose polynomial is wrong by at least this [m]
 TURN = 1e-5  # step of the numerical derivatives of the lengths, which give moment arms [rad]
 SHORT_ARM = 1e-3  # do not compare the sign of a shorter moment arm [m]
-LISTED = 12  # list at most this many names in a message
+LISTED = 12  # name at most this many elements in a message, so that it stays readable
 # The largest tension that the source states for a muscle becomes its tension.limit.
-MAX_SHARE = 1.5  # set tension.max to this multiple of the limit
+MAX_SHARE = 1.5  # set tension.max to this multiple of tension.limit
 #: set tension.bias to this share of the limit if the muscle may be slack in the source; modules and
 #: their sensors need a tension above 0
 BIAS_SHARE = 0.01

@@ -33,15 +33,17 @@ TURNED = 0.05  # treat a pose as unreachable if the orientation differs by more 
 HAND_SPEED = 0.25  # move the hand to a single pose no faster than this [m/s]
 SHORTEST = 0.3  # take at least this time for a movement to a single pose [s]
 PEAK = 1.875  # peak speed of a minimum-jerk motion, as a multiple of its mean speed
-PATH_INTERVAL = 0.25  # count poses as a path if they arrive within this time of each other [s]
-#: count poses as a path only if the hand needs no more than this speed between them [m/s]
+#: treat poses that arrive within this time of each other as a path, not as single targets [s]
+PATH_INTERVAL = 0.25
+#: treat poses as single targets if the hand would have to move faster than this between them [m/s]
 PATH_SPEED = 1.0
-INTERVAL_WEIGHT = 0.2  # give the newest interval this weight in the average interval of a path
+#: weight of the newest interval between poses in the average interval of a path
+INTERVAL_WEIGHT = 0.2
 JOINING = 0.1  # take at least this time to join a path [s]
 #: come to rest at the last pose of a path within this time after passing it [s]
 RETURNING = 2.0 * STOPPING
-TWIST_TIMEOUT = 0.3  # move the hand for this time by one twist [s]
-STARTING = 0.1  # accelerate to a twist in this time [s]
+TWIST_TIMEOUT = 0.3  # duration of the motion of the hand that one twist commands [s]
+STARTING = 0.1  # time in which the hand accelerates to a twist [s]
 #: damp the inverse Jacobian by this length, to limit joint speeds near singularities [m]
 DAMPING = 0.02
 

@@ -15,7 +15,8 @@ WINDING = 0.03
 #: weight of the initial guess λ = 0 in the fit [m²/s²]; a muscle that moves at speed v adds v²
 LAGS = 2.0e-3
 LARGEST_LAG = 0.1  # clip the measured lag to this [s]
-SPAN = 0.0095  # compute speeds from lengths that are at least this far apart in time [s]
+#: compute speeds from lengths that are at least this far apart in time, so that noise is small [s]
+SPAN = 0.0095
 
 
 class Winches:
