@@ -149,7 +149,7 @@ def read_posture(message: Any, units: JointUnits, some: bool = False) -> Array:
     if len(index) < len(names):
         for name in known:
             if names.count(name) > 1:
-                raise MessageError('duplicate joint', repr(name))
+                raise MessageError('duplicate joint', f'{name!r} is listed more than once')
     if len(known) < (1 if some else len(joints)):
         missing = ', '.join(name for name in joints if name not in index)
         raise MessageError('missing joint', missing)
@@ -199,7 +199,7 @@ def target_values(message: Any, joints: Sequence[str]) -> dict[str, tuple[float,
         raise MessageError('unknown joint', f'{unknown[0]!r}; legal: {", ".join(joints)}')
     name, count = Counter(names).most_common(1)[0]
     if count > 1:
-        raise MessageError('duplicate joint', repr(name))
+        raise MessageError('duplicate joint', f'{name!r} is listed more than once')
     efforts = np.array(message.effort if len(message.effort) else [0.0] * len(names), dtype=float)
     for what, values in (
         ('position', message.position), ('effort', efforts), ('velocity', message.velocity)
@@ -362,7 +362,8 @@ def _check_names(names: Sequence[str], joints: Sequence[str]) -> None:
     if unknown := [name for name in names if name not in joints]:
         raise MessageError('unknown joint', f'{unknown[0]!r}; legal: {", ".join(joints)}')
     if len(set(names)) < len(names):
-        raise MessageError('duplicate joint', repr(max(names, key=names.count)))
+        name = max(names, key=names.count)
+        raise MessageError('duplicate joint', f'{name!r} is listed more than once')
 
 
 def _column(points: Sequence[Any], what: str, joint_count: int) -> Array | None:

@@ -57,7 +57,7 @@ SETTLING = 4  # count the arm as arrived after this time at rest [s]
 STILL = 0.02  # count the arm as at rest if no joint moves more than this in a second [rad]
 HEALTHY_TIME = 18_000.0  # let healthy arms explore for this time, shared by the individuals [s]
 PUSH_EVERY = 10.0  # push the hand of a healthy arm at this interval [s]
-PUSH = (10.0, 30.0)  # range of the forces of these pushes [N]
+PUSH = (10.0, 30.0)  # range of the forces that push the hand of a healthy arm [N]
 
 
 class IsolatingLoop(ClosedLoop):
