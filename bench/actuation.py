@@ -96,7 +96,10 @@ class Watched:
 def learn(
     arm: Arm, initial: Mae, seed: int, seconds: float, watched: Watched
 ) -> tuple[Learner, int]:
-    """Learn from an exploration of a time [s]; return the learner and the number of stops."""
+    """Learn from an exploration; return the learner and the number of stops of the controller.
+
+    `seed` selects the exploration, which takes `seconds` [s]. `watched` records the tensions.
+    """
     loop = ClosedLoop(arm, initial, None, EXPLORATION_STREAM + seed)
     learner = Learner(arm.robot, initial, 'default', seed)
     for count, row in enumerate(online_learning.explore(loop, learner, seconds)):
@@ -106,7 +109,9 @@ def learn(
 
 
 def estimate(arm: Arm, mae: Mae, seed: int, seconds: float, watched: Watched) -> tuple[float, int]:
-    """Estimate θ in an exploration [s]; return the mean error [rad] and the number of mistakes.
+    """Estimate θ in an exploration; return the mean error [rad] and the number of mistakes.
+
+    `seed` selects the exploration, which takes `seconds` [s]. `watched` records the tensions.
 
     Each isolation of a muscle is a mistake, because the arm is healthy. A stop that lasts at the
     end is another one.
@@ -185,7 +190,8 @@ def measure(
 ) -> Result:
     """Measure one individual with one kind of module.
 
-    `share` scales the durations and counts; `held` is the time for each target [s].
+    `reality` and `seed` name the individual. `share` scales the durations and counts; `held` is the
+    time for each target [s].
     """
     own = with_kind(robot, kind)
     arm = make_arm(own, seed, reality)

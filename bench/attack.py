@@ -157,7 +157,10 @@ def overloads(loads: list[tuple[float, Array]], highest: Array | float) -> Array
 
 
 def wound_in(time: Array, value: Array, begin: float, end: float) -> float:
-    """Return the largest length [m] by which a muscle was wound in from `begin` to `end` [s]."""
+    """Return the largest length [m] by which a muscle was wound in from `begin` to `end` [s].
+
+    `value` are the commanded lengths [m], (N, M), at the times `time` [s], (N,).
+    """
     during = value[(time > begin) & (time < end)]
     if len(during) < 2:
         return 0.0

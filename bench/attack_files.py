@@ -279,7 +279,10 @@ def _write_bag(path: Path) -> Path:
 
 
 def attempts(start: int, count: int, seed: int, folder: Path) -> Iterator[Attempt]:
-    """Write and read the hostile files `start` to `count` − 1; yield the outcome of each."""
+    """Write and read the hostile files `start` to `count` − 1; yield the outcome of each.
+
+    `seed` selects the files, which are written to `folder`.
+    """
     reader = Reader(folder)
     for i in range(start, count):
         kind = KINDS[i % len(KINDS)]

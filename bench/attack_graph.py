@@ -93,7 +93,7 @@ class Process:
     """One node's process, with its log and its memory over time."""
 
     def __init__(self, name: str, command: list[str], log: Path) -> None:
-        """Start the process; append its output to the log."""
+        """Start the process of the node `name`; append its output to the file `log`."""
         self.name, self.log = name, log
         with log.open('ab') as stream:
             self.process = subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT)
@@ -350,7 +350,7 @@ class Attack:
             self.tried['requests'] += 1
 
     def send_parameter(self, node: str, name: str, value: Any) -> None:
-        """Send a parameter to a node without waiting for the response."""
+        """Send the parameter `name` to a node without waiting for the response."""
         self.send(SetParameters, f'{node}/set_parameters', set_request(name, value))
 
     def set_faults(self, lines: list[str]) -> None:

@@ -81,7 +81,7 @@ class Child:
     """A process that runs a learner, and what it has reported so far."""
 
     def __init__(self, robot: Path, directory: Path, initial: Path, life: int) -> None:
-        """Start the process, which continues from the state that earlier ones have saved."""
+        """Start child number `life`, which continues from the state that `directory` keeps."""
         words = [sys.executable, '-m', 'bench.attack_kills', str(robot), str(directory)]
         words += [str(initial), str(life)]
         self._process = subprocess.Popen(

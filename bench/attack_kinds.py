@@ -195,7 +195,7 @@ class Scene:
     # -- actions of the hostile node ------------------------------------------------------------
 
     def publish(self, topic: str, *messages: Any, period: float = 0.1, qos: Any = OWN) -> None:
-        """Publish messages on a topic of the arm as the hostile node."""
+        """Publish messages on a topic of the arm as the hostile node, one every `period` [s]."""
         attack = self.attack
         if topic not in attack.publishers:
             kind = type(messages[0])
@@ -237,7 +237,15 @@ def _body(
     isolated: Sequence[int] = (),
     anomaly: Anomaly = Anomaly.NONE,
 ) -> Float64MultiArray:
-    """Return a false body state, with offsets of alternating sign."""
+    """Return a false body state.
+
+    Args:
+        scene: The attacked arm, whose present body state is falsified.
+        offset: Absolute value of the length offsets, whose signs alternate [m].
+        deviation: Standard deviation that the body state states for the offsets [m].
+        isolated: Indices of the muscles that are isolated.
+        anomaly: State of the anomaly.
+    """
     muscles = scene.attack.robot.muscle_count
     sign = np.where(np.arange(muscles) % 2, 1.0, -1.0)
     offsets = LengthOffsets(sign * offset, np.full(muscles, deviation))
@@ -385,9 +393,10 @@ def wrong_network(change: Callable[[Mae], Mae]) -> Callable[[Scene], None]:
 
 
 def _lengths(scale: float, offset: float = 0.0, every: int = 1) -> Callable[[Mae], Mae]:
-    """Return a function that falsifies the lengths of a network by a factor and an offset [m].
+    """Return a function that falsifies the lengths of a network.
 
-    It changes the lengths of every muscle, or of every second one if `every` is 2.
+    It multiplies lengths by `scale` and adds `offset` [m], for every muscle, or for every second
+    one if `every` is 2.
     """
 
     def change(mae: Mae) -> Mae:

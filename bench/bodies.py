@@ -127,7 +127,11 @@ def _divided(name: str, clones: Path) -> tuple[SoftLink, Run, Run]:
 
 
 def recorded(name: str, count: int, draw: int, clones: Path, cache: Path) -> Case:
-    """Return the case of a recording with random training rows; its first network is cached."""
+    """Return the case of a recording; its first network is cached in `cache`.
+
+    `name` is that of the recording. `draw` is the random seed with which `count` of its training
+    rows are drawn.
+    """
     file = cache / f'initial_{name}_{count}_{draw}.safetensors'
     name, _, effort = name.partition('+')
     link, every, test = _divided(name, clones)
@@ -148,7 +152,11 @@ def recorded(name: str, count: int, draw: int, clones: Path, cache: Path) -> Cas
 
 
 def emulated(name: str, count: int, draw: int, cache: Path) -> Case:
-    """Return the case of an emulated arm; its samples are cached in a folder."""
+    """Return the case of an emulated arm; its samples are cached in `cache`.
+
+    `name` is that of the case. `draw` is the random seed with which `count` of the training samples
+    are drawn.
+    """
     individual, *options = name.split('+')
     reality, _, seed = individual.partition('_')
     robot = Robot.load(ROBOT)
@@ -210,7 +218,10 @@ def coupling(robot: Robot, theta: Array) -> Array:
 
 
 def package(case: Case, updates: int, seed: int) -> str:
-    """Learn a case, and return its errors as text."""
+    """Learn a case in `updates` updates, and return its errors as text.
+
+    `seed` is the random seed of the training.
+    """
     updater, times = BodyUpdater(case.robot, case.initial, seed), list[float]()
     for _ in range(updates):
         begin = time.process_time()

@@ -122,7 +122,17 @@ def measure(
     minutes: float,
     scale: float,
 ) -> dict[str, Honesty]:
-    """Let an individual learn; return how well its covariance fits its errors, by source of θ."""
+    """Let an individual learn; return how well its covariance fits its errors, by source of θ.
+
+    Args:
+        robot: The geometric model.
+        driver: The network that commands the exploration, and from which learning starts.
+        reality: Emulator model of the individual.
+        seed: Seed of the individual and of the exploration.
+        exploration: Preset that explores.
+        minutes: Duration of the exploration [min].
+        scale: Factor of each covariance before it is compared with the errors.
+    """
     steps = Exploration(robot, EXPLORATION_STREAM + seed, exploration)
     exploring = record(make_arm(robot, seed, reality), driver, steps, 60.0 * minutes)
     held_out = record(make_arm(robot, seed, reality), driver, HELD_OUT_STREAM, HELD_OUT)

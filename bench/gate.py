@@ -80,7 +80,7 @@ class Spread:
         self.refused, self.count = list[str](), 0
 
     def take(self, gate: CheckpointValidator, mae: Mae, name: str) -> None:
-        """Measure a network, and record it as refused if the validation rejects it."""
+        """Measure a network, and record it under `name` as refused if the validation rejects it."""
         self.count += 1
         values = {key: error.max() for key, error in filter(None, gate.postures.errors(mae))}
         errors = gate.message_errors(mae)

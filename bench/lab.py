@@ -182,7 +182,10 @@ class Lab:
     """
 
     def __init__(self, arm: Arm, initial: Mae, seed: int, load: float = 0.0) -> None:
-        """Connect an arm at rest to the nodes; `load` is the number of other processes."""
+        """Connect an arm at rest to the nodes.
+
+        `seed` selects the exploration and the waits, and `load` is the number of other processes.
+        """
         self.arm, self.now, self.clock_shift = arm, 0.0, 0.0
         self.wire = Wire()
         self.before_step: list[Callable[[Lab], object]] = []

@@ -92,7 +92,10 @@ def mirrored(value: str) -> str:
 
 
 def on_ring(angle: float, radius: float, height: float) -> list[float]:
-    """Return a point [m] on a ring; the angle [degrees] is from the front towards the left."""
+    """Return a point [m], (3,), on a horizontal ring of a radius [m] at a height [m].
+
+    The angle [degrees] is from the front towards the left.
+    """
     at = radians(angle)
     return [round(radius * cos(at), 4), round(radius * sin(at), 4), height]
 

@@ -294,7 +294,10 @@ def retied(lab: Lab, rng: Rng) -> Case:
 
 
 def module_fault(kind: str, low: float = 0.0, high: float = 0.0) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which one module has a mechanical fault of the emulator."""
+    """Return a mishap by which one module has the emulator's fault `kind`.
+
+    The size of the fault is drawn between `low` and `high`, in the unit of the fault.
+    """
 
     def begin(lab: Lab, rng: Rng) -> Case:
         muscle, name = _any(rng, lab.arm.robot.muscles)
@@ -358,7 +361,11 @@ def changed(
     row: int, change: Callable[[float, float], float], low: float, high: float, unit: str,
     is_signed: bool = True,
 ) -> Callable[[Lab, Rng], Case]:  # fmt: skip
-    """Return a mishap by which one reading of a muscle is changed by a random size."""
+    """Return a mishap by which one reading of a muscle is changed by a random size.
+
+    `row` is the row of the reading in muscle_states. `change` gets the true value and the size,
+    which is drawn between `low` and `high`, and is negative at random if `is_signed`.
+    """
 
     def begin(lab: Lab, rng: Rng) -> Case:
         muscle, name = _any(rng, lab.arm.robot.muscles)

@@ -376,7 +376,10 @@ def judge(statement: Statement, mishap: Mishap, case: Case) -> str:
 
 
 def learned_lab(robot: Robot, first: Mae, seed: int, reality: str, seconds: float) -> Lab:
-    """Return a laboratory whose individual has explored and learned for a time [s]."""
+    """Return a laboratory whose individual has explored and learned for `seconds` [s].
+
+    `reality` and `seed` name the individual, and `first` is its initial network.
+    """
     lab = Lab(make_arm(robot, seed, reality), first, seed)
     lab.run(1.0)
     lab.controller.explore(True)
@@ -385,7 +388,10 @@ def learned_lab(robot: Robot, first: Mae, seed: int, reality: str, seconds: floa
 
 
 def play(lab: Lab, mishap: Mishap, seed: int, reality: str, before: float) -> dict[str, Any]:
-    """Play one mishap in a laboratory; return its result by name."""
+    """Play one mishap in a laboratory; return its result by name.
+
+    `reality` and `seed` name the individual. `before` is the error of its estimate so far [rad].
+    """
     number = [each.name for each in MISHAPS].index(mishap.name)
     rng = np.random.default_rng([seed, reality == FOREIGN, number, 0x315])
     begun, from_now = time.process_time(), lab.now
@@ -475,7 +481,10 @@ def results(folder: Path) -> list[dict[str, Any]]:
 
 
 def without_result(folder: Path, seed: int, reality: str, kinds: Sequence[str]) -> list[str]:
-    """Return the names of those mishaps of an individual that have no result in the folder yet."""
+    """Return the names of those mishaps in `kinds` that have no result in the folder yet.
+
+    `reality` and `seed` name the individual.
+    """
     done = {
         each['mishap']
         for each in results(folder)
@@ -485,7 +494,7 @@ def without_result(folder: Path, seed: int, reality: str, kinds: Sequence[str]) 
 
 
 def run_seed(robot: Robot, folder: Path, seed: int, reality: str, to_do: Sequence[str]) -> None:
-    """Run mishaps of one individual, and append their results to its file."""
+    """Run mishaps of the individual of `reality` and `seed`, and append the results to its file."""
     file = folder / f'{reality}_{seed}.jsonl'
     first = initial(robot, folder)
     mishap_kinds.OTHER_NETWORK[:] = [other_network(robot, first, reality, folder)]
@@ -505,7 +514,7 @@ def run_seed(robot: Robot, folder: Path, seed: int, reality: str, to_do: Sequenc
 
 
 def other_network(robot: Robot, first: Mae, reality: str, folder: Path) -> Mae:
-    """Return the network of another individual, from the cache in `folder` if it is there."""
+    """Return the network of another individual of `reality`, if possible from `folder`."""
     file = folder / f'other_{reality}.safetensors'
     if not file.exists():
         lab = learned_lab(robot, first, OTHER_SEED, reality, OTHER_LEARNING)
@@ -514,7 +523,7 @@ def other_network(robot: Robot, first: Mae, reality: str, folder: Path) -> Mae:
 
 
 def run_healthy(robot: Robot, folder: Path, seed: int, reality: str, hours: float) -> int:
-    """Run a healthy arm that explores; print and count its different warnings and errors."""
+    """Let a healthy arm explore for `hours`; print and count its different warnings and errors."""
     lab = learned_lab(robot, initial(robot, folder), seed, reality, AFTER)
     course = Course(lab, MISHAPS[0])
     course.run(3600.0 * hours - AFTER)
@@ -532,7 +541,10 @@ def is_wanted(name: str, kinds: Sequence[str] | None) -> bool:
 def run_graph(
     folder: Path, seeds: Iterable[int], wanted: Sequence[str] | None, again: bool
 ) -> None:
-    """Run the mishaps on the ROS graph that have no result yet, once for each seed."""
+    """Run the mishaps on the ROS graph, once for each seed.
+
+    Mishaps that have a result are left out, unless `again` repeats them.
+    """
     from bench.mishaps_on_graph import GRAPH_MISHAPS, run
 
     network = folder / 'graph.safetensors'

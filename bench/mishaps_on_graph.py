@@ -212,7 +212,10 @@ def true_error(attack: Attack) -> float:
 def run(
     folder: Path, initial: Path, seed: int, kinds: list[str], keep: Callable[[dict[str, Any]], None]
 ) -> None:
-    """Run the system, and play the named mishaps; call `keep` with each result."""
+    """Run the system, and play the named mishaps; call `keep` with each result.
+
+    `seed` selects muscles, joints and sizes. `initial` is the network to start from.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     with Attack(folder, initial, seed) as attack:
         scene = Scene(attack)

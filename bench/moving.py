@@ -60,7 +60,10 @@ def record(
 
 
 def measure(robot: Robot, mae: Mae, reality: str, seed: int, seconds: float) -> list[str]:
-    """Return the errors of one individual as lines of text."""
+    """Return the errors of one individual after learning, as lines of text.
+
+    `reality` and `seed` name the individual. Each recording takes `seconds` [s].
+    """
     held_out = record(robot, reality, seed, 60.0, 1.0, 1.0, order=9)
     before = robot.units.error_text(errors(mae, held_out))
     lines = [f'{reality} {seed}: initial network {before}']

@@ -275,7 +275,10 @@ def rupture_cells(study: Study, seed: int) -> list[str]:
 
 
 def attempt(error: Callable[[Study, int], float], study: Study, seed: int) -> str:
-    """Return an error of an individual as a text; if `error` raises an exception, its message."""
+    """Return the error that `error` measures on an individual as a text.
+
+    If `error` raises an exception, the text is the message of the exception.
+    """
     try:
         return f'{error(study, seed):.4f}'
     except MusculoskeletalError as problem:

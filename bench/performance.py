@@ -236,7 +236,10 @@ def starting(used: dict[str, float], held: dict[str, tuple[float, float]], netwo
 
 
 def flames(network: Path, seconds: float, out: Path) -> str:
-    """Draw a flame graph of each node, and return the text of the page with links to the graphs."""
+    """Draw a flame graph of each node, and return the text of the page with links to the graphs.
+
+    Each node is recorded for `seconds` [s], and the graphs are written to `out`.
+    """
     out.mkdir(parents=True, exist_ok=True)
     system = System(ARM, network, FLAME_RATE, KINDS['with learner'])
     try:

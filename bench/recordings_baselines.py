@@ -67,7 +67,11 @@ def _centred(training: Run) -> tuple[Array, Array]:
 
 
 def kernel_ridge(training: Run, with_effort: bool, width: float, penalty: float) -> Model:
-    """Return kernel ridge regression with a Gaussian kernel of this width."""
+    """Return kernel ridge regression with a Gaussian kernel.
+
+    `width` is the width of the kernel, and `penalty` that of the squared weights. With
+    `with_effort`, the inputs include the efforts.
+    """
     inputs, (theta, mean) = _inputs(training, with_effort), _centred(training)
     known = inputs(training)
 

@@ -106,7 +106,7 @@ class Observed:
 def explore(
     arm: Arm, initial: Mae, seed: int, seconds: float, held_out: Recording
 ) -> tuple[Excess, int, int, float]:
-    """Explore and learn for a time [s].
+    """Explore and learn for `seconds` [s]; `seed` selects the exploration.
 
     Returns:
         How tensions exceeded their limit, the number of stops, the number of samples, and the mean
