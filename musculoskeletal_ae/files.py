@@ -86,7 +86,7 @@ def read_csv(
 ) -> list[tuple[int, str, list[str]]]:
     """Return (line number, line, cells) of each row below the header of a CSV table.
 
-    Empty lines and lines that begin with # are skipped.
+    The header must consist of `columns`. Empty lines and lines that begin with # are skipped.
     """
     rows = []
     for number, line in enumerate(read_text(file, refuse, LARGEST_CSV).splitlines(), 1):

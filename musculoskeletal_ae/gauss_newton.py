@@ -73,18 +73,24 @@ SETTLED = 0.1
 
 
 def student(score: Array) -> Array:
-    """Return the weights ω for scaled residuals ρ/σ, in the same shape."""
+    """Return the weights ω of Student's t distribution for scaled residuals, in the same shape."""
     weight: Array = (FREEDOM + 1.0) / (FREEDOM + score**2)
     return weight
 
 
 def student_cost(score: Array) -> float:
-    """Return −2 times the log-likelihood of scaled residuals ρ/σ, up to a constant."""
+    """Return −2 times the log-likelihood of scaled residuals (`score`), up to a constant.
+
+    The residuals have Student's t distribution with FREEDOM degrees of freedom.
+    """
     return float((FREEDOM + 1.0) * np.log1p(score**2 / FREEDOM).sum())
 
 
 def whitening(covariance: Array) -> Array:
-    """Return R with RᵀR = Σ⁻¹; R ρ are independent residuals of standard deviation 1, (R, R)."""
+    """Return R with RᵀR = Σ⁻¹ for a covariance Σ of residuals ρ, (R, R) each.
+
+    The elements of R ρ are independent, with standard deviation 1.
+    """
     root: Array = np.linalg.inv(np.linalg.cholesky(covariance))
     return root
 

@@ -112,7 +112,10 @@ def muscle_rows(message: Any, muscles: int) -> Array:
 
 
 def _values(message: Any, rows: int, columns: int, owner: str = 'muscle') -> Array:
-    """Return the data of a Float64MultiArray as (rows, columns), with size and layout checked."""
+    """Return the data of a Float64MultiArray as (rows, columns), with size and layout checked.
+
+    `owner` is the legal label of the columns.
+    """
     count = len(message.data)
     if count > MOST_ENTRIES:
         raise MessageError('oversized', f'{count} values; legal: at most {MOST_ENTRIES}')
@@ -270,7 +273,10 @@ def read_wrench(message: Any, root_link: str) -> Array:
 
 
 def _six(first: Any, second: Any, most: Array, what: str) -> Array:
-    """Return two vectors as one array (6,), whose elements must be finite and within ±`most`."""
+    """Return two vectors as one array (6,), whose elements must be finite and within ±`most`.
+
+    `what` names the vectors in messages of errors.
+    """
     values = np.array([first.x, first.y, first.z, second.x, second.y, second.z])
     if not np.isfinite(values).all():
         raise _not_finite(what, values)
@@ -280,7 +286,10 @@ def _six(first: Any, second: Any, most: Array, what: str) -> Array:
 
 
 def _not_finite(what: str, values: Array) -> MessageError:
-    """Return the error for an array with NaN or infinite values; it states the first of these."""
+    """Return the error for an array with NaN or infinite values; it states the first of these.
+
+    `what` names the array in the message.
+    """
     return MessageError(
         'not finite', f'{what} is {values[~np.isfinite(values)][0]}; expected finite numbers'
     )
@@ -367,7 +376,10 @@ def _check_names(names: Sequence[str], joints: Sequence[str]) -> None:
 
 
 def _column(points: Sequence[Any], what: str, joint_count: int) -> Array | None:
-    """Return one quantity of all K points, (K, joint_count); None if the points do not state it."""
+    """Return the field `what` of all K points as an array (K, joint_count).
+
+    The result is None if the points do not state this quantity.
+    """
     rows = [getattr(point, what) for point in points]
     lengths = {len(row) for row in rows}
     legal = {joint_count} if what == 'positions' else {0, joint_count}

@@ -34,7 +34,10 @@ T = TypeVar('T')
 def _type(
     convert: Callable[[str], T], is_legal: Callable[[T], bool], expected: str
 ) -> Callable[[str], T]:
-    """Return an argparse type that converts a text and rejects values that are not legal."""
+    """Return an argparse type that converts a text and rejects values that are not legal.
+
+    The message for a rejected value names the legal values in `expected`.
+    """
 
     def checked(text: str) -> T:
         with suppress(ValueError):
@@ -135,7 +138,7 @@ class Parser(argparse.ArgumentParser):
         self.add_argument('--reality', choices=('kin', 'foreign'), default='kin', help=text)
 
     def add_minutes(self, text: str, default: float | None) -> None:
-        """Add `--minutes`, a duration in robot time [min]; the text is its help."""
+        """Add `--minutes`, a duration in robot time [min]; `text` is its help text."""
         self.add_argument('--minutes', type=minutes, default=default, help=text)
 
     def add_quick(self, text: str) -> None:
@@ -160,7 +163,8 @@ class Parser(argparse.ArgumentParser):
     ) -> None:
         """Add `--out`, a file or directory; it is required unless it has a default or is optional.
 
-        An optional one is None if it is not given.
+        `metavar` and `text` appear in its help. `read` converts and checks the argument. An
+        optional one is None if it is not given.
         """
         required = default is None and not is_optional
         self.add_argument(

@@ -62,7 +62,7 @@ def secure_output() -> None:
 
 
 def _secured(stream: TextIO | None, number: int) -> TextIO:
-    """Return a stream that replaces `stream`, which Python has opened for a descriptor."""
+    """Return a stream that replaces `stream`, which Python has opened for descriptor `number`."""
     if stream is not None and not isinstance(stream, io.TextIOWrapper):
         return stream  # not Python's own one
     if stream is not None:

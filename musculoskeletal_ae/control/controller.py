@@ -448,7 +448,7 @@ class Controller:
         return reason
 
     def explore(self, wanted: bool) -> str:
-        """Start or end the exploration; return the reason if this is refused, else ''."""
+        """Start the exploration if `wanted`, else end it; return why this is refused, or ''."""
         condition = self.supervisor.condition
         if wanted and condition is not None:
             if self.supervisor.is_latched:
@@ -474,7 +474,7 @@ class Controller:
         return ''
 
     def stop(self, cause: ConditionKind, detail: str = '') -> None:
-        """Stop the arm; the stop is latched."""
+        """Stop the arm for a cause, with an optional detail; the stop lasts until `reset`."""
         self.supervisor.on_event(cause.condition(detail))
 
     def reset(self, now: float) -> Condition | None:
@@ -659,7 +659,7 @@ class Controller:
         return Command(command.kind, np.where(self.robot.used, command.value, released))
 
     def _stopped(self, present: list[Condition], dt: float) -> Command | None:
-        """Return the command of a stopped arm."""
+        """Return the command of an arm that the causes `present` stop, after a step of dt [s]."""
         if not self.stopping.is_entered:
             self.activities.leave()
             self.stopping.enter()
@@ -704,7 +704,7 @@ class Controller:
         self.supervisor.on_request(activity)
 
     def _approach(self, duration: float) -> None:
-        """Start a trajectory to the target, along the path of `Planner.to_posture`."""
+        """Start a trajectory of `duration` [s] to the target, along `Planner.to_posture`'s path."""
         state = self.target_state
         assert state.theta is not None
         start, mae = self._ready()
@@ -713,7 +713,7 @@ class Controller:
         self._begin(plan, 0.0, state.effort)
 
     def _follow(self, plan: Plan, delay: float = 0.0) -> None:
-        """Follow a requested trajectory, whose end becomes the target."""
+        """Follow a requested trajectory after `delay` [s]; its end becomes the target."""
         nothing = np.zeros(self.robot.joint_count)
         end = plan.trajectory.end
         self.target_state = Target(nothing, end, (), plan.unreachable_reason)

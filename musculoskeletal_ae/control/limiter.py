@@ -271,7 +271,10 @@ class CommandLimiter:
         return relieved
 
     def _tension_rate(self, time: float, tension: Array) -> Array:
-        """Return the rates of change of the tensions [N/s], (M,), between the last two messages."""
+        """Return the rates of change of the tensions [N/s], (M,), between the last two messages.
+
+        `tension` [N], (M,), are those of the last message, which was sent at `time` [s].
+        """
         rate = np.zeros_like(tension)
         if self._tension is not None:
             before, old, rate = self._tension
@@ -285,7 +288,11 @@ class CommandLimiter:
     def _shortest(
         self, before: Array, change: Array, sample: MuscleSample, limit: Array, dt: float
     ) -> Array:
-        """Return the shortest length commands [m], (M,), that demand no tension above the limit."""
+        """Return the shortest length commands [m], (M,), that demand no tension above the limit.
+
+        Unless a measured tension is too high, they exceed the last command `before` by at most
+        `change`, both [m], (M,). `limit` is in [N], (M,), and dt in [s].
+        """
         robot, actuation = self._robot, self._robot.actuation
         tension = sample.motor_tension * sample.usable * actuation.knows_tension
         rate = self._tension_rate(sample.sent_at, tension)

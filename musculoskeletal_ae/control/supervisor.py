@@ -188,7 +188,7 @@ class Supervisor:
         self.awaits_exploration = False
 
     def on_offsets(self, known: bool) -> None:
-        """Adapt the activity to new length offsets.
+        """Adapt the activity when the length offsets become `known`, or unknown.
 
         While the offsets are unknown, the arm can only explore gently. A motion to a target ends,
         because its trajectory was planned with the previous offsets.

@@ -431,7 +431,10 @@ class Listening:
         return bool((model >= least)[has_moved].all())
 
     def _suspected_signs(self, theta: Array, length: Array, tension: Array) -> list[str]:
-        """Return the joints of which a reversed sign alone would explain all wrong lengths."""
+        """Return the joints of which a reversed sign alone would explain all wrong lengths.
+
+        Arguments are joint angles [rad], (N, D), lengths [m] and tensions [N], (N, M) each.
+        """
         names = []
         for j, name in enumerate(self._robot.joints):
             turned, other = theta.copy(), Verdict(self._robot)
@@ -452,7 +455,7 @@ class Listening:
         return bool(self._moved(theta).any()) and are_places and len(verdict.faults) > 2
 
     def _moved(self, theta: Array) -> Bools:
-        """Return which joints moved enough to check the signs of their angles, (D,)."""
+        """Return which joints moved enough in θ [rad] (N, D) to check their signs, (D,)."""
         moved: Bools = np.ptp(theta, axis=0) > MOVED_JOINT
         return moved
 

@@ -198,7 +198,10 @@ class MotionTest(ABC):
         return any(np.isfinite(theta).all() for theta, _, _ in self._history)
 
     def _wrong_side(self, winds: dict[int, int]) -> Literal['readings', 'commands'] | None:
-        """Return whether the readings or the commands are exchanged; None if it is unknown."""
+        """Return whether the readings or the commands are exchanged; None if it is unknown.
+
+        `winds` is the column of the readings that responded to each muscle's command.
+        """
         if any(self.verdict.has_passed('order', column) for column in winds.values()):
             return 'commands'  # the readings were checked while a hand moved the arm
         if not self._knows_joints():

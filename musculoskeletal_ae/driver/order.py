@@ -66,7 +66,7 @@ def wrong_side(
     )
 
     def misfit(theta: Array, owner: dict[int, int]) -> float:
-        """Return the misfit [m] if column k belongs to muscle `owner[k]`."""
+        """Return the misfit [m] at θ [rad] (N, D) if column k belongs to muscle `owner[k]`."""
         (square,) = misfits_of(theta)
         return float(np.sqrt(sum(square[k, m] for k, m in owner.items())))
 

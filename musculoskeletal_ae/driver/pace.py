@@ -52,7 +52,7 @@ class Pace:
         return len(self._messages)
 
     def message(self, came: float, sent: float, number: int) -> None:
-        """Record when a message was received and when it was sent [s], and its sequence number."""
+        """Record a message: when it came, when it was sent [s], and its sequence number."""
         self._messages.append(_Received(came, self._awake.at(came), sent, number))
 
     def judge(self, verdict: Verdict, now: float) -> None:

@@ -180,7 +180,10 @@ class Winding(MotionTest):
             self.verdict.failed('hold', m, got=held.tension[m], asked=held.demand[m])
 
     def _run_away(self, states: Array, start: Array) -> RunAwayError | None:
-        """Return the error of a muscle that exceeds its demand or shortens too far."""
+        """Return the error of a muscle that exceeds its demand or shortens too far; else None.
+
+        `states` and `start` are the newest readings and those when the present wait began, (3, M).
+        """
         length, tension = states[:2]
         tensions = self._robot.tension
         verified = np.minimum(np.maximum(tensions.limit, self._most), tensions.max)
@@ -483,7 +486,11 @@ class Winding(MotionTest):
             self._judge_latency(m, min(half + whole))
 
     def _judge_law(self, m: int, home: _Reading, last: _Reading, out: _Reading) -> None:
-        """Judge whether T obeys the law at the highest demand, and with l_target beyond l."""
+        """Judge whether the tension of muscle m obeys the control law of the modules.
+
+        `home` is the reading before it was wound in, `last` that at the highest demand, and `out`
+        that with l_target beyond l, which must demand T_bias only.
+        """
         failed = self.verdict.failed
         asked, got = last.demand[m] - home.demand[m], last.tension[m] - home.tension[m]
         if asked < 0.25 * (self._highest - self._bias)[m]:

@@ -248,7 +248,10 @@ class Arm(ABC):
     _order: Ints  # indices of the joints of θ in `_angles` and `_rates`
 
     def __init__(self, robot: Robot, seed: int, length_bias: Array) -> None:
-        """Build the modules; `length_bias` [m] (M,) are the offsets of their length sensors."""
+        """Build the modules of the individual `seed`.
+
+        `length_bias` [m] (M,) are the offsets of their length sensors.
+        """
         self.robot, self._length_bias = robot, length_bias
         #: time without a command after which the modules go to their safe state [s]
         self.command_timeout = 0.5
@@ -313,7 +316,7 @@ class Arm(ABC):
         self._age = 0.0
 
     def _attach(self, which: Bools) -> None:
-        """Attach the selected muscles so that they carry T_bias in the present posture."""
+        """Attach the muscles that are True in `which` (M,), so that they carry T_bias now."""
         bias = self.robot.tension.bias
         length = self.individual.muscle_lengths(self.theta[None], bias)[0] - self.faults.slack
         self._muscle.length[which] = length[which]

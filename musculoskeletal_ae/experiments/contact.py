@@ -42,7 +42,10 @@ class ContactLoop(ClosedLoop):
     """A closed loop whose arm is pushed."""
 
     def contact(self, exploring: bool = False) -> Contact:
-        """Simulate until the next message, and return the contact that is estimated from it."""
+        """Simulate until the next message, and return the contact that is estimated from it.
+
+        If `exploring`, the arm explores for this message; otherwise, it continues as before.
+        """
         _ = self.explore() if exploring else self.step()
         assert self.estimator.output is not None and self.estimator.output.contact is not None
         return self.estimator.output.contact

@@ -234,7 +234,7 @@ def _bars(trace: Mapping[str, Any], labels: list[str], title: str) -> Any:
 
     A dashed line shows the QP bound of each group. `labels` are the names of the groups. In
     `trace`, 'errors' [rad] and 'tensions' [N] are arrays (groups, approaches) by method, and
-    'bound' [N] is an array (groups,).
+    'bound' [N] is an array (groups,). `title` is that of the figure.
     """
     figure, (upper, lower) = plots.new_figure(11.0, 6.4, 2, sharex=True)
     place, width, bound = np.arange(len(labels)), 0.8 / len(METHODS), trace['bound']

@@ -137,7 +137,7 @@ class GraspAndRupture:
 
 
 def grasp_and_release(arm: Arm, time: float) -> None:
-    """Alternate between grasping and releasing a payload, once a minute; see `recording.Script`."""
+    """Let an arm grasp or release a payload, in turn, if a minute begins at `time` [s]."""
     turn, since = divmod(round(time / SAMPLE_TIME), round(GRASPING / SAMPLE_TIME))
     if since == 0:
         arm.set_payload(PAYLOAD if turn % 2 else 0.0)

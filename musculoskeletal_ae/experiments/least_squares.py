@@ -81,7 +81,7 @@ def oracle(robot: Robot, true: Individual) -> LeastSquares:
 
 
 def nominal(robot: Robot, tension_noise: float = TENSION_NOISE) -> LeastSquares:
-    """Return the estimator that uses the geometric model."""
+    """Return the estimator that uses the geometric model, and tensions with this noise [N]."""
     routes = robot.routes
     model = robot.muscle_lengths, routes.muscle_jacobian, routes.length_at_zero
     return LeastSquares(robot, *model, robot.series_elastic, tension_noise)

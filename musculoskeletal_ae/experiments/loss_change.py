@@ -161,7 +161,7 @@ def _run_arm(arm: Arm, command: Array) -> Motion:
 
 
 def _phases(numbers: dict[str, Any]) -> list[str]:
-    """Return the names of the phases, with the joints and angles of this robot."""
+    """Return the names of the phases, with the joints and angles in the numbers of a robot."""
     flexed_deg, forced_deg = np.degrees([numbers['flexed_rad'], numbers['forced_rad']])
     names = [phase.name for phase in PHASES]
     names[0] = f'{numbers["flexed_joint"]}\n{flexed_deg:.0f}°'

@@ -166,7 +166,8 @@ def train_initial(study: Study, preset: str) -> None:
 def new_learner(study: Study, seed: int, preset: str, source: str = SENSOR) -> Learner:
     """Return a learner that starts with the initial network of a preset.
 
-    `source` names where its joint angles come from, such as the joint sensors.
+    `seed` determines its random numbers, and `source` names where its joint angles come from, such
+    as the joint sensors.
     """
     initial, steps = study.network(None, preset), STEPS // 5 if study.quick else STEPS
     return Learner(study.robot, initial, preset, seed, steps=steps, joint_source=source)
@@ -175,7 +176,10 @@ def new_learner(study: Study, seed: int, preset: str, source: str = SENSOR) -> L
 def new_learner_and_loop(
     study: Study, arm: Arm, seed: int, preset: str
 ) -> tuple[Learner, ClosedLoop]:
-    """Return a learner with the initial network, and a closed loop in which the arm explores."""
+    """Return a learner with the initial network of a preset, and a closed loop that explores.
+
+    `seed` is that of the individual `arm`; it also selects the exploration.
+    """
     learner = new_learner(study, seed, preset)
     settings = Settings(preset=preset)
     return learner, ClosedLoop(arm, learner.mae, settings, EXPLORATION_STREAM + seed)

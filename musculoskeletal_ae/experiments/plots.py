@@ -86,7 +86,7 @@ def bars(
     """Draw means over N individuals as bars with their values, and a dot for each individual.
 
     `groups` maps labels to a colour and values (N, K) of the K names. NaN stands for no value
-    (`mean_of_known`).
+    (`mean_of_known`). `panel` are the axes to draw in, with a title and a label of the x axis.
     """
     place, height = np.arange(len(names)), 0.8 / len(groups)
     for g, (label, (colour, values)) in enumerate(groups.items()):
@@ -114,8 +114,9 @@ def ranked_bars(
 ) -> None:
     """Draw one bar per name: the mean over individuals, with a dot for each individual.
 
-    A column beside the axes shows the means as numbers. `values` maps names to the individuals'
-    values; None stands for no value (`mean_of_known`).
+    A column beside the axes shows the means as numbers, with `digits` after the point. `values`
+    maps names to the individuals' values; None stands for no value (`mean_of_known`). `colours`
+    has one colour for each name. `panel` are the axes to draw in.
     """
     place = np.arange(len(values))
     numbers = {name: np.array(each, dtype=float) for name, each in values.items()}

@@ -80,7 +80,11 @@ class ClosedLoop:
         seed: int = 0,
         on_anomaly: str = 'stop',
     ) -> None:
-        """Connect an arm in its present posture; `seed` determines the exploration."""
+        """Connect an arm in its present posture.
+
+        `seed` determines the exploration, and `on_anomaly` what happens on an anomaly, as the
+        parameter of the estimator does.
+        """
         self.arm, self.core, self.stops = arm, Controller(arm.robot, settings, seed), 0
         self.estimator = Estimator(arm.robot, mae.preset)
         self.estimator.configure(EstimatorSettings(on_anomaly=on_anomaly))
@@ -233,7 +237,7 @@ def rows_between(start: float, end: float) -> slice:
 
 
 def mean_error(estimate: Array, truth: Array) -> float:
-    """Return the mean over samples of ‖θ_est − θ_true‖₂ [rad]."""
+    """Return the mean of ‖θ_est − θ_true‖₂ [rad] over N samples of both, (N, D) each."""
     return float(np.linalg.norm(estimate - truth, axis=1).mean())
 
 

@@ -64,7 +64,10 @@ class IsolatingLoop(ClosedLoop):
     """A closed loop that isolates faulty muscles, and notes verdicts and errors."""
 
     def __init__(self, arm: Arm, mae: Mae, seed: int = 0) -> None:
-        """Connect an arm at rest to an estimator that isolates suspect muscles."""
+        """Connect an arm at rest to an estimator that isolates suspect muscles.
+
+        `seed` determines the exploration.
+        """
         #: isolated muscles and the reason, after each verification
         self.verdicts: list[tuple[tuple[int, ...], str]] = []
         self.error = np.nan  # distance ‖θ_est − θ‖ at the last message [rad]

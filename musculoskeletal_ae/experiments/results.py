@@ -194,7 +194,7 @@ class ResultRow(Strict, frozen=True):
     worst: bool = False  # show the worst individual instead of the mean
 
     def number(self, result: Mapping[str, Any], key: str) -> float | None:
-        """Return the value of a key, or None if it was not measured."""
+        """Return the value of a key in a result.json, or None if it was not measured."""
         if not self.worst:
             return flat(result).get(key)
         every = [flat(numbers).get(key) for numbers in result.get('seeds', {}).values()]
@@ -231,7 +231,7 @@ def table(results: Results) -> list[Cells]:
 
 
 def individuals(seeds: Sequence[int]) -> str:
-    """Return the individuals' names, such as 'individual 0' or 'individuals 0–4'."""
+    """Return the names of the individuals with these seeds, such as 'individuals 0–4'."""
     names = ', '.join(map(str, seeds))
     if len(seeds) > 2 and list(seeds) == list(range(seeds[0], seeds[-1] + 1)):
         names = f'{seeds[0]}–{seeds[-1]}'

@@ -181,7 +181,7 @@ ESTIMATES = {
 
 
 def _estimates(rows: Rows, reality: str) -> Plot:
-    """Draw the errors of all estimators on one emulator model."""
+    """Draw the errors of all estimators on the emulator model `reality`, by individual."""
     figure, (panel,) = plots.new_figure(8.0, 3.2)
     values = {
         label: [row.numbers[reality][key] for row in rows.values()]

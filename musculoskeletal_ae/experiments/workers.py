@@ -116,10 +116,11 @@ class _Processes(Workers):
     def _run(
         self, function: Callable[..., Any], calls: Mapping[int, Call], is_first: bool
     ) -> Iterator[tuple[int, Any]]:
-        """Run calls, whose keys are their indices; a single call again only if `is_first`.
+        """Run a function with the arguments in `calls`, and yield results with the keys of `calls`.
 
         If one worker is killed, joblib ends all of them. The halves of the remaining calls then run
-        one after the other. If the fault is in a call, it is finally alone.
+        one after the other, until a call is alone. A lone call runs again if this `is_first`
+        attempt with it; after that, its result is a WorkerKilledError.
         """
         missing = dict(calls)
         try:

@@ -98,7 +98,10 @@ class ExportReport(NamedTuple):
 
 
 def kept_text(kept: dict[str, str]) -> str:
-    """Return a line that names the muscles with the points of the input, and the reasons."""
+    """Return a line that names the muscles which keep the points of the input.
+
+    `kept` is the reason for each of them. Muscles with the same reason are listed together.
+    """
     reasons = dict[str, list[str]]()
     for muscle, reason in kept.items():
         reasons.setdefault(reason, []).append(muscle)

@@ -193,7 +193,7 @@ class AdaptedModel:
         self._remove(is_removed)
 
     def _split_balls(self, kept: set[str]) -> None:
-        """Replace each ball joint by those of its hinges that the robot has."""
+        """Replace each ball joint by those of its three hinges whose names are in `kept`."""
         model = self._model
         parents = {child: parent for parent in self.root.iter() for child in parent}
         for j, parts in self._balls.items():

@@ -501,9 +501,10 @@ class _Reader:
         return data
 
     def _lengths(self, tendons: dict[str, int], values: dict[str, Array]) -> dict[str, Array]:
-        """Return the tendon lengths that MuJoCo computes [m], (N,) each; see `source.Lengths`.
+        """Return the tendon lengths that MuJoCo computes [m], (N,) each, by name.
 
-        `tendons` are the indices of the tendons by name.
+        `tendons` are the tendons' indices, and `values` the joint positions [rad or m], (N,) each,
+        both by name.
         """
         m, data, start = self.model, mujoco.MjData(self.model), self.model.qpos0
         address = {self.names['joint'][j]: at for j, at in enumerate(m.jnt_qposadr.tolist())}

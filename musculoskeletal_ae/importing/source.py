@@ -136,13 +136,16 @@ class Source:
         return [note for note in self.notes if re.match('dropped: (muscle|tendon|actuator) ', note)]
 
     def rename(self, kind: str, original: str | None, fallback: str, taken: Iterable[str]) -> str:
-        """Return a legal, unused name, and add a note if it differs from the original."""
+        """Return a legal name that is not in `taken`, and add a note if it is not the original.
+
+        `fallback` is used without an original name. The note begins with `kind`, such as 'muscle'.
+        """
         (name,) = distinct([safe_name(original, fallback)], taken)
         self.renamed(kind, original, name)
         return name
 
     def renamed(self, kind: str, original: str | None, name: str) -> None:
-        """Add a note if a name differs from the original."""
+        """Note that an element, such as a 'muscle' (`kind`), has another name than the original."""
         if original and name != original:
             self.note('renamed', f'{kind} {original} is {name} here')
 
@@ -174,7 +177,17 @@ class Source:
         self, name: str, parent: int, at: pin.SE3, slides: bool, axis: Array,
         limits: tuple[float, float], rest: float = 0.0,
     ) -> int:  # fmt: skip
-        """Add a joint at a pose in the frame of the joint `parent` (0: none); return its index."""
+        """Add a joint, and return its index.
+
+        Args:
+            name: Unique name of the joint.
+            parent: Index of the joint in whose frame `at` is; 0 for the root link.
+            at: Pose of the joint.
+            slides: Whether the joint is prismatic.
+            axis: Direction of the joint's axis in its own frame, (3,).
+            limits: Lower and upper limit in the source [rad or m].
+            rest: Position of the joint in the rest posture of the source [rad or m].
+        """
         kind = pin.JointModelPrismaticUnaligned if slides else pin.JointModelRevoluteUnaligned
         if (size := np.linalg.norm(axis)) < 1e-9:
             raise ValueError(
@@ -207,7 +220,7 @@ class Source:
         return float(self.model.lowerPositionLimit[q]), float(self.model.upperPositionLimit[q])
 
     def reduce_range(self, joint: str, low: float, high: float) -> None:
-        """Reduce the limits of a joint [rad or m] to the part that its muscles can hold."""
+        """Reduce a joint's limits to `low` and `high` [rad or m], where its muscles can hold it."""
         before = ' to '.join(f'{end:.4g}' for end in self.span(joint))
         q = self.model.joints[self.model.getJointId(joint)].idx_q
         for limits, end in (('lowerPositionLimit', low), ('upperPositionLimit', high)):
@@ -286,7 +299,7 @@ def numbers(text: str | None, count: int, where: str) -> Array:
 
 
 def link_inertia(link: str, mass: float, centre: Array, tensor: Array) -> pin.Inertia:
-    """Return the inertia of a link.
+    """Return the inertia of a link from its mass [kg], centre of mass [m] and tensor [kg·m²].
 
     Raises:
         ValueError: If the inertia is not physical; the message names the link.
@@ -316,7 +329,10 @@ def distinct(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
 
 
 def names_of_all(kind: str, originals: Iterable[str]) -> list[str]:
-    """Return legal and unique names of all elements of a kind; unnamed ones are numbered."""
+    """Return legal and unique names of all elements of a kind such as 'joint'.
+
+    Elements without a name are numbered, such as 'joint_2'.
+    """
     safe = (safe_name(name, f'{kind}_{i}') for i, name in enumerate(originals))
     return distinct(safe, ['universe'])  # pinocchio's name of the world
 
@@ -327,7 +343,8 @@ def unique(
     """Return the elements in `items`, pairs (name, element), as a dictionary by name.
 
     Raises:
-        ValueError: If a name occurs twice.
+        ValueError: If a name occurs twice. The message names the kind of the elements and states
+            what is legal.
     """
     named: dict[str, Any] = {}
     for name, item in items:
@@ -678,7 +695,7 @@ def _joint_elasticity(source: Source, joints: list[str]) -> list[dict[str, Any]]
 
 
 def _coupling(slave: str, coupling: Coupling) -> dict[str, Any]:
-    """Return an entry of `couplings` in muscles.yaml."""
+    """Return an entry of `couplings` in muscles.yaml, for the joint `slave`."""
     entry: dict[str, Any] = {'joint': slave, 'master': coupling.master}
     if coupling.higher:
         return {**entry, 'polynomial': list(coupling.terms)}

@@ -131,7 +131,7 @@ class Planner:
         return Plan(planned, problem and f'{problem}; the arm goes to the nearest posture')
 
     def is_under_way(self, pose: pin.SE3, whole: bool, followed: Trajectory | None) -> bool:
-        """Return whether the followed trajectory already leads to this pose."""
+        """Return whether `followed` was planned for this pose, `whole` or its position only."""
         if self._last_pose is None or followed is None:
             return False
         before, whole_before, trajectory = self._last_pose

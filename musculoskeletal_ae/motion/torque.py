@@ -106,7 +106,7 @@ class TorqueControl(ActivityControl):
         return Command(TENSION, self._command.copy())
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
-        """Return the feedback torque [N·m], (D,), from posture and velocity."""
+        """Return the torque [N·m], (D,), that pulls θ towards `target` and damps the velocity."""
         return POSITION_GAIN * (target - theta) - VELOCITY_GAIN * velocity
 
 

@@ -372,7 +372,10 @@ class Shell(Node):
         handle: Callable[[UInt8MultiArray], Iterator[None]],
         unfit: Callable[[str], None] = lambda _: None,
     ) -> CheckpointQueue:
-        """Return a queue that processes the checkpoints of a topic in small steps."""
+        """Return a queue that processes the checkpoints of a topic in small steps.
+
+        `handle` yields after each step. `unfit` is called with the reason if one is refused.
+        """
         return CheckpointQueue(self, self._reception, topic, handle, unfit)
 
     # -- messages -------------------------------------------------------------------------------
@@ -434,7 +437,11 @@ class Shell(Node):
     def _from_author(
         self, topic: str, callback: Callable[[Any], object], is_latched: bool
     ) -> Callable[[Any], None]:
-        """Return a callback that rejects messages while several nodes publish the topic."""
+        """Return a callback that rejects messages while several nodes publish the topic.
+
+        On a latched topic, it also rejects them while the node of one of several publishers is
+        not known yet.
+        """
 
         def take(message: Any) -> None:
             self.sources.check(topic, is_latched)
@@ -582,7 +589,10 @@ def _signs(conditions: Iterable[Condition]) -> frozenset[tuple[str, str, tuple[s
 def _recorded(
     recording: StopRecording, topic: str, kind: type, callback: Callable[[Any], Any]
 ) -> Callable[[bytes], Any]:
-    """Return a callback that records a serialized message, then passes it to `callback`."""
+    """Return a callback that records a serialized message of a topic, and calls `callback` with it.
+
+    `callback` receives the deserialized message, of the type `kind`.
+    """
 
     def read(data: bytes) -> Any:
         message = deserialize_message(data, kind)

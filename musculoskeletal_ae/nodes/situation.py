@@ -232,14 +232,14 @@ class Situation:
         return 'learner' in self._reports
 
     def number(self, node: str, key: str) -> float:
-        """Return a number that a node has reported; NaN if it is unknown."""
+        """Return the number that a node has reported as `key`; NaN if it is unknown."""
         try:
             return float(self.values(node).get(key, 'nan'))
         except ValueError:
             return math.nan
 
     def count(self, key: str) -> str:
-        """Return a count of the learner; '0' without a learner."""
+        """Return the count that the learner has reported as `key`; '0' without a learner."""
         return self.values('learner').get(key, '0')
 
     def hint(self) -> str:

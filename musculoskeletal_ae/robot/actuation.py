@@ -280,7 +280,10 @@ class Actuation(ABC):
 
     @abstractmethod
     def winding_depth(self, muscle: int) -> float:
-        """Return the length [m] by which a suspect may be wound in, whatever its sensors read."""
+        """Return the length [m] by which `muscle` may be wound in while it is verified.
+
+        The limit applies whatever the sensors of the suspect muscle read.
+        """
 
 
 class StiffnessControl(Actuation):
@@ -339,7 +342,10 @@ class StiffnessControl(Actuation):
         return self.demanded(length, command)
 
     def is_pulling(self, length: Array, command: Array) -> Bools:
-        """Return which muscles are longer than commanded, (M,); these demand more than T_bias."""
+        """Return which muscles are longer than commanded, (M,); these demand more than T_bias.
+
+        Measured and commanded lengths are in [m], (M,) each.
+        """
         pulling: Bools = length > command
         return pulling
 
@@ -385,7 +391,10 @@ class StiffnessControl(Actuation):
         return np.where(self._robot.used, end, np.minimum(end, longest))
 
     def rise(self, muscle: int, length: float, command: float, tension: float) -> float:
-        """Return by how much the higher of measured and demanded tension exceeds T_bias [N]."""
+        """Return by how much the higher of measured and demanded tension exceeds T_bias [N].
+
+        The demanded tension follows from the measured length and the length command, both [m].
+        """
         measured = tension - self._whole.bias[muscle]
         return float(max(measured, self._stiffness[muscle] * (length - command)))
 

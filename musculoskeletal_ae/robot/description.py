@@ -401,7 +401,10 @@ def _read_couplings(
 def _read_joint_elasticity(
     content: MuscleFile, couplings: Iterable[str], fail: Fail
 ) -> JointElasticity:
-    """Return springs, dampers and passive tendons, in the units of the joints."""
+    """Return the springs, dampers and passive tendons in `content`, in the units of the joints.
+
+    `couplings` are joints that follow another joint, and can therefore have no spring.
+    """
     joints = content.joints
     stiffness, rest, damping = (
         np.zeros(shape) for shape in ((len(joints),) * 2, *[len(joints)] * 2)
@@ -551,7 +554,8 @@ def _read_end_effectors(
 ) -> tuple[str, ...]:
     """Return the links that muscles.yaml names as end effectors.
 
-    If it names none, return the link that the largest number of joints move.
+    If it names none, return the link that the largest number of joints move. `couplings` are the
+    coupled joints, and `order` are the links in the order of robot.urdf.
     """
     links = _joints_above(model, {*content.joints})
     moved = _joints_above(model, {*content.joints, *couplings})
@@ -593,7 +597,10 @@ def _joints_above(model: pin.Model, names: set[str]) -> dict[str, int]:
 def with_modules(
     description: RobotDescription, actuation: str, tension_source: str = 'sensor'
 ) -> RobotDescription:
-    """Return the description with another kind of muscle modules and their default values."""
+    """Return the description with another kind of muscle modules and their default values.
+
+    `actuation` and `tension_source` have the values that they may have in muscles.yaml.
+    """
     follows_position, ones = actuation == POSITION, np.ones(len(description.muscles))
     scale = ones * NEWTON_PER_AMPERE if tension_source == CURRENT else None
     return replace(

@@ -44,16 +44,25 @@ class JointUnit(NamedTuple):
         return f'{theta * self.radian:{form}} {self.position}'
 
     def range_text(self, low: float, high: float, form: str = '.2f') -> str:
-        """Return a range of positions with its unit, such as '0.00 to 0.05 m', for θ [rad]."""
+        """Return the range from `low` to `high`, both θ [rad], as text such as '0.00 to 0.05 m'.
+
+        `form` is the format of the numbers.
+        """
         low, high = low * self.radian, high * self.radian
         return f'{low:{form}} to {high:{form}} {self.position}'
 
     def torque_text(self, torque: float, form: str = '.2f') -> str:
-        """Return a joint torque, or the force on a prismatic joint, for a torque in [N·m]."""
+        """Return a joint torque [N·m] as text; of a prismatic joint, the force [N] instead.
+
+        `form` is the format of the number.
+        """
         return f'{torque / self.radian:{form}} {self.torque}'
 
     def stiffness_text(self, stiffness: float, form: str = '.2f') -> str:
-        """Return a joint stiffness with its unit, for a stiffness in [N·m/rad]."""
+        """Return a joint stiffness [N·m/rad] as text; of a prismatic joint, in [N/m] instead.
+
+        `form` is the format of the number.
+        """
         return f'{stiffness / self.radian**2:{form}} {self.stiffness}'
 
 

@@ -174,7 +174,7 @@ def _topics(content: MotorFile) -> MotorTopics:
 
 
 def _constant(name: str, content: MotorFile, entry: MotorEntry) -> float:
-    """Return a constant of a motor: its own, or that of the file, or the default."""
+    """Return the constant `name` of a motor: its own, or that of the file, or the default."""
     values = (getattr(source, name) for source in (entry, content))
     stated = [value for value in values if value is not UNSET]
     return stated[0] if stated else CONSTANTS[name]

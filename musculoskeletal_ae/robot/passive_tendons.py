@@ -102,7 +102,10 @@ class PassiveTendons:
         return replace(self, arrays=arrays)
 
     def scaled(self, radian: Array) -> PassiveTendons:
-        """Return the same tendons for other units of the joint angles, as `JointElasticity`."""
+        """Return the same tendons for other units of the joint angles.
+
+        `radian` (D,) is the value of one unit of the new angles in the present units.
+        """
         own = self.arrays
         coefficient = own.coefficient * np.prod(radian**own.power, axis=1)
         arrays = own._replace(centre=own.centre / radian, coefficient=coefficient)

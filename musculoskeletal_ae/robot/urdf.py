@@ -209,7 +209,10 @@ def _check_tree(file: Path, parts: list[ET.Element]) -> None:
 
 
 def _link_at(where: str, joint: ET.Element, end: str, links: set[str]) -> str:
-    """Return the link that is the parent or child of a joint; it has to be one of `links`."""
+    """Return the link that is the 'parent' or 'child' (`end`) of a joint.
+
+    It has to be one of `links`; the message of the error begins with `where`.
+    """
     element = joint.find(end)
     link = '' if element is None else element.get('link', '')
     if link not in links:

@@ -67,7 +67,7 @@ def _options_beside_ros() -> list[str]:
 
 
 def _run(kinds: list[Any]) -> None:
-    """Construct nodes, spin them until a stop, and destroy them."""
+    """Construct nodes of the given classes, spin them until a stop, and destroy them."""
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     nodes: list[Any] = []
     watch = ProgressWatch()

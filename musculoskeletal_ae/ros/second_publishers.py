@@ -255,6 +255,8 @@ class Sources:
     def check(self, topic: str, is_latched: bool) -> None:
         """Check the publishers of a topic on which a message has just arrived.
 
+        On a latched topic, the node of each of several publishers must be known.
+
         Raises:
             MessageError: If the message may come from another node than the intended publisher.
         """

@@ -53,7 +53,10 @@ def _say(text: object) -> None:
 
 
 def _instruction(robot: Robot, options: Namespace, has_joint_sensors: bool) -> str:
-    """Return what the user has to do with the arm while `check_driver` listens."""
+    """Return what the user has to do with the arm while `check_driver` listens.
+
+    An arm without joint sensors has to be held still.
+    """
     if options.move:
         return 'do not touch the arm; it moves by itself afterwards, if no fault is found'
     if options.posture:

@@ -76,7 +76,10 @@ def _problem(bag: Bag, robot: Robot, namespace: str | None, stop: int) -> str:
 
 
 def _described(bag: Bag, robot: Robot, namespace: str | None) -> tuple[str, list[str]]:
-    """Return the name and the movable joints of the recorded URDF; '' and [] without one."""
+    """Return the name and the movable joints of the URDF in a recording.
+
+    They are '' and [] if the recording has no URDF. `namespace` is that of the recorded topics.
+    """
     topics = interface_topics(bag, namespace, robot.description.motor_topics)
     topic = topics.get('robot_description')
     for message in bag.messages([topic] if topic else []):

@@ -332,7 +332,10 @@ def _learns_from_motion(robot: Robot, sources: list[TableSource], preset: str) -
 
 
 def _count(robot: Robot, sources: list[TableSource], enough: int, *, from_motion: bool) -> int:
-    """Count how many postures would be learned, up to `enough`."""
+    """Count how many postures would be learned, up to `enough`.
+
+    They are resting postures, or slow moments of a motion if `from_motion`.
+    """
     count = 0
     learned = [source for source in sources if not source.is_held_out]
     what = 'slow moments' if from_motion else 'resting postures'
@@ -360,7 +363,10 @@ def _learn_and_show(learner: Learner, source: TableSource) -> str:
 
 
 def _nothing_learned(learner: Learner, at_rest: bool) -> str:
-    """Return why no update took place, and what to record instead."""
+    """Return why no update took place, and what to record instead.
+
+    `at_rest` says whether the recording consists of resting postures only.
+    """
     rest = '' if at_rest else f' and rests in each for at least {REST_TIME:g} s'
     return (
         f'nothing was learned ({learner.updates} updates): {unchanged(learner)}. Record some '

@@ -287,8 +287,8 @@ class Controls:
     def push(self, event: Any) -> Array:
         """Draw the force that a visitor exerts by dragging; return the force [N], (3,).
 
-        The force is proportional to the length of the drag, up to MOST_PUSH; it is 0 when the drag
-        ends.
+        `event` is viser's event of the drag. The force is proportional to the length of the drag,
+        up to MOST_PUSH; it is 0 when the drag ends.
         """
         ends = np.array([event.start_position, event.end_position])
         force = PUSH_STIFFNESS * (ends[1] - ends[0])

@@ -149,7 +149,7 @@ class Page:
             readings.show(status, bars, self._history)
 
     def _muscles(self, tension: Array, temperature: Array) -> list[dict[str, Any]]:
-        """Return the template variables of each muscle's bar."""
+        """Return the template variables of each muscle's bar, at T [N] and temperature [°C]."""
         columns = {
             'rgb': map(
                 tuple, body.colours(self._robot, np.nan_to_num(tension), self.scene.kinds).tolist()
@@ -169,7 +169,10 @@ class Page:
         return text if self.controls is None else with_buttons(text)
 
     def notify(self, text: str, good: bool) -> None:
-        """Notify all visitors of the outcome of a request, naming buttons instead of services."""
+        """Notify all visitors that a request is done (`good`) or refused, with the text.
+
+        The text names buttons of the page instead of services.
+        """
         title, color = ('done', 'teal') if good else ('refused', 'red')
         for client in self._server.get_clients().values():
             client.add_notification(

@@ -133,7 +133,7 @@ class ReadingsPanel:
             self._tops.append(1.0)
 
     def show(self, status: str, bars: str, history: History) -> None:
-        """Show the HTML texts and the curves."""
+        """Show the status and the muscles' bars, both HTML, and the curves of the history."""
         self._status.content, self._bars.content = status, bars
         for number, (curve, plot) in enumerate(self._plots):
             data = history.curve(curve.values)

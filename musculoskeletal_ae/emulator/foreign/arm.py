@@ -140,7 +140,9 @@ def _individual_model(robot: Robot, draw: Draw) -> Any:
 
 
 def _imported_model(robot: Robot, file: Path, draw: Draw, deviates: bool) -> Any:
-    """Return the MuJoCo model of a file that `import_robot` wrote, with or without deviations.
+    """Return the MuJoCo model of a file that `import_robot` wrote.
+
+    If `deviates`, the model gets the deviations of the individual that `draw` selects.
 
     Raises:
         MusculoskeletalError: If the file is not the model of the robot.

@@ -125,7 +125,7 @@ def _is_inside(model: Any, site: int) -> bool:
 
 
 def change_masses(model: Any, draw: Draw) -> None:
-    """Change mass and inertia of each body by a random factor."""
+    """Multiply mass and inertia of each body of a MuJoCo model by a random factor, in place."""
     factor = np.exp(MASS * draw.rng('masses').normal(size=model.nbody))
     model.body_mass[:] *= factor
     model.body_inertia[:] *= factor[:, None]

@@ -304,7 +304,11 @@ def _obstacle(
 
 
 def _add_round(body: Any, name: str, place: Array, axis: Array | None, radius: float) -> None:
-    """Add a sphere or a cylinder for tendons to wrap around, without collisions."""
+    """Add an object without collisions to a body, for tendons to wrap around.
+
+    In the frame of the body, it is a sphere around `place` [m], or a cylinder along `axis` if there
+    is one.
+    """
     kind, turn = mujoco.mjtGeom.mjGEOM_SPHERE, pin.Quaternion.Identity()
     if axis is not None:
         kind = mujoco.mjtGeom.mjGEOM_CYLINDER
@@ -365,7 +369,7 @@ def from_file(robot: Robot, file: Path) -> Any:
 
 
 def other_robot(robot: Robot, file: Path, problem: str) -> MusculoskeletalError:
-    """Return an error that says why a file does not describe a robot, and what to do."""
+    """Return the error for a MuJoCo file that is not the model of the robot, with the `problem`."""
     directory = robot.description.directory
     remedy = 'import the MuJoCo model again, and use the model.xml that import_robot writes'
     return MusculoskeletalError(
