@@ -74,7 +74,7 @@ def strange_file(file: Path, rng: random.Random) -> None:
 
 
 def changed_tree(value: object, rng: random.Random) -> object:
-    """Return a tree of lists and mappings with one entry replaced, dropped or repeated."""
+    """Return `value`, a tree of lists and mappings, with an entry replaced, dropped or repeated."""
     if isinstance(value, dict) and value and rng.random() < 0.9:
         key = rng.choice(list(value))
         return {**value, key: changed_tree(value[key], rng)}
@@ -304,8 +304,10 @@ def attempts(start: int, count: int, seed: int, folder: Path) -> Iterator[Attemp
 def attack(count: int, seed: int) -> tuple[int, list[str], Counter[str]]:
     """Attack the package with `count` hostile files, which child processes read.
 
+    `seed` selects the files.
+
     Returns:
-        The number of files, the findings, and the number of each outcome.
+        The number of files, a text for each broken promise, and the number of each outcome.
     """
     findings, outcomes, done = [], Counter[str](), 0
     while done < count:

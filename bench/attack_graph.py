@@ -354,7 +354,7 @@ class Attack:
         self.send(SetParameters, f'{node}/set_parameters', set_request(name, value))
 
     def set_faults(self, lines: list[str]) -> None:
-        """Set the faults of the emulated arm."""
+        """Set the faults of the emulated arm; `lines` is its parameter `faults`."""
         if self._lying_since:
             self.lying.append((self._lying_since, time.time() + 1.0))
         is_lying = any(line.split(':')[0] not in MECHANICAL for line in lines)
@@ -434,7 +434,10 @@ class Attack:
         self.tried['messages'] += 1
 
     def hostile(self, topic: str, kind: Any) -> Any:
-        """Return a modified genuine message, or one with random content."""
+        """Return a hostile message for a topic, of the type `kind`.
+
+        It is the last genuine message with changed values, or one with random content.
+        """
         rng, last = self.rng, self.genuine.get(topic)
         if topic.endswith('_checkpoint') and last is not None and rng.random() < 0.7:
             return bytes_message(self._network(bytes(last.data)))
@@ -472,7 +475,7 @@ class Attack:
         return checkpoint.to_bytes(replace(mae, decoder=layers))
 
     def request(self, service: str, kind: str) -> None:
-        """Request something illegal of a service, without waiting for the response."""
+        """Request something illegal of a service of type `kind`; do not wait for the response."""
         rng, name = self.rng, SERVICES[kind]
         request = name.Request()
         node = service.removeprefix(f'{self.namespace}/').split('/')[0]
@@ -563,7 +566,7 @@ HEALTHY: tuple[tuple[str, str, Any], ...] = (
 
 
 def set_request(name: str, value: Any) -> SetParameters.Request:
-    """Return the request that sets one parameter."""
+    """Return the request that sets the parameter `name` to `value`."""
     return SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
 
 

@@ -214,7 +214,7 @@ class Scene:
             self.attack.spin(LASTING)
 
     def set(self, node: str, name: str, value: Any) -> None:
-        """Set a parameter of a node, as any program on the graph may."""
+        """Set the parameter `name` of a node to `value`, as any program on the graph may."""
         self.attack.call(SetParameters, f'{node}/set_parameters', set_request(name, value))
 
     def pause(self, name: str) -> None:

@@ -99,9 +99,9 @@ def _nothing(robot: Robot) -> Healthy:
 
 
 def _divided(name: str, clones: Path) -> tuple[SoftLink, Run, Run]:
-    """Return a recording's link, and its rows without payload for training and for the test.
+    """Return the link of the recording `name`, and its rows for training and for the test.
 
-    With `stand`, training and test use the same rows.
+    Rows with payload are left out. With `stand`, training and test use the same rows.
     """
     for repository in repositories():
         if repository.recording != RECORDINGS[name]:
@@ -207,7 +207,7 @@ def _explored(robot: Robot, driver: Mae, reality: str, seed: int) -> Iterator[tu
 
 
 def coupling(robot: Robot, theta: Array) -> Array:
-    """Return changes of all lengths [m] (N, M) that depend smoothly on all joints."""
+    """Return changes of all lengths [m] (N, M) that depend smoothly on θ [rad] (N, D)."""
     rng, waves = np.random.default_rng(123), 40
     frequency = rng.normal(0.0, 1.0, (waves, robot.joint_count))
     frequency /= 0.6 * (robot.upper - robot.lower)

@@ -69,7 +69,10 @@ class Process:
     """
 
     def __init__(self, load: float, seed: list[int]) -> None:
-        """Share the computer with `load` other processes, on average."""
+        """Share the computer with `load` other processes, on average.
+
+        `seed` determines how long the process waits for the processor.
+        """
         self._per_core, self._rng = load / CORES, np.random.default_rng(seed)
         self._runs_at = 0.0  # time at which the process runs next [s]
         self._subscribed_at = 0.0  # time from which it receives messages [s]
@@ -160,7 +163,10 @@ class Wire:
         return packets
 
     def command(self, now: float, value: Array) -> Array | None:
-        """Return the length command [m] (M,) that reaches the modules; None if it is lost."""
+        """Return the length command [m] (M,) that reaches the modules; None if it is lost.
+
+        `value` is the command that the controller has sent.
+        """
         command: Array | None = value
         for fault in self.command_faults:
             command = None if command is None else fault(now, command)

@@ -86,7 +86,7 @@ Muscle = dict[str, Any]
 
 
 def mirrored(value: str) -> str:
-    """Return the text of a vector, mirrored to the other side of the body."""
+    """Return the text `value` of a vector, 'x y z', mirrored to the other side of the body."""
     x, y, z = map(float, value.split())
     return f'{x:g} {0.0 - y:g} {z:g}'
 

@@ -160,12 +160,12 @@ def on_theta(change: Callable[[float, Array], None]) -> ReadingFault:
 
 
 def silent(start: float, seconds: float) -> ReadingFault:
-    """Return a fault by which the driver is silent for a time [s]."""
+    """Return a fault by which the driver is silent for `seconds` after the time `start` [s]."""
     return lambda now, packet: [] if now < start + seconds else [packet]
 
 
 def deaf(start: float, seconds: float) -> CommandFault:
-    """Return a fault by which no command reaches the modules for a time [s]."""
+    """Return a fault by which no command arrives for `seconds` after the time `start` [s]."""
     return lambda now, value: None if now < start + seconds else value
 
 
@@ -196,7 +196,11 @@ def _loaded(lab: Lab, rng: Rng) -> int:
 
 
 def _is_demanded(muscle: int) -> Callable[[Lab], bool]:
-    """Return whether the module should now pull with another tension than it does."""
+    """Return a function that says whether a module pulls otherwise than it should.
+
+    The function is that for the module of `muscle`: its tension must deviate from the demanded one
+    by more than SHOWN_TENSION.
+    """
 
     def shown(lab: Lab) -> bool:
         sample, command = lab.controller.sample, lab.controller.limiter.command
@@ -322,7 +326,10 @@ LENGTH, TENSION, TEMPERATURE = 0, 1, 2
 
 
 def frozen(row: int) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which one reading freezes, with an effect once the value changes."""
+    """Return a mishap by which one reading of a muscle freezes, with an effect once it changes.
+
+    `row` is the row of the reading in muscle_states.
+    """
 
     def begin(lab: Lab, rng: Rng) -> Case:
         muscle, name = _any(rng, lab.arm.robot.muscles)
@@ -388,12 +395,12 @@ def changed(
 
 
 def bias(value: float, size: float) -> float:
-    """Return a value with an offset, at least 0 as the reading of a tension sensor."""
+    """Return a value to which `size` is added, at least 0 as the reading of a tension sensor."""
     return max(value + size, 0.0)
 
 
 def gain(value: float, size: float) -> float:
-    """Return a value multiplied by a factor, as an amplifier with a wrong gain would."""
+    """Return a value multiplied by `size`, as an amplifier with a wrong gain would."""
     return value * size
 
 
@@ -510,7 +517,10 @@ def joint_drifts(lab: Lab, rng: Rng) -> Case:
 
 
 def joint_fault(change: Callable[[float], float], what: str) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which a joint sensor reads a function of its true angle."""
+    """Return a mishap by which a joint sensor reads the function `change` of its true angle.
+
+    `what` describes the mishap in the results.
+    """
 
     def begin(lab: Lab, rng: Rng) -> Case:
         j, name = _any(rng, lab.arm.robot.joints)
@@ -754,7 +764,10 @@ def lost_module(lab: Lab, rng: Rng) -> Case:
 
 
 def mounted(least: float, most: float) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which the base is mounted at a random angle [rad] to the vertical."""
+    """Return a mishap by which the base is mounted at an angle to the vertical.
+
+    The angle is drawn between `least` and `most` [rad].
+    """
 
     def begin(lab: Lab, rng: Rng) -> Case:
         around, angle = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(least, most)

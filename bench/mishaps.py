@@ -213,7 +213,7 @@ class Course:
         return self.mended_at is not None and self.lab.now - self.quiet_since >= QUIET
 
     def mend(self, by_advice: bool = False) -> None:
-        """Mend the fault, as a person would."""
+        """Mend the fault, as a person would; `by_advice` if a true message led to it."""
         if self.mended_at is None:
             self.case.mend(self.lab)
             self.mended_at, self.is_found_by_advice = self.lab.now, by_advice
@@ -640,7 +640,7 @@ def _place(name: str) -> int:
 
 
 def _false_statements(of: Iterable[dict[str, Any]]) -> str:
-    """Return the false statements, one for each mishap and identifier, in Markdown."""
+    """Return a Markdown table of the false statements, one for each mishap and identifier."""
     first: dict[tuple[str, str], tuple[str, int]] = {}
     for each in of:
         for name, what in each['false'].items():
@@ -655,7 +655,7 @@ def _false_statements(of: Iterable[dict[str, Any]]) -> str:
 
 
 def _bad_ends(of: Iterable[dict[str, Any]]) -> str:
-    """Return the cases that did not end well, in Markdown."""
+    """Return a Markdown table of the cases that did not end well, with the steps and the reason."""
     rows = []
     for each in sorted(of, key=lambda each: _place(each['mishap'])):
         if each['well']:

@@ -286,7 +286,10 @@ def attempt(error: Callable[[Study, int], float], study: Study, seed: int) -> st
 
 
 def nodes_row(name: str, file: Path, chain: dict[str, Any], args: Namespace) -> list[str]:
-    """Import a model, run all nodes, and return the cells with the CPU time of each node."""
+    """Import a model, run all nodes, and return the cells with the CPU time of each node.
+
+    `chain` are options of `import_robot` that select a part of the model in `file`.
+    """
     robot: Robot = import_robot(file, args.out / name / 'robot', **chain).robot
     directory = str(robot.description.directory)
     emulator = f'reality:={directory}/model.xml', 'deviates:=true', f'seed:={args.seeds[0]}'
@@ -301,7 +304,8 @@ def model_rows(
 ) -> Iterator[list[str]]:
     """Import a model, train, and yield the row of each individual.
 
-    Networks and rows of an interrupted run with the same --out are read from its files.
+    `chain` are options of `import_robot` that select a part of the model in `file`. Networks and
+    rows of an interrupted run with the same --out are read from its files.
     """
     folder = args.out / name
     directory = folder / 'robot'

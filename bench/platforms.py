@@ -85,6 +85,8 @@ class Site:
     def run(self, title: str, *lines: str, on_platform: bool = False) -> str:
         """Run shell lines on the host, or on the platform; return their output.
 
+        `title` is printed first.
+
         Raises:
             MusculoskeletalError: If a line fails. The end of the output has then been printed.
         """

@@ -29,7 +29,10 @@ STARTS = 3.0, 1.0
 
 
 def baselines(training: Run, with_effort: bool) -> Iterator[tuple[str, Model]]:
-    """Yield each model that knows nothing of the robot, with its name in the results."""
+    """Yield each model that knows nothing of the robot, with its name in the results.
+
+    The models estimate θ from muscle lengths and, if `with_effort`, from motor efforts as well.
+    """
     polynomials = [
         partial(polynomial, degree=degree, with_effort=with_effort, ridge=ridge)
         for degree, ridge in product(DEGREES, RIDGES)

@@ -41,7 +41,7 @@ class Platform:
     name: str = 'cable_platform'
 
     def write(self, directory: Path, tension_source: str = 'none') -> Path:
-        """Write the robot directory and return its path."""
+        """Write the robot directory, with `tension_source` in muscles.yaml; return its path."""
         lines, parent = ['<robot name="cable_platform"><link name="frame"/>'], 'frame'
         for name, axis, limit in zip(JOINTS, 2 * ('1 0 0', '0 1 0', '0 0 1'), LIMITS, strict=True):
             child = 'platform' if name == 'yaw' else f'after_{name}'

@@ -88,7 +88,7 @@ class Body(Protocol):
         """Name of the recorded robot, which its URDF states."""
 
     def write(self, directory: Path, tension_source: str = 'none') -> Path:
-        """Write the robot directory and return its path."""
+        """Write the robot directory, with `tension_source` in muscles.yaml; return its path."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,10 @@ class SoftLink:
     limit: float  # limit of both joints that represent the bend [rad]
 
     def write(self, directory: Path, tension_source: str = 'none') -> Path:
-        """Write the robot directory and return its path; the muscle modules regulate positions."""
+        """Write the robot directory, with `tension_source` in muscles.yaml; return its path.
+
+        The muscle modules regulate positions.
+        """
         low, high, half = -self.limit, self.limit, 0.5 * self.height
         urdf = URDF.format(name=self.name, half=half, mass=self.mass, low=low, high=high)
         muscles = []

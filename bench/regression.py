@@ -55,7 +55,11 @@ def _squares(one: Array, other: Array) -> Array:
 def _chosen(
     inputs: Array, outputs: Array, candidates: Iterator[Callable[[Array, Array], Predict]]
 ) -> Predict:
-    """Return the candidate with the smallest error in cross-validation, fitted to all samples."""
+    """Return the candidate with the smallest error in cross-validation, fitted to all samples.
+
+    The samples are `inputs` and `outputs`, with one row for each. A candidate is a function that
+    returns a model fitted to such arrays.
+    """
     parts = np.array_split(np.random.default_rng(0).permutation(len(inputs)), PARTS)
 
     def error(fit: Callable[[Array, Array], Predict]) -> float:

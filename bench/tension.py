@@ -124,6 +124,8 @@ def explore(
 def go(arm: Arm, initial: Mae, seed: int, method: str, targets: int) -> tuple[Excess, int]:
     """Go to random targets with one control method, and hold them.
 
+    `seed` selects the targets.
+
     Returns:
         How tensions exceeded their limit, and the number of stops.
     """
@@ -161,6 +163,9 @@ def measure(
     seconds: float,
 ) -> list[tuple[str, Excess, int, tuple[int, float] | None]]:
     """Let an individual explore, and move to targets by each method.
+
+    `reality` and `seed` name the individual. It explores for `share` · `seconds` [s]; `share` also
+    scales the number of targets.
 
     Returns:
         What the arm did, the excess of its tensions, the number of its stops, and if it explored,
