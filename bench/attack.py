@@ -85,8 +85,8 @@ class Steps(NamedTuple):
     """The largest changes of one controller's commands, and the changes that were too fast."""
 
     commands: int  # number of commands that the controller published
-    largest_in: float  # largest winding in within one tick [m]
-    largest_out: float  # largest paying out within one tick [m]
+    largest_in: float  # largest length by which a command winds a muscle in within one tick [m]
+    largest_out: float  # largest length by which a command pays a muscle out within one tick [m]
     too_fast: list[str]
 
 

@@ -89,7 +89,8 @@ class CommandLimiter:
         self.command: Command | None = None
         #: last published length command [m], (M,), and its age [s]
         self._last_length: tuple[Array, float] | None = None
-        self._relief: Array = np.zeros(robot.muscle_count)  # relief r of each muscle [m]
+        #: length r by which each muscle is paid out further while T is too high [m], (M,)
+        self._relief: Array = np.zeros(robot.muscle_count)
         #: time of sending [s], T [N] and dT/dt [N/s], (M,), of the last message
         self._tension: tuple[float, Array, Array] | None = None
         #: l_exceeded of each muscle (see the module's description) [m], (M,)

@@ -33,7 +33,7 @@ LEAST_LOST = 0.05  # report a loss of more than this fraction of the messages
 class _Received(NamedTuple):
     came: float  # time of reception [s]
     came_awake: float  # time of reception by a clock that stops while this process is blocked [s]
-    sent: float  # source time by the driver's clock [s]; NaN if unknown
+    sent: float  # time of sending by the driver's clock [s]; NaN if unknown
     number: int  # sequence number; 0 if unknown
 
 

@@ -109,7 +109,7 @@ class Command(NamedTuple):
     length_error: Array  # reading of the length sensor minus the true l [m]
     stuck: Array  # share of its speed that each motor loses; 1 for a jammed one
     slack: Array  # excess length of the tendon [m]
-    zero: Array  # additional offset of the length sensor [m]
+    zero: Array  # offset that a fault adds to the reading of the length sensor [m]
     hot: Array  # lowest temperature of each housing that a fault imposes [°C]
     ceiling: Array  # highest reading of the tension sensor [N]
 
@@ -264,7 +264,7 @@ class Arm(ABC):
         self._current_zero = rng.normal(0.0, CURRENT_ZERO, count)
         share = DRIVE_FRICTION * rng.uniform(0.5, 1.5, count)
         self._drive_friction: Array = share * robot.description.tension.limit
-        self._mount = self.faults.mount  # present turn of the base
+        self._mount = self.faults.mount  # present turn of the base, as a rotation matrix
         self._wrench = np.zeros(6)
         #: present friction of tendons or joints, as a multiple of the individual's own
         self._friction_factor = 1.0

@@ -60,7 +60,7 @@ APPROACHES = 5  # number of targets θ_eval, and of starts from which each of th
 class Durations(NamedTuple):
     """Durations of the parts of an approach [s]."""
 
-    start: float  # duration of the motion to a start
+    start: float  # duration of the motion to the posture from which the approach starts
     end: float  # time from the command until the results are read; `second` must have ended by then
     first: float  # value of the setting `first_duration`
     second: float  # value of the setting `second_duration`

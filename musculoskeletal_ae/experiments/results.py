@@ -187,7 +187,7 @@ class ResultRow(Strict, frozen=True):
     default: str  # key of the value with the preset of the run
     published: str = NOTHING  # value that the paper reports for Musashi
     paper: str = ''  # key of the value of preset `paper`, whose name replaces {preset} in the key
-    bound: str = ''  # key of the reference value
+    bound: str = ''  # key of the reference value, such as the error of an oracle
     aim: float | None = None  # goal: the highest value, or the lowest if `more_is_better`
     digits: int = 3
     more_is_better: bool = False

@@ -149,7 +149,8 @@ class MotionFeedback:
 
     def __init__(self, rest: RestFeedback) -> None:
         self._rest = rest
-        self._shift: Array = np.zeros_like(rest.correction)  # shift of θ [rad], (D,)
+        #: present shift of the desired posture [rad], (D,)
+        self._shift: Array = np.zeros_like(rest.correction)
 
     def step(self, error: Array, is_held_back: bool, dt: float) -> Array:
         """Return the angles [rad], (D,), by which to shift the desired posture.

@@ -71,7 +71,8 @@ class Solution(NamedTuple):
     length: Array  # length command l_target [m], (M,)
     tension: Array  # tension T that the command should produce [N], (M,)
     missing_torque: Array  # torque that no tensions within their limits provide [N·m], (D,)
-    stiffness: JointStiffness | None = None  # only for the method `stiffness`
+    #: planned joint stiffness; None except with the method `stiffness`
+    stiffness: JointStiffness | None = None
 
 
 class LengthCommand(Protocol):

@@ -90,7 +90,7 @@ class LengthRamps:
         self.use(robot, settings)
         self._goals: list[Goal] = []
         self._goal: Goal | None = None  # present goal, which is approached or held
-        self._remaining = 0.0  # remaining time of the goal [s]
+        self._remaining = 0.0  # time until the next goal begins [s]
         self._ramp: Ramp | None = None
         self._command: Array = np.zeros(robot.muscle_count)
         self._tension: Array = robot.tension.bias  # T_const or T_current of the goal [N], (M,)

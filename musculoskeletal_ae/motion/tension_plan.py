@@ -50,7 +50,7 @@ class Stiffening:
         self.solution: Solution | None = None  # the solution that T_K approaches
         #: present tensions T_K [N], (M,), which approach `solution`
         self._near: Array = self._robot.tension.bias
-        self._solved = 0.0  # age of the solution [s]
+        self._solved = 0.0  # time since the solution was computed [s]
 
     def step(
         self, mae: Mae, trajectory: Trajectory, time: float, effort: Array, limit: Array, dt: float
@@ -114,7 +114,7 @@ class TensionPlan:
         self._limit: Array = robot.tension.limit  # tension limit of the present plan [N], (M,)
         #: friction coefficient μ of each tendon, (M,)
         self._friction: Array = np.full(robot.muscle_count, FRICTION)
-        #: sliding direction s of each tendon, (M,)
+        #: sliding state s of each tendon: 1 after winding in, −1 after paying out, (M,)
         self._sliding: Array = np.zeros(robot.muscle_count)
         self._stiffening = Stiffening(robot, settings)
 

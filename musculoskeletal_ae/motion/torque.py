@@ -22,7 +22,7 @@ HOLD = 15.0  # stiffness of the spring that holds the arm at θ_held [N·m/rad]
 #: move θ_held with the arm once the arm is this far from it [rad]; a hand therefore has to exert
 #: HOLD · BAND = 0.75 N·m to move a joint
 BAND = 0.05
-DAMPING = 1.0  # damping of each joint [N·m·s/rad]
+DAMPING = 1.0  # joint torque against the motion, per unit of the joint velocity [N·m·s/rad]
 WALL = 30.0  # stiffness of the spring that pushes a joint away from its limits [N·m/rad]
 WALL_AT = 0.05  # let this spring act from this distance before a joint limit [rad]
 

@@ -34,7 +34,7 @@ class Winches:
         self._robot = robot
         self._products, self._squares = 0.0, LAGS
         self._since = self._last = 0.0
-        self._delay = 0.0  # delay of the last message [s]
+        self._delay = 0.0  # delay of the last muscle_states message on its way here [s]
         self._length: Array | None = None
         self._speed: Array = np.zeros(robot.muscle_count)  # speed of each muscle, dl/dt [m/s], (M,)
 

@@ -87,7 +87,7 @@ QOS_REMEDIES = {
 class Shell(Node):
     """A node that knows its robot, counts the messages it rejects, and reports once a second."""
 
-    core: Any = None  # the object that computes, without ROS
+    core: Any = None  # object, independent of ROS, that computes what the node publishes
     is_time_critical = True  # whether a delay of this node delays commands
     is_watched = True  # whether the process ends if it makes no progress for 10 s
     #: recorder of every message that arrives, before the message is used; None to record nothing
@@ -116,7 +116,7 @@ class Shell(Node):
         #: name of the root link's frame in published messages
         self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
         warn = self.get_logger().warning
-        self.awake = AwakeClock()  # excludes the pauses of this process
+        self.awake = AwakeClock()  # clock that stops while this process is blocked
         self._reception = Reception(
             lambda text: warn(f'{text} (counted in /diagnostics)'), self.awake
         )

@@ -51,10 +51,10 @@ class Constants(Strict, frozen=True):
     spool_radius: Radius | UnsetType = UNSET
     #: 1 if the position rises as the motor pays out, −1 if it rises as the motor winds in
     direction: Number | UnsetType = UNSET
-    zero: Number | UnsetType = UNSET  # position at which l is 0
+    zero: Number | UnsetType = UNSET  # position of the motor at which l is 0
     #: tension per unit of effort, negative if the effort falls as the motor pulls [N]
     tension_per_effort: Number | UnsetType = UNSET
-    effort_zero: Number | UnsetType = UNSET  # effort at which T is 0
+    effort_zero: Number | UnsetType = UNSET  # effort of the motor at which T is 0
 
     def __post_init__(self) -> None:
         """Check the values that may have either sign, but not every size."""

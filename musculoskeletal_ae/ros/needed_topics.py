@@ -39,7 +39,7 @@ class NeededTopics:
         #: rates that the topics should have [Hz], by topic
         self._expected_rates = dict[str, float]()
         self._slow_reports = Counter[str]()  # successive reports with a low rate, by topic
-        self._waiting = ''  # the missing topics, as last logged
+        self._waiting = ''  # the missing topics that were logged last, '' if none is missing
 
     def __contains__(self, topic: object) -> bool:
         return topic in self._topics

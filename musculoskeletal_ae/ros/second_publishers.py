@@ -150,7 +150,7 @@ class Twins:
         text = name.encode() + b'\0'
         self._name, self._identity = struct.pack('<I', len(text)) + text, identity.encode()
         self._has_reported = False
-        self._others = Arrival(clock)  # reports of other nodes
+        self._others = Arrival(clock)  # reports that other nodes of this name have sent
 
     def take(self, report: bytes, now: float) -> None:
         """Process a serialized report (CDR) that arrived at `now` [s].

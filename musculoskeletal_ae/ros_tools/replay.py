@@ -198,7 +198,8 @@ class Replay(Node):
             longest = LOCKSTEP_LAG
             if self._lockstep.is_due(recorded):
                 self._lockstep.step(recorded, self._spinner)
-            self._next_tick = 0.0  # the nodes are to know the time of this message
+            #: publish /clock at once, so that the nodes know the time of this message
+            self._next_tick = 0.0
         self._timeline.catch_up(recorded, time.monotonic(), longest)
 
     def _report_waiting(self) -> None:

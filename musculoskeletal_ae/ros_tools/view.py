@@ -70,7 +70,7 @@ ARM_TOPICS = {
     'estimated': 'estimated_joint_states',
     'simulated': 'sim/joint_states',
 }
-RUPTURE = 'rupture'  # kind of fault (`emulator/faults.py`)
+RUPTURE = 'rupture'  # kind of the emulated fault with which visitors rupture tendons
 #: service that sets a parameter of the emulator, such as `faults`
 SET = 'hardware_emulator/set_parameters'
 GET = 'hardware_emulator/get_parameters'

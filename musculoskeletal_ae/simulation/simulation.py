@@ -46,7 +46,7 @@ TENSION_MARGIN = 1.0  # let `limits` name a muscle that is nearer to T_max than 
 class Simulation:
     """Simulates N arms with the learned body of one robot, in compiled code."""
 
-    mae: Mae  # the learned body
+    mae: Mae  # network whose learned body is simulated
     state: ArmState  # the arms now; assign an earlier state to return to it
     command: Array  # length commands l_target [m], (N, M)
     wrench: Array  # wrench on the end effectors in axes of the root link [N, N·m], (N, 6)
