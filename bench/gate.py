@@ -135,7 +135,7 @@ def learned(arm: Arm, mae: Mae, driver: Mae, seed: int, minutes: float, spread: 
 
 
 def limit(name: str) -> float:
-    """Return the limit of a measure by its name."""
+    """Return the value above which checkpoint validation refuses a network, for a named measure."""
     if name in (limits := LIMITS | MESSAGES):
         return limits[name]
     return FLOOR.get(name.removesuffix(' of messages'), WORSE if 'in use' in name else 1.0)

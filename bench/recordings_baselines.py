@@ -86,9 +86,10 @@ def kernel_ridge(training: Run, with_effort: bool, width: float, penalty: float)
 
 
 def gaussian_process(training: Run, with_effort: bool) -> Model:
-    """Return a Gaussian process with one length scale for each input, found by the evidence.
+    """Return a Gaussian process with one length scale for each input.
 
-    All joints share the length scales and the ratio of noise and signal.
+    The length scales maximise the evidence (marginal likelihood). All joints share them, and the
+    ratio of noise and signal.
     """
     inputs, (theta, mean) = _inputs(training, with_effort), _centred(training)
     x, count = inputs(training), theta.shape[0]

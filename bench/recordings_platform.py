@@ -21,7 +21,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 JOINTS = 'x', 'y', 'z', 'roll', 'pitch', 'yaw'
-#: joint limits [m, rad], relative to the platform in the middle at this height [m]
+#: joint limits [m, rad] around the middle position of the platform, and its height there [m]
 LIMITS, HEIGHT = (0.8, 0.8, 0.7, 0.4, 0.4, 0.3), 0.6
 MASS, CENTRE = 12.966, 0.173  # mass [kg], and height of its centre above the origin [m]
 #: points at which the cables enter their pulleys, and attachments to the platform [m]

@@ -127,7 +127,8 @@ def kernel_ridge(inputs: Array, outputs: Array) -> Predict:
 def gaussian_process(inputs: Array, outputs: Array) -> Predict:
     """Return a Gaussian process whose kernel is the sum of a smooth and a linear one.
 
-    The evidence chooses the constants of the kernel, which are common to all outputs.
+    The constants of the kernel maximise the evidence (marginal likelihood), and are common to all
+    outputs.
     """
     scaling, mean, unit = Scaling(inputs), outputs.mean(axis=0), outputs.std(axis=0) + 1e-12
     scaled, targets = scaling(inputs), (outputs - mean) / unit

@@ -115,7 +115,8 @@ class Arrival:
         #: [s]
         self._used_at = self._measured_at = self._clock.at(since)
         self._sent = 0  # time of sending of the newest message [ns]; 0 if it is unknown
-        self._least = math.inf  # least r − s of all messages [s], which rises by DRIFT
+        #: smallest difference of reception and sending [s]; it rises by DRIFT
+        self._least = math.inf
         self._count = 0  # number of used messages since the last measurement of the rate
         self.received_at = -math.inf
         self.delay, self.rate = 0.0, math.nan

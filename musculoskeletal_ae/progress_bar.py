@@ -62,7 +62,7 @@ class ProgressBar:
         )
         self._done = 0.0
         self._first: tuple[float, float] | None = None  # time [s] and sum after the first part
-        self._last = 0.0  # time of the last part [s]
+        self._last = 0.0  # time at which the last part was done [s]
         # sums of durations [s] and parts since the first part, in which old ones count less
         self._recent_time = self._recent_parts = 0.0
         self._shown = time.perf_counter()  # time of the last line of text or note [s]

@@ -56,7 +56,7 @@ class HoldingCheck:
     def step(self, target: Array | None, theta: Array | None, dt: float) -> None:
         """Compare target and estimate, θ [rad] (D,) each, dt [s] after the last call.
 
-        Without a target, the arm does not claim to hold a posture.
+        Without one of them, there is no distance, and the arm is not away from its target.
         """
         self.distance = None if target is None or theta is None else target - theta
         if self.distance is None:

@@ -61,8 +61,8 @@ class JointStiffness(NamedTuple):
     """Expected joint stiffness of a command, and the range that the posture allows [N·m/rad]."""
 
     expected: Array  # joint stiffness K_θ that the command produces, (D, D)
-    lowest: Array  # smallest K_jj of each joint separately, (D,)
-    highest: Array  # largest K_jj of each joint separately, (D,)
+    lowest: Array  # smallest stiffness that tensions can give to each joint alone, (D,)
+    highest: Array  # largest stiffness that tensions can give to each joint alone, (D,)
 
 
 class Solution(NamedTuple):

@@ -24,7 +24,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: by default, expect a typical camera to measure a marker with σ_p [m] and σ_R [rad], (6,)
 SPREADS = np.repeat([0.002, 0.01], 3)
-#: standard deviations that leave the orientation free
+#: the same with so large a σ_R that any orientation is accepted
 POSITION_ONLY = np.repeat([0.002, 100.0], 3)
 ROUNDS = 30  # end the search after this many steps
 #: damp each step by this prior standard deviation, so that joints that the pose does not determine
