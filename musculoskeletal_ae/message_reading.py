@@ -281,7 +281,8 @@ def _six(first: Any, second: Any, most: Array, what: str) -> Array:
     if not np.isfinite(values).all():
         raise _not_finite(what, values)
     if (np.abs(values) > most).any():
-        raise MessageError('oversized', f'{values}; legal: magnitudes of at most {most}')
+        detail = f'{what} is too large: {values}; legal: magnitudes of at most {most}'
+        raise MessageError('oversized', detail)
     return values
 
 

@@ -190,4 +190,4 @@ def check_verdict(check: RobotCheck) -> str:
     )
     kinds = Counter(fault.kind for fault in check.faults)
     faults = ', '.join(f'{kind} ({count})' for kind, count in kinds.items())
-    return f'check_robot: {f"not sound: {faults}" if faults else "sound"}; {shares}'
+    return f'check_robot: {f"faults: {faults}" if faults else "no faults"}; {shares}'
