@@ -40,7 +40,7 @@ class JointUnit(NamedTuple):
     stiffness: str
 
     def position_text(self, theta: float, form: str = '.2f') -> str:
-        """Return the joint's position with its unit, for θ [rad]; `form` is a format."""
+        """Return the joint's position θ [rad] as text with its unit, in the format `form`."""
         return f'{theta * self.radian:{form}} {self.position}'
 
     def range_text(self, low: float, high: float, form: str = '.2f') -> str:

@@ -122,7 +122,7 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
 
 
 def _drawn_springs(robot: Robot, draw: Draw) -> JointElasticity:
-    """Return the springs of an individual's joints."""
+    """Return the robot's joint springs with the random deviations that `draw` selects."""
     kin, drawn = robot.kinematics, draw.rng('springs').normal(size=(2, robot.joint_count))
     factor = np.exp(draw.sizes.springs * drawn[0])
     return kin.elasticity.deviating(factor, draw.sizes.spring_rest * drawn[1])
