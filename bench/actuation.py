@@ -42,7 +42,8 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: explore and learn for EXPLORED, and then measure in a held-out motion of HELD_OUT [s]
 EXPLORED, HELD_OUT = 300.0, 60.0
-TARGETS, HELD = 5, 4.0  # move to this many targets, and by default stay at each for this time [s]
+#: numbers of targets to which an arm moves, and default time for each of them [s]
+TARGETS, HELD = 5, 4.0
 RUPTURES = 3  # rupture this many muscles, one after another
 MOVING = 4.0  # explore for this time before a rupture [s]
 LATEST = 10.0  # wait at most this long for an isolation after a rupture [s]
@@ -67,10 +68,10 @@ class Result(NamedTuple):
     before: float
     after: float
     control: float
-    isolated: float  # fraction of the ruptures after which a muscle was isolated
-    named: float  # fraction of the ruptures after which only the ruptured muscle was isolated
+    isolated: float  # share of the ruptures after which a muscle was isolated
+    named: float  # share of the ruptures after which only the ruptured muscle was isolated
     finding_time: float  # mean time from a rupture to the first isolation, LATEST without one [s]
-    highest: float  # highest tension, relative to tension.limit
+    highest: float  # highest tension, as a multiple of tension.limit
     wrong: float
     samples: float
 
@@ -87,7 +88,7 @@ class Watched:
         self._arm, self.highest = arm, 0.0
 
     def note(self) -> None:
-        """Raise `highest` if a present tension exceeds it."""
+        """Record the present tensions: raise `highest` if one of them exceeds it."""
         share = self._arm.tension / self._arm.robot.tension.limit
         self.highest = max(self.highest, float(share.max()))
 
@@ -95,7 +96,10 @@ class Watched:
 def learn(
     arm: Arm, initial: Mae, seed: int, seconds: float, watched: Watched
 ) -> tuple[Learner, int]:
-    """Learn from an exploration of a time [s]; return the learner and the number of stops."""
+    """Learn from an exploration; return the learner and the number of stops of the controller.
+
+    `seed` selects the exploration, which takes `seconds` [s]. `watched` records the tensions.
+    """
     loop = ClosedLoop(arm, initial, None, EXPLORATION_STREAM + seed)
     learner = Learner(arm.robot, initial, 'default', seed)
     for count, row in enumerate(online_learning.explore(loop, learner, seconds)):
@@ -105,7 +109,9 @@ def learn(
 
 
 def estimate(arm: Arm, mae: Mae, seed: int, seconds: float, watched: Watched) -> tuple[float, int]:
-    """Explore for a time [s]; return the mean estimation error [rad] and the number of mistakes.
+    """Estimate θ in an exploration; return the mean error [rad] and the number of mistakes.
+
+    `seed` selects the exploration, which takes `seconds` [s]. `watched` records the tensions.
 
     Each isolation of a muscle is a mistake, because the arm is healthy. A stop that lasts at the
     end is another one.
@@ -125,7 +131,7 @@ def estimate(arm: Arm, mae: Mae, seed: int, seconds: float, watched: Watched) ->
 def control(
     arm: Arm, mae: Mae, seed: int, targets: int, held: float, watched: Watched
 ) -> tuple[float, int]:
-    """Move to `targets` random holdable postures, with `held` seconds for each of them.
+    """Control an arm to `targets` random holdable postures, with `held` seconds for each.
 
     Returns:
         The mean distance between the target and the posture that the arm reached [rad], and the
@@ -184,7 +190,8 @@ def measure(
 ) -> Result:
     """Measure one individual with one kind of module.
 
-    `share` scales the durations and counts; `held` is the time for each target [s].
+    `reality` and `seed` name the individual. `share` scales the durations and counts; `held` is the
+    time for each target [s].
     """
     own = with_kind(robot, kind)
     arm = make_arm(own, seed, reality)
@@ -205,7 +212,7 @@ def measure(
 
 
 def line(reality: str, seed: str, kind: str, result: Result) -> str:
-    """Return a line of the table."""
+    """Return a line of the table: results of an individual, or means, with one kind of module."""
     return (
         f'{reality:<8} {seed:>4} {kind:<18} {result.before:>7.3f} {result.after:>7.3f} '
         f'{result.control:>8.3f} {result.isolated:>9.2f} {result.named:>6.2f} '

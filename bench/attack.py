@@ -42,9 +42,10 @@ from musculoskeletal_ae.robot.robot import Robot
 if TYPE_CHECKING:
     from bench.attack_graph import Attack
 
-JITTER = 0.03  # allow this delay from computing to publishing a command on a loaded machine [s]
+#: accept a delay of this size between computing and publishing a command on a loaded machine [s]
+JITTER = 0.03
 RELIEF = 0.3  # let paying out exceed the rate limit for this time after an excess tension [s]
-SILENT = 10.0  # report a longer time between two reports of a node under attack [s]
+SILENT = 10.0  # report a node under attack that has not reported on /diagnostics for this time [s]
 GROWTH = 1.2  # report a node whose memory exceeds this multiple of its memory at the age YOUNG
 YOUNG = 300.0  # measure the memory of a node for GROWTH at this age [s]
 #: Report a tension that exceeds ABOVE times tension.limit for longer than MOMENT [s].
@@ -82,11 +83,11 @@ class Row(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """The largest changes of the commands of one controller process, and those too fast."""
+    """The largest changes of one controller's commands, and the changes that were too fast."""
 
-    commands: int  # number of commands
-    largest_in: float  # largest winding in within one tick [m]
-    largest_out: float  # largest paying out within one tick [m]
+    commands: int  # number of commands that the controller published
+    largest_in: float  # largest length by which a command winds a muscle in within one tick [m]
+    largest_out: float  # largest length by which a command pays a muscle out within one tick [m]
     too_fast: list[str]
 
 
@@ -157,7 +158,10 @@ def overloads(loads: list[tuple[float, Array]], highest: Array | float) -> Array
 
 
 def wound_in(time: Array, value: Array, begin: float, end: float) -> float:
-    """Return the largest length [m] by which a muscle was wound in from `begin` to `end` [s]."""
+    """Return the largest length [m] by which a muscle was wound in from `begin` to `end` [s].
+
+    `value` are the commanded lengths [m], (N, M), at the times `time` [s], (N,).
+    """
     during = value[(time > begin) & (time < end)]
     if len(during) < 2:
         return 0.0

@@ -26,8 +26,8 @@ from robots import chain
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
-LONGEST = 5.0  # report a file that takes more CPU time [s]
-MOST_MEMORY = 300  # report a file that adds more to the peak memory of the process [MB]
+LONGEST = 5.0  # report a file whose reading takes more CPU time [s]
+MOST_MEMORY = 300  # report a file whose reading raises the peak memory of the process by more [MB]
 NASTY: tuple[object, ...] = (
     0.0, -1.0, 1e-300, 1e300, -1e300, float('nan'), float('inf'), 2**70, '', '\x1b[2J', [], {},
 )  # fmt: skip
@@ -74,7 +74,7 @@ def strange_file(file: Path, rng: random.Random) -> None:
 
 
 def changed_tree(value: object, rng: random.Random) -> object:
-    """Return a tree of lists and mappings with one entry replaced, dropped or repeated."""
+    """Return `value`, a tree of lists and mappings, with an entry replaced, dropped or repeated."""
     if isinstance(value, dict) and value and rng.random() < 0.9:
         key = rng.choice(list(value))
         return {**value, key: changed_tree(value[key], rng)}
@@ -148,7 +148,7 @@ class Reader:
     """Writes hostile files of every kind to a folder, and reads them as the package does."""
 
     def __init__(self, folder: Path) -> None:
-        """Write the valid files that are damaged later."""
+        """Write the valid files, of which damaged copies are read later."""
         from musculoskeletal_ae.learning.samples import Sample, SampleStore
         from musculoskeletal_ae.learning.state import NEWEST, StateStore
         from musculoskeletal_ae.mae import checkpoint
@@ -279,7 +279,10 @@ def _write_bag(path: Path) -> Path:
 
 
 def attempts(start: int, count: int, seed: int, folder: Path) -> Iterator[Attempt]:
-    """Write and read the hostile files `start` to `count` − 1; yield the outcome of each."""
+    """Write and read the hostile files `start` to `count` − 1; yield the outcome of each.
+
+    `seed` selects the files, which are written to `folder`.
+    """
     reader = Reader(folder)
     for i in range(start, count):
         kind = KINDS[i % len(KINDS)]
@@ -301,8 +304,10 @@ def attempts(start: int, count: int, seed: int, folder: Path) -> Iterator[Attemp
 def attack(count: int, seed: int) -> tuple[int, list[str], Counter[str]]:
     """Attack the package with `count` hostile files, which child processes read.
 
+    `seed` selects the files.
+
     Returns:
-        The number of files, the findings, and the number of each outcome.
+        The number of files, a text for each broken promise, and the number of each outcome.
     """
     findings, outcomes, done = [], Counter[str](), 0
     while done < count:

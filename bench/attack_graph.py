@@ -69,11 +69,11 @@ OWN = QoSProfile(depth=1000)
 JUDGE_PERIOD = 0.25  # check the status line at this interval [s]
 PATIENCE = 90.0  # wait at most this long for an expected event [s]
 COOLING = 900.0  # wait at most this much longer for overheated windings to cool [s]
-WARM = 40.0  # reset the emulated arm if a winding is warmer [°C]
+WARM = 40.0  # reset the emulated arm before an attack if a winding is warmer than this [°C]
 LENGTH, TENSION = 'muscle_length_command', 'muscle_tension_command'
 
 FLOATS = (0.0, -0.0, 1.0, -1.0, 1e-300, 1e9, -1e9, 1e308, -1e308, math.nan, math.inf, -math.inf)
-#: values that no parameter accepts
+#: values that every parameter must refuse
 ILLEGAL = (math.nan, math.inf, -math.inf, 1e308, -1e308, -1e12)
 TEXTS = ('', 'torso', '\x1b[2J', '\x9b1m', 'ö' * 300, '/dev/zero', 'a\nb', '*' * 3000)
 LENGTHS = (0, 1, 2, 6, 18, 1000)
@@ -93,15 +93,16 @@ class Process:
     """One node's process, with its log and its memory over time."""
 
     def __init__(self, name: str, command: list[str], log: Path) -> None:
-        """Start the process; append its output to the log."""
+        """Start the process of the node `name`; append its output to the file `log`."""
         self.name, self.log = name, log
         with log.open('ab') as stream:
             self.process = subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT)
         self.started = time.monotonic()
-        self.memory: list[tuple[float, float]] = []  # age [s] and resident memory [MB]
+        #: resident memory of the process over time: age [s] and memory [MB]
+        self.memory: list[tuple[float, float]] = []
 
     def alive(self) -> bool:
-        """Whether the process still runs."""
+        """Return whether the process still runs."""
         return self.process.poll() is None
 
     def look(self) -> None:
@@ -110,7 +111,7 @@ class Process:
             self.memory.append((time.monotonic() - self.started, memory(self.process.pid)))
 
     def kill(self) -> None:
-        """Kill the process by SIGKILL."""
+        """Kill the process by SIGKILL, which gives it no time to save anything."""
         self.process.kill()
         self.process.wait()
 
@@ -138,11 +139,13 @@ class Attack:
         self.processes: dict[str, Process] = {}
         self.publishers: dict[str, Any] = {}
         self.clients: dict[str, Any] = {}
-        self.sent: set[int] = set()  # digests of the hostile messages
+        #: digests of the hostile messages, by which they are told from genuine ones
+        self.sent: set[int] = set()
         self.genuine: dict[str, Any] = {}  # last message that the system itself sent, by topic
         self.commands: list[Command] = []
         self.life = 0
-        self.loads: list[tuple[float, Array]] = []  # time [s] and measured T [N] (M,)
+        #: measured tensions T over time: time [s] and T [N] (M,)
+        self.loads: list[tuple[float, Array]] = []
         self.levels: dict[str, tuple[float, DiagnosticStatus]] = {}
         self.silences: dict[str, float] = {}  # longest time between two reports of a node [s]
         self.tried: Counter[str] = Counter()
@@ -152,7 +155,8 @@ class Attack:
         self.status: list[
             tuple[float, str, str]
         ] = []  # time [s], level and text of the status line
-        self.modes: list[tuple[float, str]] = []  # time [s], mode of the controller
+        #: mode of the controller over time: time [s] and mode
+        self.modes: list[tuple[float, str]] = []
         self.foreign: list[
             tuple[float, float]
         ] = []  # intervals in which other nodes may send commands [s]
@@ -182,7 +186,7 @@ class Attack:
         rclpy.try_shutdown()
 
     def start(self, name: str) -> None:
-        """Start a node."""
+        """Start a node of the attacked system, with the parameters of the bench."""
         self.processes[name] = self.process(name)
         self.levels.pop(name, None)
         self.life += name == 'controller'
@@ -346,11 +350,11 @@ class Attack:
             self.tried['requests'] += 1
 
     def send_parameter(self, node: str, name: str, value: Any) -> None:
-        """Send a parameter to a node without waiting for the response."""
+        """Send the parameter `name` to a node without waiting for the response."""
         self.send(SetParameters, f'{node}/set_parameters', set_request(name, value))
 
     def set_faults(self, lines: list[str]) -> None:
-        """Set the faults of the emulated arm."""
+        """Set the faults of the emulated arm; `lines` is its parameter `faults`."""
         if self._lying_since:
             self.lying.append((self._lying_since, time.time() + 1.0))
         is_lying = any(line.split(':')[0] not in MECHANICAL for line in lines)
@@ -415,7 +419,7 @@ class Attack:
         return self._services
 
     def publish(self, topic: str, kind: str) -> None:
-        """Publish one hostile message."""
+        """Publish one hostile message of the type `kind` on a topic."""
         if topic not in self.publishers:
             # `episode` destroys latching publishers after a burst, and thereby their last message.
             qos = LATCHED if topic.endswith(LATCHING) else OWN
@@ -430,7 +434,10 @@ class Attack:
         self.tried['messages'] += 1
 
     def hostile(self, topic: str, kind: Any) -> Any:
-        """Return a modified genuine message, or one with random content."""
+        """Return a hostile message for a topic, of the type `kind`.
+
+        It is the last genuine message with changed values, or one with random content.
+        """
         rng, last = self.rng, self.genuine.get(topic)
         if topic.endswith('_checkpoint') and last is not None and rng.random() < 0.7:
             return bytes_message(self._network(bytes(last.data)))
@@ -468,7 +475,7 @@ class Attack:
         return checkpoint.to_bytes(replace(mae, decoder=layers))
 
     def request(self, service: str, kind: str) -> None:
-        """Request something illegal of a service, without waiting for the response."""
+        """Request something illegal of a service of type `kind`; do not wait for the response."""
         rng, name = self.rng, SERVICES[kind]
         request = name.Request()
         node = service.removeprefix(f'{self.namespace}/').split('/')[0]
@@ -495,7 +502,7 @@ class Attack:
         self.tried['faults'] += 1
 
     def kill(self) -> None:
-        """Kill a node and restart it."""
+        """Kill a random node of the system and restart it."""
         name = self.rng.choice(NODES)
         self.processes[name].kill()
         self.tried['kills'] += 1
@@ -559,7 +566,7 @@ HEALTHY: tuple[tuple[str, str, Any], ...] = (
 
 
 def set_request(name: str, value: Any) -> SetParameters.Request:
-    """Return the request that sets one parameter."""
+    """Return the request that sets the parameter `name` to `value`."""
     return SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
 
 

@@ -26,7 +26,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: kill a child no later than this after its start [s]; by then, it has started, trained and saved
 LONGEST = 6.0
-SPACING = 0.02  # accept a sample at this interval [s]
+SPACING = 0.02  # let the learner accept a sample at this interval [s]
 #: train for this many steps in an update; they are few, so that a kill interrupts many saves
 STEPS = 20
 DEADLINE = 60.0  # wait at most this long for a child to start [s]
@@ -78,10 +78,10 @@ def live(robot: Robot, directory: Path, initial: Path, life: int) -> None:
 
 
 class Child:
-    """One child process and its reports."""
+    """A process that runs a learner, and what it has reported so far."""
 
     def __init__(self, robot: Path, directory: Path, initial: Path, life: int) -> None:
-        """Start the process."""
+        """Start child number `life`, which continues from the state that `directory` keeps."""
         words = [sys.executable, '-m', 'bench.attack_kills', str(robot), str(directory)]
         words += [str(initial), str(life)]
         self._process = subprocess.Popen(
@@ -102,7 +102,7 @@ class Child:
                     self.up.set()
 
     def kill(self) -> None:
-        """Kill the process by SIGKILL."""
+        """Kill the process by SIGKILL, which gives it no time to save anything."""
         self._process.kill()
         self._process.wait()
         self._reader.join()

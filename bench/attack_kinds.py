@@ -29,7 +29,7 @@ from musculoskeletal_ae.ros.messages import LATCHED, array_message, bytes_messag
 from musculoskeletal_ae.signals.body_state import Anomaly, BodyState, LengthOffsets
 
 MOMENTS = 'holding', 'exploring'
-LASTING = 4.0  # attack for this time [s]
+LASTING = 4.0  # let an attack last for this time [s]
 #: report a violation if the status line says OK this long after a problem has begun [s]
 REPORT_TIME = 2.0
 #: steps that end the faults of the emulated arm
@@ -44,7 +44,7 @@ REPAIRS = {
     Step.CHECK_JOINT_SENSOR,
     Step.REPAIR_SENSOR,
 }
-OFFSET = 0.08  # publish false length offsets of this absolute value [m]
+OFFSET = 0.08  # absolute value of the false length offsets that are published [m]
 
 
 class Scene:
@@ -195,7 +195,7 @@ class Scene:
     # -- actions of the hostile node ------------------------------------------------------------
 
     def publish(self, topic: str, *messages: Any, period: float = 0.1, qos: Any = OWN) -> None:
-        """Publish messages on a topic of the arm as the hostile node."""
+        """Publish messages on a topic of the arm as the hostile node, one every `period` [s]."""
         attack = self.attack
         if topic not in attack.publishers:
             kind = type(messages[0])
@@ -214,15 +214,15 @@ class Scene:
             self.attack.spin(LASTING)
 
     def set(self, node: str, name: str, value: Any) -> None:
-        """Set a parameter."""
+        """Set the parameter `name` of a node to `value`, as any program on the graph may."""
         self.attack.call(SetParameters, f'{node}/set_parameters', set_request(name, value))
 
     def pause(self, name: str) -> None:
-        """Suspend a node."""
+        """Suspend the process of a node, so that it no longer reacts to anything."""
         self.attack.processes[name].process.send_signal(signal.SIGSTOP)
 
     def resume(self, name: str) -> None:
-        """Resume a suspended node."""
+        """Resume the suspended process of a node."""
         self.attack.processes[name].process.send_signal(signal.SIGCONT)
 
     def genuine(self, topic: str) -> Any:
@@ -237,7 +237,15 @@ def _body(
     isolated: Sequence[int] = (),
     anomaly: Anomaly = Anomaly.NONE,
 ) -> Float64MultiArray:
-    """Return a false body state, with offsets of alternating sign."""
+    """Return a false body state.
+
+    Args:
+        scene: The attacked arm, whose present body state is falsified.
+        offset: Absolute value of the length offsets, whose signs alternate [m].
+        deviation: Standard deviation that the body state states for the offsets [m].
+        isolated: Indices of the muscles that are isolated.
+        anomaly: State of the anomaly.
+    """
     muscles = scene.attack.robot.muscle_count
     sign = np.where(np.arange(muscles) % 2, 1.0, -1.0)
     offsets = LengthOffsets(sign * offset, np.full(muscles, deviation))
@@ -253,30 +261,30 @@ def zeros_unknown_then_false(scene: Scene) -> None:
 
 
 def zeros_false(scene: Scene) -> None:
-    """Publish false length offsets."""
+    """Publish false length offsets in place of those of the estimator."""
     scene.latch('body_state', _body(scene, OFFSET, 1e-3))
 
 
 def zeros_alternating(scene: Scene) -> None:
-    """Publish alternating length offsets."""
+    """Publish length offsets that change their signs again and again."""
     pair = [_body(scene, OFFSET, 1e-3), _body(scene, -OFFSET, 1e-3)]
     scene.latch('body_state', *pair * 10)
 
 
 def isolate_most(scene: Scene) -> None:
-    """Isolate most muscles."""
+    """Publish that most muscles are isolated, so that the controller must not use them."""
     most = range(scene.attack.robot.muscle_count - 1)
     scene.latch('body_state', _body(scene, isolated=most))
 
 
 def isolate_all(scene: Scene) -> None:
-    """Isolate all muscles."""
+    """Publish that all muscles are isolated, so that no muscle can hold the arm."""
     muscles = range(scene.attack.robot.muscle_count)
     scene.latch('body_state', _body(scene, isolated=muscles))
 
 
 def isolate_in_turns(scene: Scene) -> None:
-    """Isolate changing sets of muscles."""
+    """Publish for one muscle after the other that it alone is isolated."""
     each = [_body(scene, isolated=[m]) for m in range(scene.attack.robot.muscle_count)]
     scene.latch('body_state', *each, _body(scene))
 
@@ -385,9 +393,10 @@ def wrong_network(change: Callable[[Mae], Mae]) -> Callable[[Scene], None]:
 
 
 def _lengths(scale: float, offset: float = 0.0, every: int = 1) -> Callable[[Mae], Mae]:
-    """Return a function that falsifies the lengths of a network by a factor and an offset [m].
+    """Return a function that falsifies the lengths of a network.
 
-    It changes the lengths of every muscle, or of every second one if `every` is 2.
+    It multiplies lengths by `scale` and adds `offset` [m], for every muscle, or for every second
+    one if `every` is 2.
     """
 
     def change(mae: Mae) -> Mae:
@@ -463,7 +472,7 @@ def stop_a_verification(scene: Scene) -> None:
 
 
 def random_event(scene: Scene) -> None:
-    """Trigger one random event."""
+    """Trigger one random event: a target, a service, a fault, a suspended node or a false state."""
     attack, rng = scene.attack, scene.rng
     robot = attack.robot
     name = rng.choice(NODES)

@@ -59,12 +59,14 @@ from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
 
-ROBOT = 'musashi_left_arm'  # the emulated arm
-EXPLORED, HELD_OUT = 300.0, 60.0  # explore for EXPLORED, and test on a motion of HELD_OUT [s]
-THINNED = 10  # use every tenth message of the test
+ROBOT = 'musashi_left_arm'  # robot that the emulated cases use
+#: let an emulated arm explore for EXPLORED, and test on a held-out motion of HELD_OUT [s]
+EXPLORED, HELD_OUT = 300.0, 60.0
+THINNED = 10  # use only every tenth message of the held-out motion for the test
 MOST_ROWS = 1500  # test on at most this many rows
-COUPLING = 0.006  # add a coupling of this standard deviation to each length [m]
-MOST_FITTED = 150  # fit at most this many test rows by least squares
+#: standard deviation of the coupling of joints that `+coupled` adds to each length [m]
+COUPLING = 0.006
+MOST_FITTED = 150  # fit at most this many test rows by least squares, because each fit is slow
 #: constants of least squares: step of finite differences [rad], typical step as a share of the
 #: joint ranges, and number of iterations after which it ends
 DIFFERENCE, USUAL_STEP, ROUNDS = 1e-4, 0.1, 15
@@ -82,7 +84,7 @@ class Case(NamedTuple):
 
 
 class Never(Trainer):
-    """A trainer that never updates."""
+    """A trainer that never updates the network, so that the bench decides when to update."""
 
     ready = False
 
@@ -97,9 +99,9 @@ def _nothing(robot: Robot) -> Healthy:
 
 
 def _divided(name: str, clones: Path) -> tuple[SoftLink, Run, Run]:
-    """Return a recording's link, and its rows without payload for training and for the test.
+    """Return the link of the recording `name`, and its rows for training and for the test.
 
-    With `stand`, training and test use the same rows.
+    Rows with payload are left out. With `stand`, training and test use the same rows.
     """
     for repository in repositories():
         if repository.recording != RECORDINGS[name]:
@@ -125,7 +127,11 @@ def _divided(name: str, clones: Path) -> tuple[SoftLink, Run, Run]:
 
 
 def recorded(name: str, count: int, draw: int, clones: Path, cache: Path) -> Case:
-    """Return the case of a recording with random training rows; its first network is cached."""
+    """Return the case of a recording; its first network is cached in `cache`.
+
+    `name` is that of the recording. `draw` is the random seed with which `count` of its training
+    rows are drawn.
+    """
     file = cache / f'initial_{name}_{count}_{draw}.safetensors'
     name, _, effort = name.partition('+')
     link, every, test = _divided(name, clones)
@@ -146,7 +152,11 @@ def recorded(name: str, count: int, draw: int, clones: Path, cache: Path) -> Cas
 
 
 def emulated(name: str, count: int, draw: int, cache: Path) -> Case:
-    """Return the case of an emulated arm; its samples are cached in a folder."""
+    """Return the case of an emulated arm; its samples are cached in `cache`.
+
+    `name` is that of the case. `draw` is the random seed with which `count` of the training samples
+    are drawn.
+    """
     individual, *options = name.split('+')
     reality, _, seed = individual.partition('_')
     robot = Robot.load(ROBOT)
@@ -177,7 +187,7 @@ def emulated(name: str, count: int, draw: int, cache: Path) -> Case:
 
 
 def _explored(robot: Robot, driver: Mae, reality: str, seed: int) -> Iterator[tuple[str, Array]]:
-    """Record an individual, and yield the fields of its samples with their names."""
+    """Let an individual explore, and yield the name and values of each field of its samples."""
     stream = EXPLORATION_STREAM + seed
     exploring = record(make_arm(robot, seed, reality), driver, stream, EXPLORED)
     held = record(make_arm(robot, seed, reality), driver, HELD_OUT_STREAM, HELD_OUT)
@@ -197,7 +207,7 @@ def _explored(robot: Robot, driver: Mae, reality: str, seed: int) -> Iterator[tu
 
 
 def coupling(robot: Robot, theta: Array) -> Array:
-    """Return changes of all lengths [m] (N, M) that depend smoothly on all joints."""
+    """Return changes of all lengths [m] (N, M) that depend smoothly on θ [rad] (N, D)."""
     rng, waves = np.random.default_rng(123), 40
     frequency = rng.normal(0.0, 1.0, (waves, robot.joint_count))
     frequency /= 0.6 * (robot.upper - robot.lower)
@@ -208,7 +218,10 @@ def coupling(robot: Robot, theta: Array) -> Array:
 
 
 def package(case: Case, updates: int, seed: int) -> str:
-    """Learn a case, and return its errors as text."""
+    """Learn a case in `updates` updates, and return its errors as text.
+
+    `seed` is the random seed of the training.
+    """
     updater, times = BodyUpdater(case.robot, case.initial, seed), list[float]()
     for _ in range(updates):
         begin = time.process_time()
@@ -301,7 +314,7 @@ def read_case(text: str, clones: Path | None, cache: Path) -> Case:
 
 
 def main(argv: list[str]) -> None:
-    """Print one line for each case."""
+    """Learn each case that the command line names, and print a line with its errors."""
     parser = Parser('bodies', (__doc__ or '').partition('\n')[0])
     parser.add_argument('cases', nargs='+', metavar='CASE', help='NAME[:COUNT[:DRAW]]')
     parser.add_argument('--clones', type=Path, help='directory with clones of the recordings')

@@ -44,8 +44,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-HELD_OUT_SEED = 9001  # move the held-out motion by this seed, from which no experiment learns
-EVERY = 10  # evaluate the length error at every tenth message
+HELD_OUT_SEED = 9001  # random seed of the held-out motion, from which no experiment learns
+EVERY = 10  # evaluate the length error only at every tenth message, to save time
 
 
 class Row(NamedTuple):

@@ -52,7 +52,7 @@ from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
 HELD_OUT = 40.0  # test on a held-out motion of this duration [s]
-STEPS = 400, 1200  # train for these numbers of steps in the updates
+STEPS = 400, 1200  # numbers of training steps of the successive updates
 #: function that returns the joint angles which the learner receives, by its source of θ
 VIEWS: dict[str, JointView] = {
     SENSOR: lambda _learner, _n, _true, read: read,
@@ -63,9 +63,9 @@ VIEWS: dict[str, JointView] = {
 class Honesty(NamedTuple):
     """How well the covariance of a network describes its errors on a recording."""
 
-    error: float  # mean ‖θ_est − θ‖ [rad]
+    error: float  # mean error ‖θ_est − θ‖ [rad]
     inside: float  # share of the errors within the 95 % confidence ellipsoid
-    nees: float  # mean of eᵀ Σ⁻¹ e / D
+    nees: float  # mean of eᵀ Σ⁻¹ e / D (NEES); above 1, the covariance is too small
 
     def text(self) -> str:
         """Return the mean error, the share inside the ellipsoid and the NEES as text."""
@@ -89,7 +89,7 @@ def honesty(covariance: Array, error: Array) -> Honesty:
 
 
 class Never(Trainer):
-    """A trainer that never updates."""
+    """A trainer that never updates the network, so that the bench decides when to update."""
 
     ready = False
 
@@ -122,7 +122,17 @@ def measure(
     minutes: float,
     scale: float,
 ) -> dict[str, Honesty]:
-    """Let an individual learn; return how honest its covariance is, by source of joint angles."""
+    """Let an individual learn; return how well its covariance fits its errors, by source of θ.
+
+    Args:
+        robot: The geometric model.
+        driver: The network that commands the exploration, and from which learning starts.
+        reality: Emulator model of the individual.
+        seed: Seed of the individual and of the exploration.
+        exploration: Preset that explores.
+        minutes: Duration of the exploration [min].
+        scale: Factor of each covariance before it is compared with the errors.
+    """
     steps = Exploration(robot, EXPLORATION_STREAM + seed, exploration)
     exploring = record(make_arm(robot, seed, reality), driver, steps, 60.0 * minutes)
     held_out = record(make_arm(robot, seed, reality), driver, HELD_OUT_STREAM, HELD_OUT)

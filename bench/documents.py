@@ -37,6 +37,7 @@ PAGES = (
     *(str(file.relative_to(ROOT)) for file in sorted(ROOT.glob('doc/tutorials/*.md'))),
     *(str(file.relative_to(ROOT)) for file in sorted(ROOT.glob('doc/howto/*.md'))),
 )
+#: text in the comment of a command that the bench runs in the background
 BACKGROUND = 'Ctrl-C ends it'
 #: variables that the commands get from the environment, besides those of pip
 KEPT = ('LANG', 'ROS_DOMAIN_ID', 'GIT_CONFIG_GLOBAL', 'TMPDIR')
@@ -94,7 +95,7 @@ background() {{ # SCRIPT COMMAND
 
 
 class Command(NamedTuple):
-    """One command of a page."""
+    """One command of a page, and how the bench has to run it."""
 
     line: str
     is_background: bool

@@ -41,7 +41,7 @@ class Result(NamedTuple):
     samples: int  # number of samples that the learner took
 
     def line(self, seed: int) -> str:
-        """Return a line of the table."""
+        """Return the results of the individual `seed` as a line of the table."""
         return (
             f'{seed:>5} {self.seconds:>8.0f} {self.pauses:>7} {self.lost:>8} '
             f'{1000.0 * self.delay:>9.0f} {self.samples:>7}  {self.problem}'
@@ -58,7 +58,10 @@ class BusyLoop(Lab):
     """A laboratory with an arm that explores all the time, and counts its pauses."""
 
     def __init__(self, arm: Arm, initial: Mae, seed: int, load: float = 0.0) -> None:
-        """Connect an arm at rest to the nodes; `load` is the number of other processes."""
+        """Connect an arm at rest to the nodes.
+
+        `seed` selects the exploration, and `load` is the number of other processes.
+        """
         super().__init__(arm, initial, seed, load)
         self.pauses = 0
 
@@ -95,7 +98,10 @@ class BusyLoop(Lab):
 def watch(
     robot: Robot, reality: str, seed: int, initial: Mae, load: float, seconds: float
 ) -> Result:
-    """Let the individual of a seed explore; return what happened (see `BusyLoop`)."""
+    """Let an individual explore for `seconds` [s], and return what happened.
+
+    `reality` and `seed` name the individual; `load` is the number of other processes.
+    """
     return BusyLoop(make_arm(robot, seed, reality), initial, seed, load).watch(seconds)
 
 

@@ -44,7 +44,7 @@ from musculoskeletal_ae.signals.friction import directions
 from musculoskeletal_ae.signals.limits import LIMITS as SIGNAL_LIMITS
 from musculoskeletal_ae.signals.limits import share_outside
 
-LOAD = 3.6  # let the arm carry a payload of this mass [kg]
+LOAD = 3.6  # mass of the payload that the arm carries every second minute [kg]
 MINUTE = 60.0  # add or remove the payload at this interval [s]
 
 MESSAGES = {
@@ -72,7 +72,7 @@ class Spread:
     """The largest value of each measure over networks, and the refused networks."""
 
     def __init__(self) -> None:
-        """Begin without any measured network."""
+        """Start without a measured network."""
         self.most: defaultdict[str, float] = defaultdict(float)
         #: largest d among the ruptured muscles of a network, as a multiple of the detection
         #: threshold; the smallest of these values over all networks
@@ -80,7 +80,7 @@ class Spread:
         self.refused, self.count = list[str](), 0
 
     def take(self, gate: CheckpointValidator, mae: Mae, name: str) -> None:
-        """Measure a network, and record it as refused if the validation rejects it."""
+        """Measure a network, and record it under `name` as refused if the validation rejects it."""
         self.count += 1
         values = {key: error.max() for key, error in filter(None, gate.postures.errors(mae))}
         errors = gate.message_errors(mae)
@@ -135,7 +135,7 @@ def learned(arm: Arm, mae: Mae, driver: Mae, seed: int, minutes: float, spread: 
 
 
 def limit(name: str) -> float:
-    """Return the limit of a measure by its name."""
+    """Return the value above which checkpoint validation refuses a network, for a named measure."""
     if name in (limits := LIMITS | MESSAGES):
         return limits[name]
     return FLOOR.get(name.removesuffix(' of messages'), WORSE if 'in use' in name else 1.0)

@@ -34,7 +34,8 @@ from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
-DRAWN = 'visual', 'collision'  # elements of a link that do not affect muscle lengths
+#: elements of a link that are left out, because they do not affect muscle lengths
+DRAWN = 'visual', 'collision'
 HEAD = (
     'model', 'joints', 'muscles', 'wrap', 'max error [mm]', 'median [mm]', 'moment arm [mm]',
     'wrong signs', 'check_robot',
@@ -132,7 +133,7 @@ def row(file: Path, out: Path) -> list[str]:
 
 
 def main(argv: list[str]) -> None:
-    """Print the table."""
+    """Import the files that the command line names, and print a row for each."""
     parser = Parser('importing', 'Imports public models that you have downloaded.')
     parser.add_argument(
         'files', nargs='+', type=Path, metavar='FILE', help='model to import as a robot'

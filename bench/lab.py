@@ -42,12 +42,12 @@ from musculoskeletal_ae.learning.state import StateStore
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.signals.body_state import BodyState
 
-CORES = 2  # simulate a computer with this many cores
+CORES = 2  # number of cores of the simulated computer
 #: let a process wait for the processor for this mean time, for each process per core [s]
 WAIT = 0.0008
 STALL_EVERY = 10.0  # stall a process at this mean interval [s]
 STALL = 0.015  # let a stall take this mean time, for each process per core [s]
-HANDLING = 0.0005  # let a node handle a message in this time [s]
+HANDLING = 0.0005  # time in which a node handles a message [s]
 QUEUE = 10  # let at most this many messages wait in a subscription; drop older ones
 #: set the publisher's clock ahead of the steady clock by this time [s]; no node may depend on it
 AHEAD = 1.7e9
@@ -69,7 +69,10 @@ class Process:
     """
 
     def __init__(self, load: float, seed: list[int]) -> None:
-        """Share the computer with `load` other processes, on average."""
+        """Share the computer with `load` other processes, on average.
+
+        `seed` determines how long the process waits for the processor.
+        """
         self._per_core, self._rng = load / CORES, np.random.default_rng(seed)
         self._runs_at = 0.0  # time at which the process runs next [s]
         self._subscribed_at = 0.0  # time from which it receives messages [s]
@@ -143,12 +146,12 @@ class Wire:
     """
 
     def __init__(self) -> None:
-        """Start without faults."""
+        """Start with a healthy wire, which changes nothing."""
         self.reading_faults: list[ReadingFault] = []
         self.command_faults: list[CommandFault] = []
 
     def clear(self) -> None:
-        """Clear all faults."""
+        """Clear all faults, so that readings and commands pass unchanged."""
         self.reading_faults.clear()
         self.command_faults.clear()
 
@@ -160,7 +163,10 @@ class Wire:
         return packets
 
     def command(self, now: float, value: Array) -> Array | None:
-        """Return the length command [m] (M,) that reaches the modules; None if it is lost."""
+        """Return the length command [m] (M,) that reaches the modules; None if it is lost.
+
+        `value` is the command that the controller has sent.
+        """
         command: Array | None = value
         for fault in self.command_faults:
             command = None if command is None else fault(now, command)
@@ -182,7 +188,10 @@ class Lab:
     """
 
     def __init__(self, arm: Arm, initial: Mae, seed: int, load: float = 0.0) -> None:
-        """Connect an arm at rest to the nodes; `load` is the number of other processes."""
+        """Connect an arm at rest to the nodes.
+
+        `seed` selects the exploration and the waits, and `load` is the number of other processes.
+        """
         self.arm, self.now, self.clock_shift = arm, 0.0, 0.0
         self.wire = Wire()
         self.before_step: list[Callable[[Lab], object]] = []
@@ -194,9 +203,9 @@ class Lab:
         self.controller = Controller(robot, seed=EXPLORATION_STREAM + seed)
         self.learner = Learner(robot, initial, seed=seed, steps=STEPS, trainer=Seldom)
         self._connect_networks()
-        self.rejected_networks: list[str] = []  # why the estimator rejected networks
+        self.rejected_networks: list[str] = []  # reasons for which the estimator rejected networks
         self._candidate: Mae | None = None  # newest network that the learner published
-        #: reliable messages that wait for controller and learner, and estimates and command
+        #: reliable messages that wait for the controller until it runs
         self._to_controller: list[Callable[[], object]] = []
         self._to_learner: list[Callable[[], object]] = []
         self._estimates: list[Array] = []

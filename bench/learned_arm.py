@@ -66,7 +66,7 @@ def initial(robot: Robot, folder: Path) -> Mae:
 def learned_arm(
     robot: Robot, seed: int, folder: Path, minutes: float, reality: str = KIN
 ) -> LearnedArm:
-    """Return an individual that has learned for `minutes` [min].
+    """Return the individual of `reality` and `seed` that has learned for `minutes` [min].
 
     If the cache in `folder` has the individual, it is read from there.
     """

@@ -29,7 +29,7 @@ BODIES: dict[str, tuple[int | str, ...]] = {
     '17x40': (4, 4, 'neck'),
     '39x74': (3, 3, 3, 3, 3, 'held'),
 }
-BELOW = 0.8  # mount each pair of arms this far below the one above [m]
+BELOW = 0.8  # distance between a pair of arms and the pair above [m]
 WRIST = """<r>
   <joint name="wrist_flexion" type="revolute"><parent link="forearm"/><child link="carpus"/>
     <origin xyz="0 0 -0.20"/><axis xyz="1 0 0"/>
@@ -86,13 +86,16 @@ Muscle = dict[str, Any]
 
 
 def mirrored(value: str) -> str:
-    """Return the text of a vector, mirrored to the other side of the body."""
+    """Return the text `value` of a vector, 'x y z', mirrored to the other side of the body."""
     x, y, z = map(float, value.split())
     return f'{x:g} {0.0 - y:g} {z:g}'
 
 
 def on_ring(angle: float, radius: float, height: float) -> list[float]:
-    """Return a point [m] on a ring; the angle [degrees] is from the front towards the left."""
+    """Return a point [m], (3,), on a horizontal ring of a radius [m] at a height [m].
+
+    The angle [degrees] is from the front towards the left.
+    """
     at = radians(angle)
     return [round(radius * cos(at), 4), round(radius * sin(at), 4), height]
 
@@ -173,7 +176,7 @@ class Body:
         self.end_effectors.append(prefix + 'hand')
 
     def add_neck(self) -> None:
-        """Add a neck and a head."""
+        """Add a neck of three joints, a head, and the twelve tendons of the neck."""
         parts = list(ET.fromstring(NECK))  # noqa: S314
         self.urdf.extend(parts)
         self.joints += [part.get('name', '') for part in parts if part.tag == 'joint']

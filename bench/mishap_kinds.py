@@ -75,9 +75,9 @@ SOFTWARE = frozenset({
     Step.CHANGE_TARGET,
 })  # fmt: skip
 
-SHOWN_ANGLE = 0.1  # count a wrong joint angle as visible from this error on [rad]
-SHOWN_LENGTH = 0.02  # count a wrong length as visible from this error on [m]
-SHOWN_TENSION = 20.0  # count a wrong tension as visible from this error on [N]
+SHOWN_ANGLE = 0.1  # a wrong joint angle can be noticed from this error on [rad]
+SHOWN_LENGTH = 0.02  # a wrong length can be noticed from this error on [m]
+SHOWN_TENSION = 20.0  # a wrong tension can be noticed from this error on [N]
 
 
 def _at_once(_: Lab) -> bool:
@@ -160,12 +160,12 @@ def on_theta(change: Callable[[float, Array], None]) -> ReadingFault:
 
 
 def silent(start: float, seconds: float) -> ReadingFault:
-    """Return a fault by which the driver is silent for a time [s]."""
+    """Return a fault by which the driver is silent for `seconds` after the time `start` [s]."""
     return lambda now, packet: [] if now < start + seconds else [packet]
 
 
 def deaf(start: float, seconds: float) -> CommandFault:
-    """Return a fault by which no command reaches the modules for a time [s]."""
+    """Return a fault by which no command arrives for `seconds` after the time `start` [s]."""
     return lambda now, value: None if now < start + seconds else value
 
 
@@ -196,7 +196,11 @@ def _loaded(lab: Lab, rng: Rng) -> int:
 
 
 def _is_demanded(muscle: int) -> Callable[[Lab], bool]:
-    """Return whether the module should now pull with another tension than it does."""
+    """Return a function that says whether a module pulls otherwise than it should.
+
+    The function is that for the module of `muscle`: its tension must deviate from the demanded one
+    by more than SHOWN_TENSION.
+    """
 
     def shown(lab: Lab) -> bool:
         sample, command = lab.controller.sample, lab.controller.limiter.command
@@ -221,7 +225,7 @@ def rupture_under_load(lab: Lab, rng: Rng) -> Case:
 
 
 def rupture_at_rest(lab: Lab, rng: Rng) -> Case:
-    """A tendon ruptures while it has the tension bias; seen when it should carry load."""
+    """A tendon ruptures while it has the tension bias; noticed when it should carry load."""
     pull, bias = lab.arm.tension, lab.arm.robot.tension.bias
     idle = np.flatnonzero(pull < bias + 3.0)
     muscle = int(rng.choice(idle)) if len(idle) else int((pull - bias).argmin())
@@ -294,7 +298,10 @@ def retied(lab: Lab, rng: Rng) -> Case:
 
 
 def module_fault(kind: str, low: float = 0.0, high: float = 0.0) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which one module has a mechanical fault of the emulator."""
+    """Return a mishap by which one module has the emulator's fault `kind`.
+
+    The size of the fault is drawn between `low` and `high`, in the unit of the fault.
+    """
 
     def begin(lab: Lab, rng: Rng) -> Case:
         muscle, name = _any(rng, lab.arm.robot.muscles)
@@ -306,7 +313,7 @@ def module_fault(kind: str, low: float = 0.0, high: float = 0.0) -> Callable[[La
 
 
 def hot_motor(lab: Lab, rng: Rng) -> Case:
-    """A motor becomes hot."""
+    """A module becomes at least 88 to 100 °C hot, whatever its muscle exerts."""
     _, name = _any(rng, lab.arm.robot.muscles)
     size = rng.uniform(88.0, 100.0)
     lab.arm.set_faults([f'overheat:{name}:{size:.0f}'])
@@ -319,7 +326,10 @@ LENGTH, TENSION, TEMPERATURE = 0, 1, 2
 
 
 def frozen(row: int) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which one reading is frozen; it is seen when the value should change."""
+    """Return a mishap by which one reading of a muscle freezes, with an effect once it changes.
+
+    `row` is the row of the reading in muscle_states.
+    """
 
     def begin(lab: Lab, rng: Rng) -> Case:
         muscle, name = _any(rng, lab.arm.robot.muscles)
@@ -358,7 +368,11 @@ def changed(
     row: int, change: Callable[[float, float], float], low: float, high: float, unit: str,
     is_signed: bool = True,
 ) -> Callable[[Lab, Rng], Case]:  # fmt: skip
-    """Return a mishap by which one reading of a muscle is changed by a random size."""
+    """Return a mishap by which one reading of a muscle is changed by a random size.
+
+    `row` is the row of the reading in muscle_states. `change` gets the true value and the size,
+    which is drawn between `low` and `high`, and is negative at random if `is_signed`.
+    """
 
     def begin(lab: Lab, rng: Rng) -> Case:
         muscle, name = _any(rng, lab.arm.robot.muscles)
@@ -381,17 +395,17 @@ def changed(
 
 
 def bias(value: float, size: float) -> float:
-    """Return a value with an offset, not below 0 for a tension sensor."""
+    """Return a value to which `size` is added, at least 0 as the reading of a tension sensor."""
     return max(value + size, 0.0)
 
 
 def gain(value: float, size: float) -> float:
-    """Return a value times a factor."""
+    """Return a value multiplied by `size`, as an amplifier with a wrong gain would."""
     return value * size
 
 
 def nothing(_: float, __: float) -> float:
-    """Return NaN."""
+    """Return NaN instead of a value, as a sensor without a signal does."""
     return math.nan
 
 
@@ -503,7 +517,10 @@ def joint_drifts(lab: Lab, rng: Rng) -> Case:
 
 
 def joint_fault(change: Callable[[float], float], what: str) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which a joint sensor reads a function of its true angle."""
+    """Return a mishap by which a joint sensor reads the function `change` of its true angle.
+
+    `what` describes the mishap in the results.
+    """
 
     def begin(lab: Lab, rng: Rng) -> Case:
         j, name = _any(rng, lab.arm.robot.joints)
@@ -747,7 +764,10 @@ def lost_module(lab: Lab, rng: Rng) -> Case:
 
 
 def mounted(least: float, most: float) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which the base is mounted at a random angle [rad] to the vertical."""
+    """Return a mishap by which the base is mounted at an angle to the vertical.
+
+    The angle is drawn between `least` and `most` [rad].
+    """
 
     def begin(lab: Lab, rng: Rng) -> Case:
         around, angle = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(least, most)

@@ -68,22 +68,22 @@ from musculoskeletal_ae.options import Parser, names, positive
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.robot.robot import Robot
 
-LEARNING = 180.0  # let an individual learn for this time before its mishaps [s]
+LEARNING = 180.0  # let an individual explore and learn for this time before its mishaps [s]
 #: learn for this time with the individual of this seed, whose network serves as the wrong one [s]
 OTHER_LEARNING, OTHER_SEED = 90.0, 990
 LOOK = 0.1  # read the statements at this interval [s]
 GOAL = 5.0  # count a true statement as in time within this time after the first effect [s]
 PATIENCE = 30.0  # let a person find an unstated fault this long after its first effect [s]
 LONGEST_WAIT = 75.0  # wait at most this long for the first effect and PATIENCE together [s]
-REACTION = 5.0  # let the operator act this long after a node has first advised a step [s]
+REACTION = 5.0  # let the operator react this long after a node has first advised a step [s]
 BETWEEN = 0.5  # take the steps of a remedy at this interval [s]
 SETTLING = 4.0  # read the statements again this long after the steps of a remedy [s]
-QUIET = 3.0  # count the arm as well once it has explored without a condition for this time [s]
+QUIET = 3.0  # call the arm well once it has explored without any condition for this time [s]
 CALIBRATION = 60.0  # wait at most this long for a length calibration [s]
 COOLING = 240.0  # wait at most this long for motors to cool, in all [s]
 AFTER = 20.0  # measure the true error over this time [s]
-#: count a case as not well if the error has grown to more than this multiple, and by more than this
-#: much [rad]
+#: a case has not ended well if the error has grown to more than this multiple, and by more than
+#: this [rad]
 WELL, WELL_RAD = 1.5, 0.02
 HOLDABLE = 4  # choose the posture to hold among this many holdable ones
 #: individuals and emulator models of the complete table
@@ -134,7 +134,7 @@ class Course:
     """The course of one mishap: watches statements and tensions, and plays the operator."""
 
     def __init__(self, lab: Lab, mishap: Mishap) -> None:
-        """Prepare a mishap of this laboratory."""
+        """Prepare a mishap, which `play` will let happen in the laboratory."""
         self.lab, self.mishap, self.case = lab, mishap, Case('', lambda _: None)
         self.begun_at = math.inf  # time at which the mishap begins [s]
         self.effect_at: float | None = None  # time of the first effect [s]
@@ -145,7 +145,8 @@ class Course:
         self.mended_at: float | None = None
         self.is_found_by_advice = False
         self.false: dict[str, dict[str, Any]] = {}  # the first of each false statement
-        self.later: dict[str, str] = {}  # statements after the mending
+        #: false statements that came only after the fault was mended
+        self.later: dict[str, str] = {}
         self.stated: dict[str, Any] = {}  # all different statements, with time and judgement
         self.taken: list[str] = []  # steps that the operator took, and refusals
         self.peak = 0.0  # highest tension, in multiples of tension.limit
@@ -212,7 +213,7 @@ class Course:
         return self.mended_at is not None and self.lab.now - self.quiet_since >= QUIET
 
     def mend(self, by_advice: bool = False) -> None:
-        """Mend the fault, as a person would."""
+        """Mend the fault, as a person would; `by_advice` if a true message led to it."""
         if self.mended_at is None:
             self.case.mend(self.lab)
             self.mended_at, self.is_found_by_advice = self.lab.now, by_advice
@@ -375,7 +376,10 @@ def judge(statement: Statement, mishap: Mishap, case: Case) -> str:
 
 
 def learned_lab(robot: Robot, first: Mae, seed: int, reality: str, seconds: float) -> Lab:
-    """Return a laboratory whose individual has explored and learned for a time [s]."""
+    """Return a laboratory whose individual has explored and learned for `seconds` [s].
+
+    `reality` and `seed` name the individual, and `first` is its initial network.
+    """
     lab = Lab(make_arm(robot, seed, reality), first, seed)
     lab.run(1.0)
     lab.controller.explore(True)
@@ -384,7 +388,10 @@ def learned_lab(robot: Robot, first: Mae, seed: int, reality: str, seconds: floa
 
 
 def play(lab: Lab, mishap: Mishap, seed: int, reality: str, before: float) -> dict[str, Any]:
-    """Play one mishap in a laboratory; return its result by name."""
+    """Play one mishap in a laboratory; return its result by name.
+
+    `reality` and `seed` name the individual. `before` is the error of its estimate so far [rad].
+    """
     number = [each.name for each in MISHAPS].index(mishap.name)
     rng = np.random.default_rng([seed, reality == FOREIGN, number, 0x315])
     begun, from_now = time.process_time(), lab.now
@@ -474,7 +481,10 @@ def results(folder: Path) -> list[dict[str, Any]]:
 
 
 def without_result(folder: Path, seed: int, reality: str, kinds: Sequence[str]) -> list[str]:
-    """Return the names of those mishaps of an individual that have no result in the folder yet."""
+    """Return the names of those mishaps in `kinds` that have no result in the folder yet.
+
+    `reality` and `seed` name the individual.
+    """
     done = {
         each['mishap']
         for each in results(folder)
@@ -484,7 +494,7 @@ def without_result(folder: Path, seed: int, reality: str, kinds: Sequence[str]) 
 
 
 def run_seed(robot: Robot, folder: Path, seed: int, reality: str, to_do: Sequence[str]) -> None:
-    """Run mishaps of one individual, and append their results to its file."""
+    """Run mishaps of the individual of `reality` and `seed`, and append the results to its file."""
     file = folder / f'{reality}_{seed}.jsonl'
     first = initial(robot, folder)
     mishap_kinds.OTHER_NETWORK[:] = [other_network(robot, first, reality, folder)]
@@ -504,7 +514,7 @@ def run_seed(robot: Robot, folder: Path, seed: int, reality: str, to_do: Sequenc
 
 
 def other_network(robot: Robot, first: Mae, reality: str, folder: Path) -> Mae:
-    """Return the network of another individual, from the cache in `folder` if it is there."""
+    """Return the network of another individual of `reality`, if possible from `folder`."""
     file = folder / f'other_{reality}.safetensors'
     if not file.exists():
         lab = learned_lab(robot, first, OTHER_SEED, reality, OTHER_LEARNING)
@@ -513,7 +523,7 @@ def other_network(robot: Robot, first: Mae, reality: str, folder: Path) -> Mae:
 
 
 def run_healthy(robot: Robot, folder: Path, seed: int, reality: str, hours: float) -> int:
-    """Run a healthy arm that explores; print and count its different warnings and errors."""
+    """Let a healthy arm explore for `hours`; print and count its different warnings and errors."""
     lab = learned_lab(robot, initial(robot, folder), seed, reality, AFTER)
     course = Course(lab, MISHAPS[0])
     course.run(3600.0 * hours - AFTER)
@@ -531,7 +541,10 @@ def is_wanted(name: str, kinds: Sequence[str] | None) -> bool:
 def run_graph(
     folder: Path, seeds: Iterable[int], wanted: Sequence[str] | None, again: bool
 ) -> None:
-    """Run the mishaps on the ROS graph that have no result yet, once for each seed."""
+    """Run the mishaps on the ROS graph, once for each seed.
+
+    Mishaps that have a result are left out, unless `again` repeats them.
+    """
     from bench.mishaps_on_graph import GRAPH_MISHAPS, run
 
     network = folder / 'graph.safetensors'
@@ -627,7 +640,7 @@ def _place(name: str) -> int:
 
 
 def _false_statements(of: Iterable[dict[str, Any]]) -> str:
-    """Return the false statements, one for each mishap and identifier, in Markdown."""
+    """Return a Markdown table of the false statements, one for each mishap and identifier."""
     first: dict[tuple[str, str], tuple[str, int]] = {}
     for each in of:
         for name, what in each['false'].items():
@@ -642,7 +655,7 @@ def _false_statements(of: Iterable[dict[str, Any]]) -> str:
 
 
 def _bad_ends(of: Iterable[dict[str, Any]]) -> str:
-    """Return the cases that did not end well, in Markdown."""
+    """Return a Markdown table of the cases that did not end well, with the steps and the reason."""
     rows = []
     for each in sorted(of, key=lambda each: _place(each['mishap'])):
         if each['well']:

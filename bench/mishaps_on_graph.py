@@ -30,7 +30,7 @@ WATCHED = 15.0  # watch the status line for this time while the mishap lasts [s]
 ERROR_TIME = 10.0  # measure the true error over this time [s]
 #: statements that blame the computer; count them as false unless other programs use it up
 OVERLOADED = 'overloaded|stop other programs'
-BUSY = 8  # keep the computer busy with this many programs
+BUSY = 8  # number of programs that keep the computer busy
 
 
 class GraphMishap(NamedTuple):
@@ -212,7 +212,10 @@ def true_error(attack: Attack) -> float:
 def run(
     folder: Path, initial: Path, seed: int, kinds: list[str], keep: Callable[[dict[str, Any]], None]
 ) -> None:
-    """Run the system, and play the named mishaps; call `keep` with each result."""
+    """Run the system, and play the named mishaps; call `keep` with each result.
+
+    `seed` selects muscles, joints and sizes. `initial` is the network to start from.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     with Attack(folder, initial, seed) as attack:
         scene = Scene(attack)

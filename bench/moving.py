@@ -21,7 +21,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-PERIOD = 0.01  # take a reading at this interval [s]
+PERIOD = 0.01  # interval between two readings [s]
 TENSIONS = 40.0, 120.0  # draw the tensions at the postures from this range [N]
 
 
@@ -31,8 +31,8 @@ def record(
     """Record an arm that moves to random postures; return the recording.
 
     Args:
-        robot: The geometric model.
-        reality: The emulator model.
+        robot: The geometric model, which commands the lengths.
+        reality: The emulator model of the individual.
         seed: Seed of the emulated individual.
         seconds: Duration of the recording [s].
         motion: Duration of each motion [s].
@@ -60,7 +60,10 @@ def record(
 
 
 def measure(robot: Robot, mae: Mae, reality: str, seed: int, seconds: float) -> list[str]:
-    """Return the errors of one individual as lines of text."""
+    """Return the errors of one individual after learning, as lines of text.
+
+    `reality` and `seed` name the individual. Each recording takes `seconds` [s].
+    """
     held_out = record(robot, reality, seed, 60.0, 1.0, 1.0, order=9)
     before = robot.units.error_text(errors(mae, held_out))
     lines = [f'{reality} {seed}: initial network {before}']
@@ -75,7 +78,7 @@ def measure(robot: Robot, mae: Mae, reality: str, seed: int, seconds: float) -> 
 
 
 def main(argv: list[str]) -> int:
-    """Print the errors for each individual."""
+    """Record, learn and test each individual, and print its errors."""
     parser = Parser('moving', 'Learns emulated recordings with and without rests.')
     parser.add_robot(default='arm26')
     parser.add_reality()

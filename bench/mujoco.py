@@ -86,7 +86,7 @@ from musculoskeletal_ae.options import Parser, number, seeds
 from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot
 
-ALL_NODES = 'with learner'  # the kind of `bench wire` that runs all nodes
+ALL_NODES = 'with learner'  # kind of `bench wire` that runs all nodes
 HEAD = (
     'model', 'seed', 'joints', 'muscles', 'held', 'first network [s]', 'before [rad]', '`paper`',
     'after', 'detected', 'named', 'trajectory [rad]', 'held [rad]', 'export, network [mm]',
@@ -95,11 +95,11 @@ HEAD = (
 NODES_HEAD = 'model', 'joints', 'muscles', *KINDS[ALL_NODES], 'sum', 'arrived'
 MOTIONS, DURATION, TRIES = 4, 2.0, 400
 MOMENTS = 25  # evaluate the torque of a motion at this many instants
-LEAST_TORQUE = 1e-6  # count the muscles as too weak for a motion if more torque is missing [N·m]
-HOLDING = 5.0  # hold a posture for this time [s]
+LEAST_TORQUE = 1e-6  # treat the muscles as too weak for a motion if more torque is missing [N·m]
+HOLDING = 5.0  # let the arm hold each posture for this time [s]
 ARM_POSTURES = 300
 RATE = 100.0  # rate of muscle_states with --nodes [Hz]
-TRAINED = 'trained'  # the part of a run that contains the first networks
+TRAINED = 'trained'  # name of the part of a run that contains the first networks
 LISTS = 'joints', 'muscles', 'without'
 MuscleJacobian = Callable[[Array], Array]
 
@@ -148,7 +148,7 @@ def can_exert(
     Args:
         limits: The bone-side tensions that the arm may use.
         muscle_jacobian: Returns the true G [m/rad] (N, M, D) for θ (N, D).
-        planned: The trajectory.
+        planned: The trajectory that the arm should follow.
     """
     moments = planned.sample(np.linspace(0.0, planned.duration, MOMENTS + 1)[1:])
     each = zip(muscle_jacobian(moments.theta), map(Setpoint._make, zip(*moments)))
@@ -217,12 +217,12 @@ def table_row(
     """Return the cells of one individual.
 
     Args:
-        study: The experiments.
+        study: The experiments on the model.
         name: Name of the model.
         seed: Seed of the individual.
         training: CPU time of the initial training [s].
-        file: The MJCF file.
-        chain: The part of it that was imported.
+        file: The MJCF file that was imported.
+        chain: Arguments that select the imported part of the file.
     """
     robot = study.robot
     held_out = record(study.arm(seed), study.network(None), 0xB0 + seed, study.held_out_time)
@@ -275,7 +275,10 @@ def rupture_cells(study: Study, seed: int) -> list[str]:
 
 
 def attempt(error: Callable[[Study, int], float], study: Study, seed: int) -> str:
-    """Return an error of an individual as a text; if `error` raises an exception, its message."""
+    """Return the error that `error` measures on an individual as a text.
+
+    If `error` raises an exception, the text is the message of the exception.
+    """
     try:
         return f'{error(study, seed):.4f}'
     except MusculoskeletalError as problem:
@@ -283,7 +286,10 @@ def attempt(error: Callable[[Study, int], float], study: Study, seed: int) -> st
 
 
 def nodes_row(name: str, file: Path, chain: dict[str, Any], args: Namespace) -> list[str]:
-    """Import a model, run all nodes, and return the cells with the CPU time of each node."""
+    """Import a model, run all nodes, and return the cells with the CPU time of each node.
+
+    `chain` are options of `import_robot` that select a part of the model in `file`.
+    """
     robot: Robot = import_robot(file, args.out / name / 'robot', **chain).robot
     directory = str(robot.description.directory)
     emulator = f'reality:={directory}/model.xml', 'deviates:=true', f'seed:={args.seeds[0]}'
@@ -298,7 +304,8 @@ def model_rows(
 ) -> Iterator[list[str]]:
     """Import a model, train, and yield the row of each individual.
 
-    Networks and rows of an interrupted run with the same --out are read from its files.
+    `chain` are options of `import_robot` that select a part of the model in `file`. Networks and
+    rows of an interrupted run with the same --out are read from its files.
     """
     folder = args.out / name
     directory = folder / 'robot'
@@ -338,7 +345,7 @@ def model_rows(
 
 
 def main(argv: list[str]) -> None:
-    """Print the table, row by row."""
+    """Learn the models that the command line names, and print a row for each individual."""
     parser = Parser('mujoco', 'Learns MuJoCo models that you have fetched.')
     text = (
         'name and MJCF file of a model, and the part of it to import: joints=…, muscles=…, '

@@ -33,7 +33,7 @@ from musculoskeletal_ae.robot.robot import Robot
 ARM = 'musashi_left_arm'
 LARGE = 'musashi_upper_body'
 RATES, SIZES = (100.0, 200.0, 500.0), ('arm26', ARM, LARGE)
-EXPLORING = 60.0  # explore for this time to get the samples of the timed update [s]
+EXPLORING = 60.0  # explore for this time, to fill the sample store before an update is timed [s]
 #: rate of muscle_states for start-up, memory, late messages and profiles [Hz]
 FLAME_RATE = 200.0
 STARTING = 60.0  # wait at most this long for the first command [s]
@@ -125,14 +125,14 @@ FLAMES = '\n## Where a node’s time goes\n\nFlame graphs, recorded by py-spy at
 
 
 def rows(head: str, lines: Iterable[Iterable[object]]) -> str:
-    """Return a table in Markdown."""
+    """Return a table in Markdown with the heading `head` and the cells of each line."""
     columns = head.count('|') + 1
     cells = (f'| {" | ".join(map(str, line))} |' for line in lines)
     return '\n'.join((f'| {head} |', '|---' * columns + '|', *cells))
 
 
 def core(measured: Iterable[timings.Timed]) -> str:
-    """Return the table of core steps."""
+    """Return the table of the CPU times that one call of each core step takes."""
     cells = []
     for row in measured:
         ratio = f'{row.torch_eager / row.ours:.1f}' if row.torch_eager else ''
@@ -236,7 +236,10 @@ def starting(used: dict[str, float], held: dict[str, tuple[float, float]], netwo
 
 
 def flames(network: Path, seconds: float, out: Path) -> str:
-    """Draw a flame graph of each node, and return the text of the page with links to the graphs."""
+    """Draw a flame graph of each node, and return the text of the page with links to the graphs.
+
+    Each node is recorded for `seconds` [s], and the graphs are written to `out`.
+    """
     out.mkdir(parents=True, exist_ok=True)
     system = System(ARM, network, FLAME_RATE, KINDS['with learner'])
     try:
@@ -262,14 +265,14 @@ def learning(name: str, folder: Path) -> tuple[float, float, Path]:
 
 
 def machine() -> str:
-    """Return a description of the machine."""
+    """Return the number of cores and the processor of this machine as text."""
     text = Path('/proc/cpuinfo').read_text('utf-8')
     names = {line.partition(':')[2].strip() for line in text.splitlines() if 'model name' in line}
     return f'{os.cpu_count()} cores of {", ".join(sorted(names)) or platform.machine()}'
 
 
 def main(argv: list[str]) -> None:
-    """Measure everything and write the page."""
+    """Measure all times that the page shows, and write the page."""
     parser = Parser('performance', 'Writes doc/performance.md.')
     parser.add_argument(
         '--seconds', type=number(1.0, 3600.0), default=20.0, help='duration of each measurement [s]'

@@ -24,7 +24,7 @@ from musculoskeletal_ae.ros.messages import array_message
 
 ROBOT = 'arm26'
 PATIENCE = 120.0  # wait at most this long for an estimate, because the machine may be busy [s]
-LARGEST_DIFFERENCE = 1e-9  # report a larger difference of two estimates [rad]
+LARGEST_DIFFERENCE = 1e-9  # fail if the estimates of node and core differ by more than this [rad]
 START = 'from musculoskeletal_ae.executables import estimator; raise SystemExit(estimator())'
 
 

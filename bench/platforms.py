@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[1]
 ROS_REQUIREMENTS = ROOT / '.ci' / 'requirements-ros.txt'
 #: packages that `--node` installs: all that the core and the estimator import
 NODE_REQUIREMENTS = ('numpy', 'pin', 'safetensors', 'msgspec', 'PyYAML')
-#: package versions of Ubuntu 24.04
+#: versions that Ubuntu 24.04 ships, which the emulated system must contain
 UBUNTU = ('numpy==1.26.4', 'scipy==1.11.4', 'matplotlib==3.8.4', 'PyYAML==6.0.1', 'lark==1.1.9')
 #: a pinocchio compiled for NumPy 1, like the one of apt
 APT_PINOCCHIO = ('pin==2.7.0', 'numpy==1.26.4')
@@ -74,7 +74,7 @@ class Site:
 
     @property
     def clone(self) -> Path:
-        """The clone of the repository."""
+        """Path of the platform's clone of the repository."""
         return self.folder / 'clone'
 
     @property
@@ -84,6 +84,8 @@ class Site:
 
     def run(self, title: str, *lines: str, on_platform: bool = False) -> str:
         """Run shell lines on the host, or on the platform; return their output.
+
+        `title` is printed first.
 
         Raises:
             MusculoskeletalError: If a line fails. The end of the output has then been printed.

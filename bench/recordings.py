@@ -51,7 +51,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-HALF = slice(0, None, 2)  # every other rest is for training
+HALF = slice(0, None, 2)  # rests that are used for training: every other one
 ALL_ROWS = ', of all rows'
 #: label of the one row that stands for all polynomials fitted to all rows of the training runs
 OF_ALL_ROWS = 'best polynomial of all training rows (chosen by its test error)'
@@ -71,8 +71,8 @@ class Split(NamedTuple):
     """One way to divide a recording into training and test data."""
 
     name: str
-    training: Run  # rest samples
-    test: Run  # all rows
+    training: Run  # the training data, which contain rest samples only
+    test: Run  # the test data, with all rows
     #: `training` by run, to which `Statics` is fitted; empty if it is not fitted to this split
     rests: list[Run]
     #: all rows of the training runs or poses, not only rests; polynomials are fitted to them as

@@ -29,7 +29,10 @@ STARTS = 3.0, 1.0
 
 
 def baselines(training: Run, with_effort: bool) -> Iterator[tuple[str, Model]]:
-    """Yield each baseline with its name."""
+    """Yield each model that knows nothing of the robot, with its name in the results.
+
+    The models estimate θ from muscle lengths and, if `with_effort`, from motor efforts as well.
+    """
     polynomials = [
         partial(polynomial, degree=degree, with_effort=with_effort, ridge=ridge)
         for degree, ridge in product(DEGREES, RIDGES)
@@ -67,7 +70,11 @@ def _centred(training: Run) -> tuple[Array, Array]:
 
 
 def kernel_ridge(training: Run, with_effort: bool, width: float, penalty: float) -> Model:
-    """Return kernel ridge regression with a Gaussian kernel of this width."""
+    """Return kernel ridge regression with a Gaussian kernel.
+
+    `width` is the width of the kernel, and `penalty` that of the squared weights. With
+    `with_effort`, the inputs include the efforts.
+    """
     inputs, (theta, mean) = _inputs(training, with_effort), _centred(training)
     known = inputs(training)
 
@@ -79,9 +86,10 @@ def kernel_ridge(training: Run, with_effort: bool, width: float, penalty: float)
 
 
 def gaussian_process(training: Run, with_effort: bool) -> Model:
-    """Return a Gaussian process with one length scale for each input, found by the evidence.
+    """Return a Gaussian process with one length scale for each input.
 
-    All joints share the length scales and the ratio of noise and signal.
+    The length scales maximise the evidence (marginal likelihood). All joints share them, and the
+    ratio of noise and signal.
     """
     inputs, (theta, mean) = _inputs(training, with_effort), _centred(training)
     x, count = inputs(training), theta.shape[0]

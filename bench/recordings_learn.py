@@ -30,7 +30,8 @@ INITIAL_STEPS, STEPS, UPDATES = 1000, 400, 8
 #: efforts in the training data. Tensions are proportional to efforts.
 STRONG = 40.0
 
-Model = Callable[[Run], Array]  # returns θ [rad], (N, D)
+#: a model: returns the estimated θ [rad], (N, D), of the N rows of a run
+Model = Callable[[Run], Array]
 
 
 def error(model: Model, run: Run) -> float:
@@ -149,7 +150,7 @@ class Statics:
     #: standard deviations of the IMU's orientation in the prior, and of θ in a rest sample [rad]
     TILT, NOISE = 0.02, 0.015
     ROUNDS = 15
-    CONVERGED = 1e-10  # count the postures as found once a step is no larger than this [rad]
+    CONVERGED = 1e-10  # end the search for the postures once a step is no larger than this [rad]
 
     def __init__(self, robot: Robot, rests: list[Run]) -> None:
         """Fit the unknowns to the rest samples of runs with different payloads."""
@@ -235,7 +236,7 @@ def bend_gain(run: Run, azimuths: Array) -> float:
     """Return the slope of the bend at rest over the commanded bend [rad/m].
 
     Args:
-        run: The run.
+        run: The run, which contains rests.
         azimuths: Azimuth of each tendon [rad], (M,). With these, the tendon lengths [m] give the
             commanded bend in two directions.
     """
@@ -250,7 +251,7 @@ def effort_slope(run: Run, azimuths: Array) -> float:
     """Return the slope of the efforts at rest over the commanded bend [unit of the effort per m].
 
     Args:
-        run: The run.
+        run: The run, which contains rests.
         azimuths: Azimuth of each tendon [rad], (M,). With these, the tendon lengths [m] give the
             commanded bend in two directions.
     """

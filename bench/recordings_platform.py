@@ -21,7 +21,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 JOINTS = 'x', 'y', 'z', 'roll', 'pitch', 'yaw'
-#: joint limits [m, rad], relative to the platform in the middle at this height [m]
+#: joint limits [m, rad] around the middle position of the platform, and its height there [m]
 LIMITS, HEIGHT = (0.8, 0.8, 0.7, 0.4, 0.4, 0.3), 0.6
 MASS, CENTRE = 12.966, 0.173  # mass [kg], and height of its centre above the origin [m]
 #: points at which the cables enter their pulleys, and attachments to the platform [m]
@@ -29,8 +29,8 @@ ENTRY = np.array([[a, b, 1.839] for a, b in ((1.068, -1.155), (1.068, 1.155))])
 ENTRY = np.vstack([ENTRY, ENTRY[::-1] * [-1.0, 1.0, 1.0]])
 ATTACHED = np.array([[0.075, b, 0.28] for b in (-0.075, 0.075)])
 ATTACHED = np.vstack([ATTACHED, ATTACHED[::-1] * [-1.0, 1.0, 1.0]])
-PULLEY = 0.03  # radius of the pulleys [m]
-STILL = 0.002  # count a length as at rest if it changes by less than this in SPAN [m]
+PULLEY = 0.03  # radius of the swivelling pulleys [m]
+STILL = 0.002  # treat a length as at rest if it changes by less than this within SPAN rows [m]
 SPAN = 5  # average this many rows (0.5 s) in a rest sample
 
 
@@ -41,7 +41,7 @@ class Platform:
     name: str = 'cable_platform'
 
     def write(self, directory: Path, tension_source: str = 'none') -> Path:
-        """Write the robot directory and return its path."""
+        """Write the robot directory, with `tension_source` in muscles.yaml; return its path."""
         lines, parent = ['<robot name="cable_platform"><link name="frame"/>'], 'frame'
         for name, axis, limit in zip(JOINTS, 2 * ('1 0 0', '0 1 0', '0 0 1'), LIMITS, strict=True):
             child = 'platform' if name == 'yaw' else f'after_{name}'

@@ -49,7 +49,7 @@ class Run:
     """The readings of one recorded run, in which the payload is constant."""
 
     name: str
-    load: float  # payload [kg]
+    load: float  # mass of the payload [kg]
     #: l, length of tendon paid out since the start [m], (N, M); `continuum_stand` scales it by 10
     length: Array
     effort: Array  # effort of the motors in units of the recording, (N, M); (N, 0) if it is unknown
@@ -85,10 +85,10 @@ class Body(Protocol):
 
     @property
     def name(self) -> str:
-        """Name of the robot."""
+        """Name of the recorded robot, which its URDF states."""
 
     def write(self, directory: Path, tension_source: str = 'none') -> Path:
-        """Write the robot directory and return its path."""
+        """Write the robot directory, with `tension_source` in muscles.yaml; return its path."""
 
 
 @dataclass(frozen=True)
@@ -100,10 +100,13 @@ class SoftLink:
     radius: tuple[float, ...]  # distance of each tendon from the middle [m]
     height: float  # length of the link [m]
     mass: float  # mass of the tip of the link [kg]
-    limit: float  # largest bend [rad]
+    limit: float  # limit of both joints that represent the bend [rad]
 
     def write(self, directory: Path, tension_source: str = 'none') -> Path:
-        """Write the robot directory and return its path; the muscle modules regulate positions."""
+        """Write the robot directory, with `tension_source` in muscles.yaml; return its path.
+
+        The muscle modules regulate positions.
+        """
         low, high, half = -self.limit, self.limit, 0.5 * self.height
         urdf = URDF.format(name=self.name, half=half, mass=self.mass, low=low, high=high)
         muscles = []
@@ -123,7 +126,7 @@ class SoftLink:
 
 @dataclass(frozen=True)
 class Recording:
-    """The runs of a repository."""
+    """All runs that one repository contains, and the robot that was recorded."""
 
     link: Body
     runs: list[Run]
@@ -131,9 +134,9 @@ class Recording:
 
 @dataclass(frozen=True)
 class Repository:
-    """A public repository with recordings."""
+    """A public repository with recordings of a robot, and how to read it."""
 
-    name: str  # owner/name on GitHub
+    name: str  # name of the repository on GitHub: OWNER/NAME
     recording: str  # name of the link; the results are stored under it
     licence: str
     robot: str  # one line about the robot and its sensors
@@ -141,7 +144,7 @@ class Repository:
 
 
 class Files:
-    """The files of a clone."""
+    """The files of a clone, read from its working tree or from git."""
 
     def __init__(self, path: Path) -> None:
         """Open a working tree or a git directory.

@@ -19,13 +19,15 @@ from scipy.optimize import minimize
 from musculoskeletal_ae.arrays import Array
 
 PARTS = 5  # divide the samples into this many parts for cross-validation
-DEGREES = 1, 2, 3  # try polynomials of these degrees
+DEGREES = 1, 2, 3  # degrees among which cross-validation chooses the polynomial
 #: try these penalties of the squared coefficients, relative to N
 PENALTIES = 1e-8, 1e-6, 1e-4, 1e-3, 1e-2
 MOST_TERMS = 600  # fit no polynomial with more terms
-WIDTHS = 0.5, 1.0, 2.0, 4.0, 8.0, 16.0  # try kernels of these widths, in units of √K
-RIDGES = 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0  # try these penalties of the kernel ridge regression
-JITTER = 1e-8  # add this variance to keep covariances positive definite
+#: kernel widths among which cross-validation chooses, in units of √K
+WIDTHS = 0.5, 1.0, 2.0, 4.0, 8.0, 16.0
+#: penalties of the kernel ridge regression among which cross-validation chooses
+RIDGES = 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0
+JITTER = 1e-8  # variance that is added to the diagonal, to keep covariances positive definite
 
 Predict = Callable[[Array], Array]
 
@@ -40,7 +42,7 @@ class Scaling:
         self._mean, self._spread = inputs.mean(axis=0)[self._varies], spread[self._varies]
 
     def __call__(self, inputs: Array) -> Array:
-        """Return scaled inputs."""
+        """Return inputs (N, K), scaled like the training inputs."""
         scaled: Array = (inputs[:, self._varies] - self._mean) / self._spread
         return scaled
 
@@ -53,7 +55,11 @@ def _squares(one: Array, other: Array) -> Array:
 def _chosen(
     inputs: Array, outputs: Array, candidates: Iterator[Callable[[Array, Array], Predict]]
 ) -> Predict:
-    """Return the candidate with the smallest error in cross-validation, fitted to all samples."""
+    """Return the candidate with the smallest error in cross-validation, fitted to all samples.
+
+    The samples are `inputs` and `outputs`, with one row for each. A candidate is a function that
+    returns a model fitted to such arrays.
+    """
     parts = np.array_split(np.random.default_rng(0).permutation(len(inputs)), PARTS)
 
     def error(fit: Callable[[Array, Array], Predict]) -> float:
@@ -121,7 +127,8 @@ def kernel_ridge(inputs: Array, outputs: Array) -> Predict:
 def gaussian_process(inputs: Array, outputs: Array) -> Predict:
     """Return a Gaussian process whose kernel is the sum of a smooth and a linear one.
 
-    The evidence chooses the constants of the kernel, which are common to all outputs.
+    The constants of the kernel maximise the evidence (marginal likelihood), and are common to all
+    outputs.
     """
     scaling, mean, unit = Scaling(inputs), outputs.mean(axis=0), outputs.std(axis=0) + 1e-12
     scaled, targets = scaling(inputs), (outputs - mean) / unit

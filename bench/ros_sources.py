@@ -60,7 +60,7 @@ class Builder:
         self.site_packages = self.venv / 'lib' / version / 'site-packages'
 
     def run(self, title: str, *command: str | Path) -> str:
-        """Run a command; return its standard output.
+        """Run a command, after printing `title`; return its standard output.
 
         Raises:
             MusculoskeletalError: If it fails. The end of its output has then been printed.
@@ -104,7 +104,7 @@ class Builder:
                 file.write_text(BUILD_PATHS.sub('', text), 'utf-8')
 
     def build(self, name: str, version: str) -> Path:
-        """Build a package, and return the path of its wheel."""
+        """Build a version of the ROS package `name`, and return the path of its wheel."""
         print(f'-- {name} {version}', flush=True)
         tag, url = self.tag(name, version), RELEASES[name].url()
         stem = f'ros_{name}-{version}'
@@ -132,7 +132,7 @@ class Builder:
         return self._pack(name, version, wheel)
 
     def tag(self, name: str, version: str) -> str:
-        """Return the tag of the newest release of a version."""
+        """Return the git tag of the newest release of a package in this version."""
         url, prefix = RELEASES[name].url(), f'release/jazzy/{name}/'
         listed = self.run('looking up the release', 'git', 'ls-remote', '--tags', url, f'{prefix}*')
         tags = re.findall(rf'refs/tags/{prefix}([\d.]+)-(\d+)$', listed, re.M)

@@ -72,7 +72,10 @@ Row = dict[str, float]
 
 
 def measure(body: str, folder: Path, minutes: float) -> Row:
-    """Measure a body, and return the results. Errors [rad] are divided by √D, for D joints."""
+    """Measure a body after `minutes` [min] of exploration, and return the results.
+
+    Errors [rad] are divided by √D, for D joints.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     robot = Robot.load(find_robot('arm26') if body == SMALLEST else write_body(body, folder / body))
     # Training is timed, so a file that an interrupted run left must not replace it.
@@ -161,7 +164,10 @@ def draw(rows: dict[str, Row], file: Path) -> None:
 
 
 def run(bodies: list[str], minutes: float, out: Path) -> None:
-    """Run the bodies that have no results in `out` yet; print the table and draw the plot."""
+    """Run the bodies that have no results in `out` yet; print the table and draw the plot.
+
+    `minutes` is the duration of the exploration [min].
+    """
     out.mkdir(parents=True, exist_ok=True)
     file = out / 'rows.json'
     rows: dict[str, Row] = json.loads(file.read_text()) if file.exists() else {}
@@ -177,7 +183,7 @@ def run(bodies: list[str], minutes: float, out: Path) -> None:
 
 
 def main(argv: list[str]) -> None:
-    """Run the bench."""
+    """Measure the bodies that the command line names, and print the table."""
     parser = Parser('scaling', 'Measures accuracy, time and memory over the size of the body.')
     text = f'bodies to measure, of {", ".join((SMALLEST, *BODIES))}'
     parser.add_argument('--bodies', type=names, default=[SMALLEST, *BODIES], help=text)

@@ -41,8 +41,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-PART = 300.0  # record for this robot time at once [s]
-REPORT = 1800.0  # report at this interval of robot time [s]
+PART = 300.0  # record this much robot time at once, then learn from it [s]
+REPORT = 1800.0  # print a line at this interval of robot time [s]
 #: check the error from this robot time on [s]; before, the network has just begun to learn
 SETTLED = 1800.0
 #: report an error, or a memory, that exceeds its earlier value by more than this factor

@@ -21,8 +21,8 @@ class Statement(NamedTuple):
     """One statement of a node.
 
     Attributes:
-        owner: The node.
-        identifier: What is stated.
+        owner: Name of the node.
+        identifier: Identifier of the condition that is stated.
         level: 'ok', 'warn' or 'error'.
         text: The statement as users read it.
         steps: What users are advised to do.

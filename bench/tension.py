@@ -48,7 +48,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: Report a tension that exceeds ALLOWED times tension.limit for longer than LONGEST [s].
 ALLOWED, LONGEST = 1.1, 0.5
-EXPLORED = 60.0  # explore for this time [s]
+EXPLORED = 60.0  # let each individual explore for this time [s]
 #: move to this many targets with each method, and stay at each for this time [s]
 TARGETS, HELD = 4, 4.0
 HELD_OUT = 60.0  # measure the error on a held-out motion of this duration [s]
@@ -106,7 +106,7 @@ class Observed:
 def explore(
     arm: Arm, initial: Mae, seed: int, seconds: float, held_out: Recording
 ) -> tuple[Excess, int, int, float]:
-    """Explore and learn for a time [s].
+    """Explore and learn for `seconds` [s]; `seed` selects the exploration.
 
     Returns:
         How tensions exceeded their limit, the number of stops, the number of samples, and the mean
@@ -122,7 +122,9 @@ def explore(
 
 
 def go(arm: Arm, initial: Mae, seed: int, method: str, targets: int) -> tuple[Excess, int]:
-    """Move to random targets with one control method and hold them.
+    """Go to random targets with one control method, and hold them.
+
+    `seed` selects the targets.
 
     Returns:
         How tensions exceeded their limit, and the number of stops.
@@ -144,7 +146,7 @@ def go(arm: Arm, initial: Mae, seed: int, method: str, targets: int) -> tuple[Ex
 
 
 def line(seed: int, what: str, excess: Excess, stops: int, rest: str = '') -> str:
-    """Return a line of the table."""
+    """Return a line of the table: what an individual did, and how far it exceeded its limits."""
     return (
         f'{seed:>5} {what:<12} {excess.highest:>9.3f} {excess.longest:>8.2f} '
         f'{excess.allowed:>7.2f} {excess.limit:>7.2f} {stops:>5}{rest}'
@@ -161,6 +163,9 @@ def measure(
     seconds: float,
 ) -> list[tuple[str, Excess, int, tuple[int, float] | None]]:
     """Let an individual explore, and move to targets by each method.
+
+    `reality` and `seed` name the individual. It explores for `share` · `seconds` [s]; `share` also
+    scales the number of targets.
 
     Returns:
         What the arm did, the excess of its tensions, the number of its stops, and if it explored,

@@ -49,7 +49,7 @@ from musculoskeletal_ae.simulation.simulation import Simulation
 
 #: time a batch of this many arms; end a round of calls after about this time [s]
 MANY, LONGEST = 4096, 0.05
-SIMULATED = 0.01  # simulate this time in each call [s]
+SIMULATED = 0.01  # simulate this much time in each timed call [s]
 ROLLED = 256  # number of arms in `mujoco.rollout`, whose time per arm does not depend on it
 #: rate [Hz] and number of the messages of which each is timed in the cores of the nodes
 RATE, MESSAGES = 500.0, 2000
@@ -316,7 +316,7 @@ def rollout_rows(robot: Robot, mae: Mae, theta: Array) -> list[Row]:
     the inertia of the links, which our simulator neglects.
 
     Args:
-        robot: The robot.
+        robot: The robot whose learned body is exported.
         mae: The network to export.
         theta: Postures in which the arms begin [rad], (N, D).
     """
@@ -427,7 +427,7 @@ def measure(robot: Robot, preset: str, device: str | None = None) -> list[Timed]
 
 
 def show(robot: Robot, preset: str, device: str | None = None) -> None:
-    """Print the table."""
+    """Measure all steps, and print the table of their times."""
     name = robot.description.directory.name
     print(f'{name}, preset {preset}: median time of one call [µs]; torch uses one thread')
     print(f'{"":<64}{"ours":>10}{"torch eager":>14}{"bound":>10}')

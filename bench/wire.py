@@ -129,7 +129,7 @@ with make_executor() as executor, suppress(KeyboardInterrupt):
 
 
 class System:
-    """Nodes in separate processes."""
+    """A running system of nodes in separate processes, whose messages are observed."""
 
     def __init__(
         self,
@@ -220,7 +220,7 @@ class System:
         self._listener.start()
 
     def end(self) -> None:
-        """End the nodes."""
+        """End all processes of the system, and leave the ROS graph."""
         with STOP.reacting(Reaction.REMEMBER):
             end_processes(self.nodes.values(), signal.SIGINT)
             self._rclpy.try_shutdown()
@@ -237,7 +237,7 @@ class Wire(NamedTuple):
     cpu: dict[str, float]  # CPU time of each node [% of a core]
 
     def __str__(self) -> str:
-        """Return one line of the table."""
+        """Return latency, losses and CPU times as one line of the table."""
         half, most, largest = self.latency
         cost = ', '.join(f'{name} {value:.0f}' for name, value in self.cpu.items())
         return (

@@ -43,12 +43,12 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.signals.wiring import Wiring
 
-MINUTES = 2.0  # learn from an exploration of this duration [min]
-BEFORE = 10.0  # explore for this time before the restart [s]
-RESTART = 0.5  # publish no messages for this time [s]
-LONGEST = 180.0  # follow the advice for at most this time [s]
+MINUTES = 2.0  # let an individual learn from an exploration of this duration first [min]
+BEFORE = 10.0  # let the arm explore for this time before the driver restarts [s]
+RESTART = 0.5  # let the driver publish no messages for this time while it restarts [s]
+LONGEST = 180.0  # follow the advice of the estimator for at most this time [s]
 NOTHING = 60.0  # end the advice at an instant without a report, but not before this time [s]
-AFTER = 10.0  # explore for this time after the advice [s]
+AFTER = 10.0  # let the arm explore for this time after the advice was followed [s]
 REFUSING = 15.0  # let a calibration go on for at most this time after it has enough data [s]
 OFFSET = 0.1  # let a driver that loses its offsets restart with offsets of up to this length [m]
 
@@ -155,9 +155,9 @@ def _named(estimator: Estimator, text: str) -> set[int]:
 
 
 class Case(NamedTuple):
-    """One restart of a driver."""
+    """One restart of a driver, with what has changed in it."""
 
-    what: str  # 'exchange', 'sign' or 'healthy'
+    what: str  # what changes in the driver: 'exchange', 'sign' or 'healthy'
     wiring: Wiring
     has_sensors: bool
 

@@ -42,14 +42,12 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 LEAST, MOST = 0.05, 0.13  # draw length offsets of a magnitude in this range [m]
-MINUTES = 10.0  # explore for this time [min]
+MINUTES = 10.0  # let an individual learn from an exploration of this duration first [min]
 HELD_OUT = 300.0  # measure errors on a held-out motion of this duration [s]
-AFTER = 30.0  # move for this time after a calibration [s]
-LONGEST = 120.0  # end a calibration after this time [s]
-SETTLING = 20.0  # let the arm hang for this time until it is still [s]
-#: state postures to the calibration with errors of this standard deviation [rad], the same for each
-#: joint
-STATED = 0.0
+AFTER = 30.0  # let the arm explore for this time after a calibration, and count false alarms [s]
+LONGEST = 120.0  # give a calibration up after this time [s]
+SETTLING = 20.0  # let the arm hang for this time after power-on, so that it is still [s]
+STATED = 0.0  # standard deviation of the error of a stated posture [rad], the same for each joint
 #: report a calibration that takes longer than this [s], or after which the error exceeds the
 #: earlier error by more than this factor
 GOALS = {'sensors': (30.0, 1.2), 'none': (60.0, 1.5), 'posture': (30.0, 1.5)}

@@ -33,28 +33,30 @@ from typing import Any
 
 from musculoskeletal_ae.awake_clock import AwakeClock
 
-#: Count a topic that should be published continually as silent, and its last message as out of
-#: date, without a usable message for this time [s].
+#: treat a topic that should be published continually as silent, and its last message as out of
+#: date, without a usable message for this time [s]
 SILENCE = 1.0
-#: Longest legal gap between two messages of a running arm [s]. After a longer one, the state of the
-#: arm is unknown: the controller pauses (`max_age`), and the detectors discard their evidence.
+#: after a longer gap between two messages of a running arm, the state of the arm is unknown: the
+#: controller pauses (`max_age`), and the detectors discard their evidence [s]
 INTERRUPTION = 0.2
-#: Largest time between two messages or steps that advances detectors, commands and emulated arms
-#: [s]. After a longer pause, they do not catch up.
+#: let at most this much time between two messages or steps advance detectors, commands and emulated
+#: arms [s]; after a longer pause, they do not catch up
 LONGEST_STEP = 0.1
-#: Skip a message that follows the last one used sooner than this, where no more than about 100
-#: messages a second are needed [s]. Detectors and learning are tuned at 100 Hz, and their
-#: computation for each message would otherwise take most of the time of a fast arm's nodes.
+#: skip a message that follows the last used one sooner than this, where about 100 messages a second
+#: suffice [s]: detectors and learning are tuned at 100 Hz, and more messages would take most of the
+#: processor time of the nodes of a fast arm
 SPACING = 0.006
-#: longest time between two requests of one stream of requests [s]; it exceeds SILENCE, because
-#: `ros2 topic pub` sends one message a second
+#: treat requests as one stream if no two are further apart than this [s]; it exceeds SILENCE,
+#: because `ros2 topic pub` sends one message a second
 STREAM_GAP = 1.5
-#: Times of sending that lie further back than this come from another clock, or from one that was
-#: set back, not from reordering [ns].
+#: attribute a time of sending that lies further back than this to another clock, or to one that was
+#: set back, and not to reordering [ns]
 REORDERING = 1_000_000_000
-#: rate at which the minimum rises; clocks drift by up to 1e-4, and NTP slews them by up to 5e-4
+#: let the minimum of r − s rise at this rate, because clocks drift by up to 1e-4, and NTP slews
+#: them by up to 5e-4
 DRIFT = 1e-3
-#: longest delay [s]; a node that makes no progress for this time ends (`ros/hang_detection.py`)
+#: report no longer delay than this [s]: a node that makes no progress for this time ends
+#: (`ros/hang_detection.py`)
 LONGEST_DELAY = 10.0
 
 
@@ -72,12 +74,12 @@ def longer_pause(elapsed: float, delay_before: float, delay: float) -> float:
 def is_later(sent: int, before: int) -> bool:
     """Return whether a message was sent after another one, by the clock of one publisher.
 
-    It was if its time of sending is later, or at least REORDERING earlier, because the clock was
-    then set back.
+    The message was sent later if its time of sending is later, or at least REORDERING earlier,
+    because the clock was then set back.
 
     Args:
-        sent: When the message was sent [ns].
-        before: When the other message was sent [ns].
+        sent: Time at which the message was sent [ns].
+        before: Time at which the other message was sent [ns].
     """
     return not 0 <= before - sent < REORDERING
 
@@ -102,16 +104,19 @@ class Arrival:
     """
 
     def __init__(self, clock: AwakeClock | None = None, since: float = -math.inf) -> None:
-        """Start without a message.
+        """Start before the first message.
 
         Args:
-            clock: Measures ages; None for the steady clock.
+            clock: Clock that measures the ages of messages; None for the steady clock.
             since: The time from which the age counts until the first message is used [s].
         """
         self._clock = clock or AwakeClock()
-        self._used_at = self._measured_at = self._clock.at(since)  # awake time [s]
+        #: times of the last used message and of the last measurement of the rate, without pauses
+        #: [s]
+        self._used_at = self._measured_at = self._clock.at(since)
         self._sent = 0  # time of sending of the newest message [ns]; 0 if it is unknown
-        self._least = math.inf  # least r − s, which rises by DRIFT [s]
+        #: smallest difference of reception and sending [s]; it rises by DRIFT
+        self._least = math.inf
         self._count = 0  # number of used messages since the last measurement of the rate
         self.received_at = -math.inf
         self.delay, self.rate = 0.0, math.nan
@@ -125,7 +130,7 @@ class Arrival:
         number: int = 0,
         is_from_one: Callable[[], bool] = lambda: True,
     ) -> bool:
-        """Record a message, unless it repeats or precedes an earlier one; return whether it is new.
+        """Receive a message: record it if it is new, and return whether it is.
 
         A message is old if neither its time of sending nor its sequence number is later than that
         of the message before. Both are checked, because only the numbers keep rising when the clock
@@ -155,7 +160,7 @@ class Arrival:
         self._sent = self.number = 0
 
     def use(self, now: float) -> None:
-        """Record that a message was used, perhaps later than it was received."""
+        """Record the use of a message, which may be later than its reception."""
         self._used_at, self.was_used = self._clock.at(now), True
         self._count += 1
 
@@ -168,7 +173,7 @@ class Arrival:
         return max(self._clock.at(now) - self._used_at, 0.0)
 
     def measure_rate(self, now: float) -> None:
-        """Set `rate` to the rate since the last call; it stays NaN until a message is used."""
+        """Measure `rate` since the last call; it stays NaN until a message is used."""
         awake = self._clock.at(now)
         elapsed = awake - self._measured_at
         if elapsed <= 0.0:  # this process has just continued after a pause

@@ -16,7 +16,7 @@ therefore a question for the steady clock, not for this one.
 
 import math
 
-PAUSE = 0.3  # count the time between two ticks that exceeds this as a pause of this process [s]
+PAUSE = 0.3  # treat the time between two ticks that exceeds this as a pause of this process [s]
 
 
 class AwakeClock:

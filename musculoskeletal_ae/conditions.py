@@ -24,7 +24,7 @@ from musculoskeletal_ae.remedy import REPAIR, Step
 #: 'ok' means that nothing has to be done: another condition, or the user, is the cause
 Level = Literal['ok', 'warn', 'error']
 LEVELS: tuple[Level, ...] = get_args(Level)
-CONDITIONS = 'conditions'  # key of the value in /diagnostics
+CONDITIONS = 'conditions'  # key under which /diagnostics contains the list of conditions
 
 
 class Action(IntEnum):
@@ -39,7 +39,7 @@ class Action(IntEnum):
 
 
 class Clears(Enum):
-    """How a stop ends."""
+    """How a stop may end: by itself, by a verification, or only by a reset."""
 
     #: auto-recoverable until the arm is released; afterwards only by a reset
     CONDITION = 'when the condition clears within hold_time, else on controller/reset'
@@ -52,6 +52,8 @@ class Clears(Enum):
 class Stop(NamedTuple):
     """Consequence of a stop cause: what the controller does, and how the stop ends."""
 
+    #: whether the cause is a single event, which is over at once; otherwise it lasts until it
+    #: clears
     action: Action
     clears: Clears
     is_event: bool = False  # whether the cause is a single event; otherwise it lasts or clears
@@ -87,17 +89,19 @@ class Revokes(Enum):
 
 
 class Declaration(NamedTuple):
-    """Declaration of a kind of condition."""
+    """Declaration of a kind of condition: its texts for users, its remedy and its consequences."""
 
-    identifier: str  # stable name for programs
-    owner: str  # the nodes that report it
+    identifier: str  # stable name, by which programs recognise the kind
+    owner: str  # names of the nodes that report the kind
     level: Level
-    when: str  # when it is present
-    text: str  # what happened, for users
-    steps: tuple[Step, ...] = ()  # the remedy
-    stop: Stop | None = None  # consequence of a stop cause
-    reaction: FindingReaction | None = None  # consequence of a finding
-    revokes: Revokes | None = None  # length offsets that a finding revokes
+    when: str  # when the condition is present, for the reference pages
+    text: str  # text for users that says what happened
+    steps: tuple[Step, ...] = ()  # steps of the remedy, in order
+    stop: Stop | None = None  # what a stop cause does to the arm; None if the kind is no stop cause
+    #: what the estimator does about a finding; None if the kind is no finding
+    reaction: FindingReaction | None = None
+    #: length offsets that become unreliable by a finding; None if there are none
+    revokes: Revokes | None = None
 
 
 _RESET, _VERIFICATION, _CONDITION = Clears.RESET, Clears.VERIFICATION, Clears.CONDITION
@@ -128,13 +132,13 @@ class ConditionKind(Enum):
 
     @property
     def action(self) -> Action:
-        """Action of a stop cause."""
+        """What the controller does with the commands because of this stop cause."""
         assert self.stop is not None, self
         return self.stop.action
 
     @property
     def clears(self) -> Clears:
-        """How the stop ends that a stop cause has caused."""
+        """How the stop that this cause has begun may end."""
         assert self.stop is not None, self
         return self.stop.clears
 
@@ -792,7 +796,7 @@ class Condition(NamedTuple):
     Attributes:
         identifier: Identifier of its kind, for programs.
         level: How urgent it is.
-        text: What is the case, for users. It can be read alone.
+        text: What has happened, for users; understandable without any other text.
         steps: What ends it, in this order; () if it ends by itself.
         subjects: Names of the muscles, joints, topics or nodes that it concerns.
     """

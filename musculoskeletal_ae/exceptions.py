@@ -18,7 +18,8 @@ def printable(text: object) -> str:
 class MusculoskeletalError(Exception):
     """Base class of the errors whose text tells the user what is wrong."""
 
-    reason = 'cannot be used'  # short text under which rejected messages are counted
+    #: short text under which messages that are rejected with this error are counted
+    reason = 'cannot be used'
 
     def __str__(self) -> str:
         return printable(super().__str__())

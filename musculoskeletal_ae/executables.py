@@ -33,7 +33,7 @@ def _prepare_process() -> None:
 
 
 def _run_node(name: str) -> int:
-    """Run one node, or several in one process, and return the exit status."""
+    """Run the nodes of an executable in this process; return the exit status."""
     _prepare_process()
     STOP.install(Reaction.EXIT, exit_status=0)
     if {'--help', '-h'} & set(sys.argv[1:]):

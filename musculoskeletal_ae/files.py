@@ -20,11 +20,12 @@ import yaml
 T = TypeVar('T')
 Refuse = Callable[[Path, str], Exception]
 
-LARGEST = 5_000_000  # size limit of a file unless the caller states another one [bytes]
-LARGEST_YAML = 1 << 19  # size limit of a YAML file [bytes]; parsing YAML is slow
-LARGEST_CSV = 1 << 20  # size limit of a CSV file [bytes]; each cell takes fifty bytes of memory
-MOST_ENTRIES = 100_000  # largest number of entries of a YAML file after aliases are expanded
-DEEPEST = 50  # largest number of nesting levels of a YAML file
+LARGEST = 5_000_000  # refuse a larger file, unless the caller states another limit [bytes]
+LARGEST_YAML = 1 << 19  # refuse a larger YAML file, because parsing YAML is slow [bytes]
+#: refuse a larger CSV file, because each cell takes fifty bytes of memory [bytes]
+LARGEST_CSV = 1 << 20
+MOST_ENTRIES = 100_000  # refuse a YAML file with more entries after aliases are expanded
+DEEPEST = 50  # refuse a YAML file that is nested more deeply than this number of levels
 
 _Loader = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
@@ -85,7 +86,7 @@ def read_csv(
 ) -> list[tuple[int, str, list[str]]]:
     """Return (line number, line, cells) of each row below the header of a CSV table.
 
-    Empty lines and lines that begin with # are skipped.
+    The header must consist of `columns`. Empty lines and lines that begin with # are skipped.
     """
     rows = []
     for number, line in enumerate(read_text(file, refuse, LARGEST_CSV).splitlines(), 1):
@@ -129,10 +130,10 @@ def parse_yaml(text: str) -> Any:
 
 @dataclass
 class _Collection:
-    """A list or mapping whose end has not been reached yet."""
+    """An open list or mapping of a YAML text that is being checked."""
 
-    anchor: str  # '' if the collection has none
-    first: int  # number of entries before the collection
+    anchor: str  # name of the collection's anchor, '' if it has none
+    first: int  # number of entries that precede the collection
     is_mapping: bool
     keys: set[str] = field(default_factory=set)
     at_key: bool = True  # whether the next entry is a key

@@ -58,30 +58,39 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
-FREEDOM = 4.0  # ν of the Student distribution
-PRIOR_COUNT = 4.0  # number of residuals that count as much as the prior at σ₀
-WEIGHTINGS = 3  # steps of the EM algorithm in each round
-DAMPING = (0.0, 0.1, 1.0, 10.0, 100.0)  # values of λ that a round tries
+#: degrees of freedom ν of the Student distribution of the residuals; small values tolerate outliers
+FREEDOM = 4.0
+PRIOR_COUNT = 4.0  # weight of the prior at σ₀ when the noise is estimated, as a number of residuals
+WEIGHTINGS = 3  # number of steps of the EM algorithm in each round
+DAMPING = (0.0, 0.1, 1.0, 10.0, 100.0)  # damping factors λ that a round tries, in this order
 SMALL = 1e-6  # added to the diagonal of C, so that the Schur complement is positive definite
-#: values of λ in `minimise_each`; more of them, because a start may be far from the solution
+#: damping factors λ of `minimise_each`; there are more of them, because a start may be far from the
+#: solution
 LADDER = np.array([0.0, *np.logspace(-1.0, 9.0, 11)])
-#: predicted decrease of ‖r‖² by the last step of `minimise_each`, a third of a standard deviation
+#: let `minimise_each` end after a step that is predicted to lower ‖r‖² by less than this, which
+#: moves the solution by less than a third of a standard deviation
 SETTLED = 0.1
 
 
 def student(score: Array) -> Array:
-    """Return the weights ω for scaled residuals ρ/σ, in the same shape."""
+    """Return the weights ω of Student's t distribution for scaled residuals, in the same shape."""
     weight: Array = (FREEDOM + 1.0) / (FREEDOM + score**2)
     return weight
 
 
 def student_cost(score: Array) -> float:
-    """Return −2 times the log-likelihood of scaled residuals ρ/σ, up to a constant."""
+    """Return −2 times the log-likelihood of scaled residuals (`score`), up to a constant.
+
+    The residuals have Student's t distribution with FREEDOM degrees of freedom.
+    """
     return float((FREEDOM + 1.0) * np.log1p(score**2 / FREEDOM).sum())
 
 
 def whitening(covariance: Array) -> Array:
-    """Return R with RᵀR = Σ⁻¹; R ρ are independent residuals of standard deviation 1, (R, R)."""
+    """Return R with RᵀR = Σ⁻¹ for a covariance Σ of residuals ρ, (R, R) each.
+
+    The elements of R ρ are independent, with standard deviation 1.
+    """
     root: Array = np.linalg.inv(np.linalg.cholesky(covariance))
     return root
 
@@ -120,11 +129,11 @@ def determined(curvature: Array, precision: Array) -> float:
 
 
 class Equations(NamedTuple):
-    """The matrix of the normal equations."""
+    """The blocks of the normal equations' matrix."""
 
-    samples: Array  # A, (N, D, D)
-    mixed: Array  # B, (N, D, P)
-    common: Array  # C, (P, P)
+    samples: Array  # blocks A of the unknowns of single samples, (N, D, D)
+    mixed: Array  # blocks B that couple these unknowns with the shared ones, (N, D, P)
+    common: Array  # block C of the shared unknowns, (P, P)
 
     @classmethod
     def of_common(cls, common: Array) -> Equations:
@@ -139,8 +148,8 @@ class Equations(NamedTuple):
 class RightSides(NamedTuple):
     """The right sides of the normal equations."""
 
-    samples: Array  # a, (N, D)
-    common: Array  # c, (P,)
+    samples: Array  # part a of the unknowns of single samples, (N, D)
+    common: Array  # part c of the shared unknowns, (P,)
 
     @classmethod
     def of_common(cls, common: Array) -> RightSides:
@@ -153,11 +162,11 @@ class RightSides(NamedTuple):
 
 
 class SolvedStep(NamedTuple):
-    """A solution of the normal equations."""
+    """A step of the unknowns that solves the normal equations."""
 
-    samples: Array  # Δθ, (N, D)
-    common: Array  # Δw, (P,)
-    decrease: float  # predicted decrease of the cost
+    samples: Array  # step Δθ of the unknowns of single samples, (N, D)
+    common: Array  # step Δw of the shared unknowns, (P,)
+    decrease: float  # predicted decrease of the cost by the step
 
 
 class Eliminated:
@@ -182,8 +191,9 @@ class Eliminated:
         damped = samples + np.asarray(sample_damping)[..., None] * eye
         # L is the inverse of the Cholesky factor of A, so that A⁻¹ = Lᵀ L. Products with L are
         # cheaper than triangular solves.
-        self._inverse = np.linalg.inv(np.linalg.cholesky(damped))  # L
-        self._reduced = self._inverse @ mixed  # L B
+        #: L, the inverse of the Cholesky factor of A
+        self._inverse = np.linalg.inv(np.linalg.cholesky(damped))
+        self._reduced = self._inverse @ mixed  # the product L B
         tall = self._reduced.reshape(-1, len(common))
         diagonal = np.broadcast_to(common_damping, len(common))
         # numpy alone: nodes that estimate would wait 0.3 s for the import of scipy.linalg.
@@ -232,7 +242,7 @@ class Problem(Protocol[Point]):
         ...
 
     def moved(self, point: Point, step: SolvedStep) -> Point:
-        """Return the point after a step."""
+        """Return the point that is reached from `point` by a step."""
         ...
 
 
@@ -257,11 +267,11 @@ Work = Generator[None, None, Result[Point]]  # yields before each short piece of
 
 
 def minimise(problem: Problem[Point], start: Point, rounds: int, enough: float) -> Result[Point]:
-    """Fit a problem, beginning at a point.
+    """Minimise the cost of a problem, beginning at a point.
 
     Args:
         problem: The problem to fit.
-        start: The first point.
+        start: Point at which the fit begins.
         rounds: Largest number of steps.
         enough: The fit ends when a step lowers the cost, or is predicted to lower it, by less than
             this value.
@@ -281,7 +291,7 @@ def minimise(problem: Problem[Point], start: Point, rounds: int, enough: float) 
 def minimise_in_pieces(
     problem: Problem[Point], start: Point, rounds: int, enough: float
 ) -> Work[Point]:
-    """Fit a problem like `minimise`, and yield before every evaluation of a new point."""
+    """Minimise as `minimise` does, but yield before every evaluation of a new point."""
     fit = Result(start)
     for _ in range(rounds):
         problem.weigh(fit.point)

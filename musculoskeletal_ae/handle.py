@@ -15,13 +15,13 @@ from numba.experimental import structref
 
 @structref.register
 class HandleType(types.StructRef):  # type: ignore[misc]
-    """The numba type of a `Handle`."""
+    """The type by which numba recognises a `Handle` in compiled code."""
 
 
 class Handle(structref.StructRefProxy):  # type: ignore[misc]
     """Passes tuples of arrays to compiled code as one argument, without copying the arrays."""
 
-    held: Any  # only compiled code may read it
+    held: Any  # the arrays, which only compiled code may read
 
 
 structref.define_proxy(Handle, HandleType, ['held'])

@@ -23,20 +23,22 @@ from musculoskeletal_ae.robot.joint_units import JointUnits
 from musculoskeletal_ae.robot.tension_source import TENSION_SENSOR, TensionSource
 from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Presence, Row
 
-#: largest legal number of entries of an array in a message, or of joints × points in a trajectory;
-#: far more than any arm needs
+#: reject a message with more entries in an array, or a trajectory with more joints × points; no arm
+#: needs nearly as many
 MOST_ENTRIES = 10_000
-#: largest force [N] and torque [N·m] of a wrench, for each axis
+#: reject a wrench whose force [N] or torque [N·m] exceeds this along any axis
 MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)
-#: largest commanded linear [m/s] and angular velocity [rad/s] of the end effector, for each axis
+#: reject a twist whose linear [m/s] or angular [rad/s] velocity exceeds this along any axis
 MOST_TWIST = np.array([5.0] * 3 + [20.0] * 3)
-#: range of plausible accelerometer readings on an arm [m/s²]
+#: reject accelerometer readings outside this range [m/s²]; a sensor at rest measures 9.81
 LEAST_GRAVITY, MOST_GRAVITY = 3.0, 30.0
-LAST_VELOCITY = 1e-6  # highest velocity at the end of a trajectory [rad/s]
-MOST_EFFORT = 1000.0  # highest torque or force that may be requested of one joint [N·m or N]
-#: largest value of an isolated muscle that is kept; much larger values could overflow when squared
+#: reject a trajectory with a higher velocity at its end [rad/s], because the arm holds its last
+#: point
+LAST_VELOCITY = 1e-6
+MOST_EFFORT = 1000.0  # reject a request for a higher torque or force of one joint [N·m or N]
+#: replace larger values of isolated muscles by NaN, because they could overflow when squared
 MOST_ISOLATED = 1e6
-UNIT_TOLERANCE = 0.01  # largest deviation of a quaternion's norm from 1
+UNIT_TOLERANCE = 0.01  # reject a quaternion whose norm deviates further from 1
 
 
 def read_array(message: Any, rows: int, columns: int, owner: str = 'muscle') -> Array:
@@ -110,7 +112,10 @@ def muscle_rows(message: Any, muscles: int) -> Array:
 
 
 def _values(message: Any, rows: int, columns: int, owner: str = 'muscle') -> Array:
-    """Return the data of a Float64MultiArray as (rows, columns), with size and layout checked."""
+    """Return the data of a Float64MultiArray as (rows, columns), with size and layout checked.
+
+    `owner` is the legal label of the columns.
+    """
     count = len(message.data)
     if count > MOST_ENTRIES:
         raise MessageError('oversized', f'{count} values; legal: at most {MOST_ENTRIES}')
@@ -147,7 +152,7 @@ def read_posture(message: Any, units: JointUnits, some: bool = False) -> Array:
     if len(index) < len(names):
         for name in known:
             if names.count(name) > 1:
-                raise MessageError('duplicate joint', repr(name))
+                raise MessageError('duplicate joint', f'{name!r} is listed more than once')
     if len(known) < (1 if some else len(joints)):
         missing = ', '.join(name for name in joints if name not in index)
         raise MessageError('missing joint', missing)
@@ -197,7 +202,7 @@ def target_values(message: Any, joints: Sequence[str]) -> dict[str, tuple[float,
         raise MessageError('unknown joint', f'{unknown[0]!r}; legal: {", ".join(joints)}')
     name, count = Counter(names).most_common(1)[0]
     if count > 1:
-        raise MessageError('duplicate joint', repr(name))
+        raise MessageError('duplicate joint', f'{name!r} is listed more than once')
     efforts = np.array(message.effort if len(message.effort) else [0.0] * len(names), dtype=float)
     for what, values in (
         ('position', message.position), ('effort', efforts), ('velocity', message.velocity)
@@ -268,17 +273,24 @@ def read_wrench(message: Any, root_link: str) -> Array:
 
 
 def _six(first: Any, second: Any, most: Array, what: str) -> Array:
-    """Return two vectors as one array (6,), whose elements must be finite and within ±`most`."""
+    """Return two vectors as one array (6,), whose elements must be finite and within ±`most`.
+
+    `what` names the vectors in messages of errors.
+    """
     values = np.array([first.x, first.y, first.z, second.x, second.y, second.z])
     if not np.isfinite(values).all():
         raise _not_finite(what, values)
     if (np.abs(values) > most).any():
-        raise MessageError('oversized', f'{values}; legal: magnitudes of at most {most}')
+        detail = f'{what} is too large: {values}; legal: magnitudes of at most {most}'
+        raise MessageError('oversized', detail)
     return values
 
 
 def _not_finite(what: str, values: Array) -> MessageError:
-    """Return the error for an array with NaN or infinite values; it states the first of these."""
+    """Return the error for an array with NaN or infinite values; it states the first of these.
+
+    `what` names the array in the message.
+    """
     return MessageError(
         'not finite', f'{what} is {values[~np.isfinite(values)][0]}; expected finite numbers'
     )
@@ -287,11 +299,13 @@ def _not_finite(what: str, values: Array) -> MessageError:
 class TrajectoryPoints(NamedTuple):
     """K points of some joints in a JointTrajectory."""
 
-    joints: Ints  # indices in θ, (J,)
-    time: Array  # times from the start [s], (K,)
-    position: Array  # [rad], (K, J)
-    velocity: Array | None  # [rad/s], (K, J)
-    acceleration: Array | None  # [rad/s²], (K, J)
+    joints: Ints  # indices of the named joints in θ, (J,)
+    time: Array  # times of the points, relative to the start [s], (K,)
+    position: Array  # positions of the named joints at each point [rad], (K, J)
+    #: velocities at each point [rad/s], (K, J); None if the message states none
+    velocity: Array | None
+    #: accelerations at each point [rad/s²], (K, J); None if the message states none
+    acceleration: Array | None
 
     def later(self, slower: float) -> TrajectoryPoints:
         """Return the points slowed by the factor `slower`."""
@@ -358,11 +372,15 @@ def _check_names(names: Sequence[str], joints: Sequence[str]) -> None:
     if unknown := [name for name in names if name not in joints]:
         raise MessageError('unknown joint', f'{unknown[0]!r}; legal: {", ".join(joints)}')
     if len(set(names)) < len(names):
-        raise MessageError('duplicate joint', repr(max(names, key=names.count)))
+        name = max(names, key=names.count)
+        raise MessageError('duplicate joint', f'{name!r} is listed more than once')
 
 
 def _column(points: Sequence[Any], what: str, joint_count: int) -> Array | None:
-    """Return one quantity of all K points, (K, joint_count); None if the points do not state it."""
+    """Return the field `what` of all K points as an array (K, joint_count).
+
+    The result is None if the points do not state this quantity.
+    """
     rows = [getattr(point, what) for point in points]
     lengths = {len(row) for row in rows}
     legal = {joint_count} if what == 'positions' else {0, joint_count}

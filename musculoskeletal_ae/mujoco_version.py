@@ -14,7 +14,7 @@ RANGE = (3, 10), (4,)
 
 
 def check_mujoco(version: str = mujoco.__version__) -> None:
-    """Raise a MusculoskeletalError if the MuJoCo version is not supported."""
+    """Check a version of MuJoCo; raise a MusculoskeletalError if it is not supported."""
     first, end = RANGE
     numbers = tuple(map(int, re.findall(r'\d+', version)[:3]))
     if not first <= numbers < end:

@@ -23,8 +23,8 @@ from musculoskeletal_ae.presets.names import DEFAULT, PRESET_NAMES
 from musculoskeletal_ae.process_signals import INTERRUPTED
 from musculoskeletal_ae.robot.directories import shipped_robots
 
-DEFAULT_ROBOT = 'musashi_left_arm'
-DEFAULT_SEED = 0  # default of --seed
+DEFAULT_ROBOT = 'musashi_left_arm'  # robot that a command uses without --robot
+DEFAULT_SEED = 0  # random seed that a command uses without --seed
 #: exit status after the reader of the output has closed it, as of other tools: 128 + SIGPIPE
 CLOSED = 141
 PICTURES = ('.png', '.svg', '.pdf', '.jpg')
@@ -34,7 +34,10 @@ T = TypeVar('T')
 def _type(
     convert: Callable[[str], T], is_legal: Callable[[T], bool], expected: str
 ) -> Callable[[str], T]:
-    """Return an argparse type that converts a text and rejects values that are not legal."""
+    """Return an argparse type that converts a text and rejects values that are not legal.
+
+    The message for a rejected value names the legal values in `expected`.
+    """
 
     def checked(text: str) -> T:
         with suppress(ValueError):
@@ -61,7 +64,7 @@ def _listed(text: str) -> list[str]:
 
 not_negative = _type(float, lambda value: 0.0 <= value < math.inf, 'a number of at least 0')
 positive = _type(float, lambda value: 0.0 < value < math.inf, 'a number above 0')
-minutes = number(0.2, 600.0)  # duration in robot time [min]
+minutes = number(0.2, 600.0)  # argparse type for a duration of the emulated arm [min]
 seed = whole(0, 2**63 - 1)
 # `seeds`, `numbers` and `names` are lists separated by commas.
 seeds = _type(
@@ -135,7 +138,7 @@ class Parser(argparse.ArgumentParser):
         self.add_argument('--reality', choices=('kin', 'foreign'), default='kin', help=text)
 
     def add_minutes(self, text: str, default: float | None) -> None:
-        """Add `--minutes`, a duration in robot time [min]; the text is its help."""
+        """Add `--minutes`, a duration in robot time [min]; `text` is its help text."""
         self.add_argument('--minutes', type=minutes, default=default, help=text)
 
     def add_quick(self, text: str) -> None:
@@ -160,7 +163,8 @@ class Parser(argparse.ArgumentParser):
     ) -> None:
         """Add `--out`, a file or directory; it is required unless it has a default or is optional.
 
-        An optional one is None if it is not given.
+        `metavar` and `text` appear in its help. `read` converts and checks the argument. An
+        optional one is None if it is not given.
         """
         required = default is None and not is_optional
         self.add_argument(

@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, TextIO
 if TYPE_CHECKING:
     from typing_extensions import Buffer
 
-#: standard input, output and error
-_DESCRIPTORS = range(3)
-#: longest wait until a terminal in non-blocking mode takes more text [s]
+_DESCRIPTORS = range(3)  # file descriptors of standard input, output and error
+#: wait at most this long until a terminal in non-blocking mode takes more text [s]
 _LONGEST_WAIT = 1.0
 
 
@@ -47,7 +46,7 @@ class _Output(io.FileIO):
 
 
 def secure_output() -> None:
-    """Make stdout and stderr never raise an error.
+    """Secure stdout and stderr, so that writing to them never raises an error.
 
     Characters that the encoding of the terminal lacks are shown as "?". A descriptor that was
     closed when the process started leads to /dev/null from now on, because the next file that is
@@ -63,7 +62,7 @@ def secure_output() -> None:
 
 
 def _secured(stream: TextIO | None, number: int) -> TextIO:
-    """Return a stream that replaces `stream`, which Python has opened for a descriptor."""
+    """Return a stream that replaces `stream`, which Python has opened for descriptor `number`."""
     if stream is not None and not isinstance(stream, io.TextIOWrapper):
         return stream  # not Python's own one
     if stream is not None:

@@ -27,9 +27,9 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError, ParameterError
 from musculoskeletal_ae.options import DEFAULT_ROBOT
 from musculoskeletal_ae.presets.names import DEFAULT, PRESET_NAMES
 
-#: torch devices on which networks can be trained
-DEVICES = 'cpu', 'cuda'
-UNBOUNDED = 2**63 - 1  # largest integer of a ROS parameter
+DEVICES = 'cpu', 'cuda'  # torch devices on which networks can be trained
+#: highest legal value of a parameter without an upper limit: the largest integer of ROS
+UNBOUNDED = 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class Parameter:
     """A value that a user may choose, with its default, meaning, unit and legal values."""
 
     default: Any  # also determines the type; a tuple for a list of numbers or names
-    meaning: str  # description as one phrase
-    unit: str = ''  # such as 'rad/s'
+    meaning: str  # meaning of the parameter, as one phrase for the documentation
+    unit: str = ''  # unit of the value for users, such as 'rad/s'
     within: tuple[float, float] | None = None  # lowest and highest legal value of a number
-    legal: tuple[str, ...] = ()  # legal words; empty for any
-    settable: bool = False  # whether it may change while a node runs
+    legal: tuple[str, ...] = ()  # legal words; empty if any word is legal
+    settable: bool = False  # whether the parameter may be set while the node runs
 
     @property
     def description(self) -> str:

@@ -13,7 +13,7 @@ import os
 import sys
 from pathlib import Path
 
-#: The libraries of the wheel, each after its dependencies.
+#: libraries of the wheel, each listed after those on which it depends
 LIBRARIES = (
     'libeigenpy.so',
     'libcoal.so',

@@ -18,11 +18,12 @@ from types import ModuleType
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 INTERRUPTED = 130  # exit status of an interrupted tool
-GRACE = 2  # time from the signal to the exit under `Reaction.EXIT_SOON` [s]
+#: under `Reaction.EXIT_SOON`, end the process at the latest this long after the signal [s]
+GRACE = 2
 
 
 class Reaction(Enum):
-    """Effect of a stop signal."""
+    """What a process does when it receives a stop signal (SIGINT or SIGTERM)."""
 
     #: End the process at once. Used during imports, because extension modules turn a
     #: KeyboardInterrupt during their initialisation into other errors.

@@ -9,13 +9,13 @@ from collections.abc import Callable
 
 from tqdm import tqdm
 
-REPORT_INTERVAL = 5.0  # time between two lines of text [s]
-NOTE_INTERVAL = 0.2  # time between two updates of the note behind a bar [s]
+REPORT_INTERVAL = 5.0  # print lines of text at this interval [s]
+NOTE_INTERVAL = 0.2  # update the note behind a bar at this interval [s]
 FORMAT = '{desc}: {percentage:3.0f}%|{bar}| {elapsed}{postfix}'
-#: time [s] and share of the task after which the remaining time is estimated; estimates from less
-#: are wrong by large factors
+#: estimate the remaining time only after this time [s] and share of the task; earlier estimates are
+#: wrong by large factors
 ESTIMATE_TIME, ESTIMATE_SHARE = 5.0, 0.05
-SMOOTHING_TIME = 30.0  # time constant over which the speed is averaged [s]
+SMOOTHING_TIME = 30.0  # average the speed with this time constant [s]
 
 
 def is_bar_visible() -> bool:
@@ -49,8 +49,8 @@ class ProgressBar:
         """Show the bar, if stderr is a terminal.
 
         Args:
-            title: What is being done.
-            total: Sum of all parts.
+            title: What the task does, in a few words.
+            total: Sum of the parts that `add` will report.
             note: Returns a text on the present state, which is shown beside the progress.
             is_even: Whether all parts take the same time.
         """
@@ -62,7 +62,7 @@ class ProgressBar:
         )
         self._done = 0.0
         self._first: tuple[float, float] | None = None  # time [s] and sum after the first part
-        self._last = 0.0  # time of the last part [s]
+        self._last = 0.0  # time at which the last part was done [s]
         # sums of durations [s] and parts since the first part, in which old ones count less
         self._recent_time = self._recent_parts = 0.0
         self._shown = time.perf_counter()  # time of the last line of text or note [s]

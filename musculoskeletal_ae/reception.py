@@ -12,7 +12,7 @@ from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 
 LONGEST_TEXT = 500
-SHOWN = 10.0  # report refusals and internal errors for this time [s]
+SHOWN = 10.0  # report a refusal or an internal error for this time after it happened [s]
 
 
 class Reception:
@@ -75,7 +75,8 @@ class Reception:
     def deliver(self, topic: str, callback: Callable[..., Any], *content: Any) -> bool:
         """Call a function with the content of a message; return whether it accepts the message.
 
-        If the function raises a MusculoskeletalError, the message is rejected and counted.
+        If the function raises a MusculoskeletalError, the message is rejected and counted for
+        `topic`.
         """
         try:
             callback(*content)
@@ -89,7 +90,10 @@ class Reception:
         self.rejected[f'{topic}: repeated or reordered'] += 1
 
     def reject(self, source: str, reason: str, detail: str) -> bool:
-        """Count a rejected message or request; return whether it is the first for this reason."""
+        """Count a rejected message or request; return whether it is the first for this reason.
+
+        `source` names the topic or service, and `detail` describes this case in the message.
+        """
         self.last_rejected = f'{source}: {detail}'[:LONGEST_TEXT]
         self.rejected[f'{source}: {reason}'] += 1
         if source in self.commands:
@@ -110,7 +114,7 @@ class Reception:
         return text if time.monotonic() - refused_at < SHOWN else ''
 
     def ignore(self, source: str, part: str) -> None:
-        """Count an unused part of a message, such as one joint's position."""
+        """Count a part of a message on `source` that is not used, such as a joint's position."""
         self.ignored[f'{source}: {part}'] += 1
         if self.ignored[f'{source}: {part}'] == 1:
             self._warn(f'ignored {source}: {part}')

@@ -11,11 +11,11 @@ from typing import NamedTuple
 from musculoskeletal_ae.conditions import Condition, Level, ordered, remedy_of, worst
 from musculoskeletal_ae.remedy import Step
 
-MOST_DIGITS = 17  # significant digits that identify a double
+MOST_DIGITS = 17  # number of significant digits with which every double is printed uniquely
 _UNITS_OF_TIME = {'years': 365.25 * 86400.0, 'days': 86400.0, 'h': 3600.0, 'min': 60.0}
 #: values of `state` in the reports of a replay
 WAITING, PLAYING, PAUSED, END_OF_RECORDING = 'waiting', 'playing', 'paused', 'end_of_recording'
-#: key in the last report of a replay: names of nodes that may have missed messages
+#: key in the last report of a replay whose value names nodes that may have missed messages
 NOT_WAITED_FOR = 'nodes not waited for'
 
 
@@ -24,7 +24,7 @@ class Report(NamedTuple):
 
     Attributes:
         doing: What the component does, in a few words; '' if a condition states it.
-        values: Named values.
+        values: Named values, as texts.
         conditions: All conditions that are present.
     """
 
@@ -34,7 +34,7 @@ class Report(NamedTuple):
 
     @property
     def level(self) -> Level:
-        """Level of the most urgent condition."""
+        """Level of the most urgent condition; 'ok' if no condition is present."""
         return worst(self.conditions)
 
     @property

@@ -40,7 +40,7 @@ def convert(value: Any, kind: type[T], refuse: Callable[[str], Exception]) -> T:
 
 
 def explanation(error: msgspec.ValidationError, value: Any, kind: Any) -> str:
-    """Return a readable text for msgspec's error about a value that does not fit a type."""
+    """Return a readable text for msgspec's error about a value that does not fit a type, `kind`."""
     message = _MESSAGE.fullmatch(str(error))
     assert message is not None  # the pattern matches every text
     place, problem = message['place'] or '$', message['problem'].replace('`', '')

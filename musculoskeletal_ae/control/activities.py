@@ -13,7 +13,7 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 
 class Inputs(NamedTuple):
-    """Inputs of an activity at one step of control; all of them are always available."""
+    """What an activity may read at one control step; the controller provides every value."""
 
     mae: Mae
     sample: MuscleSample  # the newest muscle states
@@ -34,11 +34,11 @@ class ActivityControl(ABC):
 
     @abstractmethod
     def enter(self, inputs: Inputs, /) -> None:
-        """Enter the activity, or restart it after a pause, from the present tensions."""
+        """Begin the activity, or restart it after a pause, from the present tensions."""
 
     @abstractmethod
     def step(self, inputs: Inputs, /) -> Command | None:
-        """Return the desired command; None keeps the last command."""
+        """Advance by one control step; return the desired command, or None to keep the last one."""
 
     @abstractmethod
     def leave(self) -> None:
@@ -51,7 +51,7 @@ class ActivityControl(ABC):
 
     @property
     def has_arrived(self) -> bool:
-        """Whether the requested motion has ended."""
+        """Whether the requested motion has ended, so that the arm should rest at its target."""
         return False
 
     @property

@@ -20,7 +20,7 @@ class Command(NamedTuple):
 
     Attributes:
         kind: `LENGTH` or `TENSION`.
-        value: l_target [m] or T_target [N], (M,).
+        value: Target length [m] or target tension [N] of each muscle, (M,).
     """
 
     kind: str
@@ -33,7 +33,7 @@ class Pull(NamedTuple):
     Isolated muscles have tension 0.
     """
 
-    motor: Array  # motor-side tension T: measured, or where that is impossible, assumed
+    motor: Array  # motor-side tension T; with a missing or faulty sensor, an assumed value
     bone: Array  # bone-side tension T_end, after tendon friction
 
 
@@ -43,7 +43,7 @@ def msc_compensation(robot: Robot, tension: Array) -> Array:
         l_comp(T) = −(T − T_bias) / K_stiff              (paper, §III-E, eq. 6)
 
     Args:
-        robot: The body.
+        robot: Provides T_bias and K_stiff of the muscle modules.
         tension: The tension T [N], (..., M).
 
     Returns:

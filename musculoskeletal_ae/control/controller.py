@@ -10,9 +10,9 @@ computes the commands (`follower`, `ramps`, `torque`, `exploration`, `calibratin
 passes the limiter before it is published.
 
 Plans assume that isolated muscles have no tension, and the modules of isolated muscles are
-commanded to keep the tendons slack. While the estimator verifies a suspect, the arm is stopped, and
-the suspect is wound in slightly. The arm resumes when the verification has ended the anomaly,
-unless another stop cause needs a reset.
+commanded to keep the tendons slack. While the estimator verifies a suspect, which is a muscle that
+may be faulty, the arm is stopped and the suspect is wound in slightly. The arm resumes when the
+verification has ended the anomaly, unless another stop cause needs a reset.
 
 `now` is the time of a steady clock [s], and `time` is the time of the messages' clock [s].
 """
@@ -64,10 +64,11 @@ GUIDED = (
 #: stop the arm if the lengths have jumped and the estimator has not revoked the length offsets
 #: within this time [s]
 REACTION_TIME = 1.0
-#: count the estimate as stale only if a length calibration brings none within this time [s]; if
-#: messages arrive at 10 Hz, it needs 3.5 s
+#: after a length calibration has begun, wait this long for its first estimate before the estimate
+#: counts as stale [s]; if messages arrive at 10 Hz, a calibration needs 3.5 s
 FIRST_ESTIMATE = 5.0
-#: let an arm with isolated muscles that falls start towards its target again at most this often
+#: after an arm with isolated muscles has fallen away from its trajectory, plan a new trajectory to
+#: the same target at most this many times, because it may fall again
 APPROACHES = 3
 
 
@@ -108,7 +109,7 @@ class Activities:
         self.entered: ActivityControl | None = None
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings.
+        """Use another robot description and other settings from the next step on.
 
         `robot` must already describe isolated muscles as muscles without tension.
         """
@@ -165,21 +166,21 @@ class Controller:
         seed: int = 0,
         clock: AwakeClock | None = None,
     ) -> None:
-        """Start without messages.
+        """Create a controller that has no target and has received no message.
 
         Args:
-            robot: The robot.
+            robot: The robot to control.
             settings: The settings; None for the defaults.
             seed: Random seed of the exploration.
-            clock: Measures the ages of messages without the pauses of the process; each control
-                step ticks it. None for a clock of this object alone.
+            clock: Clock that excludes pauses of the process from the ages of messages; each control
+                step ticks it. None to create one.
         """
         self.robot, self.settings = robot, settings or Settings()
         check_settings(robot, self.settings)
         self.mae: Mae | None = None
         self.stream = MuscleStream(robot, window=WINDOW)
         self.sample: MuscleSample | None = None
-        #: `RejectionError.pull` of the newest message if it was rejected, else None
+        #: l [m] and T [N], (2, M), of the newest message if it was rejected, else None
         self.rejected_pull: Array | None = None
         #: Estimated θ [rad], (D,), computed with the present length offsets. None while there is no
         #: such estimate, for example after the start of a length calibration; the arm then does not
@@ -204,7 +205,7 @@ class Controller:
     # -- settings and messages ------------------------------------------------------------------
 
     def configure(self, settings: Settings) -> None:
-        """Apply new settings.
+        """Configure all parts with new settings.
 
         If the method or the preset changes while the arm has a target, the arm moves to this
         target anew, starting from the present tensions.
@@ -292,7 +293,7 @@ class Controller:
         self.estimate = theta
 
     def use_body(self, body: BodyState) -> None:
-        """Apply a body state: length offsets, isolated muscles and the anomaly."""
+        """Use a body state: its length offsets, isolated muscles and anomaly."""
         before = self.stream.body
         if body.offsets != before.offsets:
             self._use_offsets(body)
@@ -334,7 +335,7 @@ class Controller:
         self.supervisor.on_offsets(is_known)
 
     def _use_parts(self) -> None:
-        """Pass robot and settings to all parts."""
+        """Let all parts use the present robot and settings."""
         for part in (self.watchdog, self.planner, self.activities, self.limiter, self.stopping):
             part.use(self.robot, self.settings)
 
@@ -366,7 +367,9 @@ class Controller:
         robot, state = self.robot, self.target_state
         kept = self.estimate if state.theta is None else state.theta
         if kept is None and len(joints) < robot.joint_count:
-            raise MessageError('no posture yet', 'name all joints, or wait for an estimate')
+            raise MessageError(
+                'no posture estimated yet', 'name all joints, or wait for an estimate'
+            )
         before = zip(np.zeros(robot.joint_count) if kept is None else kept, state.effort)
         theta, effort = np.array([joints.get(*pair) for pair in zip(robot.joints, before)]).T
         goal = np.clip(theta, robot.lower, robot.upper)
@@ -410,7 +413,7 @@ class Controller:
 
         Args:
             pose: The pose.
-            whole: Whether the orientation counts, too; otherwise only the position.
+            whole: True to reach position and orientation, False for the position alone.
             now: Present time [s].
 
         Raises:
@@ -424,10 +427,10 @@ class Controller:
         self._follow(self.planner.to_pose(mae, start, pose, whole, now))
 
     def twist(self, twist: Array) -> None:
-        """Move the end effector for a short time by a twist in the axes of the root link.
+        """Move the end effector at a given velocity for `hand.TWIST_TIMEOUT` seconds.
 
         Args:
-            twist: Linear [m/s] and angular [rad/s] velocity, (6,).
+            twist: Linear [m/s] and angular [rad/s] velocity in the axes of the root link, (6,).
 
         Raises:
             MessageError: If the twist is refused; nothing is changed then.
@@ -445,7 +448,7 @@ class Controller:
         return reason
 
     def explore(self, wanted: bool) -> str:
-        """Start or end the exploration; return the reason if this is refused, else ''."""
+        """Start the exploration if `wanted`, else end it; return why this is refused, or ''."""
         condition = self.supervisor.condition
         if wanted and condition is not None:
             if self.supervisor.is_latched:
@@ -471,7 +474,7 @@ class Controller:
         return ''
 
     def stop(self, cause: ConditionKind, detail: str = '') -> None:
-        """Stop the arm; the stop is latched."""
+        """Stop the arm for a cause, with an optional detail; the stop lasts until `reset`."""
         self.supervisor.on_event(cause.condition(detail))
 
     def reset(self, now: float) -> Condition | None:
@@ -523,7 +526,7 @@ class Controller:
         return ''
 
     def step(self, now: float, time: float | None = None) -> Command | None:
-        """Advance all parts to `now`, and return the command to publish; None before the first.
+        """Advance all parts to `now`, and return the command to publish; None to publish nothing.
 
         Args:
             now: Time of the steady clock [s].
@@ -562,7 +565,11 @@ class Controller:
 
     @property
     def _held_posture(self) -> Array | None:
-        """The posture [rad], (D,), that the arm claims to hold; None while it claims none."""
+        """Posture [rad], (D,), at which the arm should rest now; None if no posture is demanded.
+
+        The arm is not required to rest while it moves or is stopped, or while its target contains
+        a torque in addition to gravity compensation.
+        """
         activity, target = self.supervisor.activity, self.target_state
         control = self.activities.of(activity, self.settings)
         is_holding = activity in (Activity.HOLDING, Activity.TORQUE) and self.supervisor.is_running
@@ -652,7 +659,7 @@ class Controller:
         return Command(command.kind, np.where(self.robot.used, command.value, released))
 
     def _stopped(self, present: list[Condition], dt: float) -> Command | None:
-        """Return the command of a stopped arm."""
+        """Return the command of an arm that the causes `present` stop, after a step of dt [s]."""
         if not self.stopping.is_entered:
             self.activities.leave()
             self.stopping.enter()
@@ -697,7 +704,7 @@ class Controller:
         self.supervisor.on_request(activity)
 
     def _approach(self, duration: float) -> None:
-        """Start a trajectory to the target, along the path of `Planner.to_posture`."""
+        """Start a trajectory of `duration` [s] to the target, along `Planner.to_posture`'s path."""
         state = self.target_state
         assert state.theta is not None
         start, mae = self._ready()
@@ -706,7 +713,7 @@ class Controller:
         self._begin(plan, 0.0, state.effort)
 
     def _follow(self, plan: Plan, delay: float = 0.0) -> None:
-        """Follow a requested trajectory, whose end becomes the target."""
+        """Follow a requested trajectory after `delay` [s]; its end becomes the target."""
         nothing = np.zeros(self.robot.joint_count)
         end = plan.trajectory.end
         self.target_state = Target(nothing, end, (), plan.unreachable_reason)
@@ -742,7 +749,7 @@ class Controller:
         """
         self._refuse_gravity_compensation()
         if self.estimate is None or self.mae is None:
-            raise MessageError('no posture yet', 'wait for an estimate and a checkpoint')
+            raise MessageError('no posture estimated yet', 'wait for an estimate and a checkpoint')
         present = self.stop_conditions(self.watchdog.steps.stepped_at)
         condition = self.supervisor.condition or next(iter(present), None)
         if condition is not None:

@@ -4,13 +4,14 @@
     e = max_j |θ_target − θ_estimated|_j
     the arm is away from its target:  e > AWAY, or e > e_least + CARRIED, for LASTING
 
-"Holding" is a claim about the posture, not about the commands. The distance e counts from the end
-of the motion, and e_least is the smallest one since then. While the arm moves, and where a user
-asks for a torque besides that of the weight, no posture is claimed.
+e is computed from the end of a motion on, and e_least is its smallest value since then. The check
+is off while the arm moves, and while a user demands a torque in addition to gravity compensation,
+because the arm then need not rest at its target.
 
-Friction leaves healthy arms at a distance, which is smaller than AWAY, see
-doc/explanation/control_and_safety.md. It never carries an arm away from where it rested: a payload
-or a contact does, weak or lost muscles, or a base that is mounted otherwise than in `robot.urdf`.
+Friction leaves healthy arms at a distance that is smaller than AWAY, see
+doc/explanation/control_and_safety.md. Friction never moves an arm away from where it has rested. A
+payload, a contact, weak or lost muscles, or a base that is mounted otherwise than in `robot.urdf`
+can do so.
 """
 
 from __future__ import annotations
@@ -24,12 +25,14 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion import reach
 from musculoskeletal_ae.robot.robot import Robot
 
-AWAY = 0.5  # report a joint that rests further than this away from its target [rad]
-#: report a joint that rests further away than an earlier distance by more than this [rad]; updates
-#: of the network changed the estimate of healthy resting arms by up to 0.19 rad
+#: report a joint that rests further than this away from its target [rad]; tendon friction alone
+#: leaves healthy arms nearer
+AWAY = 0.5
+#: report a joint whose distance from its target has grown by more than this while the arm rests
+#: [rad]; updates of the network change the estimate of a healthy resting arm by up to 0.19 rad
 CARRIED = 0.25
 LASTING = 5.0  # report a joint only once it has been away for this time [s]
-#: state these causes where the check finds no other
+#: causes that a report lists unless the muscles evidently lack torque in this posture
 POSSIBLE_CAUSES = (
     'possible causes: a payload or contact, tendon friction, a muscle that pulls less than its '
     'sensor reads, or a base that is mounted otherwise than in robot.urdf'
@@ -53,7 +56,7 @@ class HoldingCheck:
     def step(self, target: Array | None, theta: Array | None, dt: float) -> None:
         """Compare target and estimate, θ [rad] (D,) each, dt [s] after the last call.
 
-        Without a target, the arm does not claim to hold a posture.
+        Without one of them, there is no distance, and the arm is not away from its target.
         """
         self.distance = None if target is None or theta is None else target - theta
         if self.distance is None:
@@ -84,7 +87,10 @@ class HoldingCheck:
 
     @property
     def text(self) -> str:
-        """This joint and its distance, such as 'elbow 0.62 rad'; '' while `distance` is None."""
+        """The joint farthest from its target and its distance, such as 'elbow 0.62 rad'.
+
+        The text is empty while `distance` is None.
+        """
         joint = self.farthest
         if self.distance is None or joint is None:
             return ''

@@ -68,8 +68,8 @@ from musculoskeletal_ae.robot.model_errors import LARGEST
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-POSTURES = 200  # find the longest muscle lengths in this many random postures
-LONGEST_INTERVAL = 0.05  # assume dT/dt = 0 after a longer interval between two messages [s]
+POSTURES = 200  # sample this many random postures to find the longest length of each muscle
+LONGEST_INTERVAL = 0.05  # assume dT/dt = 0 if two messages are further apart than this [s]
 CONFIDENCE = 2.0  # lower the tension limit by this many standard deviations of the measured tension
 #: gain of the tension feedback r [1/s]; its time constant of 0.2 s is long compared with the lag of
 #: a module, which is about 30 ms
@@ -89,7 +89,8 @@ class CommandLimiter:
         self.command: Command | None = None
         #: last published length command [m], (M,), and its age [s]
         self._last_length: tuple[Array, float] | None = None
-        self._relief: Array = np.zeros(robot.muscle_count)  # relief r of each muscle [m]
+        #: length r by which each muscle is paid out further while T is too high [m], (M,)
+        self._relief: Array = np.zeros(robot.muscle_count)
         #: time of sending [s], T [N] and dT/dt [N/s], (M,), of the last message
         self._tension: tuple[float, Array, Array] | None = None
         #: l_exceeded of each muscle (see the module's description) [m], (M,)
@@ -101,7 +102,7 @@ class CommandLimiter:
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings.
+        """Use another robot description and other settings from the next step on.
 
         `robot` must already describe isolated muscles as muscles without tension.
         """
@@ -257,7 +258,7 @@ class CommandLimiter:
         tension is too high has to follow the jump. For all other muscles, the bound is −∞.
 
         Args:
-            rejected: l [m] and T [N], (2, M); −∞ where they are implausible.
+            rejected: Lengths l [m] and tensions T [N], (2, M); −∞ where they are implausible.
             sample: The last accepted muscle states.
             limit: Tension limit [N], (M,).
         """
@@ -271,7 +272,10 @@ class CommandLimiter:
         return relieved
 
     def _tension_rate(self, time: float, tension: Array) -> Array:
-        """Return the rates of change of the tensions [N/s], (M,), between the last two messages."""
+        """Return the rates of change of the tensions [N/s], (M,), between the last two messages.
+
+        `tension` [N], (M,), are those of the last message, which was sent at `time` [s].
+        """
         rate = np.zeros_like(tension)
         if self._tension is not None:
             before, old, rate = self._tension
@@ -285,7 +289,11 @@ class CommandLimiter:
     def _shortest(
         self, before: Array, change: Array, sample: MuscleSample, limit: Array, dt: float
     ) -> Array:
-        """Return the shortest length commands [m], (M,), that demand no tension above the limit."""
+        """Return the shortest length commands [m], (M,), that demand no tension above the limit.
+
+        Unless a measured tension is too high, they exceed the last command `before` by at most
+        `change`, both [m], (M,). `limit` is in [N], (M,), and dt in [s].
+        """
         robot, actuation = self._robot, self._robot.actuation
         tension = sample.motor_tension * sample.usable * actuation.knows_tension
         rate = self._tension_rate(sample.sent_at, tension)

@@ -12,10 +12,10 @@ from musculoskeletal_ae.robot.robot import Robot
 
 
 def check_settings(robot: Robot, settings: Settings) -> None:
-    """Check that settings fit a robot: the desired stiffness its joints, the method its modules.
+    """Check that the desired stiffness fits the robot's joints, and the method its modules.
 
     Raises:
-        ParameterError: If they do not; the text names the reason and the legal values.
+        ParameterError: If one of them does not fit; the text names the reason and the legal values.
     """
     with naming_parameter('joint_stiffness'):
         settings.desired_stiffness(robot.units)
@@ -43,7 +43,7 @@ def _check_method(robot: Robot, settings: Settings) -> None:
 
 
 def length_methods(settings: Settings) -> Mapping[str, LengthMethod]:
-    """Return the length methods of the preset in the settings."""
+    """Return the control methods of the preset that command lengths, by name."""
     return preset_named(settings.preset).length_methods()
 
 

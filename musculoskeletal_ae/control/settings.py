@@ -21,9 +21,12 @@ MOST_STIFFNESS = 1000.0  # refuse a larger desired stiffness of a revolute joint
 
 
 def _most_stiffness(radian: float) -> float:
-    """Return the largest desired stiffness of a joint in its own unit, of which `radian` is 1 rad.
+    """Return the largest legal stiffness of a joint [N·m/rad, or N/m for a prismatic joint].
 
-    It is a whole number, so that messages state the limit exactly.
+    The result is a whole number, so that messages state the limit exactly.
+
+    Args:
+        radian: Position of the joint [rad or m] at θ = 1 rad.
     """
     return float(math.ceil(MOST_STIFFNESS / radian**2))
 

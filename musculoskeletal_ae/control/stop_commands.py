@@ -49,18 +49,18 @@ class SafeStop:
         self.leave()
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings."""
+        """Use another robot description and other settings from the next step on."""
         self._robot, self._settings = robot, settings
 
     def enter(self) -> None:
-        """Enter a stop."""
+        """Begin a stop, whose hold time starts now."""
         self.leave()
         self.is_entered = True
 
     def leave(self) -> None:
-        """Leave a stop."""
+        """End the stop, and forget its hold time and the lengths at which its release began."""
         self.is_entered = False
-        self._held = 0.0  # counted time since the start of the stop (see `step`) [s]
+        self._held = 0.0  # duration of the stop [s]; excludes the time of waiting to resume
         self._wound_from: float | None = None  # suspect's command before it was wound in [m]
         self._released_from: Array | None = None  # lengths at the start of the release [m], (M,)
 
@@ -82,7 +82,7 @@ class SafeStop:
         Args:
             sample: The newest muscle states.
             dt: Time since the last call [s]; 0 while the arm waits to resume.
-            is_fresh: Whether the sample is still up to date.
+            is_fresh: Whether the sample is still up to date. If it is not, no suspect is wound in.
             may_wind: Whether the suspect may be wound in.
             releases_at_once: Whether to release the arm without holding the last command.
         """

@@ -22,7 +22,8 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.files import read_text
 
 FILE, LOCK = 'controller.stop', 'controller.lock'
-LARGEST = 10_000  # treat a larger file as one that states no stop cause [bytes]
+#: ignore the content of a larger file, which then counts as the stop cause `restarted` [bytes]
+LARGEST = 10_000
 RETRY_INTERVAL = 2.0  # wait this long after a failed attempt to write [s]
 BEFORE = 'before this controller was started'
 

@@ -16,19 +16,20 @@ from enum import Enum
 from musculoskeletal_ae.conditions import Action, Clears, Condition, ConditionKind
 from musculoskeletal_ae.remedy import Step
 
-RESUME = 0.2  # continue a paused arm after this time without a cause [s]
+RESUME = 0.2  # let a paused arm continue once no cause has been present for this time [s]
 
 
 class Activity(Enum):
     """What the arm does when nothing stops it."""
 
-    IDLE = 'idle'  # no target yet
+    IDLE = 'idle'  # the arm has no target yet
     HOLDING = 'holding'
-    MOVING = 'moving'  # along a trajectory
+    MOVING = 'moving'  # the arm follows a trajectory
     EXPLORING = 'exploring'
     CALIBRATING = 'calibrating'  # exploring gently while the length offsets are unknown
-    TORQUE = 'torque'  # commanding tensions (method `tension`)
-    GRAVITY_COMPENSATION = 'gravity_compensation'  # hand guiding (method `float`)
+    TORQUE = 'torque'  # the arm is controlled by commanded tensions (method `tension`)
+    #: the arm is guided by hand, and only its weight is compensated (method `float`)
+    GRAVITY_COMPENSATION = 'gravity_compensation'
 
 
 class StopState(Enum):
@@ -36,7 +37,7 @@ class StopState(Enum):
 
     RUNNING = 'running'
     PAUSED = 'paused'  # stopped by an auto-recoverable cause
-    STOPPED = 'stopped'  # stopped until a reset or a verification
+    STOPPED = 'stopped'  # stopped until a reset, or until the verification of a suspect begins
     VERIFYING = 'verifying'  # stopped; a suspect muscle is wound in
     RESUMING = 'resuming'  # the suspect is verified; the arm continues once no cause is present
 
@@ -102,7 +103,7 @@ class Supervisor:
         self.condition: Condition | None = None
         #: the latching causes since the stop began, with their newest details
         self._causes: dict[ConditionKind, Condition] = {}
-        self._clear_for = 0.0  # time without a cause [s]
+        self._clear_for = 0.0  # time for which no cause of the stop has been present [s]
 
     @property
     def mode(self) -> str:
@@ -116,12 +117,12 @@ class Supervisor:
 
     @property
     def is_latched(self) -> bool:
-        """Whether the stop is latched."""
+        """Whether the arm is in a latched stop, which only a reset or a verification ends."""
         return self.state in (StopState.STOPPED, StopState.VERIFYING, StopState.RESUMING)
 
     @property
     def may_wind_suspect(self) -> bool:
-        """Whether a suspect may be wound in: while it is verified, unless an operator stopped."""
+        """Whether a suspect may be wound in to verify its fault; never after an operator's stop."""
         return self.state is StopState.VERIFYING and ConditionKind.OPERATOR not in self._causes
 
     @property
@@ -187,7 +188,7 @@ class Supervisor:
         self.awaits_exploration = False
 
     def on_offsets(self, known: bool) -> None:
-        """Adapt the activity to new length offsets.
+        """Adapt the activity when the length offsets become `known`, or unknown.
 
         While the offsets are unknown, the arm can only explore gently. A motion to a target ends,
         because its trajectory was planned with the previous offsets.

@@ -30,7 +30,8 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 #: steps of a stopped arm then follow the steady clock
 SLOWEST = 0.05
 PACE_SPAN = 1.0  # average the pace of the messages' clock with this time constant [s]
-OVERHEATED = 20.0  # stop the arm if a winding is this far above temperature_limit [°C]
+#: stop the arm if a winding is hotter than the parameter temperature_limit by this [°C]
+OVERHEATED = 20.0
 #: stop the arm if a tension exceeds this multiple of tension.limit for OVERLOAD_TIME; meanwhile,
 #: the limiter pays out the muscle
 OVERLOAD = 1.1
@@ -56,14 +57,14 @@ class ControlSteps:
     """
 
     def __init__(self, clock: AwakeClock) -> None:
-        """Tick `clock` in each step."""
+        """Begin to measure steps with `clock`, which each step ticks."""
         self._clock = clock
         self._time = math.nan  # time of the messages' clock at the last step [s]
         self.stepped_at = -math.inf
         self.pace = 1.0
 
     def allowed_age(self, max_age: float) -> float:
-        """Return `max_age` [s], extended accordingly if the messages' clock runs slowly."""
+        """Return `max_age` [s], divided by the pace of the messages' clock while this is slow."""
         return max_age / min(max(self.pace, SLOWEST), 1.0)
 
     def clock_jumped_back(self) -> None:
@@ -110,13 +111,14 @@ class Overload:
         #: time of sending of the message with which each muscle's overload began [s]; ∞ without an
         #: overload
         self._since: Array = np.full(robot.muscle_count, math.inf)
-        self._received_at = self._sent_at = -math.inf  # times of the newest message [s]
+        #: times of reception and of sending of the newest message [s]
+        self._received_at = self._sent_at = -math.inf
 
     def take(self, tension: Array, now: float, delay: float) -> None:
         """Record which filtered tensions of a message exceed the permitted level.
 
         Args:
-            tension: T [N], (M,). Where it is not finite, nothing changes.
+            tension: Tensions T [N], (M,). Where it is not finite, nothing changes.
             now: Time of reception by the steady clock [s].
             delay: How late the message is (`Arrival.delay`) [s].
         """
@@ -219,7 +221,7 @@ class Watchdog:
     """
 
     def __init__(self, robot: Robot, settings: Settings, clock: AwakeClock | None = None) -> None:
-        """Start without data; `clock` is as in `Controller`."""
+        """Start without data; `clock` excludes pauses of the process from the ages of data."""
         clock = clock or AwakeClock()
         self.steps = ControlSteps(clock)
         self.muscle_states, self.estimate = Arrival(clock), Arrival(clock)
@@ -229,7 +231,7 @@ class Watchdog:
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings."""
+        """Use another robot description and other settings from the next step on."""
         self._robot, self._settings = robot, settings
 
     def take_sample(self, sample: MuscleSample, now: float) -> None:

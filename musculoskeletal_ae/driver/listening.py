@@ -37,12 +37,16 @@ from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement
 
 #: report a fault if a larger share of the messages repeats the previous message exactly
 MOST_REPEATED = 0.2
-QUIET = 3  # count sensors that show at most this many different values as free of noise
-TEMPERATURES = -20.0, 130.0  # count temperatures outside this range as impossible [°C]
+#: treat sensors with at most this many different values as free of noise: repeated readings of an
+#: arm at rest are then no fault
+QUIET = 3
+TEMPERATURES = -20.0, 130.0  # treat temperatures outside this range as impossible [°C]
 #: let l exceed its range by this distance, with and without length calibration [m]
 BEYOND = 0.1, 1.0
 BEYOND_JOINT = 0.3  # report a fault if θ exceeds the joint limits by more than this [rad]
-BEYOND_SHARE = 0.95  # judge θ by the excess that this share of the messages does not exceed
+#: compare the excess of θ over its limits that this share of the messages does not exceed with
+#: BEYOND_JOINT
+BEYOND_SHARE = 0.95
 #: report a fault if |T − T_bias| exceeds the smaller of these while nothing is commanded, [N] and
 #: relative to T_bias; they cover errors of the sensor and of its zero
 RESTING_TENSION, RESTING_SHARE = 15.0, 0.5
@@ -52,7 +56,8 @@ USUAL = 10.0, 60.0
 #: T is in another unit if all muscles, converted from that unit to N, are within this fraction of
 #: T_bias
 UNIT_TOLERANCE = 0.3
-TENSION_UNITS = {'kgf': 9.80665, 'lbf': 4.44822, 'kN': 1000.0}  # other units of tension [N]
+#: units in which a driver may publish tensions by mistake, each in newtons
+TENSION_UNITS = {'kgf': 9.80665, 'lbf': 4.44822, 'kN': 1000.0}
 #: doubt the unit of a higher temperature of modules without commands [°C]; modules above 13 °C
 #: exceed this value if their temperature is published in °F
 HOTTEST_AT_REST = 55.0
@@ -68,7 +73,7 @@ MOVED = 0.04  # check sign and slope of l only if its range is larger than this 
 #: otherwise, blame the lengths
 JOINTS_BETTER = 0.8
 MOVED_JOINT = 0.2  # check the sign of θ only if its range is larger than this [rad]
-MOST_SAMPLES = 400  # compare at most this many messages with the model
+MOST_SAMPLES = 400  # compare at most this many messages with the model, to save time
 #: units in which values may have been published by mistake, in SI units or °C
 UNITS = {
     'length': {'mm': 1e-3, 'cm': 1e-2},
@@ -120,7 +125,8 @@ class Listening:
         #: times [s] of the joint messages, which are those of the muscles before them, and θ (D,)
         self._angles_read: list[tuple[float, Array]] = []
         self._now = 0.0  # time of the newest message of the muscles [s]
-        self._rejected: dict[tuple[str, str], list[MessageError]] = {}  # by topic and reason
+        #: errors of the rejected messages, by topic and reason
+        self._rejected: dict[tuple[str, str], list[MessageError]] = {}
         #: lowest and highest possible values of each quantity, (Q, M)
         self._low, self._high = (each[: len(Row)] for each in possible_readings(robot))
         (low, high), beyond = length_range(robot), BEYOND[not zeroed]
@@ -144,7 +150,7 @@ class Listening:
         """Record a message of muscle_states, or of the motors.
 
         Args:
-            message: The message.
+            message: The message, which is not checked yet.
             now: Time of reception [s].
             sent: Source time by the driver's clock [s]; NaN if unknown.
             number: Sequence number; 0 if unknown.
@@ -161,7 +167,7 @@ class Listening:
             self._read.append((states[: len(Row)], len(self._angles_read)))
 
     def joints(self, message: object) -> None:
-        """Record a message of joint_states."""
+        """Record a message of joint_states, whose angles are then compared with the lengths."""
         with self._rejecting('joint_states'):
             self._not_finite.update(joints_not_finite(message, self._robot.joints))
             theta = read_posture(message, self._robot.units, some=True)
@@ -373,9 +379,9 @@ class Listening:
 
         Args:
             verdict: Receives the results.
-            theta: θ [rad], (N, D).
-            length: l [m], (N, M).
-            tension: T [N], (N, M).
+            theta: Joint angles θ [rad], (N, D).
+            length: Muscle lengths l [m], (N, M).
+            tension: Tensions T [N], (N, M).
         """
         lengths_verdict = Verdict(self._robot)
         misfit = self._judge_lengths(lengths_verdict, theta, length, tension)
@@ -425,7 +431,10 @@ class Listening:
         return bool((model >= least)[has_moved].all())
 
     def _suspected_signs(self, theta: Array, length: Array, tension: Array) -> list[str]:
-        """Return the joints of which a reversed sign alone would explain all wrong lengths."""
+        """Return the joints of which a reversed sign alone would explain all wrong lengths.
+
+        Arguments are joint angles [rad], (N, D), lengths [m] and tensions [N], (N, M) each.
+        """
         names = []
         for j, name in enumerate(self._robot.joints):
             turned, other = theta.copy(), Verdict(self._robot)
@@ -440,13 +449,13 @@ class Listening:
 
         Args:
             verdict: The faults of the lengths.
-            theta: θ [rad], (N, D).
+            theta: Joint angles θ [rad], (N, D).
         """
         are_places = all(fault.name == 'place' for fault in verdict.faults)
         return bool(self._moved(theta).any()) and are_places and len(verdict.faults) > 2
 
     def _moved(self, theta: Array) -> Bools:
-        """Return which joints moved enough to check the signs of their angles, (D,)."""
+        """Return which joints moved enough in θ [rad] (N, D) to check their signs, (D,)."""
         moved: Bools = np.ptp(theta, axis=0) > MOVED_JOINT
         return moved
 
@@ -457,9 +466,9 @@ class Listening:
 
         Args:
             verdict: Receives the results.
-            theta: θ [rad], (N, D).
-            length: l [m], (N, M). No fault of lengths was found.
-            tension: T [N], (N, M).
+            theta: Joint angles θ [rad], (N, D).
+            length: Muscle lengths l [m], (N, M). No fault of lengths was found.
+            tension: Tensions T [N], (N, M).
         """
         if self._stated or not self._moved(theta).any():
             return
@@ -528,9 +537,9 @@ class Listening:
 
         Args:
             verdict: Receives the results.
-            theta: θ [rad], (N, D).
-            length: l [m], (N, M).
-            tension: T [N], (N, M).
+            theta: Joint angles θ [rad], (N, D).
+            length: Muscle lengths l [m], (N, M).
+            tension: Tensions T [N], (N, M).
 
         Returns:
             The differences between l and the model [m], summed over the muscles, after exchanging

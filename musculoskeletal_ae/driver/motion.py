@@ -22,23 +22,27 @@ from musculoskeletal_ae.signals.joint_sensors import corrected, judge, sign_note
 from musculoskeletal_ae.signals.muscle_readings import Row
 from musculoskeletal_ae.signals.wiring import WiringJudgement
 
-RELEASE = 0.6  # wait this long after a release [s]
-MEAN = 0.3  # average readings over this time [s]
-SETTLE = 1.5  # give the arm this time to come to rest after a motion [s]
-HOLD = 0.5  # hold a demand for this time [s]
-SPEED = 0.01  # move a target further inwards at this speed [m/s]
-RELEASE_SPEED = 0.03  # move a target back at this speed [m/s]
-ABOVE_BIAS = 40.0  # by default, test up to this tension above T_bias [N]
+#: time for paying out a released muscle, and for settling after a target has moved back [s]
+RELEASE = 0.6
+MEAN = 0.3  # average the readings of the last part of a wait, of this duration [s]
+#: let the arm come to rest for this time after a motion, before its readings are judged [s]
+SETTLE = 1.5
+HOLD = 0.5  # judge the response to a command after holding it for this time [s]
+SPEED = 0.01  # let the target length of the tested muscle move inwards at this speed [m/s]
+RELEASE_SPEED = 0.03  # let the target length of the tested muscle move back at this speed [m/s]
+ABOVE_BIAS = 40.0  # without --tension, test muscles up to this tension above T_bias [N]
 #: release a muscle whose tension exceeds the highest or the demanded tension by this [N]
 RUN_AWAY_TENSION = 60.0
 MOMENT = 0.1  # let a muscle exceed a limit for this time, for example because the arm falls [s]
-LATEST = 0.1  # report a longer time from a command to the first response [s]
+LATEST = 0.1  # report a fault if a module takes longer to respond to a command [s]
 #: let a moving target advance for at most this time between two messages, so that it does not jump
 #: after a gap [s]
 LONGEST_ADVANCE = 0.05
-RESPONSE = 4.0, 0.0006  # count changes of T [N] and l [m] above noise by this as a response
+#: a change of T [N] or l [m] that exceeds the noise by this counts as a response to a command
+RESPONSE = 4.0, 0.0006
 
-Wait = Generator[None, None, None]  # each step takes one message
+#: a part of a test that takes time; each of its steps takes one message
+Wait = Generator[None, None, None]
 
 
 class RunAwayError(Exception):
@@ -80,7 +84,8 @@ class MotionTest(ABC):
         self._is_verified: Bools = np.zeros(robot.muscle_count, dtype=bool)
         self._now = 0.0
         self._recent: deque[tuple[float, Array]] = deque()
-        self._target: Array = np.full(robot.muscle_count, np.nan)  # NaN before l is known
+        #: target lengths of the muscles [m], (M,); NaN before l is known
+        self._target: Array = np.full(robot.muscle_count, np.nan)
         #: last time at which each muscle was within its limits [s]
         self._tame_at: Array = np.zeros(robot.muscle_count)
         #: θ (D,), states (3, M) and tested muscle of each message, −1 while the arm is held
@@ -128,14 +133,14 @@ class MotionTest(ABC):
 
     @abstractmethod
     def _try(self, m: int) -> Wait:
-        """Try muscle m, and check its responses."""
+        """Move muscle m, and check how its readings respond."""
 
     @abstractmethod
     def _run_away(self, states: Array, start: Array) -> RunAwayError | None:
         """Return the error of a muscle that runs away, or None.
 
         Args:
-            states: l [m], T [N] and temperature [°C] of the newest message, (3, M).
+            states: Lengths [m], tensions [N] and temperatures [°C] of the newest message, (3, M).
             start: The newest message when the present wait began, (3, M).
         """
 
@@ -154,7 +159,7 @@ class MotionTest(ABC):
     # -- common parts ---------------------------------------------------------------------------
 
     def _sequence(self) -> Wait:
-        """Run the whole test."""
+        """Run the test: hold the arm, move each muscle, then judge the joint sensors."""
         try:
             yield from self._hold()
             for m in self._muscles:
@@ -193,7 +198,10 @@ class MotionTest(ABC):
         return any(np.isfinite(theta).all() for theta, _, _ in self._history)
 
     def _wrong_side(self, winds: dict[int, int]) -> Literal['readings', 'commands'] | None:
-        """Return whether the readings or the commands are exchanged; None if it is unknown."""
+        """Return whether the readings or the commands are exchanged; None if it is unknown.
+
+        `winds` is the column of the readings that responded to each muscle's command.
+        """
         if any(self.verdict.has_passed('order', column) for column in winds.values()):
             return 'commands'  # the readings were checked while a hand moved the arm
         if not self._knows_joints():

@@ -50,8 +50,8 @@ def wrong_side(
     Args:
         robot: The geometric model.
         theta: Measured θ [rad], (N, D). Messages with NaN are not used.
-        length: l [m], (N, M).
-        tension: T [N], (N, M).
+        length: Muscle lengths l [m], (N, M).
+        tension: Tensions T [N], (N, M).
         segments: Number of the segment to which each message belongs, (N,).
         winds: The column that responded to each command, by muscle.
         joint_faults: Faults that would explain the lengths if the readings are right. Exchanged
@@ -66,7 +66,7 @@ def wrong_side(
     )
 
     def misfit(theta: Array, owner: dict[int, int]) -> float:
-        """Return the misfit [m] if column k belongs to muscle `owner[k]`."""
+        """Return the misfit [m] at θ [rad] (N, D) if column k belongs to muscle `owner[k]`."""
         (square,) = misfits_of(theta)
         return float(np.sqrt(sum(square[k, m] for k, m in owner.items())))
 

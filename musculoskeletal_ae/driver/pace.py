@@ -20,18 +20,20 @@ from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.report import is_overloaded
 
-RATE_TOLERANCE = 0.2  # tolerate this relative error of the rate
+RATE_TOLERANCE = 0.2  # accept a rate that deviates from the expected one by this share
 #: Begin the motion test only at this rate or above [Hz], unless the expected rate is lower. A
 #: muscle that runs away is then noticed within 33 ms, and `motion.MEAN` averages 9 readings.
 LEAST_RATE = 30.0
-LONGEST_STALL = 1.0  # blame the driver for any longer gap, even if this computer is overloaded [s]
+#: report a longer gap between messages as a fault of the driver, even if this computer is
+#: overloaded [s]
+LONGEST_STALL = 1.0
 LEAST_LOST = 0.05  # report a loss of more than this fraction of the messages
 
 
 class _Received(NamedTuple):
     came: float  # time of reception [s]
     came_awake: float  # time of reception by a clock that stops while this process is blocked [s]
-    sent: float  # source time by the driver's clock [s]; NaN if unknown
+    sent: float  # time of sending by the driver's clock [s]; NaN if unknown
     number: int  # sequence number; 0 if unknown
 
 
@@ -46,11 +48,11 @@ class Pace:
 
     @property
     def count(self) -> int:
-        """Number of messages."""
+        """Number of messages that were received so far."""
         return len(self._messages)
 
     def message(self, came: float, sent: float, number: int) -> None:
-        """Record when a message was received and when it was sent [s], and its sequence number."""
+        """Record a message: when it came, when it was sent [s], and its sequence number."""
         self._messages.append(_Received(came, self._awake.at(came), sent, number))
 
     def judge(self, verdict: Verdict, now: float) -> None:

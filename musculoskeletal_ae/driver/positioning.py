@@ -32,16 +32,18 @@ from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
 
-STEP = 0.003  # first move the target inwards by this, to measure the latency [m]
-FURTHEST = 0.015  # move the target inwards by at most this [m]
-OUTWARDS = 0.005  # move the target outwards by this [m]
-FOLLOWS = 0.0015  # tolerate this difference of l and l_target at rest [m]
+#: first step of a muscle's target length inwards, from which the latency is measured [m]
+STEP = 0.003
+FURTHEST = 0.015  # wind a muscle in by at most this [m]
+OUTWARDS = 0.005  # pay a muscle out by this after winding it in, to check the other direction [m]
+FOLLOWS = 0.0015  # accept a module at rest whose l differs from l_target by at most this [m]
 #: report a fault if the change of l, divided by that of l_target, is outside this range
 SHARES = 0.7, 1.4
 #: permit T to rise by this while the arm is held, even where T exceeds the highest test tension at
 #: rest [N]
 RISE = 20.0
-RUN_AWAY = 0.03  # release a muscle whose l is further away from l_target than this [m]
+#: release a muscle, and end the test, if its l is further away from l_target than this [m]
+RUN_AWAY = 0.03
 
 
 class Positioning(MotionTest):

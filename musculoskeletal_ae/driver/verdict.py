@@ -51,7 +51,7 @@ class Fault(NamedTuple):
     muscles: tuple[int, ...]  # indices of the affected muscles; all for a fault of the whole driver
     observation: str
     change: str  # what to change in the driver
-    name: str  # its name in FAULTS
+    name: str  # name of the fault in FAULTS
 
     @property
     def is_of_joints(self) -> bool:
@@ -114,7 +114,7 @@ class Verdict:
         """Record that a check is not judged, because this computer is overloaded.
 
         Args:
-            check: The check.
+            check: The check that is not judged.
             observation: What would have been a fault on a computer that is not overloaded.
         """
         self._load = self._load or load_text()
@@ -172,7 +172,7 @@ class Verdict:
         """Return which of these checks were not made, and for which muscles; '' if all were.
 
         Args:
-            checks: The checks.
+            checks: The checks to look up.
             excluded: Muscles to leave out, (M,); None for none.
         """
         names: dict[str, list[str]] = {}  # checks by the muscles that they did not judge

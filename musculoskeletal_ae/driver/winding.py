@@ -53,8 +53,8 @@ from musculoskeletal_ae.report import distinct
 #: demand at least this above T_bias, because noise hides the response to less [N]
 LEAST_ABOVE_BIAS = 20.0
 FURTHEST = 0.025  # wind a muscle in by at most this [m]
-SLACK = 0.01  # set l_target this far beyond l after winding in [m]
-RUN_AWAY = 0.05  # release a muscle that shortens by more than this [m]
+SLACK = 0.01  # after winding in, set l_target this far beyond l, so that the law demands T_bias [m]
+RUN_AWAY = 0.05  # release all muscles, and end the test, if one shortens by more than this [m]
 #: accept an error of T up to the larger of these: [N], and relative to the demand
 TENSION_TOLERANCE, TENSION_SHARE = 10.0, 0.1
 #: expect errors of l of up to this: two standard deviations of noise and resolution [m]
@@ -70,7 +70,9 @@ MIRROR_TOLERANCE = 0.008
 #: ALARM; both are fractions of the range from T_bias to the highest test tension. Healthy emulated
 #: arms that still swing reach 0.81. If K is large, T is noisy, and ALARM is raised by the excess.
 HELD, ALARM = 0.5, 0.9
-OSCILLATES = 6  # count T as oscillating if it crosses its mean more often than this within MEAN
+#: treat T as oscillating, and release all muscles, if it crosses its mean more often than this in
+#: MEAN seconds
+OSCILLATES = 6
 #: start a release with l_target this far beyond l [m], and increase the distance at this speed
 #: [m/s]; it is small at first, because commands of wrong sign wind in
 PAY_OUT = 0.003, 0.3
@@ -178,7 +180,10 @@ class Winding(MotionTest):
             self.verdict.failed('hold', m, got=held.tension[m], asked=held.demand[m])
 
     def _run_away(self, states: Array, start: Array) -> RunAwayError | None:
-        """Return the error of a muscle that exceeds its demand or shortens too far."""
+        """Return the error of a muscle that exceeds its demand or shortens too far; else None.
+
+        `states` and `start` are the newest readings and those when the present wait began, (3, M).
+        """
         length, tension = states[:2]
         tensions = self._robot.tension
         verified = np.minimum(np.maximum(tensions.limit, self._most), tensions.max)
@@ -323,7 +328,7 @@ class Winding(MotionTest):
         """Move the command of muscle m inwards, and return the muscle whose tension rises first.
 
         Args:
-            m: The muscle.
+            m: Index of the muscle.
             clear: Target at which no muscle pulls [m].
 
         Returns:
@@ -405,7 +410,7 @@ class Winding(MotionTest):
         demand or the distance FURTHEST is reached.
 
         Args:
-            m: The muscle.
+            m: Index of the muscle.
             level: The demanded tension [N].
             home: l before the test [m]; limits how far the muscle is wound in.
             latency: Receives the time to the response [s], unless noise could hide it.
@@ -441,8 +446,9 @@ class Winding(MotionTest):
 
     def _try(self, m: int) -> Wait:
         robot, verdict, home = self._robot, self.verdict, self._mean()
-        half, whole = list[float](), list[float]()  # times to the response [s]
-        # The demand at home may exceed T_bias, because the muscle carries the arm's weight.
+        #: times to the response, for half and for the whole demand [s]
+        half, whole = list[float](), list[float]()
+        # The demand before the test may exceed T_bias, because the muscle carries the arm's weight.
         rise = (self._highest - self._bias)[m]
         self._most = self._highest.copy()
         self._most[m] = home.demand[m] + rise
@@ -480,7 +486,11 @@ class Winding(MotionTest):
             self._judge_latency(m, min(half + whole))
 
     def _judge_law(self, m: int, home: _Reading, last: _Reading, out: _Reading) -> None:
-        """Judge whether T obeys the law at the highest demand, and with l_target beyond l."""
+        """Judge whether the tension of muscle m obeys the control law of the modules.
+
+        `home` is the reading before it was wound in, `last` that at the highest demand, and `out`
+        that with l_target beyond l, which must demand T_bias only.
+        """
         failed = self.verdict.failed
         asked, got = last.demand[m] - home.demand[m], last.tension[m] - home.tension[m]
         if asked < 0.25 * (self._highest - self._bias)[m]:
@@ -560,7 +570,7 @@ class Winding(MotionTest):
         """Find out why a muscle did not respond to winding in, and record the fault.
 
         Args:
-            m: The muscle.
+            m: Index of the muscle.
             home: The reading before the test.
             pulled: Increase of T of all muscles when muscle m was wound in [N], (M,).
             wound: Decrease of l of all muscles when muscle m was wound in [m], (M,).

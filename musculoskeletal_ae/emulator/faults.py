@@ -20,17 +20,17 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, muscle_reading
 
-SPEED_LIMIT = 0.25  # let a muscle module's motor turn no faster than this [m/s]; chosen by hand
-TURN = 6.2832  # accept no larger turn of the base, which is then upright again [rad]
+SPEED_LIMIT = 0.25  # fastest speed of a muscle module's motor [m/s]; chosen by hand
+TURN = 6.2832  # reject a larger turn of the base [rad]: a full turn leaves the base upright
 SPIKE_SHARE = 0.05  # give one muscle a spike in this share of the readings
 BURST_TIME, BURST_PAUSE = 0.3, 3.0  # let bursts and the pauses before them last this on average [s]
 
 
 class FaultKind(NamedTuple):
-    """Properties of a kind of fault."""
+    """What a kind of fault does, and which sizes, muscles and quantities its line may state."""
 
     meaning: str
-    size: float = 0.0  # default size
+    size: float = 0.0  # size of the fault if its line states none, in the unit `unit`
     largest: float = 0.0  # largest legal size; 0 if the kind has no size
     unit: str = ''
     of_muscle: bool = True
@@ -74,7 +74,7 @@ LEGAL = 'KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]; kinds: ' + ', '.join(KINDS)
 
 
 class Readings(NamedTuple):
-    """One sample of the arm's sensors."""
+    """What all sensors of an arm read at one moment."""
 
     theta: Array  # joint angles [rad], (D,)
     length: Array  # muscle lengths [m], (M,)
@@ -96,7 +96,7 @@ SENSED = tuple(quantity.name for quantity in QUANTITIES if quantity.name in SIZE
 
 
 class EmulatedFault(NamedTuple):
-    """One fault, parsed from a line."""
+    """One fault, as a line describes it: its kind, the parts that it affects, and its size."""
 
     kind: str
     quantities: tuple[str, ...]
@@ -163,7 +163,7 @@ def read_fault(line: str, robot: Robot) -> EmulatedFault:
 
 
 class Faults:
-    """All active faults of one arm."""
+    """All active faults of one arm; changes the readings of its sensors accordingly."""
 
     def __init__(self, robot: Robot, rng: np.random.Generator) -> None:
         """Start without faults."""
@@ -236,7 +236,7 @@ class Faults:
         return [fault for fault in self._faults if fault.kind in names]
 
     def pass_time(self, duration: float) -> None:
-        """Pass the time `duration` [s] for drifts and bursts."""
+        """Let the time `duration` [s] pass, so that drifts grow, and bursts begin and end."""
         self._time += duration
 
     def _is_in_burst(self, fault: EmulatedFault) -> bool:

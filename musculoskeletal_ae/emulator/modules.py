@@ -31,42 +31,48 @@ from musculoskeletal_ae.robot.joint_units import SLIDE
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-STEP = 0.001  # simulate in steps of this duration [s]
+STEP = 0.001  # duration of a simulation step [s]
 
 # modes of a module
+#: modes of a module: safe state, following a target length, following a target tension
 SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 
 # The following values are chosen by hand, because those of Musashi are not public.
-#: let a module in the safe state approach T_bias at this rate [N/s]
+#: let a module in the safe state change its tension towards T_bias at this rate [N/s]
 RELEASE_RATE = 100.0
-MOTOR_GAIN = 0.004  # wind in at this speed for each newton of missing tension [m/s/N]
+MOTOR_GAIN = 0.004  # speed at which a module winds in for each newton of missing tension [m/s/N]
 #: Wind in a slack tendon at this speed [m/s], which falls to 0 at half of T_bias. Weak muscles need
 #: it: MOTOR_GAIN alone would wind in at 2 mm/s with a T_bias of 0.5 N.
 TAKE_UP_SPEED = 0.03
-POSITION_LAG = 0.02  # let a position-controlled module follow with this time constant [s]
+#: time constant with which a position-controlled module follows its target length [s]
+POSITION_LAG = 0.02
 # Heat. Each motor is sized for its muscle: constant T_limit heats the average module to 85 °C at
 # the housing and 105 °C in the winding.
-AMBIENT = 25.0  # temperature of the surroundings [°C]
-LOSS = 20.0  # let a motor at T_limit lose this power as heat [W]
+AMBIENT = 25.0  # temperature of the surroundings, to which all modules cool down [°C]
+LOSS = 20.0  # heat that a motor produces at T_limit [W]
 WINDING_CAPACITY, HOUSING_CAPACITY = 20.0, 150.0  # heat capacities of an average module [J/K]
-WINDING_RESISTANCE, HOUSING_RESISTANCE = 1.0, 3.0  # thermal resistances of that module [K/W]
+#: thermal resistances of winding and housing of an average module [K/W]
+WINDING_RESISTANCE, HOUSING_RESISTANCE = 1.0, 3.0
 #: draw LOSS, capacities and resistances with this standard deviation of their logarithms
 HEAT_SPREAD = 0.15
 
 # Sensors. The values are chosen by hand. Each reading gets noise of this standard deviation, and is
 # rounded to this resolution, a power of two as of an A/D converter.
-ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # of joint angles [rad]
-LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # of muscle lengths [m]
-TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # of tensions [N]
+ANGLE_NOISE, ANGLE_RESOLUTION = 0.001, 2.0**-12  # noise and resolution of joint angles [rad]
+LENGTH_NOISE, LENGTH_RESOLUTION = 1.0e-4, 2.0**-14  # noise and resolution of muscle lengths [m]
+TENSION_NOISE, TENSION_RESOLUTION = 1.0, 2.0**-3  # noise and resolution of tensions [N]
 #: limit the noise of a tension sensor to this share of T_bias: sensors of weak muscles are finer
 TENSION_NOISE_SHARE = 0.1
-TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3  # of housing temperatures [°C]
-CURRENT_NOISE, CURRENT_RESOLUTION = 1.0, 2.0**-3  # of a motor current, as a tension [N]
+#: noise and resolution of housing temperatures [°C]
+TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION = 0.2, 2.0**-3
+#: noise and resolution of a motor current, expressed as a tension [N]
+CURRENT_NOISE, CURRENT_RESOLUTION = 1.0, 2.0**-3
 #: draw errors of a motor current as a measure of tension: standard deviation of the scale's
 #: logarithm, standard deviation of the offset [N], and mean drive friction as a share of T_limit
 CURRENT_SCALE, CURRENT_ZERO, DRIVE_FRICTION = 0.15, 5.0, 0.1
-ACCELERATION_NOISE = 0.05  # of each axis of an accelerometer [m/s²]
-MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01  # of a marker's position [m] and orientation [rad]
+ACCELERATION_NOISE = 0.05  # standard deviation of the noise of each axis of an accelerometer [m/s²]
+#: standard deviations of the noise of a marker's position [m] and orientation [rad]
+MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01
 
 
 def joint_gear(kinematics: Kinematics) -> Array:
@@ -85,15 +91,15 @@ class Modules(NamedTuple):
     length_low: Array  # shortest motor-side length that the motor can reach [m]
     length_high: Array  # longest motor-side length that the motor can reach [m]
     stiffness: Array  # K of muscle stiffness control [N/m]
-    follows_position: Array  # 1 for position-controlled modules
-    speed: Array  # largest speed [m/s]
-    tension_bias: Array  # [N]
-    tension_max: Array  # [N]
-    loss: Array  # k [W/N²]
-    winding_capacity: Array  # C₁ [J/K]
-    housing_capacity: Array  # C₂
-    winding_resistance: Array  # R₁ [K/W]
-    housing_resistance: Array  # R₂
+    follows_position: Array  # 1 for a position-controlled module, 0 for muscle stiffness control
+    speed: Array  # largest speed at which the module can wind [m/s]
+    tension_bias: Array  # tension bias T_bias [N]
+    tension_max: Array  # tension maximum T_max [N]
+    loss: Array  # heat per squared tension, k [W/N²]
+    winding_capacity: Array  # heat capacity C₁ of the winding [J/K]
+    housing_capacity: Array  # heat capacity C₂ of the housing [J/K]
+    winding_resistance: Array  # thermal resistance R₁ between winding and housing [K/W]
+    housing_resistance: Array  # thermal resistance R₂ between housing and surroundings [K/W]
 
 
 class Command(NamedTuple):
@@ -101,10 +107,10 @@ class Command(NamedTuple):
 
     value: Array  # target lengths [m] or tensions [N]
     length_error: Array  # reading of the length sensor minus the true l [m]
-    stuck: Array  # relative loss of motor speed
+    stuck: Array  # share of its speed that each motor loses; 1 for a jammed one
     slack: Array  # excess length of the tendon [m]
-    zero: Array  # additional offset of the length sensor [m]
-    hot: Array  # minimum temperature of the housing [°C]
+    zero: Array  # offset that a fault adds to the reading of the length sensor [m]
+    hot: Array  # lowest temperature of each housing that a fault imposes [°C]
     ceiling: Array  # highest reading of the tension sensor [N]
 
 
@@ -115,9 +121,9 @@ class MuscleState(NamedTuple):
     tension: Array  # true motor-side T [N]
     end_tension: Array  # true bone-side T_end [N]
     sliding: Array  # friction state s in [−1, 1]
-    winding: Array  # c₁ [°C]
-    housing: Array  # c₂ [°C]
-    reference: Array  # T_ref of the module [N]
+    winding: Array  # temperature c₁ of the winding [°C]
+    housing: Array  # temperature c₂ of the housing [°C]
+    reference: Array  # tension T_ref that the control law of the module demands [N]
     ruptured: Array  # 1 for a ruptured tendon
 
 
@@ -242,7 +248,10 @@ class Arm(ABC):
     _order: Ints  # indices of the joints of θ in `_angles` and `_rates`
 
     def __init__(self, robot: Robot, seed: int, length_bias: Array) -> None:
-        """Build the modules; `length_bias` [m] (M,) are the offsets of their length sensors."""
+        """Build the modules of the individual `seed`.
+
+        `length_bias` [m] (M,) are the offsets of their length sensors.
+        """
         self.robot, self._length_bias = robot, length_bias
         #: time without a command after which the modules go to their safe state [s]
         self.command_timeout = 0.5
@@ -255,9 +264,10 @@ class Arm(ABC):
         self._current_zero = rng.normal(0.0, CURRENT_ZERO, count)
         share = DRIVE_FRICTION * rng.uniform(0.5, 1.5, count)
         self._drive_friction: Array = share * robot.description.tension.limit
-        self._mount = self.faults.mount  # present turn of the base
+        self._mount = self.faults.mount  # present turn of the base, as a rotation matrix
         self._wrench = np.zeros(6)
-        self._friction_factor = 1.0  # present friction, as a multiple of the individual's own
+        #: present friction of tendons or joints, as a multiple of the individual's own
+        self._friction_factor = 1.0
         self._command = Command(
             np.zeros(robot.muscle_count), length_bias.copy(), self.faults.stuck,
             self.faults.slack, self.faults.zero, self.faults.hot, self.faults.ceiling,
@@ -306,7 +316,7 @@ class Arm(ABC):
         self._age = 0.0
 
     def _attach(self, which: Bools) -> None:
-        """Attach the selected muscles so that they carry T_bias in the present posture."""
+        """Attach the muscles that are True in `which` (M,), so that they carry T_bias now."""
         bias = self.robot.tension.bias
         length = self.individual.muscle_lengths(self.theta[None], bias)[0] - self.faults.slack
         self._muscle.length[which] = length[which]
@@ -390,7 +400,7 @@ class Arm(ABC):
     @property
     @abstractmethod
     def _varying_friction(self) -> Array:
-        """The friction that `set_friction` changes in place."""
+        """The friction coefficients that `set_friction` changes in place."""
 
     def set_friction(self, factor: float) -> None:
         """Set the friction of the tendons (`kin`) or of the joints (`foreign`).

@@ -13,12 +13,12 @@ from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.robot.robot import Robot
 
 MARKER_RATE = 10.0  # publish the marker's pose at this rate by default [Hz]
-HIGHEST_RATE = 100.0  # reject a higher rate of the marker [Hz]
+HIGHEST_RATE = 100.0  # reject a higher rate of the marker's pose [Hz]
 LEGAL = f'joints, marker[:RATE] (above 0 to {HIGHEST_RATE:g} Hz) and imu:LINK, each once'
 
 
 class Sensors(NamedTuple):
-    """The sensors of an emulated arm."""
+    """The sensors that an emulated arm has besides those of its muscle modules."""
 
     joints: bool = False  # whether there are joint sensors
     marker_rate: float = 0.0  # rate of the marker's pose [Hz]; 0: there is no marker

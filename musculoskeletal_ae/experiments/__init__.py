@@ -15,5 +15,5 @@ NAMES = (
     'robustness',
     'sensors',
 )
-#: the experiments that repeat an experiment of the paper or test one of its statements
+#: names of the experiments that repeat an experiment of the paper or test one of its statements
 PAPER = NAMES[:7]

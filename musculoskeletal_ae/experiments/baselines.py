@@ -77,15 +77,17 @@ class PolynomialFilter:
     name = 'polynomial mapping, EKF'
     DEGREE = 3
     MODEL_SAMPLES = 20_000
-    PRIOR_ROWS = 20.0  # weigh the prior like this many samples
-    TENSION_SCALE = 1.0 / 200.0  # scale tensions by this, so that a_m is as large as c_mk
+    #: weight of the previous coefficients when new ones are fitted, as a number of samples
+    PRIOR_ROWS = 20.0
+    #: factor that scales tensions [1/N], so that a_m is about as large as c_mk
+    TENSION_SCALE = 1.0 / 200.0
     #: standard deviation of a joint's random walk [rad/√s]; with 0.2 instead, the error differs by
     #: about 1 %
     WALK = 0.5
     LEAST_NOISE = 5e-4  # assume at least this standard deviation of a length [m]
 
     def __init__(self, robot: Robot) -> None:
-        """Fit the mapping to the geometric model."""
+        """Fit the mapping to the geometric model, before anything is learned."""
         self._robot = robot
         every = product(range(self.DEGREE + 1), repeat=robot.joint_count)
         self._powers = np.array([powers for powers in every if sum(powers) <= self.DEGREE])
@@ -100,14 +102,14 @@ class PolynomialFilter:
         self._coefficients = np.vstack([fit, np.zeros(robot.muscle_count)])
 
     def _monomials(self, theta: Array) -> Array:
-        """Return the monomials (N, K) of θ (N, D)."""
+        """Return the K monomials (N, K) of the joint angles θ (N, D)."""
         low, high = self._robot.lower, self._robot.upper
         x = (2.0 * theta - low - high) / (high - low)
         table = x[:, :, None] ** np.arange(self.DEGREE + 1)  # (N, D, DEGREE+1)
         return table[:, np.arange(theta.shape[1]), self._powers].prod(axis=-1)
 
     def learn(self, theta: Array, tension: Array, length: Array) -> None:
-        """Refit the mapping to samples θ [rad] (N, D), T [N] (N, M) and l [m] (N, M)."""
+        """Learn the mapping from samples θ [rad] (N, D), T [N] (N, M) and l [m] (N, M)."""
         design = self._monomials(theta)
         target = without_elongation(self._robot, tension, length)
         for m in range(self._robot.muscle_count):
@@ -167,13 +169,13 @@ class TableSearch:
     ROWS = 100_000
 
     def __init__(self, robot: Robot) -> None:
-        """Fill the table from the geometric model."""
+        """Fill the table with random postures of the geometric model."""
         self._robot = robot
         self._theta = robot.random_postures(self.ROWS, np.random.default_rng(0))
         self._lengths = cKDTree(robot.routes.relative_lengths(self._theta))
 
     def learn(self, theta: Array, tension: Array, length: Array) -> None:
-        """Replace the table with samples θ [rad] (N, D), T [N] (N, M) and l [m] (N, M)."""
+        """Learn by replacing the table with samples θ [rad] (N, D), T [N] (N, M), l [m] (N, M)."""
         self._theta = theta
         self._lengths = cKDTree(without_elongation(self._robot, tension, length))
 

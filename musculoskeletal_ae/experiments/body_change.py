@@ -46,10 +46,11 @@ from musculoskeletal_ae.experiments.study import (
 )
 from musculoskeletal_ae.robot.robot import Robot
 
-SWEEP = np.radians(np.linspace(-120.0, 30.0, 151))  # angles of the shoulder [rad]
-POINTS = 101  # draw a tension curve with this many points
-COLUMNS = 5  # draw this many panels in a row of a plot
-WORN = 0.5  # multiply the stiffening rate of the worn element by this
+#: angles of the shoulder over which muscle lengths are compared [rad], as in the paper's figure
+SWEEP = np.radians(np.linspace(-120.0, 30.0, 151))
+POINTS = 101  # number of points of a curve of length over tension
+COLUMNS = 5  # number of panels in a row of a plot
+WORN = 0.5  # multiply the stiffening rate of the worn series elastic element by this
 WORN_FRICTION = 0.4  # capstan exponent of the tendon with high friction (mean of others: 0.1)
 SMALL = 1e-9  # divide by at least this, to avoid a division by zero [m]
 
@@ -121,7 +122,7 @@ def _changes(
     paper's figure. All other changes cover the points in `trained` only.
 
     Args:
-        robot: The robot.
+        robot: The robot whose muscles are compared.
         name: The swept quantity, 'angle' or 'tension', with which the keys begin.
         origin: Index of the point at which this quantity is 0.
         trained: Mask (points,) of the points within the range of the training.

@@ -16,30 +16,36 @@ from musculoskeletal_ae.motion.explored_postures import TRIES, holdable_postures
 from musculoskeletal_ae.robot.robot import Robot
 
 CONTACT_STREAM = 7000
-#: push twice in this many resting postures, make this many collisions, and test `float` this often
+#: numbers of postures in which the resting arm is pushed twice, of collisions, and of tests of
+#: method `float`
 POSTURES, COLLISIONS, FLOATS = 15, 20, 4
 #: try each collision at most this often; a try fails if the arm hardly moves, or if a contact is
 #: detected before the push
 TRIES_PER_COLLISION = 20
-HEALTHY = 3600.0  # explore without contact for this time, shared by the individuals [s]
-LEAST, MOST = 10.0, 50.0  # push with forces in this range [N]
-LIGHT, FIRM = 15.0, 20.0  # guide an arm in method `float` with forces in this range [N]
-MOVE = 4.0  # move to a posture in this time [s]
-PUSH = 1.5  # push a resting arm for this time [s]
+#: explore without contact for this time, shared by the individuals, and count detected contacts as
+#: false [s]
+HEALTHY = 3600.0
+LEAST, MOST = 10.0, 50.0  # range of the forces with which the hand is pushed [N]
+LIGHT, FIRM = 15.0, 20.0  # range of the forces that guide the hand in method `float` [N]
+MOVE = 4.0  # duration of the motion to a posture before a push [s]
+PUSH = 1.5  # duration of a push against the resting arm [s]
 EVALUATED = 0.5  # average estimates over the last part of a push, of this duration [s]
-APART = 3.0  # wait at most this long between collisions [s]
+APART = 3.0  # longest wait of the exploring arm before a collision [s]
 WARM_UP = 5.0  # explore for this time before contacts of the healthy arm are counted [s]
-FLOATING = 30.0  # test the drift for this time [s]
-MOVED = 1.0  # push for this time in a collision, and to guide the hand [s]
-SOON = 0.1  # a collision should be detected within this time [s]
-INSIDE = 0.1  # keep postures away from the joint limits by this fraction of the joint ranges
+FLOATING = 30.0  # time for which the drift of the untouched arm is measured in method `float` [s]
+MOVED = 1.0  # duration of a push that collides with the moving arm, or that guides the hand [s]
+SOON = 0.1  # report the share of collisions that are detected within this time [s]
+INSIDE = 0.1  # keep random postures away from the joint limits by this fraction of the joint ranges
 
 
 class ContactLoop(ClosedLoop):
     """A closed loop whose arm is pushed."""
 
     def contact(self, exploring: bool = False) -> Contact:
-        """Simulate until the next message, and return the contact that is estimated from it."""
+        """Simulate until the next message, and return the contact that is estimated from it.
+
+        If `exploring`, the arm explores for this message; otherwise, it continues as before.
+        """
         _ = self.explore() if exploring else self.step()
         assert self.estimator.output is not None and self.estimator.output.contact is not None
         return self.estimator.output.contact

@@ -54,16 +54,16 @@ METHODS = {
     f'second_{PAPER_PRESET}': '#99D8C7',
     f'proposed_{PAPER_PRESET}': '#CC79A7',
 }
-APPROACHES = 5  # approach this many θ_eval, each from this many starts
+APPROACHES = 5  # number of targets θ_eval, and of starts from which each of them is approached
 
 
 class Durations(NamedTuple):
     """Durations of the parts of an approach [s]."""
 
-    start: float  # of the motion to a start
-    end: float  # from the command until the results are read; `second` must have ended by then
-    first: float  # setting `first_duration`
-    second: float  # setting `second_duration`
+    start: float  # duration of the motion to the posture from which the approach starts
+    end: float  # time from the command until the results are read; `second` must have ended by then
+    first: float  # value of the setting `first_duration`
+    second: float  # value of the setting `second_duration`
 
 
 DURATIONS = Durations(5.0, 8.0, 5.0, 2.0)
@@ -72,7 +72,7 @@ DURATIONS = Durations(5.0, 8.0, 5.0, 2.0)
 class Approaches(NamedTuple):
     """Results of approaching P targets from S starts each, with every control method."""
 
-    target: Array  # θ_eval [rad], (P, D)
+    target: Array  # target postures θ_eval [rad], (P, D)
     bound: Array  # least ‖T‖ with which the true body holds each target [N], (P,)
     offset: dict[str, Array]  # θ − θ_eval at the end of each approach [rad], (P, S, D)
     tension: dict[str, Array]  # ‖T‖ at the end of each approach [N], (P, S)
@@ -92,7 +92,7 @@ def protocol(
     """Approach `count` random targets from `count` random starts each, with every control method.
 
     Args:
-        arm: The arm.
+        arm: The emulated arm, which is moved.
         networks: The networks by the names of their presets.
         seed: Random seed of targets and starts.
         count: Number of targets, and of starts for each of them.
@@ -234,7 +234,7 @@ def _bars(trace: Mapping[str, Any], labels: list[str], title: str) -> Any:
 
     A dashed line shows the QP bound of each group. `labels` are the names of the groups. In
     `trace`, 'errors' [rad] and 'tensions' [N] are arrays (groups, approaches) by method, and
-    'bound' [N] is an array (groups,).
+    'bound' [N] is an array (groups,). `title` is that of the figure.
     """
     figure, (upper, lower) = plots.new_figure(11.0, 6.4, 2, sharex=True)
     place, width, bound = np.arange(len(labels)), 0.8 / len(METHODS), trace['bound']

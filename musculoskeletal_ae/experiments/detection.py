@@ -62,7 +62,7 @@ class GraspAndRupture:
         """Plan a motion, and the ruptures after it.
 
         Args:
-            robot: The robot.
+            robot: The robot whose muscles rupture.
             duration: Duration of the motion [s].
             seed: Random seed of the waits before the ruptures.
             switched_off: Whether muscles are switched off instead of ruptured.
@@ -70,12 +70,14 @@ class GraspAndRupture:
             slot: Time for each muscle [s]; it shortens the longest wait for the rupture.
         """
         count, self._switched_off = robot.muscle_count, switched_off
-        self.grasp, self._motion = 0.5 * duration, duration  # [s]
+        # time of the grasp, and duration of the motion [s]
+        self.grasp, self._motion = 0.5 * duration, duration
         # Rows of the motion without the payload, and with the payload before the first rupture.
         self.free, self.loaded = rows_between(0.0, self.grasp), rows_between(self.grasp, duration)
         # Start with the second muscle, which the paper deactivates.
         self.order = [*range(min(1, count - 1), count), *range(min(1, count - 1))][:most]
-        self._slot, self._latest = slot, slot - (SLOT - LATEST_RUPTURE)  # [s]
+        # time for each muscle, and latest rupture within it [s]
+        self._slot, self._latest = slot, slot - (SLOT - LATEST_RUPTURE)
         self.duration = duration + slot * len(self.order)  # duration of the whole script [s]
         #: time of each muscle's rupture [s], (M,); NaN for muscles that do not rupture
         self.rupture = np.full(count, np.nan)
@@ -135,19 +137,19 @@ class GraspAndRupture:
 
 
 def grasp_and_release(arm: Arm, time: float) -> None:
-    """Alternate between grasping and releasing a payload, once a minute; see `recording.Script`."""
+    """Let an arm grasp or release a payload, in turn, if a minute begins at `time` [s]."""
     turn, since = divmod(round(time / SAMPLE_TIME), round(GRASPING / SAMPLE_TIME))
     if since == 0:
         arm.set_payload(PAYLOAD if turn % 2 else 0.0)
 
 
 class DetectorOutput(NamedTuple):
-    """The detector's outputs for N messages."""
+    """What estimator and detector report for each of N messages."""
 
-    theta: Array  # estimated [rad], (N, D)
-    anomaly: Array  # A in scaled units, (N,)
-    distance: Array  # d in healthy standard deviations, (N,)
-    suspect: Ints  # the most suspect muscle, (N,)
+    theta: Array  # estimated joint angles θ [rad], (N, D)
+    anomaly: Array  # anomaly A [scaled units], (N,)
+    distance: Array  # distance d [healthy standard deviations], (N,)
+    suspect: Ints  # index of the most suspect muscle, (N,)
     alarm: Bools  # whether the message completes a detection, (N,)
 
 
@@ -159,9 +161,9 @@ def run_detector(
     Both run as in the estimator node, but they continue after an alarm.
 
     Args:
-        robot: The robot.
-        mae: The network.
-        recording: The N messages.
+        robot: The robot that was recorded.
+        mae: The network that the detector uses.
+        recording: The recording of N messages.
         sliding: Sliding directions of the tendons, (N, M), if they are already known. They are the
             same for all networks.
     """
@@ -194,7 +196,7 @@ def detection(
     The delay of a rupture that was not detected is its whole duration, RUPTURE_TIME [s].
 
     Args:
-        robot: The robot.
+        robot: The robot, whose muscles have ruptured one by one.
         plan: The script that ruptured the muscles.
         faulty: Outputs of the detector for the recording with the ruptures.
         healthy: Outputs of the detector for a healthy recording.

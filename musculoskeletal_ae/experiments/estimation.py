@@ -72,12 +72,13 @@ HEALTHY_STREAM = 9500
 HEALTHY_TIME = 3600.0
 PLOT_START = 60.0  # begin plots this long before the grasp [s]
 PLOT_TAIL = 3.0  # end plots this long after the repair [s]
-OFF_TIME = 40.0  # move for this time before muscles are switched off [s]
+OFF_TIME = 40.0  # let the arm move for this time before its muscles are switched off one by one [s]
 #: times of the pictures [s], at ends of the motion's cycles without and with the payload; a
 #: shortened run has pictures of those times that its shorter motion reaches
 MOMENTS = {'after 10 s': 9.9, 'after 20 s': 19.9, 'payload grasped': 29.9, 'payload, 40 s': 39.9}
 OFF = 'switched_off'
-OFF_KEYS = 'detection_s', 'detected_share', 'named_share'  # keys reported for switched-off muscles
+#: measures that are also reported for switched-off muscles
+OFF_KEYS = 'detection_s', 'detected_share', 'named_share'
 
 
 def measure(study: Study, seed: int) -> Measured:
@@ -188,7 +189,7 @@ def _preset(
 
 
 def _plot_range(trace: Mapping[str, Any]) -> tuple[slice, Any]:
-    """Return the slice of messages that plots show, and the times of these messages [s].
+    """Return the range of messages that plots show, as a slice, and their times [s].
 
     The messages extend from PLOT_START before the grasp to PLOT_TAIL after the first repair.
     """

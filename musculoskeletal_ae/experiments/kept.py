@@ -61,7 +61,7 @@ def read(file: Path) -> Any:
 
 
 def unusable(file: Path, problem: str) -> MusculoskeletalError:
-    """Return the exception for a kept file that cannot be used."""
+    """Return the error for a kept file that a `problem` makes unusable, with the remedy."""
     return MusculoskeletalError(
         f'{file} is no kept part of an experiment: {problem}; remove it, and the next run measures '
         'this part again'
@@ -91,7 +91,7 @@ def _encoded(value: Any, arrays: dict[str, Array]) -> Any:
 
 
 def _decoded(value: Any, arrays: Any) -> Any:
-    """Return the value that `_encoded` has converted."""
+    """Return the value that `_encoded` has converted, with its arrays from `arrays`, by name."""
     if isinstance(value, list):
         return [_decoded(part, arrays) for part in value]
     if not isinstance(value, dict):

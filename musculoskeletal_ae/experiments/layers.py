@@ -91,7 +91,11 @@ def _summary(rows: list[dict[str, Any]]) -> dict[str, float | None]:
 
 
 def _trained(study: Study, seed: int, hidden: tuple[int, ...], training: int) -> dict[str, Any]:
-    """Return the numbers of one training, from its file if an interrupted run has saved them."""
+    """Return the numbers of one training, from its file if an interrupted run has saved them.
+
+    `seed` selects the individual, `hidden` has the sizes of the hidden layers, and `training` is
+    the seed of the initial training.
+    """
     part = f'layers_{seed}_{"_".join(map(str, hidden))}_{training}'
     numbers: dict[str, Any] = study.remember(part, partial(_learn, study, seed, hidden, training))
     return numbers

@@ -29,8 +29,9 @@ from musculoskeletal_ae.gauss_newton import minimise_each
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 
-ROUNDS = 30  # take at most this many Gauss–Newton steps
-USUAL_STEP = 0.1  # typical step of a joint, as a share of its range
+ROUNDS = 30  # end the search after this many Gauss–Newton steps
+#: damp the Gauss–Newton steps so that a typical one has this size, as a share of the joint's range
+USUAL_STEP = 0.1
 EVERY = np.s_[::10]  # every tenth message of a recording, because least squares is slow
 DIFFERENCE = 1e-4  # compute finite differences with this step [rad]
 
@@ -42,7 +43,7 @@ class LeastSquares:
     robot: Robot
     lengths: Callable[[Array, Array], Array]  # maps θ (N, D) and T [N] (N, M) to l [m] (N, M)
     muscle_jacobian: Callable[[Array], Array]  # maps θ (N, D) to G [m/rad] (N, M, D)
-    length_at_zero: Array  # l_abs(0) [m], (M,)
+    length_at_zero: Array  # lengths of the routes at θ = 0, l_abs(0) [m], (M,)
     elastic: SeriesElastic
     #: standard deviation of a measured tension [N]; with 0, all muscles have the same weight
     tension_noise: float = TENSION_NOISE
@@ -80,7 +81,7 @@ def oracle(robot: Robot, true: Individual) -> LeastSquares:
 
 
 def nominal(robot: Robot, tension_noise: float = TENSION_NOISE) -> LeastSquares:
-    """Return the estimator that uses the geometric model."""
+    """Return the estimator that uses the geometric model, and tensions with this noise [N]."""
     routes = robot.routes
     model = robot.muscle_lengths, routes.muscle_jacobian, routes.length_at_zero
     return LeastSquares(robot, *model, robot.series_elastic, tension_noise)

@@ -39,15 +39,15 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-STEP = 0.02  # simulate in steps of this time [s]
-FORCED = 30.0  # force the shoulder to this angle [deg]
+STEP = 0.02  # duration of a simulation step [s]
+FORCED = 30.0  # angle at which the shoulder is held in the phase `shoulder forced` [deg]
 
 
 class Phase(NamedTuple):
     """One phase of the experiment: its duration, and the force and constraint that act."""
 
     name: str
-    duration: float  # [s]
+    duration: float  # duration of the phase [s]
     force: tuple[float, float, float] = (0.0, 0.0, 0.0)  # external force on the hand [N]
     forced: bool = False  # whether the shoulder is forced to `FORCED`
 
@@ -161,7 +161,7 @@ def _run_arm(arm: Arm, command: Array) -> Motion:
 
 
 def _phases(numbers: dict[str, Any]) -> list[str]:
-    """Return the names of the phases, with the joints and angles of this robot."""
+    """Return the names of the phases, with the joints and angles in the numbers of a robot."""
     flexed_deg, forced_deg = np.degrees([numbers['flexed_rad'], numbers['forced_rad']])
     names = [phase.name for phase in PHASES]
     names[0] = f'{numbers["flexed_joint"]}\n{flexed_deg:.0f}°'

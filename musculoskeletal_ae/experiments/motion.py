@@ -66,10 +66,10 @@ from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-DURATIONS = (1.0, 2.0)  # move in each of these times [s]
-MOTIONS, CIRCLES = 6, 3  # make this many motions of each duration, and this many circles
-STARTING = 3.0  # move to the first posture in this time [s]
-REST = 0.6  # rest for this time after a motion [s]
+DURATIONS = (1.0, 2.0)  # durations of the motions between two postures [s]
+MOTIONS, CIRCLES = 6, 3  # number of motions of each duration, and number of circles of the hand
+STARTING = 3.0  # duration of the motion to the first posture [s]
+REST = 0.6  # duration of the rest after each motion [s]
 SETTLED = 0.5  # read the settled error this long after the end of a motion [s]
 OURS = 'trajectory'
 METHODS = {
@@ -82,11 +82,11 @@ METHODS = {
 #: control methods of a shortened run; all but OURS are only measured in motions of DURATIONS[0]
 QUICK_METHODS = OURS, 'tension', 'second'
 RADIUS, SPEED = 0.05, 0.1  # radius of a circle [m], and speed of the hand along it [m/s]
-EVERY = 2  # send a pose with every second message
-NEAR = 0.002  # count a pose as reachable if the hand comes this close [m]
+EVERY = 2  # send a pose of the hand with every second message, which makes 50 poses a second
+NEAR = 0.002  # treat a pose as reachable if the hand comes this close to it [m]
 #: maps a time [s] to the desired pose of the hand
 Place = Callable[[float], pin.SE3]
-TARGETS = 20  # approach this many targets with `proposed`
+TARGETS = 20  # number of targets that `proposed` approaches
 ARRIVING = 8.0  # read the distance from a target after this time [s]
 SETTLING_TIME = 4.0  # wait at most this long for the arm to settle [s]
 WITHIN = 0.05  # count the arm as settled within this distance from the target [rad]
@@ -173,10 +173,11 @@ def follow(
 
 
 class Approach(NamedTuple):
-    """How the arm approached one target."""
+    """How fast, and how closely, the arm approached one target of `proposed`."""
 
-    settling: float  # time until it stayed within WITHIN of it, at most SETTLING_TIME [s]
-    distance: float  # ‖θ_target − θ‖ after ARRIVING [rad]
+    #: time until the arm stays within WITHIN of the target, at most SETTLING_TIME [s]
+    settling: float
+    distance: float  # distance ‖θ_target − θ‖ after the time ARRIVING [rad]
 
 
 def approach(loop: ClosedLoop, goal: Array, duration: float) -> Approach:
@@ -192,7 +193,11 @@ def approach(loop: ClosedLoop, goal: Array, duration: float) -> Approach:
 
 
 def arrivals(loop: ClosedLoop, goals: Array, duration: float) -> dict[str, float]:
-    """Approach targets θ [rad], (N, D), one after the other, for `duration` [s] each."""
+    """Approach targets θ [rad], (N, D), one after the other, for `duration` [s] each.
+
+    Returns:
+        Statistics of settling times, distances and missed targets, by key in result.json.
+    """
     approaches = [approach(loop, goal, duration) for goal in goals]
     distances = np.array([each.distance for each in approaches])
     return {

@@ -62,17 +62,19 @@ from musculoskeletal_ae.presets.names import DEFAULT, PAPER_PRESET
 from musculoskeletal_ae.presets.registry import PRESETS, preset_named
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
-CURVE_STRIDE = 10  # every tenth held-out message is evaluated after each update
+#: after each update, evaluate only every tenth message of the held-out motion, to save time
+CURVE_STRIDE = 10
 #: use the mean error over this first part of a run as the initial guess of b in the exponential fit
 #: [s]
 FIRST_ERRORS = 10.0
 PUBLISHED_MINUTES = 10.0
-PUBLISHED = (0.324, 0.154)  # the paper's fit at the start and after ten minutes [rad]
+PUBLISHED = (0.324, 0.154)  # errors that the paper fits at the start, and after ten minutes [rad]
 #: numbers of steps of a shortened initial training, by preset; after fewer steps, checkpoint
 #: validation rejects the network of preset `paper`
 QUICK_STEPS = {PAPER_PRESET: 600, DEFAULT: 300}
 NOTE_EVERY = 25  # record the training errors after every 25th mini-batch
-TEST_STATES = 1000  # test a network on this many states
+#: test a network of the initial training on this many states of the geometric model
+TEST_STATES = 1000
 COLOURS = {PAPER_PRESET: plots.AS_PRINTED, 'default': plots.AFTER}
 
 #: function that returns the θ [rad] (D,) that the learner receives, or None. Its arguments are the
@@ -164,7 +166,8 @@ def train_initial(study: Study, preset: str) -> None:
 def new_learner(study: Study, seed: int, preset: str, source: str = SENSOR) -> Learner:
     """Return a learner that starts with the initial network of a preset.
 
-    `source` names where its joint angles come from, such as the joint sensors.
+    `seed` determines its random numbers, and `source` names where its joint angles come from, such
+    as the joint sensors.
     """
     initial, steps = study.network(None, preset), STEPS // 5 if study.quick else STEPS
     return Learner(study.robot, initial, preset, seed, steps=steps, joint_source=source)
@@ -173,7 +176,10 @@ def new_learner(study: Study, seed: int, preset: str, source: str = SENSOR) -> L
 def new_learner_and_loop(
     study: Study, arm: Arm, seed: int, preset: str
 ) -> tuple[Learner, ClosedLoop]:
-    """Return a learner with the initial network, and a closed loop in which the arm explores."""
+    """Return a learner with the initial network of a preset, and a closed loop that explores.
+
+    `seed` is that of the individual `arm`; it also selects the exploration.
+    """
     learner = new_learner(study, seed, preset)
     settings = Settings(preset=preset)
     return learner, ClosedLoop(arm, learner.mae, settings, EXPLORATION_STREAM + seed)

@@ -30,7 +30,7 @@ from musculoskeletal_ae.experiments.results import (
 from musculoskeletal_ae.files import read_table, write_whole
 from musculoskeletal_ae.presets.names import PAPER_PRESET
 
-TEMPLATE = 'paper.md.jinja'  # a file in the folder of this module
+TEMPLATE = 'paper.md.jinja'  # name of the page's template, a file in the folder of this module
 #: rows of the tables, by the name of the table in the template
 TABLES = read_table(__file__, 'paper.yaml', dict[str, tuple[ResultRow, ...]])
 #: pictures of the page: file name, and the plot of an experiment that it shows
@@ -51,7 +51,7 @@ PICTURES = {
 LARGEST = 60_000  # shrink a picture to at most this size [bytes]
 WIDEST = 1000  # shrink a picture to at most this width [pixels]
 COLOURS = 128  # reduce pictures to this many colours; a small palette makes small files
-SMALLER = 0.9  # multiply the width of a picture by this until the file is small enough
+SMALLER = 0.9  # multiply the width of a picture repeatedly by this until its file is small enough
 
 
 def update_page(page: Path, measured: Path | None = None) -> list[Path]:

@@ -18,7 +18,7 @@ BEFORE, AFTER, AS_PRINTED, TRUE, MARK = '#D55E00', '#009E73', '#CC79A7', '#22222
 #: colours of results before and after learning
 WHEN = {'before': BEFORE, 'after': AFTER}
 DPI = 110
-POINTS = 1500  # draw a line with at most this many points
+POINTS = 1500  # draw at most this many points of a line, which keeps the files small
 
 #: positions of legends that never hide data
 LEGENDS: dict[str, dict[str, Any]] = {
@@ -27,7 +27,7 @@ LEGENDS: dict[str, dict[str, Any]] = {
     'below': {'loc': 'upper center', 'bbox_to_anchor': (0.5, -0.16), 'ncols': 2},
 }
 MARGIN = 0.03  # leave this free space around an arm [m]
-HEADER = 0.9  # height of the titles [inch]
+HEADER = 0.9  # leave this height above the pictures for the titles [inch]
 VIEW = (12.0, -35.0)  # elevation and azimuth of the camera [deg]: mainly from the front
 STYLES: dict[str, dict[str, Any]] = {
     'bones': {'linewidth': 6.0, 'solid_capstyle': 'round', 'zorder': 1},
@@ -86,7 +86,7 @@ def bars(
     """Draw means over N individuals as bars with their values, and a dot for each individual.
 
     `groups` maps labels to a colour and values (N, K) of the K names. NaN stands for no value
-    (`mean_of_known`).
+    (`mean_of_known`). `panel` are the axes to draw in, with a title and a label of the x axis.
     """
     place, height = np.arange(len(names)), 0.8 / len(groups)
     for g, (label, (colour, values)) in enumerate(groups.items()):
@@ -114,8 +114,9 @@ def ranked_bars(
 ) -> None:
     """Draw one bar per name: the mean over individuals, with a dot for each individual.
 
-    A column beside the axes shows the means as numbers. `values` maps names to the individuals'
-    values; None stands for no value (`mean_of_known`).
+    A column beside the axes shows the means as numbers, with `digits` after the point. `values`
+    maps names to the individuals' values; None stands for no value (`mean_of_known`). `colours`
+    has one colour for each name. `panel` are the axes to draw in.
     """
     place = np.arange(len(values))
     numbers = {name: np.array(each, dtype=float) for name, each in values.items()}

@@ -45,10 +45,10 @@ class Recording(NamedTuple):
     theta_sensor: Array  # joint-sensor readings [rad], (N, D)
     length: Array  # measured lengths [m], (N, M)
     tension: Array  # measured tensions T_read [N], (N, M)
-    command: Array  # l_target [m], (N, M)
+    command: Array  # length commands l_target [m], (N, M)
 
     def part(self, rows: slice | Ints) -> Recording:
-        """Return a part of the samples."""
+        """Return the rows of the recording that `rows` selects."""
         return Recording(*(column[rows] for column in self))
 
 
@@ -65,7 +65,7 @@ class ClosedLoop:
     Each message passes through sense → estimate → control → command.
 
     Attributes:
-        arm: The arm.
+        arm: The emulated arm.
         estimator: The core of the estimator.
         core: The core of the controller.
         mae: The network in use.
@@ -80,7 +80,11 @@ class ClosedLoop:
         seed: int = 0,
         on_anomaly: str = 'stop',
     ) -> None:
-        """Connect an arm in its present posture; `seed` determines the exploration."""
+        """Connect an arm in its present posture.
+
+        `seed` determines the exploration, and `on_anomaly` what happens on an anomaly, as the
+        parameter of the estimator does.
+        """
         self.arm, self.core, self.stops = arm, Controller(arm.robot, settings, seed), 0
         self.estimator = Estimator(arm.robot, mae.preset)
         self.estimator.configure(EstimatorSettings(on_anomaly=on_anomaly))
@@ -159,7 +163,7 @@ class ClosedLoop:
             raise MusculoskeletalError(f'control stopped: {condition.text}')
 
     def target(self, theta: Array) -> None:
-        """Set the target θ [rad] (D,)."""
+        """Set the target θ [rad] (D,) of the controller, without an additional torque."""
         self.core.target(dict(zip(self.arm.robot.joints, ((t, 0.0) for t in theta.tolist()))))
 
     def wait(self, duration: float) -> None:
@@ -187,7 +191,7 @@ def record(
     muscle is paid out instead.
 
     Args:
-        arm: The arm.
+        arm: The emulated arm, which is moved.
         mae: The network that computes the commands.
         stream: Random seed of the exploration steps, or the steps themselves.
         duration: Duration [s], rounded up to whole steps.
@@ -233,7 +237,7 @@ def rows_between(start: float, end: float) -> slice:
 
 
 def mean_error(estimate: Array, truth: Array) -> float:
-    """Return the mean over samples of ‖θ_est − θ_true‖₂ [rad]."""
+    """Return the mean of ‖θ_est − θ_true‖₂ [rad] over N samples of both, (N, D) each."""
     return float(np.linalg.norm(estimate - truth, axis=1).mean())
 
 

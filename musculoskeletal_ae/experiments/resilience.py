@@ -43,30 +43,34 @@ from musculoskeletal_ae.motion.explored_postures import TRIES
 from musculoskeletal_ae.motion.progress import FALLEN
 from musculoskeletal_ae.robot.tension import holding_tension
 
-EVERY = 10  # every tenth message of the held-out motion is evaluated
-TARGETS = 2  # approach this many targets without each muscle
-MOVING = 12.0  # explore for this time before a fault [s]
+#: evaluate only every tenth message of the held-out motion, because it is estimated very often
+EVERY = 10
+TARGETS = 2  # number of targets that the arm approaches without each muscle
+MOVING = 12.0  # let the arm explore for this time before a fault [s]
 #: wait at most this long after a fault for the end of the first verification [s]
 LATEST_VERDICT = 10
-AFTERWARDS = 6.0  # continue for this time after the wait for the first verification [s]
+AFTERWARDS = 6.0  # let the arm continue for this time after the wait for the first verification [s]
 #: wait at most this long for the arm to reach a target [s]; this allows for slow winches, and for
 #: further approaches if the arm falls
 LONGEST_APPROACH = 60
 SETTLING = 4  # count the arm as arrived after this time at rest [s]
 STILL = 0.02  # count the arm as at rest if no joint moves more than this in a second [rad]
 HEALTHY_TIME = 18_000.0  # let healthy arms explore for this time, shared by the individuals [s]
-PUSH_EVERY = 10.0  # push at this interval [s]
-PUSH = (10.0, 30.0)  # push with forces in this range [N]
+PUSH_EVERY = 10.0  # push the hand of a healthy arm at this interval [s]
+PUSH = (10.0, 30.0)  # range of the forces that push the hand of a healthy arm [N]
 
 
 class IsolatingLoop(ClosedLoop):
     """A closed loop that isolates faulty muscles, and notes verdicts and errors."""
 
     def __init__(self, arm: Arm, mae: Mae, seed: int = 0) -> None:
-        """Connect an arm at rest."""
+        """Connect an arm at rest to an estimator that isolates suspect muscles.
+
+        `seed` determines the exploration.
+        """
         #: isolated muscles and the reason, after each verification
         self.verdicts: list[tuple[tuple[int, ...], str]] = []
-        self.error = np.nan  # ‖θ_est − θ‖ at the last message [rad]
+        self.error = np.nan  # distance ‖θ_est − θ‖ at the last message [rad]
         super().__init__(arm, mae, Settings(), seed, on_anomaly='isolate')
 
     @property
@@ -100,7 +104,7 @@ def run_with_fault(
     Args:
         study: Options of the run.
         seed: Seed of the individual and of its exploration.
-        muscle: Index of the muscle.
+        muscle: Index of the muscle that fails.
         sensor: 'length' or 'tension' for a sensor that fails; '' for a rupture.
 
     Returns:
@@ -165,7 +169,8 @@ def measure_reach(
     for theta in held[:targets]:
         try:
             loop.target(theta)
-            rest_time, before = 0, loop.arm.theta  # [s]
+            #: time at rest so far [s], and the posture one second ago
+            rest_time, before = 0, loop.arm.theta
             for _ in range(LONGEST_APPROACH):
                 if rest_time == SETTLING:
                     break

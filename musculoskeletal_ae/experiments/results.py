@@ -37,9 +37,11 @@ ALARMS = ('false_contacts', 'false_alarms', 'false_alarms_beside_cuts')
 ISOLATIONS = ('wrong_isolations', 'acquittals')
 MOTIONS = ('approaches', 'missed', 'stuck')
 TOTALS = (*ALARMS, *ISOLATIONS, *MOTIONS, 'healthy_s', 'healthy_touch_s', 'counted_cuts')
-BEGIN, END = '<!-- results -->', '<!-- /results -->'  # markers around the results table
+#: lines of a page between which the results table is written
+BEGIN, END = '<!-- results -->', '<!-- /results -->'
 KEPT = Path('doc/results')
-TEMPLATE = 'report.html.jinja'  # a file in the folder of this module
+#: name of the template of report.html, a file in the folder of this module
+TEMPLATE = 'report.html.jinja'
 NOTHING = '–'
 
 
@@ -94,7 +96,7 @@ class About(Strict, frozen=True):
 
 
 class Plot(Strict, frozen=True):
-    """A plot file beside result.json."""
+    """A picture beside result.json, with the caption that the report shows."""
 
     file: str
     caption: str
@@ -185,14 +187,14 @@ class ResultRow(Strict, frozen=True):
     default: str  # key of the value with the preset of the run
     published: str = NOTHING  # value that the paper reports for Musashi
     paper: str = ''  # key of the value of preset `paper`, whose name replaces {preset} in the key
-    bound: str = ''  # key of the reference value
+    bound: str = ''  # key of the reference value, such as the error of an oracle
     aim: float | None = None  # goal: the highest value, or the lowest if `more_is_better`
     digits: int = 3
     more_is_better: bool = False
     worst: bool = False  # show the worst individual instead of the mean
 
     def number(self, result: Mapping[str, Any], key: str) -> float | None:
-        """Return the value of a key, or None if it was not measured."""
+        """Return the value of a key in a result.json, or None if it was not measured."""
         if not self.worst:
             return flat(result).get(key)
         every = [flat(numbers).get(key) for numbers in result.get('seeds', {}).values()]
@@ -229,7 +231,7 @@ def table(results: Results) -> list[Cells]:
 
 
 def individuals(seeds: Sequence[int]) -> str:
-    """Return the individuals' names, such as 'individual 0' or 'individuals 0–4'."""
+    """Return the names of the individuals with these seeds, such as 'individuals 0–4'."""
     names = ', '.join(map(str, seeds))
     if len(seeds) > 2 and list(seeds) == list(range(seeds[0], seeds[-1] + 1)):
         names = f'{seeds[0]}–{seeds[-1]}'

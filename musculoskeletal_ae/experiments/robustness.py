@@ -59,7 +59,7 @@ ABLATED = {
 }
 #: keys of ABLATED whose effects a shortened run removes; a full run does this for every key in turn
 QUICK = ('friction',)
-ABLATION_INDIVIDUALS = 2  # remove effects of this many individuals
+ABLATION_INDIVIDUALS = 2  # number of individuals for which the ablation is measured
 #: label of a run with all effects and another exploration, which shows the difference between runs
 REPEATED = 'nothing: another run'
 OTHER_RUN = 1000  # add this to the seed of exploration and training of the repeated run
@@ -181,7 +181,7 @@ ESTIMATES = {
 
 
 def _estimates(rows: Rows, reality: str) -> Plot:
-    """Draw the errors of all estimators on one emulator model."""
+    """Draw the errors of all estimators on the emulator model `reality`, by individual."""
     figure, (panel,) = plots.new_figure(8.0, 3.2)
     values = {
         label: [row.numbers[reality][key] for row in rows.values()]

@@ -48,7 +48,7 @@ class Part(NamedTuple):
 
     @property
     def weight(self) -> float:
-        """Relative duration."""
+        """Relative duration of the part; longer parts start first."""
         return 1.0 if self.seed is None else EXPERIMENTS[self.name].weight
 
     @property
@@ -66,7 +66,7 @@ class Outcome(NamedTuple):
 
     part: Part
     failure: str = ''  # '' if the result is in the folder of the run
-    seconds: float = 0.0  # processor time [s]; 0 if the part was not measured in this run
+    seconds: float = 0.0  # processor time of the part [s]; 0 if it was not measured in this run
 
 
 def stages(study: Study, names: Sequence[str]) -> tuple[list[Part], ...]:
@@ -123,7 +123,10 @@ def run(
 
 
 def _measure(study: Study, part: Part, identifier: str) -> Outcome:
-    """Measure a part, and put its result into the folder of the study; runs on a worker."""
+    """Measure a part, and put its result into the folder of the study; runs on a worker.
+
+    `identifier` is that of the run, to which the folder has to belong.
+    """
     _check_folder(study.folder, identifier)
     begun = time.process_time()
     try:
@@ -163,7 +166,10 @@ def _value(study: Study, part: Part) -> Measured | None:
 
 
 def _result(study: Study, part: Part, failures: Mapping[Part, str]) -> Measured | str:
-    """Return the result of a part from the folder of the study, or why there is none."""
+    """Return the result of a part from the folder of the study, or why there is none.
+
+    `failures` are the reasons of the parts that have failed.
+    """
     if part in failures:
         return failures[part]
     file = _result_file(study, part)

@@ -39,7 +39,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 
 CAMERA = 10  # receive one message of the camera or the accelerometer for this many muscle messages
-SIGHTED = 10  # the camera detects the marker in one of this many samples
+SIGHTED = 10  # let the camera detect the marker in one of this many samples
 
 
 def measure(study: Study, seed: int) -> Measured:

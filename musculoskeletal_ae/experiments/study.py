@@ -85,7 +85,10 @@ class Study:
         return make_arm(self.robot, seed, self.reality, friction)
 
     def network_file(self, preset: str, seed: int | None) -> Path:
-        """Return the file of the initial network (seed None) or of an individual's network."""
+        """Return the file of the network that a preset has after learning from an individual.
+
+        Without a seed (None), it is the file of the preset's initial network.
+        """
         return self.folder / f'{preset}_{"initial" if seed is None else seed}.safetensors'
 
     def numbers_file(self, seed: int) -> Path:
@@ -93,11 +96,14 @@ class Study:
         return self.folder / f'online_learning_{seed}.json'
 
     def network(self, seed: int | None, preset: str = '') -> Mae:
-        """Load the initial network (seed None), or the network that learned from an individual."""
+        """Load the initial network (seed None), or the network that learned from an individual.
+
+        `preset` is by default the preset of this study.
+        """
         return checkpoint.load(self.network_file(preset or self.preset, seed), self.robot)
 
     def networks(self, seed: int, preset: str = '') -> dict[str, Mae]:
-        """Load the networks 'before' and 'after' learning from an individual."""
+        """Load the networks 'before' and 'after' learning from the individual of a seed."""
         return {'before': self.network(None, preset), 'after': self.network(seed, preset)}
 
     def save(self, seed: int, **arrays: Recording | RestSamples) -> None:
@@ -106,11 +112,11 @@ class Study:
             kept.write(self._stream_file(seed, name), values)
 
     def stream(self, seed: int, name: str) -> Recording:
-        """Load a saved stream."""
+        """Load a saved stream of an individual: `exploring` or `held_out`."""
         return Recording(**self._load(seed, name, Recording._fields))
 
     def rests(self, seed: int) -> RestSamples:
-        """Load the saved rest samples."""
+        """Load the rest samples that the learner of an individual stored."""
         return RestSamples(**self._load(seed, 'rests', RestSamples._fields))
 
     def _stream_file(self, seed: int, name: str) -> Path:

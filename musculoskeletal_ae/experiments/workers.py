@@ -24,7 +24,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.process_signals import interrupts_blocked
 
 Call = tuple[Any, ...]  # the arguments of a function
-PATIENCE = 10  # refuse a scheduler that has not answered after this time [s]
+PATIENCE = 10  # refuse a scheduler that does not answer within this time [s]
 
 
 class WorkerKilledError(MusculoskeletalError):
@@ -38,7 +38,7 @@ class WorkerKilledError(MusculoskeletalError):
 
 
 class Workers(ABC):
-    """Processes that run calls of a function."""
+    """Processes that run calls of a function in parallel."""
 
     @abstractmethod
     def as_they_end(
@@ -116,10 +116,11 @@ class _Processes(Workers):
     def _run(
         self, function: Callable[..., Any], calls: Mapping[int, Call], is_first: bool
     ) -> Iterator[tuple[int, Any]]:
-        """Run calls, whose keys are their indices; a single call again only if `is_first`.
+        """Run a function with the arguments in `calls`, and yield results with the keys of `calls`.
 
         If one worker is killed, joblib ends all of them. The halves of the remaining calls then run
-        one after the other. If the fault is in a call, it is finally alone.
+        one after the other, until a call is alone. A lone call runs again if this `is_first`
+        attempt with it; after that, its result is a WorkerKilledError.
         """
         missing = dict(calls)
         try:

@@ -26,8 +26,9 @@ Place = tuple[str, tuple[int, ...]]
 class Errors(NamedTuple):
     """How far routes differ from a network, for each muscle (M,)."""
 
-    lengths: Array  # standard deviation of the length [m]
-    arms: Array  # moment arms: norm over the joints, root mean square over the postures [m]
+    lengths: Array  # standard deviation of the length error in random postures [m]
+    #: error of the moment arms: norm over the joints, root mean square over the postures [m]
+    arms: Array
 
 
 class LearnedRoutes(NamedTuple):
@@ -40,7 +41,7 @@ class LearnedRoutes(NamedTuple):
 
 
 def place_of(point: RoutePoint) -> Place:
-    """Return the place of a route point."""
+    """Return the link of a route point, and its position there, as a hashable value."""
     return point.link, tuple(np.rint(1e7 * point.xyz).astype(int).tolist())
 
 
@@ -101,7 +102,7 @@ def _moved(
     """Return the routes with learned points; unchanged routes are those of the description.
 
     Args:
-        robot: The robot.
+        robot: The robot whose points are moved.
         body: The fitted body, which has the displacement of each point.
         is_kept: Which muscles keep their points, (M,).
         movable: As in `learned_routes`. Shared points move by the mean of their displacements, and

@@ -41,8 +41,8 @@ from musculoskeletal_ae.robot.robot import Robot
 POSTURES = 1000  # compare the model and the network in this many postures
 #: multiply this damping by the `joint_gear` of a joint [N·m·s/rad]; chosen for a stable simulation
 DAMPING = 0.05
-THIN = 0.008  # draw bones as capsules of this radius [m]
-TIMESTEP = 0.002  # let the exported model advance by this time in a step [s]
+THIN = 0.008  # radius of the capsules that represent bones [m]
+TIMESTEP = 0.002  # time step of the exported model [s]
 LEGEND = """\
 length      standard deviation of the difference of lengths
 moment arm  difference of dl/dq (norm over all joints, root mean square over the postures), and the
@@ -98,7 +98,10 @@ class ExportReport(NamedTuple):
 
 
 def kept_text(kept: dict[str, str]) -> str:
-    """Return a line that names the muscles with the points of the input, and the reasons."""
+    """Return a line that names the muscles which keep the points of the input.
+
+    `kept` is the reason for each of them. Muscles with the same reason are listed together.
+    """
     reasons = dict[str, list[str]]()
     for muscle, reason in kept.items():
         reasons.setdefault(reason, []).append(muscle)
@@ -112,7 +115,7 @@ def export_into(robot: Robot, mae: Mae, file: Path, out: Path, seed: int = 0) ->
     Args:
         robot: The robot that was imported from the file.
         mae: The network that learned an arm of this robot.
-        file: The file.
+        file: Path of the user's MJCF file.
         out: A new or empty directory.
         seed: Seed of the fit.
 
@@ -133,7 +136,8 @@ def export_into(robot: Robot, mae: Mae, file: Path, out: Path, seed: int = 0) ->
     own = {place_of(p) for r in robot.description.routes for p in r if isinstance(p, RoutePoint)}
     if own.isdisjoint(places):
         raise refuse(
-            file, f'no site is at a route point of {robot.description.directory}; import it'
+            file,
+            f'no site is at a route point of {robot.description.directory}; import this file again',
         )
     with new_directory(out, refuse):
         robot = robot.with_elasticity(mae.elasticity)
@@ -216,9 +220,9 @@ def _write(robot: Robot, mae: Mae, out: Path) -> ExportReport:
 class SpringTable(NamedTuple):
     """Linear springs that represent M muscles; each field has the shape (M,)."""
 
-    tension: Array  # T_mid [N]
+    tension: Array  # tension T_mid in the middle between T_bias and T_limit [N]
     elongation: Array  # elongation at T_mid [m]
-    stiffness: Array  # [N/m]
+    stiffness: Array  # stiffness of the linear spring [N/m]
     error: Array  # largest error of the elongation between T_bias and T_limit [m]
 
 
@@ -307,7 +311,7 @@ def _compare(
         model: The compiled MjModel.
         springs: Linear springs that represent the series elastic elements in the model.
         warnings: Warnings of MuJoCo about the model, for the report.
-        kept: Why muscles keep their points, for the report.
+        kept: For each muscle that keeps the points of the input, the reason, for the report.
 
     Returns:
         The report, and for each muscle the offset [m], (M,), that is added to a length l in

@@ -94,7 +94,7 @@ class UserFile:
         return places
 
     def move(self, name: str, xyz: Array) -> None:
-        """Move a site to `xyz` [m], (3,), in the frame of its body."""
+        """Move the site `name` to `xyz` [m], (3,), in the frame of its body, in the file's text."""
         position = ' '.join(f'{value + 0.0:.9g}' for value in np.round(xyz, 9).tolist())
         for file, text in self.texts.items():
             for match in SITE.finditer(_without_comments(text)):

@@ -26,7 +26,7 @@ from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.importing.source import Source
 from musculoskeletal_ae.robot.urdf import parse_xml
 
-#: write this comment at the top of the file
+#: comment at the top of a file that the import has written
 NOTE = ' written by import_robot for the robot directory in which it lies '
 HAND = 'hand of the emulator'  # name of the body at the end effector
 #: for each tag, the attributes by which other elements refer to an element of this kind
@@ -48,7 +48,7 @@ class AdaptedModel:
     """The text of `model.xml`, adapted from the user's model.
 
     Attributes:
-        root: The root element.
+        root: Root element of the XML tree.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class AdaptedModel:
         compiler.set('texturedir', str(folder / spec.compiler.texturedir))
 
     def text(self) -> str:
-        """Return the text of the file."""
+        """Return the adapted model as the text of an MJCF file."""
         self.root.insert(0, ET.Comment(NOTE))
         ET.indent(self.root)
         return ET.tostring(self.root, encoding='unicode') + '\n'
@@ -193,7 +193,7 @@ class AdaptedModel:
         self._remove(is_removed)
 
     def _split_balls(self, kept: set[str]) -> None:
-        """Replace each ball joint by those of its hinges that the robot has."""
+        """Replace each ball joint by those of its three hinges whose names are in `kept`."""
         model = self._model
         parents = {child: parent for parent in self.root.iter() for child in parent}
         for j, parts in self._balls.items():

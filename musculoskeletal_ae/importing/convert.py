@@ -95,7 +95,7 @@ def import_robot(
     """Import a file as a robot directory.
 
     Args:
-        file: The file.
+        file: Path of the file to import.
         out: A new or empty directory.
         loaded: Function that gets the new robot before the comparison with the source, which takes
             long.
@@ -115,7 +115,8 @@ def import_robot(
         write(source, out)
         robot = Robot.load(out)
         if held := held_ranges(robot):
-            source.notes = notes  # those of `write` come again
+            # Discard the notes of the first `write`, because the second one repeats them.
+            source.notes = notes
             for part in held:
                 source.reduce_range(*part)
             write(source, out)
@@ -189,4 +190,4 @@ def check_verdict(check: RobotCheck) -> str:
     )
     kinds = Counter(fault.kind for fault in check.faults)
     faults = ', '.join(f'{kind} ({count})' for kind, count in kinds.items())
-    return f'check_robot: {f"not sound: {faults}" if faults else "sound"}; {shares}'
+    return f'check_robot: {f"faults: {faults}" if faults else "no faults"}; {shares}'

@@ -24,8 +24,8 @@ class HeldRange(NamedTuple):
     """The part of a joint's range that its muscles can hold."""
 
     joint: str
-    low: float  # [rad] or [m]
-    high: float  # [rad] or [m]
+    low: float  # lower end of the held part [rad or m]
+    high: float  # upper end of the held part [rad or m]
 
 
 def held_ranges(robot: Robot) -> list[HeldRange]:

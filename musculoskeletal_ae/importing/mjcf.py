@@ -48,8 +48,9 @@ check_mujoco()
 COUNTS = {
     'body': 'nbody', 'joint': 'njnt', 'tendon': 'ntendon', 'actuator': 'nu', 'equality': 'neq',
 }  # fmt: skip
-RANGE_POSTURES = 200  # measure the range of a tendon's length in this many postures
-LEAST_REACH = 1e-3  # a far end has to be at least this far from the origin of its body [m]
+#: number of random postures in which the range of a tendon's length is measured
+RANGE_POSTURES = 200
+LEAST_REACH = 1e-3  # ignore a far end that is closer than this to the origin of its body [m]
 #: ignore a larger force of an actuator [N]: MuJoCo computes it for muscles without an initial
 #: moment arm
 STRONGEST = 1e6
@@ -500,9 +501,10 @@ class _Reader:
         return data
 
     def _lengths(self, tendons: dict[str, int], values: dict[str, Array]) -> dict[str, Array]:
-        """Return the tendon lengths that MuJoCo computes [m], (N,) each; see `source.Lengths`.
+        """Return the tendon lengths that MuJoCo computes [m], (N,) each, by name.
 
-        `tendons` are the indices of the tendons by name.
+        `tendons` are the tendons' indices, and `values` the joint positions [rad or m], (N,) each,
+        both by name.
         """
         m, data, start = self.model, mujoco.MjData(self.model), self.model.qpos0
         address = {self.names['joint'][j]: at for j, at in enumerate(m.jnt_qposadr.tolist())}

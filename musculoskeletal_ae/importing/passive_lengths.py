@@ -14,16 +14,16 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 
 ACCURACY = 5e-3  # accept a polynomial if its slope is wrong by at most this share
-HIGHEST = 9  # try no higher degree
-MOST_TERMS = 130  # try no polynomial with more terms
+HIGHEST = 9  # try polynomials up to this degree
+MOST_TERMS = 130  # try no polynomial with more terms than this
 SAMPLES = 600  # fit a polynomial in this many postures, and compare it in as many others
 
 
 class Polynomial(NamedTuple):
     """Length of one tendon: Σ_r coefficient_r Π_j (q_j − centre_j)^power_rj."""
 
-    powers: Array  # (R, joints)
-    coefficient: Array  # [m/rad^p], (R,)
+    powers: Array  # powers of the joint positions in the R terms, (R, joints)
+    coefficient: Array  # factor of each term [m/rad^p], (R,)
     error: float  # root mean square error of the length in other postures [m]
     degree: int
 

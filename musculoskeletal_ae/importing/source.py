@@ -30,25 +30,28 @@ from musculoskeletal_ae.robot.kinematics import link_placement, reduced
 from musculoskeletal_ae.robot.robot import Robot
 
 KINDS = REVOLUTE + PRISMATIC
-POSTURES = 1000  # compare lengths in this many postures
-ARM_POSTURES = 200  # compare moment arms in this many postures
-PROBES = 20  # search the joints that change the length of a passive tendon in this many postures
+POSTURES = 1000  # number of random postures in which lengths are compared with those of the source
+#: number of random postures in which moment arms are compared with those of the source
+ARM_POSTURES = 200
+#: number of postures in which the joints are searched that change the length of a passive tendon
+PROBES = 20
 MOVED = 1e-8  # count a joint as moving a tendon if it changes the length by at least this [m]
 WRONG_LENGTH = 5e-5  # report a passive tendon whose polynomial is wrong by at least this [m]
-TURN = 1e-5  # step of the numerical derivatives that give moment arms [rad]
+TURN = 1e-5  # step of the numerical derivatives of the lengths, which give moment arms [rad]
 SHORT_ARM = 1e-3  # do not compare the sign of a shorter moment arm [m]
-LISTED = 12  # list at most this many names in a message
+LISTED = 12  # name at most this many elements in a message, so that it stays readable
 # The largest tension that the source states for a muscle becomes its tension.limit.
-MAX_SHARE = 1.5  # set tension.max to this multiple of the limit
+MAX_SHARE = 1.5  # set tension.max to this multiple of tension.limit
 #: set tension.bias to this share of the limit if the muscle may be slack in the source; modules and
 #: their sensors need a tension above 0
 BIAS_SHARE = 0.01
 # If tendons do not stretch in the source, give the muscles elastic elements that are as stiff as
 # the emulated modules can regulate, but no stiffer than needed.
 RIGID_STIFFNESS = 1e5  # make no element stiffer than this at tension.max [N/m]
-#: let a rigid element stretch by this at the limit, which counts as nothing [m]
+#: let an element that stands for a rigid tendon stretch by this at tension.limit [m], which is
+#: negligible
 RIGID_ELONGATION = 5e-4
-EARTH = 9.81  # gravity of the earth [m/s²]
+EARTH = 9.81  # standard gravity of the earth, which replaces another gravity of the source [m/s²]
 #: give a joint without limits ± these, by whether it is prismatic: [rad] or [m]
 UNLIMITED = {False: np.pi, True: 0.5}
 
@@ -58,7 +61,7 @@ Lengths = Callable[[dict[str, Array]], dict[str, Array]]
 
 
 class SourceError(MusculoskeletalError):
-    """A file that cannot be imported."""
+    """A file cannot be imported; the text names the file, the problem and the legal values."""
 
 
 def refuse(file: Path, problem: str) -> SourceError:
@@ -72,10 +75,10 @@ class Spring(NamedTuple):
     The torque along x is −k (x − x_0).
     """
 
-    shares: dict[str, float]  # by joint
-    stiffness: float  # k [N·m/rad]
-    rest: float  # x_0 [rad]
-    name: str  # name in the source
+    shares: dict[str, float]  # share of each joint's position in x, by joint
+    stiffness: float  # spring constant k [N·m/rad]
+    rest: float  # value x_0 of x at which the spring exerts no torque [rad]
+    name: str  # name of the spring in the source
 
 
 class PassiveTendon(NamedTuple):
@@ -85,9 +88,10 @@ class PassiveTendon(NamedTuple):
     """
 
     name: str
-    stiffness: float  # k [N/m]
-    slack: tuple[float, float]  # x_low and x_high [m]
-    damping: float  # d [N·s/m]
+    stiffness: float  # spring constant k [N/m]
+    #: lengths x_low and x_high between which the tendon exerts no force [m]
+    slack: tuple[float, float]
+    damping: float  # damping d of the tendon's length [N·s/m]
 
 
 @dataclass
@@ -96,7 +100,7 @@ class Source:
 
     name: str
     model: pin.Model = field(default_factory=pin.Model)
-    links: list[str] = field(default_factory=list)  # the root comes first
+    links: list[str] = field(default_factory=list)  # names of the links; the root comes first
     rest: dict[str, float] = field(default_factory=dict)  # rest positions of joints; 0 if missing
     fixed: list[str] = field(default_factory=list)  # joints that are fixed in the source
     couplings: dict[str, Coupling] = field(default_factory=dict)
@@ -107,7 +111,8 @@ class Source:
     #: whether tendons do not stretch in the source; otherwise, nobody stated their elasticity
     is_rigid: bool = False
     springs: list[Spring] = field(default_factory=list)
-    damping: dict[str, float] = field(default_factory=dict)  # by joint [N·m·s/rad]
+    #: damping of the joints [N·m·s/rad], by joint
+    damping: dict[str, float] = field(default_factory=dict)
     passive: list[PassiveTendon] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     lengths: Lengths | None = None
@@ -131,13 +136,16 @@ class Source:
         return [note for note in self.notes if re.match('dropped: (muscle|tendon|actuator) ', note)]
 
     def rename(self, kind: str, original: str | None, fallback: str, taken: Iterable[str]) -> str:
-        """Return a legal, unused name, and add a note if it differs from the original."""
+        """Return a legal name that is not in `taken`, and add a note if it is not the original.
+
+        `fallback` is used without an original name. The note begins with `kind`, such as 'muscle'.
+        """
         (name,) = distinct([safe_name(original, fallback)], taken)
         self.renamed(kind, original, name)
         return name
 
     def renamed(self, kind: str, original: str | None, name: str) -> None:
-        """Add a note if a name differs from the original."""
+        """Note that an element, such as a 'muscle' (`kind`), has another name than the original."""
         if original and name != original:
             self.note('renamed', f'{kind} {original} is {name} here')
 
@@ -169,7 +177,17 @@ class Source:
         self, name: str, parent: int, at: pin.SE3, slides: bool, axis: Array,
         limits: tuple[float, float], rest: float = 0.0,
     ) -> int:  # fmt: skip
-        """Add a joint at a pose in the frame of the joint `parent` (0: none); return its index."""
+        """Add a joint, and return its index.
+
+        Args:
+            name: Unique name of the joint.
+            parent: Index of the joint in whose frame `at` is; 0 for the root link.
+            at: Pose of the joint.
+            slides: Whether the joint is prismatic.
+            axis: Direction of the joint's axis in its own frame, (3,).
+            limits: Lower and upper limit in the source [rad or m].
+            rest: Position of the joint in the rest posture of the source [rad or m].
+        """
         kind = pin.JointModelPrismaticUnaligned if slides else pin.JointModelRevoluteUnaligned
         if (size := np.linalg.norm(axis)) < 1e-9:
             raise ValueError(
@@ -202,7 +220,7 @@ class Source:
         return float(self.model.lowerPositionLimit[q]), float(self.model.upperPositionLimit[q])
 
     def reduce_range(self, joint: str, low: float, high: float) -> None:
-        """Reduce the limits of a joint [rad or m] to the part that its muscles can hold."""
+        """Reduce a joint's limits to `low` and `high` [rad or m], where its muscles can hold it."""
         before = ' to '.join(f'{end:.4g}' for end in self.span(joint))
         q = self.model.joints[self.model.getJointId(joint)].idx_q
         for limits, end in (('lowerPositionLimit', low), ('upperPositionLimit', high)):
@@ -281,7 +299,7 @@ def numbers(text: str | None, count: int, where: str) -> Array:
 
 
 def link_inertia(link: str, mass: float, centre: Array, tensor: Array) -> pin.Inertia:
-    """Return the inertia of a link.
+    """Return the inertia of a link from its mass [kg], centre of mass [m] and tensor [kg·m²].
 
     Raises:
         ValueError: If the inertia is not physical; the message names the link.
@@ -311,7 +329,10 @@ def distinct(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
 
 
 def names_of_all(kind: str, originals: Iterable[str]) -> list[str]:
-    """Return legal and unique names of all elements of a kind; unnamed ones are numbered."""
+    """Return legal and unique names of all elements of a kind such as 'joint'.
+
+    Elements without a name are numbered, such as 'joint_2'.
+    """
     safe = (safe_name(name, f'{kind}_{i}') for i, name in enumerate(originals))
     return distinct(safe, ['universe'])  # pinocchio's name of the world
 
@@ -322,7 +343,8 @@ def unique(
     """Return the elements in `items`, pairs (name, element), as a dictionary by name.
 
     Raises:
-        ValueError: If a name occurs twice.
+        ValueError: If a name occurs twice. The message names the kind of the elements and states
+            what is legal.
     """
     named: dict[str, Any] = {}
     for name, item in items:
@@ -346,7 +368,7 @@ def cut(
     with a note. Muscles that move no joint are removed as well.
 
     Args:
-        source: The source.
+        source: The source, which is changed in place.
         joints: Joints that stay movable; by default all. If `end` is given, joints that move
             neither it nor a coupled joint on the path to it are held fixed as well.
         muscles: Muscles that stay; by default all.
@@ -673,7 +695,7 @@ def _joint_elasticity(source: Source, joints: list[str]) -> list[dict[str, Any]]
 
 
 def _coupling(slave: str, coupling: Coupling) -> dict[str, Any]:
-    """Return an entry of `couplings` in muscles.yaml."""
+    """Return an entry of `couplings` in muscles.yaml, for the joint `slave`."""
     entry: dict[str, Any] = {'joint': slave, 'master': coupling.master}
     if coupling.higher:
         return {**entry, 'polynomial': list(coupling.terms)}
@@ -683,7 +705,7 @@ def _coupling(slave: str, coupling: Coupling) -> dict[str, Any]:
 class Comparison(NamedTuple):
     """Differences between the lengths of an imported robot and those of its source, by muscle."""
 
-    lengths: dict[str, float]  # largest error [m]
+    lengths: dict[str, float]  # largest error of the length [m]
     arms: dict[str, float]  # largest error of a moment arm [m]
     #: share of postures with a moment arm of the wrong sign, at the joint where it is largest
     flips: dict[str, float]

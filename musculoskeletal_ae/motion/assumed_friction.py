@@ -7,7 +7,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
-FRICTION = 0.05  # assume this μ if none was learned: a typical value of hand-built arms
+#: assume this friction coefficient μ if a network has learned none: typical of hand-built arms
+FRICTION = 0.05
 
 
 def tendon_friction(robot: Robot, mae: Mae) -> Array:

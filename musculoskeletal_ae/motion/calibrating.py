@@ -14,13 +14,17 @@ from musculoskeletal_ae.motion.ramps import Ramp
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme
 
-SPEED = 0.05  # change length commands no faster than this [m/s]
+#: change length commands no faster than this [m/s]; the estimate is uncertain, so the arm moves
+#: slowly
+SPEED = 0.05
 DURATION = 1.5  # take this time for a step, or longer if SPEED requires it [s]
-REST = 0.25  # rest for this time after a step [s]
+REST = 0.25  # rest for this time after each step, so that the calibration gets a rest sample [s]
 REACH = 0.7  # move no joint further than this in one step [rad]
 INSIDE = 0.1  # keep goals away from the joint limits by this fraction of the joint range
 GOALS = 20  # try this many random goals in search of a holdable one
-SHARE = 0.6  # permit tensions up to this fraction of the range from T_bias to T_limit
+#: use no more than this fraction of the tension range from T_bias to T_limit, because unknown
+#: length offsets cause tension errors
+SHARE = 0.6
 
 
 def gentle_limit(robot: Robot) -> Array:
@@ -57,11 +61,11 @@ class Calibrating(ActivityControl):
         self._robot = robot
 
     def enter(self, _: Inputs) -> None:
-        """Enter the activity, starting from the present posture."""
+        """Begin the activity in the present posture."""
         self._ramp, self._rested = None, 0.0
 
     def step(self, inputs: Inputs) -> Command | None:
-        """Return the next length command."""
+        """Advance by one control step and return the next length command."""
         if self._ramp is None or (self._ramp.done and self._rested >= REST):
             speed = float(self._robot.actuation.fastest(SPEED).min())
             self._ramp = Ramp(inputs.length, self._goal(inputs), DURATION, speed)

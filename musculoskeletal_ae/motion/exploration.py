@@ -32,7 +32,7 @@ class Exploration:
         self.use(robot, preset)
 
     def use(self, robot: Robot, preset: str) -> None:
-        """Draw the next steps for another preset, or for a robot with other isolated muscles."""
+        """Use another preset, or a robot with other isolated muscles, for the next steps."""
         self._robot, self._draw = robot, preset_named(preset).exploration()
 
     def __iter__(self) -> Iterator[ExplorationStep]:
@@ -49,12 +49,12 @@ class Exploring(ActivityControl):
         self._theta: Array | None = None  # present target [rad], (D,)
 
     def enter(self, inputs: Inputs) -> None:
-        """Enter the exploration, or continue it after a pause, from the present tensions."""
+        """Begin the exploration, or continue it after a pause, from the present tensions."""
         self.ramps.start_from(inputs.length)
         self._steps = self._steps or iter(self.stream)
 
     def step(self, inputs: Inputs) -> Command | None:
-        """Return the next command.
+        """Advance by one control step and return the next command.
 
         Raises:
             RobotDescriptionError: If too few postures are holdable.

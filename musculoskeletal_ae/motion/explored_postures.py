@@ -15,14 +15,19 @@ from musculoskeletal_ae.robot.tension import holding_tension, least_tension
 
 TRIES = 1000  # search at most this many random postures for holdable ones
 AT_LIMITS = 0.25  # place this fraction of each joint's random angles at one of its limits
-#: seek postures with the support of joint stops after this many random postures without success
+#: look for postures that joint stops support after this many random postures without success
 TRIES_WITHOUT_STOPS = 200
-TRIES_WITH_STOPS = 5  # seek such postures near this many random ones
-LEAST_SPREAD = 0.1  # refuse them if their mean spread is less than this share of the joint ranges
-LEAST_FREE = 0.3  # refuse them if less than this share of the joints is away from its limits
-SETTLING_STEPS = 40  # move towards a posture with the support of stops in at most this many steps
-LARGEST_STEP = 0.2  # turn a joint by at most this in one of these steps [rad]
-LEAST_STIFFNESS = 0.05  # let the stiffness of a step be at least this share of the largest
+TRIES_WITH_STOPS = 5  # look for postures that joint stops support near this many random ones
+#: refuse supported postures whose mean spread is less than this share of the joint ranges, because
+#: an arm that hardly moves provides no data
+LEAST_SPREAD = 0.1
+#: refuse supported postures in which less than this share of the joints is away from its limits
+LEAST_FREE = 0.3
+SETTLING_STEPS = 40  # give up the search for a supported posture after this many steps
+LARGEST_STEP = 0.2  # turn a joint by at most this in one step of the search [rad]
+#: raise small stiffnesses in a step of the search to this share of the largest one, so that the
+#: step stays short
+LEAST_STIFFNESS = 0.05
 AT_STOP = 1e-3  # let a stop support a joint up to this distance from the limit [rad]
 STOP_TORQUE = 100.0  # let a stop support a joint with at most this torque [N·m]
 BALANCED = 1e-3  # count a posture as held if it lacks at most this share of the largest torque
@@ -31,10 +36,10 @@ PRESSES = 10  # draw this many random T_const, and use the one that presses most
 
 
 class ExplorationStep(NamedTuple):
-    """One step of the exploration."""
+    """One step of the exploration: a target posture, and the command that leads to it."""
 
     method: str  # length method of the preset: 'first' or 'second'
-    theta: Array  # θ_target [rad], (D,)
+    theta: Array  # target posture θ_target [rad], (D,)
     #: T_const of the method `first` [N], (M,). For the method `second`, which uses the present
     #: tension instead, this is the tension that the geometric model expects.
     tension: Array
@@ -42,7 +47,7 @@ class ExplorationStep(NamedTuple):
 
 
 def posture_at_limits(robot: Robot, rng: np.random.Generator, share: float = AT_LIMITS) -> Array:
-    """Return a random posture [rad], (D,); each joint is at a limit with probability `share`."""
+    """Return a random posture [rad], (D,); `share` is the probability of a joint limit."""
     theta = robot.random_postures(1, rng)[0]
     chosen, upper = rng.uniform(size=(2, robot.joint_count))
     limit = np.where(upper < 0.5, robot.upper, robot.lower)
@@ -57,7 +62,7 @@ def pressing_tension(robot: Robot, theta: Array, rng: np.random.Generator) -> Ar
 
     Args:
         robot: The robot.
-        theta: θ [rad], (D,).
+        theta: Joint angles θ [rad], (D,).
         rng: Generator of the random tensions.
 
     Returns:
@@ -74,14 +79,17 @@ def pressing_tension(robot: Robot, theta: Array, rng: np.random.Generator) -> Ar
 
 
 def explored_posture(robot: Robot, draw: Callable[[], Array]) -> tuple[Array, Array]:
-    """Return a random posture (D,) that the arm can hold, with tensions that hold it [N], (M,).
+    """Return a random posture that the arm can hold, with tensions that hold it.
 
-    If hardly any random posture is holdable, as in a hand with many joints, it is one near a random
-    posture in which joint stops support the joints that the muscles cannot hold.
+    In a hand with many joints, hardly any random posture is holdable. The returned posture is then
+    one in which joint stops support the joints that the muscles cannot hold.
 
     Args:
         robot: The robot.
-        draw: Draws a random posture.
+        draw: Draws a random posture θ [rad], (D,).
+
+    Returns:
+        The posture θ [rad], (D,), and the tensions T [N], (M,).
 
     Raises:
         RobotDescriptionError: If no posture is found.
@@ -96,10 +104,10 @@ def explored_posture(robot: Robot, draw: Callable[[], Array]) -> tuple[Array, Ar
 
 
 def supported_postures(robot: Robot, postures: Iterable[Array]) -> list[tuple[Array, Array]]:
-    """Return postures near random ones that muscles and joint stops hold, with the tensions.
+    """Return postures near given ones that muscles and joint stops hold, with the tensions.
 
-    The list is empty if the postures are nearly the same, or if nearly all joints lie at their
-    stops: the muscles of such an arm do not move it, or there are fewer of them than joints.
+    The list is empty if the postures that were found are nearly equal, or if nearly all joints lie
+    at their stops: such an arm could not be moved by its muscles.
     """
     found = [each for theta in postures if (each := settled(robot, theta)) is not None]
     if not found:

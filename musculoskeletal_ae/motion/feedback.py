@@ -13,16 +13,18 @@ from musculoskeletal_ae.control.command import Pull
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-#: Plan again if a tension limit changes by more than this, and a planned tension is nearer to the
-#: limit than this [N].
+#: plan again if a tension limit has changed by more than this [N], and a planned tension is nearer
+#: to the limit than this
 REPLAN = 5.0
-CORRECTION = 0.3  # correct no joint by more than this [rad]
-#: Do not correct smaller estimated errors [rad]. This is about the error of the estimate itself.
-#: Without this dead band, an arm with friction would never rest.
+CORRECTION = 0.3  # correct no joint by more than this [rad], because the estimate may be wrong
+#: treat smaller posture errors as 0 [rad]: they are about as large as the error of the estimate,
+#: and an arm with friction would otherwise never come to rest
 DEADBAND = 0.03
-RELIEF_INTERVAL = 0.1  # compute the needless tension at intervals of at least this time [s]
-PROPORTIONAL = 0.7  # proportional gain k_p in motion
-INTEGRAL = 4.0  # integral gain k_i in motion [1/s]
+#: compute which tension is needless at intervals of at least this [s]
+RELIEF_INTERVAL = 0.1
+#: gain k_p of the feedback in motion: shift of the desired posture per posture error
+PROPORTIONAL = 0.7
+INTEGRAL = 4.0  # gain k_i of the feedback in motion, which removes lasting posture errors [1/s]
 #: count the arm as resting once the feedback in motion has been off for this time [s]
 SETTLING = 0.5
 
@@ -34,7 +36,7 @@ def depends_on_limit(tension: Array, before: Array, limit: Array) -> bool:
     an unnecessary new plan would discard the corrections of the feedback.
 
     Args:
-        tension: Planned T [N], (M,).
+        tension: Planned tensions T [N], (M,).
         before: Limit at the time of planning [N], (M,).
         limit: Present limit [N], (M,).
     """
@@ -92,7 +94,7 @@ class RestFeedback:
         self.relief: Array = np.zeros(self._robot.muscle_count)
 
     def moving(self) -> None:
-        """Interrupt the integration at rest until the arm has settled again."""
+        """Record that the arm moves, which interrupts the integration until it has settled."""
         self._rested = self._unsolved = 0.0
 
     def step(
@@ -101,8 +103,8 @@ class RestFeedback:
         """Integrate the errors over dt [s] if the arm rests; return whether this was done.
 
         Args:
-            error: θ_target − θ_estimated [rad], (D,).
-            jacobian: G at the target [m/rad], (M, D).
+            error: Posture error θ_target − θ_estimated [rad], (D,).
+            jacobian: Muscle Jacobian G at the target [m/rad], (M, D).
             pull: Tensions of the muscles.
             limit: Highest tension that may be planned [N], (M,).
             gain: Integral gain [1/s]; 0 for no feedback.
@@ -147,13 +149,14 @@ class MotionFeedback:
 
     def __init__(self, rest: RestFeedback) -> None:
         self._rest = rest
-        self._shift: Array = np.zeros_like(rest.correction)  # shift of θ [rad], (D,)
+        #: present shift of the desired posture [rad], (D,)
+        self._shift: Array = np.zeros_like(rest.correction)
 
     def step(self, error: Array, is_held_back: bool, dt: float) -> Array:
         """Return the angles [rad], (D,), by which to shift the desired posture.
 
         Args:
-            error: Desired − estimated θ [rad], (D,).
+            error: Posture error, desired − estimated θ [rad], (D,).
             is_held_back: Whether the limiter holds a muscle back (`Follower._is_held_back`).
             dt: Time since the last call [s].
         """

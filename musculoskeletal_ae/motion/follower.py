@@ -53,17 +53,21 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: gain of the rest feedback, which reduces posture error and needless tension at rest [1/s]
 FEEDBACK_GAIN = 0.5
-BLENDING = 0.3  # blend the previous command into a new plan over this time [s]
-SETTLING = 0.8  # continue the feedback of the motion for this time after a trajectory [s]
-#: Count a muscle as held back if the limiter has made its command longer by more than this [m].
+#: blend the previous command into a new plan over this time [s], so that the command does not jump
+BLENDING = 0.3
+#: after a trajectory, continue the feedback of the motion for this time before the arm counts as
+#: resting [s]
+SETTLING = 0.8
+#: a muscle counts as held back by the limiter, and the feedback stops integrating, if the published
+#: length exceeds the desired length by more than this [m]
 HELD_BACK = 1e-4
 
 
 class HeldPosture(NamedTuple):
     """The plan with which the follower holds the end of a trajectory; it is computed only once."""
 
-    length: Array  # l_target without feedback [m], (M,)
-    jacobian: Array  # G [m/rad], (M, D)
+    length: Array  # length command l_target without feedback [m], (M,)
+    jacobian: Array  # muscle Jacobian G at the end of the trajectory [m/rad], (M, D)
 
 
 class Follower(ActivityControl):
@@ -87,7 +91,7 @@ class Follower(ActivityControl):
         self._desired: Array | None = None  # the last desired command [m], (M,)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings.
+        """Use another robot description and other settings from the next step on.
 
         `robot` must already describe isolated muscles as muscles without tension.
         """
@@ -113,7 +117,7 @@ class Follower(ActivityControl):
             self._leave_rest()
 
     def exert(self, effort: Array) -> None:
-        """Exert a torque [N·m], (D,), in addition to inverse dynamics, until it is changed."""
+        """Exert a torque [N·m], (D,), in addition to inverse dynamics, until the next call."""
         if (effort != self.plan.effort).any():
             self.plan.effort = effort
             self.plan_anew()
@@ -143,12 +147,12 @@ class Follower(ActivityControl):
 
     @property
     def has_arrived(self) -> bool:
-        """Whether the last trajectory has ended."""
+        """Whether the last trajectory has ended, so that the arm should rest at its end."""
         return not self.progress.is_moving
 
     @property
     def missing_torque(self) -> Array | None:
-        """Torque [N·m], (D,), that is missing because the tensions are limited.
+        """Torque [N·m], (D,), by which the tensions, which are limited, fall short of the plan.
 
         None without a trajectory.
         """
@@ -169,7 +173,7 @@ class Follower(ActivityControl):
         self.progress.discard()
 
     def step(self, inputs: Inputs) -> Command | None:
-        """Return the command, or None without a trajectory."""
+        """Advance by one control step; return the next command, or None without a trajectory."""
         progress, sent, dt = self.progress, inputs.length, inputs.dt
         if progress.trajectory is None:
             return None

@@ -11,7 +11,7 @@ from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.joint_units import JointUnits
 
-# Error codes of control_msgs/action/FollowJointTrajectory.
+# Error codes that control_msgs/action/FollowJointTrajectory defines for its result.
 SUCCESSFUL, INVALID, BEYOND_PATH, BEYOND_GOAL = 0, -1, -4, -5
 
 
@@ -42,11 +42,11 @@ class FollowedGoal:
     def __init__(
         self, core: Controller, joints: Sequence[str], path: Array, goal: Array, patience: float
     ) -> None:
-        """Start monitoring.
+        """Begin to monitor the trajectory that the controller has just accepted.
 
         Args:
-            core: The controller.
-            joints: Names of the joints.
+            core: The controller that follows the trajectory.
+            joints: Names of all joints, for messages.
             path: Tolerances along the trajectory [rad], (D,).
             goal: Tolerances at the end of the trajectory [rad], (D,).
             patience: Longest time after the end of the trajectory until the tolerances `goal` are

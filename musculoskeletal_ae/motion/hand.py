@@ -25,23 +25,25 @@ from musculoskeletal_ae.motion.trajectory import STOPPING, Setpoint, Trajectory
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-#: end the search of the inverse kinematics within these distances [m] and angles [rad]: for a whole
-#: pose, and for a position only, with which any orientation is legal
+#: end the search of the inverse kinematics within these distances [m] and angles [rad]: WHOLE for
+#: position and orientation, POSITION for the position alone, with which any orientation is legal
 WHOLE, POSITION = np.repeat([2e-4, 2e-3], 3), np.repeat([2e-4, 100.0], 3)
-FAR = 0.005  # a pose is unreachable if the hand remains further away than this [m]
-TURNED = 0.05  # a pose is unreachable if the hand's orientation differs by more than this [rad]
+FAR = 0.005  # treat a pose as unreachable if the hand remains further away than this [m]
+TURNED = 0.05  # treat a pose as unreachable if the orientation differs by more than this [rad]
 HAND_SPEED = 0.25  # move the hand to a single pose no faster than this [m/s]
 SHORTEST = 0.3  # take at least this time for a movement to a single pose [s]
-PEAK = 1.875  # ratio of peak to mean speed of a minimum-jerk motion
-PATH_INTERVAL = 0.25  # count poses as a path if they arrive within this time of each other [s]
-#: count poses as a path only if the hand needs no more than this speed between them [m/s]
+PEAK = 1.875  # peak speed of a minimum-jerk motion, as a multiple of its mean speed
+#: treat poses that arrive within this time of each other as a path, not as single targets [s]
+PATH_INTERVAL = 0.25
+#: treat poses as single targets if the hand would have to move faster than this between them [m/s]
 PATH_SPEED = 1.0
-INTERVAL_WEIGHT = 0.2  # give the newest interval this weight in the average interval of a path
+#: weight of the newest interval between poses in the average interval of a path
+INTERVAL_WEIGHT = 0.2
 JOINING = 0.1  # take at least this time to join a path [s]
 #: come to rest at the last pose of a path within this time after passing it [s]
 RETURNING = 2.0 * STOPPING
-TWIST_TIMEOUT = 0.3  # move the hand for this time by one twist [s]
-STARTING = 0.1  # accelerate to a twist in this time [s]
+TWIST_TIMEOUT = 0.3  # duration of the motion of the hand that one twist commands [s]
+STARTING = 0.1  # time in which the hand accelerates to a twist [s]
 #: damp the inverse Jacobian by this length, to limit joint speeds near singularities [m]
 DAMPING = 0.02
 
@@ -63,7 +65,7 @@ class Hand:
         Args:
             mae: The network in use.
             pose: The pose in the root link's frame.
-            whole: Whether the orientation counts.
+            whole: True to reach position and orientation, False for the position alone.
             start: Posture from which the search starts [rad], (D,).
             nearest: Whether to return another posture, as `unreachable: nearest` demands, if the
                 hand cannot reach or hold the pose.
@@ -93,7 +95,7 @@ class Hand:
         return theta, reason
 
     def towards(self, start: Setpoint, theta: Array, now: float) -> Trajectory:
-        """Return the trajectory to a received pose.
+        """Return the trajectory that moves the hand towards a received pose.
 
         If poses arrive in quick succession, the trajectory continues the path of the earlier ones.
 
@@ -129,7 +131,7 @@ class Hand:
         return Trajectory.to(start, theta, max(SHORTEST, PEAK * distance / HAND_SPEED))
 
     def again(self, now: float) -> None:
-        """Record that the last pose was received again at `now` [s]."""
+        """Record that the last pose was received again at `now` [s], so that its path continues."""
         if self._last is not None:
             self._last = now, *self._last[1:]
 

@@ -40,7 +40,7 @@ SOLVES = 2
 # can reduce a muscle's tension by this margin before it falls to T_bias, where the muscle is stiff
 # in one direction only.
 MARGINS = (40.0, 30.0, 20.0, 10.0, 0.0)
-ITERATIONS = 6  # stop Gauss–Newton and Frank–Wolfe after this many iterations
+ITERATIONS = 6  # end the search for tensions of a desired stiffness after this many iterations
 # Weigh the distance from the initial tensions (at first the least tensions) by this, relative to
 # the stiffness error. A reachable stiffness is missed by about this share.
 LEAST_TENSION_SHARE = 1e-3
@@ -61,33 +61,34 @@ class JointStiffness(NamedTuple):
     """Expected joint stiffness of a command, and the range that the posture allows [N·m/rad]."""
 
     expected: Array  # joint stiffness K_θ that the command produces, (D, D)
-    lowest: Array  # smallest K_jj of each joint separately, (D,)
-    highest: Array  # largest K_jj of each joint separately, (D,)
+    lowest: Array  # smallest stiffness that tensions can give to each joint alone, (D,)
+    highest: Array  # largest stiffness that tensions can give to each joint alone, (D,)
 
 
 class Solution(NamedTuple):
     """A command with its expected tension, missing torque and stiffness."""
 
-    length: Array  # l_target [m], (M,)
-    tension: Array  # T [N], (M,)
+    length: Array  # length command l_target [m], (M,)
+    tension: Array  # tension T that the command should produce [N], (M,)
     missing_torque: Array  # torque that no tensions within their limits provide [N·m], (D,)
-    stiffness: JointStiffness | None = None  # only for the method `stiffness`
+    #: planned joint stiffness; None except with the method `stiffness`
+    stiffness: JointStiffness | None = None
 
 
 class LengthCommand(Protocol):
-    """Computes one length command for a target."""
+    """Interface of the functions that compute one length command for a target."""
 
     def __call__(
         self, robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array, /
     ) -> Solution:
-        """Return the command.
+        """Return the length command and the tension that it should produce.
 
         Args:
             robot: The body, in which isolated muscles have no tension.
             mae: The network.
-            theta: θ_target [rad], (D,).
-            torque: τ_target [N·m], (D,).
-            tension: T_const, or the measured T at the start of the method [N], (M,).
+            theta: Target posture θ_target [rad], (D,).
+            torque: Torque that the muscles should exert there, τ_target [N·m], (D,).
+            tension: T_const, or the measured T at the start of the movement [N], (M,).
         """
 
 
@@ -96,9 +97,9 @@ class LengthMethod(NamedTuple):
 
     Attributes:
         command: Computes the command.
-        takes_tension: Whether the command leads to the tension that is passed to it. If so, the
-            tension is limited before it is passed.
-        follows_first: Whether the method `first` moves the arm before this method does.
+        takes_tension: Whether the command produces the tension that is passed to it. The caller
+            then limits this tension first.
+        follows_first: Whether the arm first moves to the target by the method `first`.
     """
 
     command: LengthCommand
@@ -110,10 +111,10 @@ def first_command(robot: Robot, mae: Mae, theta: Array, tension: Array) -> Array
     """Return length commands [m], (..., M), for target postures and tensions.
 
     Args:
-        robot: The body.
-        mae: The network.
-        theta: θ_target [rad], (..., D).
-        tension: T [N], (..., M).
+        robot: Provides T_bias and K_stiff of the muscle modules.
+        mae: The network that predicts the muscle lengths.
+        theta: Target postures θ_target [rad], (..., D).
+        tension: Tensions T that the commands should produce [N], (..., M).
     """
     return mae.lengths(theta, tension) + msc_compensation(robot, tension)
 
@@ -126,7 +127,7 @@ def proposed(
     Args:
         robot: The body, in which isolated muscles have no tension.
         mae: The network.
-        theta: θ_target [rad], (D,).
+        theta: Target posture θ_target [rad], (D,).
         torque: τ_target = g(θ_target) + effort [N·m], (D,).
         tension: T_current, from which the search starts [N], (M,).
         limit: Highest tension that may be planned [N], scalar or (M,).
@@ -140,17 +141,20 @@ def proposed(
 
 
 class StiffnessModel(NamedTuple):
-    """Joint stiffness around one posture according to the network."""
+    """How the joint stiffness around one posture depends on the tensions, by the network."""
 
-    jacobian: Array  # G [m/rad], (M, D)
-    hessian: Array  # ∂²l/∂θ² [m/rad²], (M, D, D)
+    jacobian: Array  # muscle Jacobian G [m/rad], (M, D)
+    hessian: Array  # second derivatives ∂²l/∂θ² of the lengths [m/rad²], (M, D, D)
     compliance: Array  # ∂L_e/∂T [m/N] as polynomials of T, highest power first, (3, M)
     module: Array  # stiffness K_stiff of the modules [N/m], (M,)
     springs: Array  # stiffness of springs and passive tendons [N·m/rad], (D, D)
 
     @classmethod
     def read(cls, robot: Robot, mae: Mae, theta: Array, tension: Array) -> StiffnessModel:
-        """Read the model from the network at the posture θ [rad], (D,), and T [N], (M,)."""
+        """Read the model from the network's lengths around the posture θ [rad] and T [N].
+
+        θ has the shape (D,), and T the shape (M,).
+        """
 
         def jacobian(postures: Array) -> Array:
             return mae.muscle_jacobian(postures, np.tile(tension, (len(postures), 1)))
@@ -225,8 +229,8 @@ def stiffness_command(
     Args:
         robot: The body, in which isolated muscles have no tension.
         mae: The network.
-        theta: θ_target [rad], (D,).
-        torque: τ_target [N·m], (D,).
+        theta: Target posture θ_target [rad], (D,).
+        torque: Target torque τ_target [N·m], (D,).
         desired: Desired diagonal entries of K_θ [N·m/rad], (D,). 0 leaves an entry unconstrained;
             values beyond the reachable range of a joint are clipped to it.
         limit: Highest tension that may be planned [N], scalar or (M,).
@@ -268,8 +272,9 @@ def _approach(
 ) -> Array:
     """Return tensions whose joint stiffness is close to `desired`, by Gauss–Newton iterations.
 
-    Only joints with `desired` > 0 count. Each step is a quadratic programme, because the tensions
-    have to balance the torque within their limits. The module `gauss_newton` cannot do that.
+    Joints with `desired` = 0 are unconstrained. Each iteration is a quadratic programme, because
+    the tensions have to balance the torque within their limits. The module `gauss_newton` solves
+    problems without such constraints only.
     """
     chosen, start = desired > 0.0, tension
     for _ in range(ITERATIONS if chosen.any() else 0):

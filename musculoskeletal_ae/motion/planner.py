@@ -28,11 +28,11 @@ from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 
-#: Refuse a point that exceeds a joint limit by more than this [rad]; clip any other to the limit.
-#: The points of a replayed motion are estimated postures. The estimate of an arm that is held
-#: against a joint stop exceeds the limit by less than this.
+#: Refuse a point that exceeds a joint limit by more than this [rad]; clip any other point to the
+#: limit. The points of a replayed motion are estimated postures, and the estimate of an arm that is
+#: held against a joint stop exceeds the limit by less than this.
 TOLERANCE = 0.01
-SAME = 1e-6  # count two poses as equal below this relative difference
+SAME = 1e-6  # treat two poses as equal below this relative difference
 
 
 class Plan(NamedTuple):
@@ -57,7 +57,7 @@ class Planner:
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings.
+        """Use another robot description and other settings from the next step on.
 
         `robot` must already describe isolated muscles as muscles without tension.
         """
@@ -96,7 +96,7 @@ class Planner:
         Args:
             mae: The network in use.
             start: Setpoint from which the motion starts.
-            points: The points.
+            points: The points, with times relative to the same time 0.
             passed: Time elapsed since time 0 of the points [s].
             lag: Lag λ of the muscle modules [s].
         """
@@ -111,7 +111,7 @@ class Planner:
         return Plan(planned)
 
     def to_rest(self, start: Setpoint) -> Plan:
-        """Plan to come to rest within `trajectory.STOPPING` seconds."""
+        """Plan to come to rest within `trajectory.STOPPING` seconds from the setpoint `start`."""
         return Plan(Trajectory.stopping(start, self._robot))
 
     def to_pose(self, mae: Mae, start: Setpoint, pose: pin.SE3, whole: bool, now: float) -> Plan:
@@ -121,7 +121,7 @@ class Planner:
             mae: The network in use.
             start: Setpoint from which the motion starts.
             pose: Target pose of the end effector.
-            whole: Whether the orientation counts.
+            whole: True to reach position and orientation, False for the position alone.
             now: Time at which the pose was received [s].
         """
         theta, problem = self._hand.posture(mae, pose, whole, start.theta, self.takes_nearest)
@@ -131,7 +131,7 @@ class Planner:
         return Plan(planned, problem and f'{problem}; the arm goes to the nearest posture')
 
     def is_under_way(self, pose: pin.SE3, whole: bool, followed: Trajectory | None) -> bool:
-        """Return whether the followed trajectory already leads to this pose."""
+        """Return whether `followed` was planned for this pose, `whole` or its position only."""
         if self._last_pose is None or followed is None:
             return False
         before, whole_before, trajectory = self._last_pose
@@ -139,18 +139,24 @@ class Planner:
         return same and trajectory is followed
 
     def repeat_pose(self, now: float) -> None:
-        """Record that the last pose was received again at `now` [s]."""
+        """Record that the last pose was received again at `now` [s], so that its path continues."""
         self._hand.again(now)
 
     def by_twist(self, mae: Mae, start: Setpoint, twist: Array) -> Plan:
-        """Plan to move the end effector by a twist, (6,) in m/s and rad/s, for a short time."""
+        """Plan to move the end effector for `hand.TWIST_TIMEOUT` seconds.
+
+        Args:
+            mae: The network in use.
+            start: Setpoint from which the motion starts.
+            twist: Linear [m/s] and angular [rad/s] velocity, (6,).
+        """
         return Plan(self._within_limits(mae, self._hand.moved(mae, start, twist)))
 
     def reachable(self, mae: Mae, start: Array, theta: Array, nearest: bool) -> tuple[Array, str]:
-        """Return θ if the muscles in use can hold it, else another posture.
+        """Return θ if the muscles can hold it, else the nearest holdable posture.
 
-        The other posture is that of `reach.nearest_held`. If no muscle is isolated, θ is returned
-        without a check.
+        The nearest holdable posture is that of `reach.nearest_held`. If no muscle is isolated, θ is
+        returned without a check.
 
         Args:
             mae: The network in use.

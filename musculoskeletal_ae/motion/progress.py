@@ -9,12 +9,13 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.robot import Robot
 
-FALLEN = 0.2  # count an arm with isolated muscles as fallen above this error at its goal [rad]
-#: wait this long after the end of a trajectory before the arm can count as fallen; count its
-#: trajectory as lost once the error has exceeded LOST for this time [s]
+#: an arm with isolated muscles counts as fallen if it ends this far away from its goal [rad]
+FALLEN = 0.2
+#: an arm counts as fallen no earlier than this after the end of its trajectory, and its trajectory
+#: counts as lost once the error has exceeded LOST for this time [s]
 FALLING = 2.0
-#: Count the trajectory of an arm with isolated muscles as lost if the error exceeds this for the
-#: time FALLING [rad].
+#: the trajectory of an arm with isolated muscles counts as lost, and is planned again, if the error
+#: exceeds this for the time FALLING [rad]
 LOST = 0.4
 
 
@@ -30,7 +31,7 @@ class Progress:
         over: Time since the end of the trajectory [s]; 0 before its end.
         lost_time: Time [s] for which the error of some joint has been larger than LOST.
         desired: The present setpoint.
-        error: Desired − estimated θ [rad], (D,).
+        error: Posture error, desired − estimated θ [rad], (D,).
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -51,7 +52,7 @@ class Progress:
         self.over = self.lost_time = 0.0
 
     def discard(self) -> None:
-        """Discard all trajectories."""
+        """Discard all trajectories, so that the next motion has to be planned anew."""
         self.trajectory = self.next = None
 
     def return_to_end(self) -> None:
@@ -88,7 +89,7 @@ class Progress:
 
     @property
     def _largest_error(self) -> float:
-        """The largest error of a joint [rad]."""
+        """Largest difference of a joint from its setpoint [rad]."""
         return float(np.abs(self.error).max())
 
     @property

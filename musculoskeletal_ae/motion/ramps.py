@@ -29,12 +29,12 @@ from musculoskeletal_ae.motion.feedback import depends_on_limit
 from musculoskeletal_ae.motion.methods import Solution
 from musculoskeletal_ae.robot.robot import Robot
 
-# Change the command in this fraction of a movement's duration. In the remaining time, the arm
-# settles and is sampled.
+# Ramp the command during this fraction of a movement's duration. In the remaining time, the arm
+# comes to rest and provides a rest sample.
 RAMP_SHARE = 0.6
-PEAK = 1.5  # ratio of peak to mean speed of a ramp
-FIRST = 'first'  # the method that uses T_const
-SECOND = 'second'  # the method that uses the measured T
+PEAK = 1.5  # peak speed of a ramp, as a multiple of its mean speed
+FIRST = 'first'  # name of the length method that uses the given tension T_const
+SECOND = 'second'  # name of the length method that uses the measured tension T
 
 
 class Ramp:
@@ -66,7 +66,7 @@ class Goal(NamedTuple):
 
     Attributes:
         method: One of the preset's length methods.
-        theta: θ_target [rad], (D,).
+        theta: Target posture θ_target [rad], (D,).
         effort: Torque in addition to gravity compensation [N·m], (D,).
         duration: Duration of the movement [s].
         tension: T_const [N], (M,); None to use T_current at the start of the goal.
@@ -90,7 +90,7 @@ class LengthRamps:
         self.use(robot, settings)
         self._goals: list[Goal] = []
         self._goal: Goal | None = None  # present goal, which is approached or held
-        self._remaining = 0.0  # remaining time of the goal [s]
+        self._remaining = 0.0  # time until the next goal begins [s]
         self._ramp: Ramp | None = None
         self._command: Array = np.zeros(robot.muscle_count)
         self._tension: Array = robot.tension.bias  # T_const or T_current of the goal [N], (M,)
@@ -98,7 +98,7 @@ class LengthRamps:
         self.solution: Solution | None = None
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings.
+        """Use another robot description and other settings from the next step on.
 
         `robot` must already describe isolated muscles as muscles without tension.
         """
@@ -181,11 +181,12 @@ class RampedTarget(ActivityControl):
 
     def __init__(self, ramps: LengthRamps, robot: Robot, settings: Settings) -> None:
         self.ramps = ramps
-        self._target: tuple[Array, Array] | None = None  # θ [rad] and effort [N·m], (D,) each
+        #: target posture θ [rad] and additional torque [N·m], (D,) each
+        self._target: tuple[Array, Array] | None = None
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings."""
+        """Use another robot description and other settings from the next step on."""
         self._robot, self._settings = robot, settings
 
     def set_target(self, theta: Array, effort: Array) -> None:
@@ -202,7 +203,7 @@ class RampedTarget(ActivityControl):
         self.ramps.pursue(self._goals())
 
     def step(self, inputs: Inputs) -> Command | None:
-        """Return the next command."""
+        """Advance by one control step and return the next length command."""
         return self.ramps.step(inputs)
 
     def leave(self) -> None:

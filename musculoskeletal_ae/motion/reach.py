@@ -31,19 +31,20 @@ from musculoskeletal_ae.motion.trajectory import Setpoint
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-NOTABLE = 0.05  # count a posture as not holdable if it lacks more torque than this [N·m]
+NOTABLE = 0.05  # treat a posture as not holdable if it lacks more torque than this [N·m]
 HALVINGS = 6  # search for the last holdable posture of a path with this many bisection steps
 
-PRICE = 20.0  # count a missing torque of 1 N·m as this much more path length [1/(N·m)]
-USED = 0.85  # let a path use this fraction of the tension range above T_bias
+#: charge one radian of a path that lacks 1 N·m like this many additional radians [1/(N·m)]
+PRICE = 20.0
+USED = 0.85  # let a path use this fraction of the tension range above T_bias, and keep the rest
 POSTURES = 300  # draw this many random postures for the roadmap
 NEIGHBOURS = 12  # connect each posture of the roadmap with this many neighbours
-LOOKS = 40  # evaluate all edges of at most this many paths
+LOOKS = 40  # evaluate all edges of at most this many paths, then use the cheapest path found so far
 SPACING = 0.15  # evaluate postures of an edge that are at most this far apart [rad]
-#: treat the sliding direction of a muscle as certain well above this change of length per angle
-#: [m/rad]
+#: assume full tendon friction for muscles whose length changes by much more than this with the
+#: angle [m/rad]; less friction for other muscles, because their sliding direction is uncertain
 CERTAIN = 0.005
-AT_STOP = 0.05  # count a joint as resting at a stop that is nearer than this [rad]
+AT_STOP = 0.05  # treat a joint as resting at a stop that is nearer than this [rad]
 STOP = 100.0  # let a stop support a joint with at most this torque [N·m]
 
 
@@ -80,7 +81,7 @@ def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Ar
 
 
 def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
-    """Return a path from `start` to θ on which the muscles hold the arm as well as possible.
+    """Return the way from `start` to θ on which the muscles hold the arm as well as possible.
 
     The path is straight if no muscle is isolated, or if the whole straight path is holdable.
 
@@ -118,10 +119,10 @@ class ReachLimits:
     def of(
         self, jacobian: Array, direction: Array, resistance: Array | float = 0.0
     ) -> tuple[Array, Array]:
-        """Return the lowest and the highest tension [N] that may be used, (M,) each.
+        """Return the lowest and the highest bone-side tension [N] that may be used, (M,) each.
 
         Args:
-            jacobian: G [m/rad], (M, D).
+            jacobian: Muscle Jacobian G [m/rad], (M, D).
             direction: Direction in which the joints move, (D,); 0 at rest. The length of this
                 vector has no effect.
             resistance: Tension by which the lowest tension is raised [N], (M,).
@@ -134,7 +135,7 @@ class ReachLimits:
         """Return the largest missing torque [N·m] at one instant of a motion.
 
         Args:
-            jacobian: G [m/rad], (M, D).
+            jacobian: Muscle Jacobian G [m/rad], (M, D).
             at: The setpoint at this instant.
             lag: Time λ by which the muscle modules lag behind their commands [s].
             slower: Factor by which the motion is slowed; ∞ for a very slow motion.

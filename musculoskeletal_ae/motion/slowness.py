@@ -13,20 +13,19 @@ from musculoskeletal_ae.motion import reach
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.robot import Robot
 
-#: let the lengths of a trajectory use this fraction of the rate limit; the remaining fraction is
-#: for tensions and feedback
+#: let the motion of the arm use this fraction of the rate limit of the lengths; the remaining
+#: fraction is for changes of tension and for feedback
 SHARE = 0.7
-#: evaluate the network at no more instants of a trajectory than this; each piece between two points
-#: still contains at least one instant, even of a trajectory of 10 000 points
+#: evaluate the network at no more instants of a trajectory than this, so that no command is late;
+#: each piece between two points still contains an instant, even of a trajectory of 10 000 points
 MOST_MOMENTS = 12_500
 
-#: try these factors of slowing a motion, in ascending order, until its tensions suffice
+#: slow a motion by the smallest of these factors with which the tensions suffice
 SLOWER = tuple(1.1**k for k in range(17))
-#: Try these factors instead for an arm with isolated muscles. Such an arm may fall where an arm
-#: with all muscles only deviates from its trajectory. It therefore needs more reserve, and the
-#: large steps between the factors provide a part of it.
+#: slow the motion of an arm with isolated muscles by one of these factors instead: it may fall
+#: where other arms only deviate from the trajectory, and coarse factors leave it a reserve
 SLOWER_ISOLATED = (1.0, 1.3, 1.7, 2.2, 2.8, 3.6, 4.6)
-#: plan motions for at least this lag λ [s]; λ is measured only after the motion has begun
+#: assume at least this lag λ in plans [s], because λ is measured only after the motion has begun
 LEAST_LAG = 0.02
 MOMENT_SPACING = 0.06  # compute tensions at instants that are at least this motion apart [rad]
 #: compute tensions at no more instants than this; 500 instants take about 30 ms

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plans the tensions along a trajectory, and the lengths that muscle stiffness control needs.
 
-`follower` contains the equations.
+The module `follower` states the equations.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.signals.friction import slid
 
-TURNING = 0.005  # treat a tendon's sliding direction as certain well above this speed [m/s]
+#: plan full tendon friction for tendons that slide much faster than this [m/s], and less for slower
+#: ones, whose sliding direction is uncertain because of noise
+TURNING = 0.005
 AHEAD = 0.2  # compute T_K at this interval, for the setpoint that is this time ahead [s]
 
 
@@ -40,14 +42,15 @@ class Stiffening:
         self.reset()
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings."""
+        """Use another robot description and other settings from the next step on."""
         self._robot, self._settings = robot, settings
 
     def reset(self) -> None:
         """Discard the present solution; the next step computes a new one."""
         self.solution: Solution | None = None  # the solution that T_K approaches
-        self._near: Array = self._robot.tension.bias  # T_K [N], (M,)
-        self._solved = 0.0  # age of the solution [s]
+        #: present tensions T_K [N], (M,), which approach `solution`
+        self._near: Array = self._robot.tension.bias
+        self._solved = 0.0  # time since the solution was computed [s]
 
     def step(
         self, mae: Mae, trajectory: Trajectory, time: float, effort: Array, limit: Array, dt: float
@@ -109,13 +112,14 @@ class TensionPlan:
         self.effort: Array = np.zeros(robot.joint_count)
         self.tension = PlannedTension.at_bias(robot)
         self._limit: Array = robot.tension.limit  # tension limit of the present plan [N], (M,)
-        self._friction: Array = np.full(robot.muscle_count, FRICTION)  # μ, (M,)
-        #: sliding direction s of each tendon, (M,)
+        #: friction coefficient μ of each tendon, (M,)
+        self._friction: Array = np.full(robot.muscle_count, FRICTION)
+        #: sliding state s of each tendon: 1 after winding in, −1 after paying out, (M,)
         self._sliding: Array = np.zeros(robot.muscle_count)
         self._stiffening = Stiffening(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings."""
+        """Use another robot description and other settings from the next step on."""
         self._robot, self._settings = robot, settings
         self._stiffening.use(robot, settings)
 
@@ -124,7 +128,7 @@ class TensionPlan:
         self._friction = tendon_friction(self._robot, mae)
 
     def reset(self) -> None:
-        """Start again from the tension bias of all muscles, with unknown sliding directions."""
+        """Discard the plan: all muscles are at T_bias again, and no sliding direction is known."""
         self.tension = PlannedTension.at_bias(self._robot)
         self._sliding = np.zeros(self._robot.muscle_count)
         self._stiffening.reset()
@@ -152,11 +156,11 @@ class TensionPlan:
         """Plan the next setpoint of a trajectory, and return its length command [m], (M,).
 
         Args:
-            trajectory: The trajectory.
+            trajectory: The trajectory that the arm follows.
             time: Time since the start of the trajectory [s].
             shift: Shift of θ by the feedback [rad], (D,).
             lag: Time λ by which the muscle modules lag behind their commands [s].
-            inputs: The present inputs.
+            inputs: What the activity may read at this control step.
         """
         robot, mae, dt = self._robot, inputs.mae, inputs.dt
         at = trajectory.sample(time + 0.5 * dt)

@@ -12,17 +12,19 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-# Gains of the method `tension`.
-POSITION_GAIN = 10.0  # K_p [N·m/rad]
-VELOCITY_GAIN = 0.5  # K_d [N·m·s/rad]
+# Gains of the method `tension`; K_p holds the arm near its target, and K_d damps its motion.
+POSITION_GAIN = 10.0  # gain K_p of the posture error [N·m/rad]
+VELOCITY_GAIN = 0.5  # gain K_d of the joint velocity [N·m·s/rad]
 SMOOTHING = 0.05  # smooth the noisy estimate with this time constant [s]
 
 # Method `float`, which compensates gravity, adds these springs and dampers to the holding torque:
 HOLD = 15.0  # stiffness of the spring that holds the arm at θ_held [N·m/rad]
-BAND = 0.05  # move θ_held with the arm once the arm is this far from it [rad]
-DAMPING = 1.0  # damping of each joint [N·m·s/rad]
-WALL = 30.0  # stiffness of the wall near a joint limit [N·m/rad]
-WALL_AT = 0.05  # begin the wall this far before the joint limit [rad]
+#: move θ_held with the arm once the arm is this far from it [rad]; a hand therefore has to exert
+#: HOLD · BAND = 0.75 N·m to move a joint
+BAND = 0.05
+DAMPING = 1.0  # joint torque against the motion, per unit of the joint velocity [N·m·s/rad]
+WALL = 30.0  # stiffness of the spring that pushes a joint away from its limits [N·m/rad]
+WALL_AT = 0.05  # let this spring act from this distance before a joint limit [rad]
 
 
 class TorqueControl(ActivityControl):
@@ -38,13 +40,14 @@ class TorqueControl(ActivityControl):
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self._missing_torque: Array = np.zeros(robot.joint_count)
-        self._target: tuple[Array, Array] | None = None  # θ [rad] and effort [N·m], (D,) each
+        #: target posture θ [rad] and additional torque [N·m], (D,) each
+        self._target: tuple[Array, Array] | None = None
         self._command: Array = robot.tension.bias  # last tension command [N], (M,)
         self._smooth: Array | None = None  # low-pass-filtered θ [rad], (D,)
         self.use(robot, settings)
 
     def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings.
+        """Use another robot description and other settings from the next step on.
 
         `robot` must already describe isolated muscles as muscles without tension.
         """
@@ -63,7 +66,7 @@ class TorqueControl(ActivityControl):
         self._smooth = None
 
     def step(self, inputs: Inputs) -> Command | None:
-        """Return the tension command, or None without a target."""
+        """Advance by one control step; return the tension command, or None without a target."""
         if self._target is None:
             return None
         return self._command_towards(*self._target, inputs)
@@ -73,7 +76,7 @@ class TorqueControl(ActivityControl):
 
     @property
     def has_arrived(self) -> bool:
-        """Whether the arm should be at its target: always, because the position gain pulls it."""
+        """Always true: the position gain pulls the arm to its target from the first command on."""
         return True
 
     @property
@@ -103,7 +106,7 @@ class TorqueControl(ActivityControl):
         return Command(TENSION, self._command.copy())
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
-        """Return the feedback torque [N·m], (D,), from posture and velocity."""
+        """Return the torque [N·m], (D,), that pulls θ towards `target` and damps the velocity."""
         return POSITION_GAIN * (target - theta) - VELOCITY_GAIN * velocity
 
 
@@ -133,13 +136,13 @@ class GravityCompensation(TorqueControl):
         self.held = None
 
     def step(self, inputs: Inputs) -> Command | None:
-        """Return the tension command."""
+        """Advance by one control step and return the tension command."""
         self._theta = inputs.theta
         return self._command_towards(inputs.theta, np.zeros_like(inputs.theta), inputs)
 
     @property
     def new_target(self) -> Array | None:
-        """The present posture, which the next method holds."""
+        """Present posture [rad], (D,): the target that another method holds after this one."""
         return self._theta
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:

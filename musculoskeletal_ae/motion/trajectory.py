@@ -28,11 +28,13 @@ from musculoskeletal_ae.message_reading import TrajectoryPoints
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 
-BEYOND = 0.02  # refuse a curve that exceeds the joint limits by more than this between points [rad]
+#: refuse a curve that exceeds the joint limits between its points by more than this [rad]
+BEYOND = 0.02
 STOPPING = 0.3  # bring a cancelled motion to rest in this time [s]
-SAMPLES = 200  # evaluate a whole trajectory at about this many instants
-WITHIN = 5  # evaluate each piece at no fewer instants than this
-AT_ONCE = 0.01  # replace a requested time of 0 by this time [s]
+SAMPLES = 200  # evaluate a trajectory at about this many instants to check limits and speeds
+WITHIN = 5  # evaluate each piece between two points at no fewer instants than this
+#: replace a requested time of 0 by this time [s]; the planner then slows the motion as necessary
+AT_ONCE = 0.01
 #: Refuse two successive times that are closer than this, relative to the later one: in a shorter
 #: piece of the curve, rounding errors of the time would matter.
 RESOLUTION = 1e-11
@@ -50,7 +52,7 @@ QUINTIC = np.array(
 
 
 class Setpoint(NamedTuple):
-    """Desired motion at one instant or at N instants; each array is (D,) or (N, D)."""
+    """Desired motion at one instant, each array (D,), or at N instants, each array (N, D)."""
 
     theta: Array  # joint angles [rad]
     velocity: Array  # joint velocities [rad/s]
@@ -67,7 +69,7 @@ class Trajectory:
     """A piecewise polynomial curve from `start` through points."""
 
     start: Setpoint
-    points: TrajectoryPoints  # the remaining points
+    points: TrajectoryPoints  # points that were still ahead at the start of the trajectory
     time: Array  # times of the knots [s], (K,); the first time is 0
     coefficients: Array  # coefficients of each piece, (K−1, 6, D)
     end: Array  # posture that is held after the last point [rad], (D,)
@@ -81,8 +83,8 @@ class Trajectory:
 
         Args:
             start: Setpoint at which the trajectory begins.
-            points: The points, with times relative to the same time 0.
-            passed: Time elapsed since time 0 of the points [s]; points up to then are dropped.
+            points: The points; their times count from the same instant, the time 0 of the points.
+            passed: Time elapsed since this time 0 [s]; points before it are skipped.
 
         Raises:
             MessageError: If no point remains, or two points are too close in time.

@@ -9,10 +9,14 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.robot.robot import Robot
 
-WINDING = 0.03  # measure the lag only at muscles that move faster than this [m/s]
-LAGS = 2.0e-3  # give the initial guess λ = 0 this weight [m²/s²]
-LARGEST_LAG = 0.1  # report no larger lag than this [s]
-SPAN = 0.0095  # compute a speed over no less than this time, so that noise is small [s]
+#: measure the lag only at muscles that move faster than this [m/s], because noise hides it in slow
+#: ones
+WINDING = 0.03
+#: weight of the initial guess λ = 0 in the fit [m²/s²]; a muscle that moves at speed v adds v²
+LAGS = 2.0e-3
+LARGEST_LAG = 0.1  # clip the measured lag to this [s]
+#: compute speeds from lengths that are at least this far apart in time, so that noise is small [s]
+SPAN = 0.0095
 
 
 class Winches:
@@ -30,9 +34,9 @@ class Winches:
         self._robot = robot
         self._products, self._squares = 0.0, LAGS
         self._since = self._last = 0.0
-        self._delay = 0.0  # delay of the last message [s]
+        self._delay = 0.0  # delay of the last muscle_states message on its way here [s]
         self._length: Array | None = None
-        self._speed: Array = np.zeros(robot.muscle_count)  # dl/dt [m/s], (M,)
+        self._speed: Array = np.zeros(robot.muscle_count)  # speed of each muscle, dl/dt [m/s], (M,)
 
     def use(self, robot: Robot) -> None:
         """Use another robot description; its isolated muscles are ignored."""
@@ -40,12 +44,12 @@ class Winches:
 
     @property
     def lag(self) -> float:
-        """The present estimate of the lag λ [s]."""
+        """Measured lag λ by which the modules follow their commands [s]; 0 before any motion."""
         return min(max(self._products / self._squares, 0.0), LARGEST_LAG)
 
     @property
     def lead(self) -> Array:
-        """Length by which modules that wind in lag behind their commands [m], (M,)."""
+        """Length by which each module that winds in lags behind its command [m], (M,)."""
         return self.lag * np.maximum(-self._speed, 0.0)
 
     def step(
@@ -54,8 +58,8 @@ class Winches:
         """Update the lag λ and the speeds of the muscles.
 
         Args:
-            length: l [m], (M,).
-            tension: T [N], (M,).
+            length: Muscle lengths l [m], (M,).
+            tension: Tensions T [N], (M,).
             command: Length command at the time of l and T [m], (M,).
             dt: Time since the previous call [s].
             delay: How late the message with l and T is (`Arrival.delay`) [s].
@@ -79,6 +83,6 @@ class Winches:
         self._squares += float(speed[is_usable] @ speed[is_usable])
 
     def forget(self) -> None:
-        """Forget the last length after a pause; the estimate of the lag remains."""
+        """Forget the last measured lengths after a pause; λ remains known."""
         self._length, self._since = None, 0.0
         self._speed = np.zeros_like(self._speed)

@@ -35,7 +35,7 @@ from musculoskeletal_ae.signals.motor_interface import STATES
 from musculoskeletal_ae.signals.muscle_readings import muscle_reading
 
 MARKER_RATE = 10.0  # publish markers at this rate [Hz]
-NAME_HEIGHT = 0.018  # draw the muscles' names at this height [m]
+NAME_HEIGHT = 0.018  # height of the letters with which the muscles' names are drawn [m]
 #: colour of the bones of these arms: red, green, blue and opacity
 BONE_COLOURS = {'estimated': (0.0, 0.62, 0.45, 0.5), 'sim': (0.58, 0.40, 0.74, 0.5)}
 HARDWARE_COLOUR = (*BONE_COLOUR, 1.0)  # colour of the bones of all arms not in BONE_COLOURS
@@ -48,7 +48,7 @@ class Markers:
     """Publishes ARM/markers while the topic has a subscriber."""
 
     def __init__(self, node: Shell, arm: str, lines: Callable[[], list[Line]]) -> None:
-        """Draw the lines that `lines` returns; if there are none, publish nothing."""
+        """Publish the markers of `arm` with the lines that `lines` returns, if it returns any."""
         self._node, self._lines = node, lines
         self._bones = BONE_COLOURS.get(arm, HARDWARE_COLOUR)
         self._publisher = node.create_publisher(MarkerArray, f'{arm}/markers', RELIABLE)
@@ -173,7 +173,7 @@ class ArmNode(Shell):
         """Publish the state of the arm.
 
         Args:
-            theta: θ [rad], (D,).
+            theta: Joint angles θ [rad], (D,).
             values: The readings of the muscle modules, as for `muscle_reading`; among them `length`
                 and `tension`.
         """

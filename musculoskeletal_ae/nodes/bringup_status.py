@@ -66,7 +66,8 @@ class BringupStatusNode(Shell):
         self.last_known = ('', math.nan)
         self.started: float | None = None
         self.ended: float | None = None  # when the end of the recording was first reported [s]
-        self.ended_report = math.inf  # arrival of that report, as `Situation.heard_at` counts [s]
+        #: arrival of the report with this end, as `Situation.heard_at` states it [s]
+        self.ended_report = math.inf
         #: the last line that was printed before the first estimate, and whether it stated the load
         self.waiting = '', False
         self.waiting_at = -math.inf  # time at which the line 'waiting for …' was printed last [s]
@@ -96,7 +97,7 @@ class BringupStatusNode(Shell):
         yield from (each.condition for each in self.situation.conditions())
 
     def status(self) -> Report:
-        """Return whether all nodes are OK."""
+        """Return the report 'all nodes are OK', or one without a text while there is trouble."""
         self.situation.forget_ended()
         return Report('' if self.situation.trouble() else 'all nodes are OK', {})
 
@@ -208,7 +209,7 @@ class BringupStatusNode(Shell):
         print(printable('  '.join(filter(None, parts))), flush=True)
 
     def _print_hint(self) -> None:
-        """Print the hint of the situation in a line of its own, once."""
+        """Print once, in a line of its own, why the error may rise before learning begins."""
         hint = self.situation.hint()
         if hint and hint != self.printed_hint:
             print(f'-- {printable(hint)}', flush=True)

@@ -94,6 +94,6 @@ class Candidates:
         self._node.needed.remove(CANDIDATES)
 
     def publish(self, mae: Mae) -> None:
-        """Publish an accepted network."""
+        """Publish a network that was accepted, so that all nodes use it."""
         self._node.checkpoint_version = mae.version
         self._accepted.publish(bytes_message(checkpoint.to_bytes(mae)))

@@ -15,8 +15,8 @@ from musculoskeletal_ae.reception import Reception
 CANDIDATES = 'mae_checkpoint'  # topic of the networks that the learner proposes
 ACCEPTED = 'accepted_checkpoint'  # topic of the networks that the estimator has accepted
 REJECTED = 'rejected_checkpoint'  # topic of the versions that the estimator has rejected
-#: Run a step at this interval [s]. A step takes a few milliseconds, at most a quarter of this
-#: time.
+#: process one step of a checkpoint at this interval [s]; a step takes a few milliseconds, at most a
+#: quarter of this time, so that the node keeps up with its messages
 STEP_PERIOD = 0.02
 LARGEST = 64 << 20  # refuse a larger checkpoint [bytes]; a typical one has half a MB
 

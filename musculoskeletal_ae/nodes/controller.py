@@ -56,7 +56,9 @@ from musculoskeletal_ae.ros.messages import (
 from musculoskeletal_ae.ros.second_publishers import AUTHORS
 from musculoskeletal_ae.signals.limits import LIMITS
 
-OVERDUE = 1.5  # compute a command after this number of periods without an estimate
+#: compute a command after this number of periods without an estimate, so that stale messages stop
+#: the arm
+OVERDUE = 1.5
 
 
 class ControllerNode(Shell):
@@ -167,7 +169,7 @@ class ControllerNode(Shell):
         self.core.take(message, now, delay)
 
     def on_intruders(self, intruders: str) -> None:
-        """Stop while another node publishes a topic that belongs to one of the arm's nodes."""
+        """Stop while `intruders`, other nodes, publish topics that belong to this arm's nodes."""
         self.core.watchdog.second_publisher = intruders
 
     def _on_estimate(self, message: JointState) -> None:
@@ -223,7 +225,10 @@ class ControllerNode(Shell):
         self._log_accepted('target_twist', 'the hand moves at this velocity')
 
     def _log_accepted(self, topic: str, content: str) -> None:
-        """Log an accepted request for motion; of a stream of requests, log only the first."""
+        """Log an accepted request for motion; of a stream of requests, log only the first.
+
+        `topic` is the topic of the request, and `content` says what the arm does.
+        """
         arrival = self._reception.arrivals[topic]
         if not arrival.was_used or arrival.age(time.monotonic()) > STREAM_GAP:
             self.get_logger().info(f'accepted {topic}: {content}')

@@ -120,7 +120,8 @@ class EstimatorNode(Shell):
 
     def _accepted(self, mae: Mae) -> None:
         self.candidates.publish(mae)
-        if Evidence.NOT_CALIBRATED in self.core.trust.evidence:  # it waits for the first network
+        # The calibration waits for the first network.
+        if Evidence.NOT_CALIBRATED in self.core.trust.evidence:
             self.core.calibrate_lengths(self.posture)
             self._publish_body()
 
@@ -164,11 +165,11 @@ class EstimatorNode(Shell):
         return f'isolated: {self.robot.names(self.core.body.isolated) or "none"}'
 
     def _reset_or_confirm(self, request: Trigger.Request) -> str:
-        """End the anomaly; if there is none, take the joint sensors as they are."""
+        """End the anomaly; if there is none, accept the joint sensors that are in doubt."""
         if not self.core.cause and (joints := self.core.confirm_joint_sensors()):
             self._publish_joint_trust()
             names = ', '.join(self.robot.joints[joint] for joint in joints)
-            return f'these joint sensors are taken as they are: {names}'
+            return f'joint sensors accepted without a further check: {names}'
         return self._reset(request)
 
     def _reset(self, _: Trigger.Request) -> str:

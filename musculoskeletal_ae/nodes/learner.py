@@ -32,10 +32,11 @@ from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.ros.messages import LATCHED, SENSOR, bytes_message, serve
 from musculoskeletal_ae.ros.second_publishers import SEVERAL, LinkSensors, publishers_of
 
-IMU = 'imu'  # topic of the accelerometers
+IMU = 'imu'  # topic on which accelerometers publish
 MOST_DIGITS = 15  # reject a version of a network with more digits
-POLL_PERIOD = 0.05  # check the training process at this interval [s]
-LEAST_PERIOD = 0.01  # pair joint angles at most as narrowly as if messages had this period [s]
+POLL_PERIOD = 0.05  # look at this interval whether the training process has finished an update [s]
+#: assume at least this period of muscle_states when pairing them with joint angles [s]
+LEAST_PERIOD = 0.01
 JOINT_TOPICS = {'sensor': 'joint_states', 'marker': 'vision_joint_states'}
 
 

@@ -43,8 +43,7 @@ STATE_DIRECTORY = Parameter(
     'saved)',
 )
 
-#: all parameters, by node and by name
-PARAMETERS: dict[str, dict[str, Parameter]] = {
+PARAMETERS: dict[str, dict[str, Parameter]] = {  # all parameters of all nodes, by node and by name
     'controller': {
         **SHARED,
         'checkpoint': CHECKPOINT,

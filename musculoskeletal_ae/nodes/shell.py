@@ -87,7 +87,7 @@ QOS_REMEDIES = {
 class Shell(Node):
     """A node that knows its robot, counts the messages it rejects, and reports once a second."""
 
-    core: Any = None  # the object that computes, without ROS
+    core: Any = None  # object, independent of ROS, that computes what the node publishes
     is_time_critical = True  # whether a delay of this node delays commands
     is_watched = True  # whether the process ends if it makes no progress for 10 s
     #: recorder of every message that arrives, before the message is used; None to record nothing
@@ -116,7 +116,7 @@ class Shell(Node):
         #: name of the root link's frame in published messages
         self.root_frame = self.parameter('frame_prefix') + self.robot.root_link
         warn = self.get_logger().warning
-        self.awake = AwakeClock()  # excludes the pauses of this process
+        self.awake = AwakeClock()  # clock that stops while this process is blocked
         self._reception = Reception(
             lambda text: warn(f'{text} (counted in /diagnostics)'), self.awake
         )
@@ -357,7 +357,8 @@ class Shell(Node):
         """Return the network in a file; None if the path is empty.
 
         Raises:
-            CheckpointError: If it does not belong to this robot, or does not explain it.
+            CheckpointError: If the network belongs to another robot, or its predictions are
+                implausible for this one.
         """
         if not path:
             return None
@@ -371,7 +372,10 @@ class Shell(Node):
         handle: Callable[[UInt8MultiArray], Iterator[None]],
         unfit: Callable[[str], None] = lambda _: None,
     ) -> CheckpointQueue:
-        """Return a queue that processes the checkpoints of a topic in small steps."""
+        """Return a queue that processes the checkpoints of a topic in small steps.
+
+        `handle` yields after each step. `unfit` is called with the reason if one is refused.
+        """
         return CheckpointQueue(self, self._reception, topic, handle, unfit)
 
     # -- messages -------------------------------------------------------------------------------
@@ -433,7 +437,11 @@ class Shell(Node):
     def _from_author(
         self, topic: str, callback: Callable[[Any], object], is_latched: bool
     ) -> Callable[[Any], None]:
-        """Return a callback that rejects messages while several nodes publish the topic."""
+        """Return a callback that rejects messages while several nodes publish the topic.
+
+        On a latched topic, it also rejects them while the node of one of several publishers is
+        not known yet.
+        """
 
         def take(message: Any) -> None:
             self.sources.check(topic, is_latched)
@@ -442,7 +450,7 @@ class Shell(Node):
         return take
 
     def _subscribe_anew(self, topic: str) -> None:
-        """Resubscribe to a latched topic to receive its value again."""
+        """Subscribe anew to a latched topic, to receive its value again."""
         subscription, subscribe = self._latched[topic]
         self.destroy_subscription(subscription)
         self._latched[topic] = subscribe(), subscribe
@@ -467,7 +475,7 @@ class Shell(Node):
         return '; '.join(filter(None, problems))
 
     def on_intruders(self, intruders: str) -> None:
-        """Called ten times a second with the value of the property `intruders`."""
+        """React to intruding nodes; called ten times a second with the property `intruders`."""
 
     def follow_muscles(
         self,
@@ -581,7 +589,10 @@ def _signs(conditions: Iterable[Condition]) -> frozenset[tuple[str, str, tuple[s
 def _recorded(
     recording: StopRecording, topic: str, kind: type, callback: Callable[[Any], Any]
 ) -> Callable[[bytes], Any]:
-    """Return a callback that records a serialized message, then passes it to `callback`."""
+    """Return a callback that records a serialized message of a topic, and calls `callback` with it.
+
+    `callback` receives the deserialized message, of the type `kind`.
+    """
 
     def read(data: bytes) -> Any:
         message = deserialize_message(data, kind)

@@ -59,9 +59,9 @@ def nodes_in_graph(node: RosNode) -> set[str]:
 
 
 class NodeReport(NamedTuple):
-    """The last report of one node."""
+    """What a node has last reported on /diagnostics."""
 
-    values: dict[str, str]  # its values, by name
+    values: dict[str, str]  # values that the node has reported, by name
     conditions: tuple[Condition, ...]
     message: str
     heard_at: float  # time of arrival, excluding pauses of this process [s]
@@ -223,23 +223,23 @@ class Situation:
 
     @property
     def is_stopped(self) -> bool:
-        """Whether the controller is stopped."""
+        """Whether the controller reports that it is stopped."""
         return self.values('controller').get('mode') == StopState.STOPPED.value
 
     @property
     def has_learner(self) -> bool:
-        """Whether a learner has reported."""
+        """Whether a learner has reported, so that the arm may learn."""
         return 'learner' in self._reports
 
     def number(self, node: str, key: str) -> float:
-        """Return a number that a node has reported; NaN if it is unknown."""
+        """Return the number that a node has reported as `key`; NaN if it is unknown."""
         try:
             return float(self.values(node).get(key, 'nan'))
         except ValueError:
             return math.nan
 
     def count(self, key: str) -> str:
-        """Return a count of the learner; '0' without a learner."""
+        """Return the count that the learner has reported as `key`; '0' without a learner."""
         return self.values('learner').get(key, '0')
 
     def hint(self) -> str:

@@ -23,8 +23,8 @@ from musculoskeletal_ae.bags.topics import TOPICS, Topic
 from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
-SECONDS = 10.0  # record this time before a stop [s]
-MOST = 50_000  # keep at most this many messages
+SECONDS = 10.0  # let a recording begin this long before the stop [s]
+MOST = 50_000  # of the time before a stop, keep only the newest messages, at most this many
 MOST_BYTES = 32 << 20  # keep messages of at most this total size [bytes]
 LARGEST_MESSAGE = 4 << 20  # leave out a larger message [bytes]; a typical network has half a MB
 FILE = 'cause.txt'  # file in the bag's directory with the cause of the stop; written last
@@ -104,7 +104,7 @@ class StopRecording:
         self._writing.start()
 
     def close(self) -> None:
-        """Wait until a recording has been written."""
+        """Wait until a recording that is being written is complete."""
         if self._writing is not None:
             self._writing.join()
 

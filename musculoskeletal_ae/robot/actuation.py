@@ -24,9 +24,10 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.robot.robot import Robot
 
 Choice = TypeVar('Choice')
-Kinded = tuple[str, Array]  # kind and value of a command
+#: a command: its kind (LENGTH or TENSION), and target lengths [m] or tensions [N]
+Kinded = tuple[str, Array]
 
-LENGTH, TENSION = 'length', 'tension'  # kinds of commands
+LENGTH, TENSION = 'length', 'tension'  # kinds of commands: target lengths, or target tensions
 
 DESIRED_SHARE = 0.3  # assume and prefer tensions of this share of T_limit, as in a well-tensed arm
 #: let rest feedback pay out a needlessly tense muscle under stiffness control by at most this [m];
@@ -279,7 +280,10 @@ class Actuation(ABC):
 
     @abstractmethod
     def winding_depth(self, muscle: int) -> float:
-        """Return the length [m] by which a suspect may be wound in, whatever its sensors read."""
+        """Return the length [m] by which `muscle` may be wound in while it is verified.
+
+        The limit applies whatever the sensors of the suspect muscle read.
+        """
 
 
 class StiffnessControl(Actuation):
@@ -338,7 +342,10 @@ class StiffnessControl(Actuation):
         return self.demanded(length, command)
 
     def is_pulling(self, length: Array, command: Array) -> Bools:
-        """Return which muscles are longer than commanded, (M,); these demand more than T_bias."""
+        """Return which muscles are longer than commanded, (M,); these demand more than T_bias.
+
+        Measured and commanded lengths are in [m], (M,) each.
+        """
         pulling: Bools = length > command
         return pulling
 
@@ -384,7 +391,10 @@ class StiffnessControl(Actuation):
         return np.where(self._robot.used, end, np.minimum(end, longest))
 
     def rise(self, muscle: int, length: float, command: float, tension: float) -> float:
-        """Return by how much the higher of measured and demanded tension exceeds T_bias [N]."""
+        """Return by how much the higher of measured and demanded tension exceeds T_bias [N].
+
+        The demanded tension follows from the measured length and the length command, both [m].
+        """
         measured = tension - self._whole.bias[muscle]
         return float(max(measured, self._stiffness[muscle] * (length - command)))
 
@@ -434,7 +444,7 @@ class PositionControl(Actuation):
         return LENGTH, self.length_for(length, measured, goal)
 
     def unchanging_length(self, length: Array, tension: Array) -> Array:  # noqa: ARG002
-        """Return the present lengths [m], (M,)."""
+        """Return the present lengths [m], (M,), which position-controlled modules hold."""
         return length.copy()
 
     def present_tension(self, length: Array, command: Array, tension: Array) -> Array:  # noqa: ARG002
@@ -442,7 +452,7 @@ class PositionControl(Actuation):
         return np.maximum(tension, self._bias)
 
     def is_pulling(self, length: Array, command: Array) -> Bools:  # noqa: ARG002
-        """Return True for every module, (M,)."""
+        """Return True for every module, (M,), because each follows its target length."""
         return np.ones(np.shape(length), dtype=bool)
 
     def tension_of_lag(self, lag: float, speed: Array) -> Array:  # noqa: ARG002

@@ -52,8 +52,9 @@ OTHER_JOINTS = {1: 'continuous', 3: 'planar', 6: 'floating'}
 #: an eigenvalue slightly negative
 LEAST_EIGENVALUE = -1e-9
 
-TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}  # tensions [N]
-STIFFNESS_DEFAULT = 10000.0  # K_stiff [N/m]
+#: T_bias, T_limit and T_max of a muscle whose entry states none [N]
+TENSION_DEFAULT = {'bias': 30.0, 'limit': 200.0, 'max': 500.0}
+STIFFNESS_DEFAULT = 10000.0  # K_stiff of a muscle whose entry states none [N/m]
 SPEED_DEFAULT = 0.1  # assume this speed of a position-controlled module that states none [m/s]
 #: scale of a motor current in `with_modules` [N per A]: 0.03 N·m/A, gear of 20, spool of 10 mm
 NEWTON_PER_AMPERE = 60.0
@@ -69,7 +70,7 @@ BY_CURRENT = (
 
 
 class RoutePoint(NamedTuple):
-    """A via point of the tendon."""
+    """A point of a link through which a tendon runs."""
 
     link: str
     xyz: Array  # position in the link's frame [m], (3,)
@@ -84,7 +85,7 @@ class Wrap(NamedTuple):
 
     link: str
     xyz: Array  # centre, or the point of a pulley at which the tendon enters it [m]
-    radius: float  # [m]
+    radius: float  # radius of the object [m]
     #: unit vector along a cylinder, or along the tendon where it enters a pulley; None for a sphere
     axis: Array | None
     #: point on the side where the tendon passes [m]; a point inside the object makes it a ring
@@ -136,7 +137,7 @@ class RobotDescription:
 
     directory: Path
     urdf: str
-    model: pin.Model  # model of the whole URDF
+    model: pin.Model  # pinocchio's model of the whole URDF
     joints: tuple[str, ...]  # names of the joints, in the order of θ
     muscles: tuple[str, ...]  # names of the muscles, in the order of T and l
     routes: tuple[Route, ...]  # one route for each muscle
@@ -144,7 +145,7 @@ class RobotDescription:
     #: K_stiff of muscle stiffness control [N/m], (M,); infinite for position-controlled modules
     stiffness: Array
     tension: TensionRange
-    actuation: str  # STIFFNESS or POSITION
+    actuation: str  # kind of the muscle modules: STIFFNESS or POSITION
     tension_source: TensionSource
     speed: Array  # speed of position-controlled modules [m/s], (M,); infinite for others
     #: length that a stop pays out if tensions are unknown [m], (M,); NaN for the default
@@ -400,7 +401,10 @@ def _read_couplings(
 def _read_joint_elasticity(
     content: MuscleFile, couplings: Iterable[str], fail: Fail
 ) -> JointElasticity:
-    """Return springs, dampers and passive tendons, in the units of the joints."""
+    """Return the springs, dampers and passive tendons in `content`, in the units of the joints.
+
+    `couplings` are joints that follow another joint, and can therefore have no spring.
+    """
     joints = content.joints
     stiffness, rest, damping = (
         np.zeros(shape) for shape in ((len(joints),) * 2, *[len(joints)] * 2)
@@ -550,7 +554,8 @@ def _read_end_effectors(
 ) -> tuple[str, ...]:
     """Return the links that muscles.yaml names as end effectors.
 
-    If it names none, return the link that the largest number of joints move.
+    If it names none, return the link that the largest number of joints move. `couplings` are the
+    coupled joints, and `order` are the links in the order of robot.urdf.
     """
     links = _joints_above(model, {*content.joints})
     moved = _joints_above(model, {*content.joints, *couplings})
@@ -592,7 +597,10 @@ def _joints_above(model: pin.Model, names: set[str]) -> dict[str, int]:
 def with_modules(
     description: RobotDescription, actuation: str, tension_source: str = 'sensor'
 ) -> RobotDescription:
-    """Return the description with another kind of muscle modules and their default values."""
+    """Return the description with another kind of muscle modules and their default values.
+
+    `actuation` and `tension_source` have the values that they may have in muscles.yaml.
+    """
     follows_position, ones = actuation == POSITION, np.ones(len(description.muscles))
     scale = ones * NEWTON_PER_AMPERE if tension_source == CURRENT else None
     return replace(

@@ -15,17 +15,18 @@ from musculoskeletal_ae.figures import save_figure
 from musculoskeletal_ae.robot.robot import Robot
 
 SHORTEST_BONE = 1e-3  # draw no shorter bone, because it connects two joints in the same place [m]
-BONE_WIDTH, MUSCLE_WIDTH = 0.02, 0.006  # draw lines of these widths [m]
-BONE_COLOUR = (0.8, 0.8, 0.75)  # red, green, blue
-BALL_SIZE = 1.7  # draw a ball of this diameter, divided by the width of its line
+BONE_WIDTH, MUSCLE_WIDTH = 0.02, 0.006  # widths of the lines that represent bones and muscles [m]
+BONE_COLOUR = (0.8, 0.8, 0.75)  # colour of bones: red, green, blue
+#: diameter of the balls that mark joints and via points, divided by the width of the line
+BALL_SIZE = 1.7
 
 
 class Line(NamedTuple):
     """A polyline in the root link's frame."""
 
     kind: Literal['bones', 'muscles']
-    points: Array  # [m], (N, 3)
-    width: float  # [m]
+    points: Array  # corners of the polyline [m], (N, 3)
+    width: float  # width of the line [m]
     colour: tuple[float, ...]  # red, green, blue in [0, 1]
     name: str = ''  # name of the muscle; only the first branch of its tendon has one
 

@@ -5,7 +5,8 @@ from typing import Annotated
 
 from msgspec import Meta
 
-LARGEST = 1e8  # refuse any number of a larger absolute value [SI units]
+#: refuse a number whose absolute value is larger [SI units], because it is certainly a mistake
+LARGEST = 1e8
 LONGEST_LIST = 1000  # refuse a list of more entries: muscles, points of a route, joints
 
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]

@@ -18,8 +18,8 @@ from musculoskeletal_ae.arrays import Bools, Ints
 class Group(NamedTuple):
     """Joints and the muscles that cross them, such as a limb; no muscle crosses two groups."""
 
-    joints: tuple[int, ...]  # indices in θ
-    muscles: tuple[int, ...]  # indices in T and l
+    joints: tuple[int, ...]  # indices of the joints in θ
+    muscles: tuple[int, ...]  # indices of the muscles in T and l
 
     @classmethod
     def whole(cls, joints: int, muscles: int) -> Group:
@@ -102,7 +102,10 @@ def parts(crossed: Bools, group: Group) -> tuple[Group, ...]:
 
 
 def _components(crossed: Bools) -> Ints:
-    """Return for each joint the first joint to which muscles link it, directly or not, (D,)."""
+    """Return for each joint the first joint to which muscles link it, directly or not, (D,).
+
+    `crossed` (M, D) says which joints each muscle crosses.
+    """
     of_joint = np.arange(crossed.shape[1])
     for own in crossed[crossed.any(axis=1)]:
         of_joint[np.isin(of_joint, of_joint[own])] = of_joint[own].min()

@@ -24,9 +24,9 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: by default, expect a typical camera to measure a marker with σ_p [m] and σ_R [rad], (6,)
 SPREADS = np.repeat([0.002, 0.01], 3)
-#: standard deviations that leave the orientation free
+#: the same with so large a σ_R that any orientation is accepted
 POSITION_ONLY = np.repeat([0.002, 100.0], 3)
-ROUNDS = 30  # take at most this many steps
+ROUNDS = 30  # end the search after this many steps
 #: damp each step by this prior standard deviation, so that joints that the pose does not determine
 #: hardly move [rad]
 STEP_SPREAD = 0.1
@@ -36,10 +36,11 @@ LEAST_GAIN = 1.0  # end the search once a step reduces the minimised sum by less
 class Posture(NamedTuple):
     """A solution of the inverse kinematics, with its remaining errors."""
 
-    theta: Array  # θ [rad], (D,)
-    distance: float  # remaining error of the position [m]
-    angle: float  # remaining error of the orientation [rad]
-    observed_theta: Array  # θ, with NaN for joints that do not move the end effector, (D,)
+    theta: Array  # joint angles θ of the solution [rad], (D,)
+    distance: float  # distance of the end effector from the pose [m]
+    angle: float  # angle between its orientation and that of the pose [rad]
+    #: θ, with NaN for joints that do not move the end effector and therefore remain unknown, (D,)
+    observed_theta: Array
 
 
 def inverse_kinematics(
@@ -48,7 +49,7 @@ def inverse_kinematics(
     """Return the posture that brings the end effector nearest to a pose.
 
     Args:
-        robot: The geometric model.
+        robot: The geometric model, whose joint limits bound the solution.
         pose: The pose in the root link's frame.
         start: Joint angles at which the search starts [rad], (D,).
         spreads: Standard deviations of the measured position [m] and orientation [rad], (6,).

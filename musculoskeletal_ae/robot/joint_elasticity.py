@@ -30,9 +30,9 @@ class JointElasticity:
     tendons.
     """
 
-    stiffness: Array  # K [N·m/rad], symmetric, (D, D)
+    stiffness: Array  # stiffness matrix K of the springs [N·m/rad], symmetric, (D, D)
     preload: Array  # b = K θ_0, the torque of the springs at θ = 0 [N·m], (D,)
-    damping: Array  # d [N·m·s/rad], (D,)
+    damping: Array  # damping d of each joint [N·m·s/rad], (D,)
     tendons: PassiveTendons = field(default_factory=lambda: PassiveTendons.none(0))
 
     def __post_init__(self) -> None:

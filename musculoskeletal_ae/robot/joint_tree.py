@@ -52,7 +52,7 @@ class Coupling(NamedTuple):
 
     master: str  # after `resolved`, a joint that is not coupled itself
     ratio: float
-    offset: float  # [rad] or [m]
+    offset: float  # position of the joint where its master is at 0 [rad or m]
     higher: tuple[float, ...] = ()  # coefficients of the second and all higher powers
 
     @classmethod
@@ -228,7 +228,7 @@ class JointTree:
         """Return the positions of all joints of the tree, including coupled joints, (..., J−1).
 
         Args:
-            theta: θ [rad], (..., D).
+            theta: Joint angles θ [rad], (..., D).
 
         Returns:
             The positions [rad] or [m] in pinocchio's order, without the root link.
@@ -247,7 +247,7 @@ class JointTree:
         """Return the second derivative of each joint's position with respect to its entry of θ.
 
         Args:
-            theta: θ [rad], (..., D).
+            theta: Joint angles θ [rad], (..., D).
 
         Returns:
             One value for each joint of the tree, (..., J−1); 0 unless its coupling is nonlinear.
@@ -271,7 +271,7 @@ class JointTree:
 
         Args:
             values: One value for each joint of the tree, (*N, ..., J−1).
-            theta: θ [rad], (*N, D).
+            theta: Joint angles θ [rad], (*N, D).
 
         Returns:
             Torques or derivatives with respect to θ, (*N, ..., D).
@@ -291,7 +291,7 @@ class JointTree:
 
         Args:
             matrix: The matrix B, (J−1, J−1).
-            theta: θ [rad], (D,).
+            theta: Joint angles θ [rad], (D,).
         """
         if not self.is_geared:
             return self.of_theta(self.of_theta(matrix, theta).T, theta).T

@@ -26,7 +26,8 @@ if TYPE_CHECKING:  # slow imports, which the parameters of the nodes do not need
     from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 
 PRISMATIC = ('JointModelPX', 'JointModelPY', 'JointModelPZ', 'JointModelPrismaticUnaligned')
-#: count this travel of a prismatic joint as one radian [m]: the radius of the assumed pinion
+#: let θ of a prismatic joint rise by 1 rad when the joint moves by this distance [m]: the radius of
+#: an assumed pinion
 RACK = 0.06
 
 
@@ -39,20 +40,29 @@ class JointUnit(NamedTuple):
     stiffness: str
 
     def position_text(self, theta: float, form: str = '.2f') -> str:
-        """Return the joint's position with its unit, for θ [rad]; `form` is a format."""
+        """Return the joint's position θ [rad] as text with its unit, in the format `form`."""
         return f'{theta * self.radian:{form}} {self.position}'
 
     def range_text(self, low: float, high: float, form: str = '.2f') -> str:
-        """Return a range of positions with its unit, such as '0.00 to 0.05 m', for θ [rad]."""
+        """Return the range from `low` to `high`, both θ [rad], as text such as '0.00 to 0.05 m'.
+
+        `form` is the format of the numbers.
+        """
         low, high = low * self.radian, high * self.radian
         return f'{low:{form}} to {high:{form}} {self.position}'
 
     def torque_text(self, torque: float, form: str = '.2f') -> str:
-        """Return a joint torque, or the force on a prismatic joint, for a torque in [N·m]."""
+        """Return a joint torque [N·m] as text; of a prismatic joint, the force [N] instead.
+
+        `form` is the format of the number.
+        """
         return f'{torque / self.radian:{form}} {self.torque}'
 
     def stiffness_text(self, stiffness: float, form: str = '.2f') -> str:
-        """Return a joint stiffness with its unit, for a stiffness in [N·m/rad]."""
+        """Return a joint stiffness [N·m/rad] as text; of a prismatic joint, in [N/m] instead.
+
+        `form` is the format of the number.
+        """
         return f'{stiffness / self.radian**2:{form}} {self.stiffness}'
 
 
@@ -146,7 +156,7 @@ class JointUnits:
         """Return the means of `mean_errors` as text, such as '0.0123 rad and 1.20 mm', or ''.
 
         Args:
-            means: The means, (2,).
+            means: Mean errors of the revolute and of the prismatic joints [rad], (2,).
             form: Format of the number in [rad].
         """
         turn, slide = means
@@ -155,7 +165,7 @@ class JointUnits:
         return ' and '.join(parts)
 
     def error_text(self, error: Array, form: str = '.4f') -> str:
-        """Return the mean size of errors of θ as text; arguments as of the two methods above."""
+        """Return the mean size of errors of θ [rad], (N, D) or (D,), as text; see `errors_text`."""
         return self.errors_text(self.mean_errors(error), form)
 
     @property

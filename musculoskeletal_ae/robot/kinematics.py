@@ -38,7 +38,7 @@ def reduced(model: pin.Model, locked: Sequence[int], at: Array) -> pin.Model:
     up by name and would reject or confuse such frames, so all frames get unique names meanwhile.
 
     Args:
-        model: The model.
+        model: The model, which is not changed.
         locked: Indices of the joints to fix.
         at: Positions of all joints, at which these joints are fixed.
     """
@@ -174,8 +174,8 @@ class Kinematics:
 
         Args:
             theta: Joint angles θ [rad], (D,).
-            velocity: θ̇ [rad/s], (D,).
-            acceleration: θ̈ [rad/s²], (D,).
+            velocity: Joint velocities θ̇ [rad/s], (D,).
+            acceleration: Joint accelerations θ̈ [rad/s²], (D,).
         """
         tree, rates = self.tree, np.array([velocity, acceleration])[:, self.tree.theta_index[1:]]
         if tree.is_geared:

@@ -51,10 +51,10 @@ class Constants(Strict, frozen=True):
     spool_radius: Radius | UnsetType = UNSET
     #: 1 if the position rises as the motor pays out, −1 if it rises as the motor winds in
     direction: Number | UnsetType = UNSET
-    zero: Number | UnsetType = UNSET  # position at which l is 0
+    zero: Number | UnsetType = UNSET  # position of the motor at which l is 0
     #: tension per unit of effort, negative if the effort falls as the motor pulls [N]
     tension_per_effort: Number | UnsetType = UNSET
-    effort_zero: Number | UnsetType = UNSET  # effort at which T is 0
+    effort_zero: Number | UnsetType = UNSET  # effort of the motor at which T is 0
 
     def __post_init__(self) -> None:
         """Check the values that may have either sign, but not every size."""
@@ -71,13 +71,13 @@ CONSTANTS = {
 
 
 class MotorEntry(Constants, frozen=True):
-    """The motor of one muscle."""
+    """The entry of motors.yaml that describes the motor of one muscle."""
 
     joint: Name | UnsetType = UNSET  # joint of ros2_control; by default, the name of the muscle
 
 
 class MotorFile(Constants, frozen=True, kw_only=True):
-    """The content of motors.yaml."""
+    """The content of motors.yaml: topics, common constants, and the motor of each muscle."""
 
     state_topic: Name
     command_topic: Name | None = None
@@ -88,7 +88,7 @@ class MotorFile(Constants, frozen=True, kw_only=True):
     )
 
     def __post_init__(self) -> None:
-        """Check the names of the topics."""
+        """Check that the topics have legal names."""
         super().__post_init__()
         for key, name in (('state_topic', self.state_topic), ('command_topic', self.command_topic)):
             if name is not None and not TOPIC_NAME.fullmatch(name):
@@ -103,10 +103,11 @@ class Motors:
     topics: MotorTopics
     joints: tuple[str, ...]  # the joint of ros2_control that is the motor of each muscle
     command_order: tuple[str, ...]  # these joints in the order of the command controller
-    spool_radius: Array  # [m]
-    direction: Array  # 1 or −1
+    spool_radius: Array  # radius of the spool, or 1 for a linear motor [m]
+    direction: Array  # 1 if the position rises as the motor pays out, −1 if it falls
     zero: Array
-    tension_per_effort: Array  # [N]
+    #: tension per unit of effort; negative if the effort falls as the motor pulls [N]
+    tension_per_effort: Array
     effort_zero: Array
 
 
@@ -124,7 +125,7 @@ def read_motors(directory: Path, muscles: Sequence[str]) -> Motors | None:
     """Return how motors are connected to muscles; None if the directory has no motors.yaml.
 
     Args:
-        directory: The robot directory.
+        directory: The robot directory, which may contain a motors.yaml.
         muscles: Names of the muscles.
 
     Raises:
@@ -173,7 +174,7 @@ def _topics(content: MotorFile) -> MotorTopics:
 
 
 def _constant(name: str, content: MotorFile, entry: MotorEntry) -> float:
-    """Return a constant of a motor: its own, or that of the file, or the default."""
+    """Return the constant `name` of a motor: its own, or that of the file, or the default."""
     values = (getattr(source, name) for source in (entry, content))
     stated = [value for value in values if value is not UNSET]
     return stated[0] if stated else CONSTANTS[name]

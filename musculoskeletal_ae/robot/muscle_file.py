@@ -50,9 +50,9 @@ class TensionEntry(Strict, frozen=True):
 class DriveEntry(Strict, frozen=True):
     """A motor whose current is measured instead of a tension."""
 
-    torque_constant: Positive  # [N·m/A]
+    torque_constant: Positive  # torque per current of the motor [N·m/A]
     gear: Positive  # turns of the motor per turn of the spool
-    spool_radius: Positive  # [m]
+    spool_radius: Positive  # radius of the spool [m]
 
     @property
     def newton_per_ampere(self) -> float:
@@ -162,9 +162,9 @@ class JointElasticityEntry(Strict, frozen=True):
     """Spring and damper of a joint; for a prismatic joint, [m] and [N] replace [rad] and [N·m]."""
 
     joint: Name
-    stiffness: NotNegative = 0.0  # [N·m/rad]
+    stiffness: NotNegative = 0.0  # stiffness of the joint's own spring [N·m/rad]
     rest_angle: Number = 0.0  # angle at which the spring exerts no torque [rad]
-    damping: NotNegative = 0.0  # [N·m·s/rad]
+    damping: NotNegative = 0.0  # damping of the joint [N·m·s/rad]
     #: off-diagonal entries of the stiffness matrix by the name of the other joint [N·m/rad]
     coupled: Annotated[dict[Name, Number], Meta(max_length=LONGEST_LIST)] = field(
         default_factory=dict
@@ -175,10 +175,11 @@ class PassiveTendonEntry(Strict, frozen=True):
     """A passive tendon, which pulls (or pushes) while its length is outside `slack`."""
 
     name: Name
-    stiffness: Positive  # [N/m]
+    stiffness: Positive  # spring constant of the tendon [N/m]
     slack: tuple[Number, Number]  # the lengths between which it exerts no force [m]
     joints: Names
-    centre: Annotated[tuple[Number, ...], Meta(max_length=LONGEST_LIST)]  # [rad or m]
+    #: joint positions from which the polynomial of the length counts [rad or m]
+    centre: Annotated[tuple[Number, ...], Meta(max_length=LONGEST_LIST)]
     #: terms of its length [m]: the coefficient, and the power of each joint's distance to `centre`
     length: Annotated[
         tuple[Annotated[tuple[Number, ...], Meta(max_length=LONGEST_LIST)], ...],
@@ -202,7 +203,7 @@ class PassiveTendonEntry(Strict, frozen=True):
 
 
 class MuscleFile(Strict, frozen=True):
-    """The content of muscles.yaml."""
+    """The content of muscles.yaml: joints, muscles, and constants that all muscles share."""
 
     joints: Names
     muscles: Annotated[tuple[MuscleEntry, ...], Meta(min_length=1, max_length=LONGEST_LIST)]

@@ -28,9 +28,9 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 class Passive(NamedTuple):
     """T passive tendons of D joints as arrays, for compiled code."""
 
-    centre: Array  # θ̄ [rad], (D,)
+    centre: Array  # joint angles θ̄ from which the polynomials count [rad], (D,)
     power: Ints  # powers p of all R terms, (R, D)
-    coefficient: Array  # c [m/rad^p], (R,)
+    coefficient: Array  # factor c of each term [m/rad^p], (R,)
     first: Ints  # index of the first term of each tendon, then R, (T+1,)
     law: Array  # k [N/m], x_low and x_high [m] of each tendon, (T, 3)
 
@@ -44,7 +44,7 @@ class PassiveTendons:
 
     @classmethod
     def none(cls, joint_count: int) -> PassiveTendons:
-        """Return no passive tendons."""
+        """Return the passive tendons of a robot that has none."""
         powers, first = np.zeros((0, joint_count), np.int64), np.zeros(1, np.int64)
         centre = np.zeros(joint_count)
         return cls((), Passive(centre, powers, np.zeros(0), first, np.zeros((0, 3))))
@@ -74,7 +74,7 @@ class PassiveTendons:
         """Return torques that hold the joints, and their derivatives.
 
         Args:
-            theta: θ [rad], (..., D).
+            theta: Joint angles θ [rad], (..., D).
 
         Returns:
             Torques [N·m], (..., D), and their derivatives with respect to θ [N·m/rad],
@@ -102,7 +102,10 @@ class PassiveTendons:
         return replace(self, arrays=arrays)
 
     def scaled(self, radian: Array) -> PassiveTendons:
-        """Return the same tendons for other units of the joint angles, as `JointElasticity`."""
+        """Return the same tendons for other units of the joint angles.
+
+        `radian` (D,) is the value of one unit of the new angles in the present units.
+        """
         own = self.arrays
         coefficient = own.coefficient * np.prod(radian**own.power, axis=1)
         arrays = own._replace(centre=own.centre / radian, coefficient=coefficient)

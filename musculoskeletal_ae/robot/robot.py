@@ -45,7 +45,8 @@ class Robot:
         self.series_elastic = description.series_elastic
         self.tension = description.tension
         self.isolated: tuple[int, ...] = ()  # indices of isolated muscles in T and l
-        self.used: Bools = np.ones(self.muscle_count, dtype=bool)  # muscles not isolated, (M,)
+        #: which muscles are not isolated, (M,)
+        self.used: Bools = np.ones(self.muscle_count, dtype=bool)
         self.stiffness = description.stiffness
         self.tension_source = description.tension_source
         #: how the modules turn commands into tensions, and what they measure

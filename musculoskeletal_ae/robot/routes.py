@@ -35,10 +35,10 @@ from musculoskeletal_ae.robot.kinematics import Kinematics
 if TYPE_CHECKING:
     from musculoskeletal_ae.robot.wrapping import WrapObjects
 
-ARC = 9  # draw the arc of a wrapped tendon with this many points
+ARC = 9  # number of points that draw the arc of a wrapped tendon
 #: evaluate this many postures at once, which limits the memory to a few tens of megabytes
 CHUNK = 4096
-MOST_SERIAL_CHUNKS = 4  # share the evaluation of more chunks between two threads
+MOST_SERIAL_CHUNKS = 4  # let two threads share the evaluation if there are more chunks than this
 
 
 def _in_chunks(method: Callable[[Routes, Array], Array]) -> Callable[[Routes, Array], Array]:

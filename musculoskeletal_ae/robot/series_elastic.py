@@ -17,7 +17,8 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
-DEFAULT = {'force': 100.0, 'rate': 30.0, 'wire_stretch': 2.0e-5}  # [N], [1/m] and [1/N]
+#: constants of a muscle whose entry states none: `force` [N], `rate` [1/m], `wire_stretch` [1/N]
+DEFAULT = {'force': 100.0, 'rate': 30.0, 'wire_stretch': 2.0e-5}
 
 
 @dataclass(frozen=True)

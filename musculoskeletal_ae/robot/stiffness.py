@@ -19,7 +19,9 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
-LEAST_COMPLIANCE = 1e-7  # assume at least this ∂L_e/∂T of an elastic element and its tendon [m/N]
+#: treat a smaller ∂L_e/∂T of an elastic element and its tendon as this [m/N], to avoid a division
+#: by zero
+LEAST_COMPLIANCE = 1e-7
 
 
 def muscle_stiffness(module: Array, compliance: Array) -> Array:

@@ -32,7 +32,7 @@ SOFT_WEIGHT = 1e-7
 class Exertion(NamedTuple):
     """Tensions, and the part of the required torque that they do not produce."""
 
-    tension: Array  # T [N], (M,)
+    tension: Array  # tensions T [N], (M,)
     missing_torque: Array  # τ + Gᵀ T, the part of τ that T does not produce [N·m], (D,)
 
 
@@ -105,11 +105,11 @@ def holding_tension(
     """Return tensions [N] (M,) within [T_bias, T_limit] that hold a posture.
 
     Args:
-        robot: The robot.
-        theta: θ [rad], (D,).
+        robot: The robot, with the tension limits of its muscles.
+        theta: Joint angles θ of the posture [rad], (D,).
         desired: Desired tension [N], scalar or (M,). Of all tensions that hold the posture, the one
             nearest to it is returned.
-        jacobian: G [m/rad], (M, D); by default computed by the geometric model.
+        jacobian: Muscle Jacobian G [m/rad], (M, D); by default computed by the geometric model.
 
     Raises:
         InfeasibleError: If no tension within the limits holds the posture, or if an entry is not

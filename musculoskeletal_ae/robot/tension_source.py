@@ -63,7 +63,7 @@ class TensionSource:
         return tension if self.is_known else np.full_like(tension, np.nan)
 
     def measured(self, rows: Array) -> Array:
-        """Return those of two rows that the robot measures.
+        """Return the rows of quantities that the robot measures.
 
         Args:
             rows: Row 0 has lengths, row 1 tensions, (2, ...).

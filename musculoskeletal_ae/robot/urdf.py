@@ -26,7 +26,8 @@ MOST_PARTS = 2000
 DEEPEST = 500
 #: elements below <robot> that xacro understands only with its prefix
 PREPROCESSED = 'include', 'macro', 'property'
-XACRO = 'http://www.ros.org/wiki/xacro'  # namespace of the elements of xacro
+#: namespace of the elements of xacro, a preprocessor of URDFs
+XACRO = 'http://www.ros.org/wiki/xacro'
 EXPAND = 'expand it to a new file first:  xacro FILE > NEW.urdf'
 #: refuse any number of a larger absolute value, except efforts and velocities [SI units]
 LARGEST = 1e6
@@ -70,7 +71,7 @@ def read_urdf(file: Path, text: str) -> pin.Model:
     for part in parts:
         where = f'{file}: {part.tag} {part.get("name")!r}'
         if printable(name := part.get('name', '')) != name:
-            raise RobotDescriptionError(f'{where}: expected printable characters only')
+            raise RobotDescriptionError(f'{where}: expected a name of printable characters only')
         if part.tag == 'joint' and name == 'universe':
             raise RobotDescriptionError(
                 f'{where}: pinocchio reserves this name for the world; rename the joint'
@@ -208,7 +209,10 @@ def _check_tree(file: Path, parts: list[ET.Element]) -> None:
 
 
 def _link_at(where: str, joint: ET.Element, end: str, links: set[str]) -> str:
-    """Return the link that is the parent or child of a joint; it has to be one of `links`."""
+    """Return the link that is the 'parent' or 'child' (`end`) of a joint.
+
+    It has to be one of `links`; the message of the error begins with `where`.
+    """
     element = joint.find(end)
     link = '' if element is None else element.get('link', '')
     if link not in links:

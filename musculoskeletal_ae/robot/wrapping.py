@@ -51,13 +51,13 @@ class WrapObjects(NamedTuple):
     """The sphere or cylinder of each of S segments, in the frame of the joint that carries it."""
 
     joint: Ints  # joint of the tree that carries the object, (S,)
-    centre: Array  # [m], (S, 3)
+    centre: Array  # centre of each object [m], (S, 3)
     axis: Array  # unit vector of a cylinder, zero for a sphere, (S, 3)
     #: side point [m], (S, 3); NaN if there is none. It is relative to the centre if the object and
     #: the side point have the same joint, otherwise in the frame of `side_joint`.
     side: Array
     side_joint: Ints  # joint of the tree that carries the side point, (S,)
-    radius: Array  # [m], (S,); 0 for a segment without an object
+    radius: Array  # radius of each object [m], (S,); 0 for a segment without an object
     #: whether it is a swivelling pulley, with its entry as centre and f as axis, (S,)
     swivels: Bools
 
@@ -195,19 +195,19 @@ def _round(a: complex, b: complex, r: float, side: complex) -> tuple[bool, float
 
 @njit(cache=True)
 def dot(a: Vector, b: Vector) -> float:
-    """Return a · b."""
+    """Return the dot product a · b of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @njit(cache=True)
 def cross(a: Vector, b: Vector) -> Vector:
-    """Return a × b."""
+    """Return the cross product a × b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @njit(cache=True)
 def plus(a: Vector, b: Vector, scale: float = 1.0) -> Vector:
-    """Return a + scale · b."""
+    """Return the vector a + scale · b."""
     return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]
 
 

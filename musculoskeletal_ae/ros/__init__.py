@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What any node or tool of ROS needs, whatever it does."""
+"""Code that every node and tool of ROS may use: running, parameters, diagnostics, publishers."""

@@ -14,18 +14,18 @@ from musculoskeletal_ae.remedy import sentence
 from musculoskeletal_ae.report import Report
 
 MANY_REPORTS = QoSProfile(depth=50)  # QoS of /diagnostics, on which all nodes of the graph report
-PERIOD = 1.0  # report at this interval [s]
-NODE_SILENCE = 2.0  # count a node as ended or hanging without a report for this time [s]
+PERIOD = 1.0  # publish a report of each node at this interval [s]
+NODE_SILENCE = 2.0  # treat a node as ended or hanging if it has not reported for this time [s]
 
 
 class Diagnostics:
     """Publishes the reports of one node, each as one DiagnosticStatus."""
 
     def __init__(self, node: Node, reception: Reception, hardware: str) -> None:
-        """Prepare the reports of a node.
+        """Prepare the reports of a node, and choose its random identity.
 
         Args:
-            node: The node.
+            node: The node whose reports are published.
             reception: Rates of the messages that the node has used, and counts of rejected ones.
             hardware: Value of `hardware_id` in each status.
         """
@@ -36,7 +36,7 @@ class Diagnostics:
         self.identity = secrets.token_hex(8)
 
     def tell(self, report: Report) -> None:
-        """Publish a report, with the rate at which the node uses the messages of each topic."""
+        """Tell the state of the node: publish a report, and the rate of each topic that it uses."""
         rejected, rates = self._reception.rejected, self._reception.rates
         values = {'doing': report.doing} if report.doing else {}
         values |= {**report.values, 'identity': self.identity}

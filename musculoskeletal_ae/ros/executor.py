@@ -47,6 +47,7 @@ RCLError = rclpy_implementation.RCLError
 RCLInvalidROSArgsError = rclpy_implementation.RCLInvalidROSArgsError
 UnknownROSArgsError = rclpy_implementation.UnknownROSArgsError
 
+#: environment variable that selects the executor: `lean` or `single`
 VARIABLE = 'MUSCULOSKELETAL_AE_EXECUTOR'
 CHOICES = ('lean', 'single')
 #: choose LeanExecutor by default from the first to the second of these versions of rclpy, with
@@ -107,7 +108,7 @@ class LeanExecutor(SingleThreadedExecutor):
         return super().add_node(node)
 
     def remove_node(self, node: Node) -> None:
-        """Remove a node."""
+        """Remove a node, whose callbacks do not run any more."""
         self._is_changed = True
         super().remove_node(node)
 

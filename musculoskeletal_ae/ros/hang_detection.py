@@ -26,7 +26,7 @@ from pathlib import Path
 
 LONGEST_STALL = 10.0  # end the process after this time without progress [s]
 LOOK_PERIOD = 0.5  # check the progress at this interval [s]
-STALLED = 70  # exit status: EX_SOFTWARE of sysexits.h
+STALLED = 70  # exit status of a process that ends because it hangs: EX_SOFTWARE of sysexits.h
 #: do not end the process while its main thread runs code of these modules
 SLOW_MODULES = ('bdb', 'numba', 'pdb', '_pydevd_bundle')
 
@@ -77,7 +77,7 @@ class ProgressWatch:
         self._thread = threading.Thread(target=self._watch, name='progress', daemon=True)
 
     def start(self) -> None:
-        """Start watching."""
+        """Start the watching thread and the timer of CPU time."""
         faulthandler.register(signal.SIGVTALRM, all_threads=True, chain=True)
         # Set the timer here as well as in the thread, because a native call may take Python's lock,
         # and never release it, before the thread runs for the first time.
@@ -89,7 +89,7 @@ class ProgressWatch:
         self._quiet = 0.0
 
     def stop(self) -> None:
-        """Stop watching."""
+        """Stop watching, so that the main thread may take as long as it needs."""
         if not self._thread.is_alive():  # `start` was not called
             return
         self._is_stopped.set()

@@ -98,7 +98,7 @@ def bytes_message(data: bytes) -> UInt8MultiArray:
 
 
 def serve(node: Node, kind: Any, name: str, work: Callable[[Any], str]) -> None:
-    """Offer a Trigger or SetBool service.
+    """Offer a service of type `kind`, Trigger or SetBool, under a name.
 
     `work` returns the response message, or raises a MusculoskeletalError to report failure.
     """

@@ -19,7 +19,7 @@ from musculoskeletal_ae.report import with_load
 #: flow, and the remedy for silence
 STREAMS = {'muscle_states': Step.CHECK_DRIVER, 'estimated_joint_states': Step.CHECK_ESTIMATOR}
 REPLAY = 'replay'  # name of the node that plays a recording
-SLOW = 0.4  # count messages as too slow below this fraction of the expected rate
+SLOW = 0.4  # warn of a topic whose rate is below this fraction of the expected rate
 SLOW_REPORTS = 3  # warn after this number of successive reports with too low a rate
 
 
@@ -27,18 +27,19 @@ class NeededTopics:
     """Reports missing, silent and slow topics of one node."""
 
     def __init__(self, node: Node, full_name: Callable[[str], str], reception: Reception) -> None:
-        """Start without needed topics.
+        """Start without needed topics; `add` adds them.
 
         Args:
-            node: The node.
+            node: The node that needs the topics.
             full_name: Returns the full name of a topic in the graph.
-            reception: The messages that the node has received.
+            reception: Statistics of the messages that the node has received.
         """
         self._node, self._full_name, self._reception = node, full_name, reception
         self._topics: list[str] = []
-        self._expected_rates = dict[str, float]()  # [Hz], by topic
+        #: rates that the topics should have [Hz], by topic
+        self._expected_rates = dict[str, float]()
         self._slow_reports = Counter[str]()  # successive reports with a low rate, by topic
-        self._waiting = ''  # the missing topics, as last logged
+        self._waiting = ''  # the missing topics that were logged last, '' if none is missing
 
     def __contains__(self, topic: object) -> bool:
         return topic in self._topics
@@ -48,11 +49,11 @@ class NeededTopics:
         self._topics += topics
 
     def expect_rate(self, topic: str, rate: float) -> None:
-        """Expect a rate [Hz] of a topic; warn while its rate is lower than SLOW times `rate`."""
+        """Expect a rate [Hz] of a topic, and warn while its rate is below SLOW times `rate`."""
         self._expected_rates[topic] = rate
 
     def remove(self, topic: str) -> None:
-        """Stop reporting a topic."""
+        """Remove a topic, which is then no longer reported as missing, silent or slow."""
         self._topics = [other for other in self._topics if other != topic]
 
     def check_rates(self) -> None:
@@ -97,9 +98,9 @@ class NeededTopics:
                 yield ConditionKind.SLOW_TOPIC.condition(with_load(detail), [topic])
 
     def _remedy(self, topic: str) -> tuple[Step, ...]:
-        """Return the step against silence of a topic, if the silence is not another node's report.
+        """Return the step that ends the silence of a topic; none if another node reports it.
 
-        A running estimator reports why it publishes no estimates.
+        A running estimator itself reports why it publishes no estimates.
         """
         publishers = self._publishers(topic)
         if set(publishers) == {REPLAY}:

@@ -8,8 +8,9 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 
 from musculoskeletal_ae.ros.executor import RCLInvalidROSArgsError, UnknownROSArgsError
 
-NO_REASON = 'error not set'  # the message of rcl for an error without a reason
-NO_LOG_FOLDER = 'log directory'  # in the message of rcl if it cannot create the folder of its logs
+NO_REASON = 'error not set'  # text of an rcl error whose reason rcl does not state
+#: part of the text of an rcl error if the folder of the logs cannot be created
+NO_LOG_FOLDER = 'log directory'
 #: exceptions of rclpy for an argument that cannot be parsed
 ARGUMENT_ERRORS = UnknownROSArgsError, RCLInvalidROSArgsError
 #: exceptions of rclpy for a wrong ROS argument: also a parameter value of the wrong type or out of
@@ -24,7 +25,7 @@ PARAMETER_ERRORS = (
 def reason(error: Exception) -> str:
     """Return the message of an rcl error, without the location in its source code.
 
-    If it is known how to mend the cause, the text also says how.
+    For errors with a known remedy, the text also states the remedy.
     """
     text = ' '.join(str(error).split(', at /')[0].split())
     if NO_LOG_FOLDER in text:

@@ -28,7 +28,7 @@ from musculoskeletal_ae.ros.hang_detection import ProgressWatch
 from musculoskeletal_ae.ros.ros_arguments import PARAMETER_ERRORS, parameters_given, reason
 
 STOP_CHECK_PERIOD = 0.1  # check for a stop signal at this interval [s]
-NICENESS = 5  # run nodes that are not time-critical with this niceness
+NICENESS = 5  # niceness of a node that is not time-critical, so that commands have priority
 
 
 def run(name: str) -> int:
@@ -67,7 +67,7 @@ def _options_beside_ros() -> list[str]:
 
 
 def _run(kinds: list[Any]) -> None:
-    """Construct nodes, spin them until a stop, and destroy them."""
+    """Construct nodes of the given classes, spin them until a stop, and destroy them."""
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     nodes: list[Any] = []
     watch = ProgressWatch()

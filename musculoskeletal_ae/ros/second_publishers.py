@@ -33,7 +33,7 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.ros.diagnostics import NODE_SILENCE
 
 _ESTIMATOR, _CONTROLLER, _DRIVER = 'the estimator', 'the controller', 'the driver'
-MOTOR_COMMAND = 'motor_command'  # stands for the topic of commands in motors.yaml
+MOTOR_COMMAND = 'motor_command'  # stands for the topic of motor commands that motors.yaml names
 CLOCK = '/clock'
 #: topics that must have one publisher, with the node that publishes them. A ros2_control robot has
 #: other topics for some of these, which `Shell.full_name` returns. Messages on /clock go to rclpy,
@@ -56,14 +56,14 @@ COMMANDS = frozenset(topic for topic, author in AUTHORS.items() if author == _CO
 SEVERAL = 'several publishers'  # reason under which rejected messages are counted
 
 LOOK_PERIOD = 0.1  # check the graph at this interval [s]
-LOOKS = 20  # count decreases of the sequence number over this many recent checks
-TURNS = 3  # count publishers of one name as two nodes after this many decreases within LOOKS checks
-#: count publishers of one name as two nodes if two of them have been in the graph for this time
-#: [s]; the graph keeps a killed node for up to 20 s
+LOOKS = 20  # search this many recent checks for decreases of the sequence number
+TURNS = 3  # conclude from this many decreases within LOOKS checks that two nodes share one name
+#: conclude that two nodes share one name if two publishers have been in the graph for this time
+#: [s]; the graph keeps a killed node for only 20 s
 LEASE = 30.0
 NAMING = 1.0  # wait at most this long until the graph knows the node of a publisher [s]
-#: report more publishers than links only after this time, and count a link as having no sensor
-#: after this time without a message [s]
+#: report that there are more publishers than links once this has lasted for this time; a link
+#: without a message for this time has no sensor [s]
 LINK_PATIENCE = 3.0
 #: name that the graph returns for a node of which it knows only a publisher
 UNNAMED = '_NODE_NAME_UNKNOWN_'
@@ -72,9 +72,9 @@ NAMELESS = 'a node that has not announced its name yet'
 
 
 class Publisher(NamedTuple):
-    """One publisher in the ROS graph."""
+    """One publisher of a topic, as the ROS graph shows it."""
 
-    node: str  # full name, or NAMELESS
+    node: str  # full name of the publisher's node, or NAMELESS
     identity: bytes
 
     @property
@@ -134,8 +134,8 @@ class Authorship:
 class Twins:
     """Detects a second node of the same name from its reports on /diagnostics.
 
-    Reports are searched as bytes, because deserializing the reports of all nodes takes 1 % of a
-    core.
+    Serialized reports are searched for the name, because deserializing the reports of all nodes
+    would take 1 % of a processor core.
     """
 
     def __init__(self, name: str, identity: str, clock: AwakeClock | None = None) -> None:
@@ -150,7 +150,7 @@ class Twins:
         text = name.encode() + b'\0'
         self._name, self._identity = struct.pack('<I', len(text)) + text, identity.encode()
         self._has_reported = False
-        self._others = Arrival(clock)  # reports of other nodes
+        self._others = Arrival(clock)  # reports that other nodes of this name have sent
 
     def take(self, report: bytes, now: float) -> None:
         """Process a serialized report (CDR) that arrived at `now` [s].
@@ -254,6 +254,8 @@ class Sources:
 
     def check(self, topic: str, is_latched: bool) -> None:
         """Check the publishers of a topic on which a message has just arrived.
+
+        On a latched topic, the node of each of several publishers must be known.
 
         Raises:
             MessageError: If the message may come from another node than the intended publisher.

@@ -43,8 +43,8 @@ JOINTS = 'joint_states'
 DISCOVERY_TIME = 1.0  # wait this long for other nodes to be discovered [s]
 COUNTDOWN = 10.0  # state the remaining time at this interval [s]
 TICK = 0.02  # tick at this interval [s]; a late tick shows that this process was paused
-#: count a longer time between two ticks as a pause [s]; it is shorter than that of the nodes,
-#: because gaps of 0.2 s between messages are judged
+#: treat a longer time between two ticks as a pause of this process [s]; the limit is lower than
+#: that of the nodes, because check_driver judges gaps of 0.2 s between messages
 LONGEST_TICK = 0.07
 
 
@@ -53,7 +53,10 @@ def _say(text: object) -> None:
 
 
 def _instruction(robot: Robot, options: Namespace, has_joint_sensors: bool) -> str:
-    """Return what the user has to do with the arm while `check_driver` listens."""
+    """Return what the user has to do with the arm while `check_driver` listens.
+
+    An arm without joint sensors has to be held still.
+    """
     if options.move:
         return 'do not touch the arm; it moves by itself afterwards, if no fault is found'
     if options.posture:
@@ -252,7 +255,7 @@ def _check(options: Namespace, arguments: list[str]) -> int:
         if verdict.allows_motion or not options.wait:
             break
         _say(
-            'fix the driver before moving the arm; still listening'
+            'correct the faults of the driver before the arm moves; still listening'
             if faults
             else f'{verdict.obstacle}; still listening'
         )
@@ -263,7 +266,11 @@ def _check(options: Namespace, arguments: list[str]) -> int:
             new = [remark for remark in verdict.remarks if remark not in remarks]
             _say('\n'.join(['after the motion test:', verdict.table, *new]))
         else:
-            reason = 'fix the faults above first' if verdict.faults else verdict.obstacle
+            reason = (
+                'the driver has the faults above; correct them first'
+                if verdict.faults
+                else verdict.obstacle
+            )
             _say(f'motion test skipped: {reason}')
     _say(verdict.conclusion)
     was_skipped = options.move and bool(verdict.obstacle)

@@ -67,7 +67,7 @@ class Lockstep:
         ]
 
     def start(self, spinner: Spinner, on_wait: Callable[[], object]) -> None:
-        """Wait until all nodes run and answer.
+        """Start the lockstep: wait until all nodes run and answer.
 
         Args:
             spinner: Runs the callbacks of the asking node.
@@ -96,7 +96,7 @@ class Lockstep:
         return not is_in_step or self._messages >= MOST_MESSAGES
 
     def count(self) -> None:
-        """Count a message that was published."""
+        """Count a published message; a question is due after MOST_MESSAGES of them."""
         self._messages += 1
 
     def ask(self) -> None:

@@ -35,7 +35,7 @@ from musculoskeletal_ae.ros_tools.ros_tool import (
     start_ros,
 )
 
-#: write to disk at this interval [s]; a killed recorder loses the messages since the last write
+#: write to disk at this interval [s]; a killed recorder loses the messages since the last writing
 FLUSH_PERIOD = 0.5
 #: QoS whose queue holds at least a second of the fastest topic, in case the disk is busy
 LIVE = QoSProfile(depth=1000)
@@ -47,7 +47,7 @@ CONNECTION_TIME = 2.0  # wait at most this long for connections to the discovere
 
 
 class Record(Node):
-    """Writes messages to a bag, in their serialized form."""
+    """Writes the messages of all recorded topics to a bag, in their serialized form."""
 
     def __init__(self, writer: BagWriter, topics: dict[str, Topic]) -> None:
         super().__init__('record')
@@ -213,13 +213,17 @@ def _record(options: Namespace, arguments: list[str]) -> int:
         print(f'warning: no message was recorded of {"; ".join(missing)}', file=sys.stderr)
         return 1
     if not writer.message_count:
-        print('warning: nothing was recorded: no message arrived on any topic', file=sys.stderr)
+        print(
+            'warning: nothing was recorded, because no message arrived on any topic; check the '
+            'namespace and ROS_DOMAIN_ID',
+            file=sys.stderr,
+        )
         return 1
     return 0
 
 
 def parse(arguments: list[str]) -> Namespace:
-    """Return the options of `record`."""
+    """Parse the command line of `record`, and return its options."""
     what = 'Records the topics of this package to a bag that `ros2 bag` can read. Ctrl-C ends it. '
     parser = Parser('record', what + ROS_HELP)
     add = parser.add_argument

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-REJECTED = 'rejected '  # begin of the keys `rejected TOPIC: REASON` in reports
+REJECTED = 'rejected '  # first word of the keys `rejected TOPIC: REASON` in reports
 LAST_REJECTED = 'last rejected'
 
 

@@ -15,6 +15,7 @@ from musculoskeletal_ae.robot.drawing import Line, save_picture
 from musculoskeletal_ae.ros.messages import SENSOR
 from musculoskeletal_ae.ros_tools.ros_tool import ROS_HELP, Spinner, run_tool, start_ros
 
+#: topics of markers: a picture shows the emulated arm if it is published, otherwise the estimate
 BODY, ESTIMATE = 'hardware_emulator/markers', 'estimated/markers'
 #: wait this long for the preferred topic after another topic has brought markers [s]
 DISCOVERY_TIME = 2.0

@@ -63,22 +63,21 @@ from musculoskeletal_ae.ros_tools.ros_tool import (
 from musculoskeletal_ae.ros_tools.taught_motion import ACKNOWLEDGE_TIME, send_taught_motion
 from musculoskeletal_ae.signals.motor_interface import STATES
 
-#: depth of the QoS; a reader that is one second late still receives every message
+#: depth of the publishers' queues; a subscriber that is one second late still gets every message
 DEPTH = 1000
-SERVICE_PERIOD = 0.02  # answer services after at most this time [s]
-LONGEST_SLEEP = 0.002  # answer services instead of sleeping during any longer wait [s]
+SERVICE_PERIOD = 0.02  # let a request of a service wait at most this long [s]
+LONGEST_SLEEP = 0.002  # sleep at most this long; run callbacks of services during a longer wait [s]
 #: wait this long after the discovery of a subscriber, until it can receive messages [s]
 SETTLE_TIME = 0.3
-#: wait this recorded time between the last message of a lap and the first of the next [ns]
+#: with --loop, let this recorded time pass between the last message and the first one [ns]
 LAP_GAP = 10_000_000
 WAIT = 2.0  # by default, wait at most this long for subscribers, and then play without them [s]
 #: by default, wait at most this long for the subscriber that --as-trajectory needs [s]
 SEND_WAIT = 10.0
 CLOCK_PERIOD = 0.005  # publish /clock at this interval of recorded time [s]
-SLOW = 0.5  # count playback as slow below this share of the wanted speed
+SLOW = 0.5  # report playback as slow below this share of the wanted speed
 LOCKSTEP_LAG = 0.005  # in lockstep, catch up with at most this delay [s]
-#: publish /clock at intervals of at least this wall time, because nodes cannot handle more messages
-#: [s]
+#: publish /clock at intervals of at least this wall time [s], because nodes cannot use more of it
 SHORTEST_CLOCK_PERIOD = 0.001
 
 
@@ -86,7 +85,7 @@ class Replay(Node):
     """Publishes recorded messages, as serialized bytes, at their recorded times."""
 
     def __init__(self, messages: TimedMessages, names: dict[str, str], options: Namespace) -> None:
-        """Advertise the topics.
+        """Advertise the topics of the recorded messages, and prepare the services.
 
         Args:
             messages: The messages to play.
@@ -109,9 +108,10 @@ class Replay(Node):
         self._clock_period = max(CLOCK_PERIOD / max(options.rate, 1.0), SHORTEST_CLOCK_PERIOD)
         # Times of the next /clock message, service round and report on the steady clock [s].
         self._next_tick = self._next_service = self._next_report = 0.0
-        self._sought: int | None = None  # recorded time to seek to [ns]
+        #: recorded time at which playback shall continue after a seek [ns]; None without a seek
+        self._sought: int | None = None
         self._rate, self._skips_pauses = options.rate, options.skip_pauses
-        self._printed = ''  # the nodes that it waits for, as last printed
+        self._printed = ''  # names of the nodes for which the replay waits, as last printed
         # Steady time and recorded time of the last report, and steady time of the last seek [s].
         self._reported, self._seek_time = (math.inf, 0.0), math.inf
         description = 'position in the bag [s]; set this parameter to seek'
@@ -142,7 +142,7 @@ class Replay(Node):
         self._spinner = Spinner(self)
 
     def get_ready(self, longest: float) -> None:
-        """Wait until messages are received, then offer services.
+        """Get ready to play: wait until messages can be received, then offer services.
 
         In lockstep, wait for the nodes. Otherwise wait at most `longest` [s] until every topic has
         a subscriber.
@@ -198,7 +198,8 @@ class Replay(Node):
             longest = LOCKSTEP_LAG
             if self._lockstep.is_due(recorded):
                 self._lockstep.step(recorded, self._spinner)
-            self._next_tick = 0.0  # the nodes are to know the time of this message
+            #: publish /clock at once, so that the nodes know the time of this message
+            self._next_tick = 0.0
         self._timeline.catch_up(recorded, time.monotonic(), longest)
 
     def _report_waiting(self) -> None:
@@ -377,7 +378,7 @@ def _replay(options: Namespace, arguments: list[str]) -> int:
 
 
 def parse(arguments: list[str]) -> Namespace:
-    """Return the options of `replay`."""
+    """Parse the command line of `replay`, and return its options."""
     parser = Parser(
         'replay',
         'Plays a recorded bag onto the topics, with the recorded spacing. ' + ROS_HELP,

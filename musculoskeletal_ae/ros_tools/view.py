@@ -61,8 +61,8 @@ TEXT_PERIOD = 0.25  # update texts and curves at this interval [s]
 GRAPH_PERIOD = 1.0  # check the graph at this interval [s]
 PATIENCE = 10.0  # wait at most this long for the response of a service [s]
 STOP_CHECK_PERIOD = 0.1  # check for a stop signal after at most this time [s]
-#: show the outcome of a reset after this time [s]; a cause that remains has stopped the arm again
-#: by then
+#: show the outcome of a reset after this time [s]; by then, a cause that is still present has
+#: stopped the arm again
 SETTLE_TIME = 2.5
 #: topics from which the arms on the page are drawn
 ARM_TOPICS = {
@@ -70,7 +70,8 @@ ARM_TOPICS = {
     'estimated': 'estimated_joint_states',
     'simulated': 'sim/joint_states',
 }
-RUPTURE = 'rupture'  # kind of fault (`emulator/faults.py`)
+RUPTURE = 'rupture'  # kind of the emulated fault with which visitors rupture tendons
+#: service that sets a parameter of the emulator, such as `faults`
 SET = 'hardware_emulator/set_parameters'
 GET = 'hardware_emulator/get_parameters'
 #: Trigger services that visitors may call
@@ -80,7 +81,7 @@ TRIGGERS = (
 )  # fmt: skip
 SERVICES = {'controller/explore': SetBool, **dict.fromkeys(TRIGGERS, Trigger), GET: GetParameters}
 SERVICES |= {SET: SetParameters, 'replay/set_parameters': SetParameters}
-EXPLORING = Activity.EXPLORING.value, Activity.CALIBRATING.value  # values of controller_mode
+EXPLORING = Activity.EXPLORING.value, Activity.CALIBRATING.value  # modes in which the arm explores
 #: for each node, a service that is available only while the node is running
 SIGNS = {'controller': 'controller/stop', 'replay': 'replay/pause', 'hardware_emulator': GET}
 
@@ -118,7 +119,7 @@ class View(Node):
         self.subscribed: list[Any] = []  # subscriptions, while somebody views the page
         #: monotonic time [s] of the last update of texts, check of the graph, and report
         self.texts_at = self.graph_at = self.reported_at = -math.inf
-        self.faults: list[str] = []  # faults of the emulated arm
+        self.faults: list[str] = []  # faults that the hardware emulator imitates
         self.payload = 0.0
         self.reset_at = math.inf  # time of a reset whose outcome has not been shown yet [s]
         #: service requests without a response: time sent [s], future, callback

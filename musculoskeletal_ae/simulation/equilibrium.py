@@ -41,15 +41,16 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import REVERSAL
 from musculoskeletal_ae.simulation.load import Load, LoadTree, hold
 
-#: use this l_target for muscles without a command [m]; MSC then holds T_bias, and modules that
+#: value of l_target for muscles without a command [m]; MSC then holds T_bias, and modules that
 #: follow positions hold their length
 PAID_OUT = np.inf
-#: give position-controlled modules this K_stiff [N/m]; 400 N move such a module by a millimetre
+#: K_stiff that represents a position-controlled module [N/m]; 400 N move such a module by 1 mm
 RIGID = 4e5
 #: Multiply Σ_i |∂l_i/∂θ| by this to get B without the dampers [N·s/rad]. Motions then take as long
 #: as on the emulated arm; values from 8 to 20 do equally well.
 VISCOSITY = 12.0
-JACOBIAN_POSTURES = 100  # average |∂l_i/∂θ| over this many postures
+#: average |∂l_i/∂θ| over this many random postures to get the viscous resistance B
+JACOBIAN_POSTURES = 100
 LEAST_VISCOSITY = 0.1  # use at least this B, such as at a joint that no muscle crosses [N·m·s/rad]
 #: move no joint faster than this [rad/s] or [m/s]; this limits each step, and so the effect of
 #: network errors
@@ -63,9 +64,9 @@ POSTURES_PER_COEFFICIENT = 10  # fit a cubic to this many postures per coefficie
 class ArmState(NamedTuple):
     """State of N arms after a step."""
 
-    theta: Array  # θ_sim [rad], (N, D)
-    tension: Array  # T_sim [N], (N, M)
-    length: Array  # l_sim [m], (N, M)
+    theta: Array  # simulated joint angles [rad], (N, D)
+    tension: Array  # simulated motor-side tensions [N], (N, M)
+    length: Array  # simulated muscle lengths [m], (N, M)
     followed: Array  # command that the muscle modules have reached [m], (N, M)
     holding: Array  # torque of a stop or an external hold on each joint [N·m], (N, D)
     slid: Array  # s, direction in which each tendon slid last, in [−1, 1], (N, M)
@@ -74,12 +75,12 @@ class ArmState(NamedTuple):
 class Body(NamedTuple):
     """Constants of muscles (M,) and joints (D,) for the compiled code."""
 
-    stiffness: Array  # K_stiff [N/m]
+    stiffness: Array  # control stiffness K_stiff of the module [N/m]
     bias: Array  # T at l = l_target [N]: T_bias, or 0 for position-controlled modules
-    most: Array  # T_max [N]
+    most: Array  # tension maximum T_max [N]
     span: Array  # distance of l_target below l at which T reaches T_max [m]
     loose: Array  # distance of l_target above l beyond which T no longer changes [m]
-    friction: Array  # tendon friction μ
+    friction: Array  # friction coefficient μ of the tendon
     speed: Array  # largest speed of the module [m/s]; infinite if it is not stated
     # constants of the series elastic elements, as in `SeriesElastic`
     force: Array
@@ -128,7 +129,7 @@ def follow(
     """Follow a command: return the length [m] that a muscle module has reached on the way.
 
     Args:
-        command: l_target [m].
+        command: Length commands l_target [m].
         followed: The length that the module had reached before this step [m].
         length: Muscle length [m].
         span: Distance of the command below `length` at which the tension reaches T_max [m].
@@ -165,9 +166,9 @@ def add_slopes(
     """Write G, and add Σ T_i ∂²l_i/∂θ² to `curvature`, from the cubics of all limbs (see `Slopes`).
 
     Args:
-        limbs: The cubics.
-        theta: θ [rad], (D, N).
-        tension: T [N], (M, N).
+        limbs: The fitted cubics of all limbs.
+        theta: Joint angles θ [rad], (D, N).
+        tension: Tensions T [N], (M, N).
         jacobian: Output, overwritten with G [m/rad], (M, D, N).
         curvature: Input and output, (D, D, N). Σ T_i ∂²l_i/∂θ² [N·m/rad] is added to the lower
             triangle; the upper triangle is not changed.
@@ -283,7 +284,7 @@ def advance(
         h: Duration of the step [s].
         passed: Fraction of the tension that reaches the bone despite friction, T_end / T, (M, N).
         pulled: The network's Gᵀ T_end [N·m], (D, N).
-        command: l_target [m], (M, N).
+        command: Length commands l_target [m], (M, N).
         wrench: Wrench on the end effectors [N, N·m], (6, N).
         fixed: Angles that joints are forced to [rad], (D, N); NaN for a free joint.
     """

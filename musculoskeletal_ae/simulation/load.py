@@ -54,7 +54,7 @@ class LoadTree(NamedTuple):
     effector: Array  # position of the end effector in the frame of that joint [m], (3,)
     springs: Array  # stiffness K of the joints' springs [N·m/rad], (D, D)
     preload: Array  # preload b of the joints' springs [N·m], (D,)
-    passive: Passive  # the passive tendons
+    passive: Passive  # passive tendons of the joints
 
 
 @njit(cache=True)
@@ -225,7 +225,7 @@ class Load:
         """Return the load [N·m] (N, D) and its gradient [N·m/rad] (N, D, D).
 
         Args:
-            theta: θ [rad], (N, D).
+            theta: Joint angles θ [rad], (N, D).
             wrench: Wrench on the end effectors in axes of the root link [N, N·m], (N, 6), or None.
         """
         wrench = np.zeros((len(theta), 6)) if wrench is None else wrench

@@ -20,7 +20,7 @@ class SimulatedBody(Protocol):
         """Return the state of the arms after a step.
 
         Args:
-            state: The arms now.
+            state: Present state of the arms.
             command: l_target [m], (N, M); PAID_OUT (∞) for muscles without a command.
             h: Duration of the step [s].
             wrench: Wrench on the end effectors in axes of the root link [N, N·m], (N, 6).

@@ -29,10 +29,12 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState
 
 LONGEST_STEP = 0.01  # divide a longer time into several steps [s]
-#: simulate this many arms in a call of the compiled code; their arrays fit into a core's cache
+#: simulate this many arms in a call of the compiled code, so that their arrays fit into a core's
+#: cache
 CHUNK = 384
-SETTLING_STEP = 0.1  # let each step of `settle` take this time [s]
-SETTLING_STEPS = 300  # let `settle` take at most this many steps
+#: duration of each step of `settle` [s]; its steps follow no motion, so they may be long
+SETTLING_STEP = 0.1
+SETTLING_STEPS = 300  # end `settle` after this many steps, even if some arms have not settled
 #: count arms as settled if a step moves them by less than this [rad]; a change of tension by 1000 N
 #: counts like 1 rad
 SETTLED = 1e-6
@@ -42,11 +44,11 @@ TENSION_MARGIN = 1.0  # let `limits` name a muscle that is nearer to T_max than 
 
 
 class Simulation:
-    """N simulated arms of one robot."""
+    """Simulates N arms with the learned body of one robot, in compiled code."""
 
-    mae: Mae  # the learned body
+    mae: Mae  # network whose learned body is simulated
     state: ArmState  # the arms now; assign an earlier state to return to it
-    command: Array  # l_target [m], (N, M)
+    command: Array  # length commands l_target [m], (N, M)
     wrench: Array  # wrench on the end effectors in axes of the root link [N, N·m], (N, 6)
     fixed: Array  # angles that joints are forced to [rad], (N, D); NaN for a free joint
 
@@ -61,8 +63,8 @@ class Simulation:
         """Start at θ = 0, or at the nearest joint limit, with T_bias and no command.
 
         Args:
-            robot: The geometric model.
-            mae: The learned body.
+            robot: The robot to simulate.
+            mae: The network with the learned body.
             preset: Name of the preset, which selects the equations.
             arms: Number of arms.
             device: Torch device of the network, such as `cuda`; None to use numpy.

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`check_robot`: checks whether a robot description is sound, and names its faults."""
+"""`check_robot`: checks whether muscles can hold a robot and make it stiff; names faults."""
 
 from musculoskeletal_ae.options import Parser, exit_status, number, whole
 from musculoskeletal_ae.process_signals import import_heavy
 
-REACH = 0.02  # let --suggest move a via point by at most this, unless --reach is given [m]
+REACH = 0.02  # without --reach, let --suggest move a via point by at most this [m]
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Check one robot; exit status 0 if it is sound, 1 if it is not or cannot be read."""
+    """Check one robot; exit status 0 if it has no faults, 1 if it has faults or cannot be read."""
     parser = Parser(
         'check_robot',
         'Checks whether a robot description is sound, and names its faults and remedies. '

@@ -72,9 +72,9 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
     """Fit the constants of a series elastic element to N rows of measurements.
 
     Args:
-        tension: T [N], (N,).
-        absolute_length: l_abs [m], (N,).
-        elongation: L_e [m], (N,).
+        tension: Tensions T [N], (N,).
+        absolute_length: Absolute lengths l_abs [m], (N,).
+        elongation: Elongations L_e [m], (N,).
 
     Returns:
         The constants, each of shape (1,).

@@ -34,8 +34,9 @@ from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.model_training import train_on_model
 
-HELD_OUT = 60.0  # measure the error in a motion of this duration, which is not learned [s]
-CHAIN = 'joints', 'muscles', 'without', 'base', 'end'  # pass these options on to `import_robot`
+HELD_OUT = 60.0  # measure the error in a motion of this duration, from which nothing is learned [s]
+#: options of `train --mujoco` that are passed on to `import_robot`
+CHAIN = 'joints', 'muscles', 'without', 'base', 'end'
 
 
 def train(args: Namespace) -> None:

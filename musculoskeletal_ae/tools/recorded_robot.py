@@ -20,14 +20,15 @@ from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
-BEGINNING = 2_000_000_000  # read this time of a recording first [ns]; it reveals most wrong robots
+#: read this much time of a recording first [ns], which reveals most wrong robots quickly
+BEGINNING = 2_000_000_000
 
 
 def misfit(bag: Bag, name: str, namespace: str | None = None) -> str:
-    """Return why a recording is not one of a robot, and what to pass instead; '' if it is one.
+    """Return why a recording does not fit a robot, and what to pass instead; '' if it fits.
 
     Args:
-        bag: The recording.
+        bag: The recording to check.
         name: A shipped robot or a robot directory.
         namespace: The namespace of the arm; required only if the bag has several.
 
@@ -75,7 +76,10 @@ def _problem(bag: Bag, robot: Robot, namespace: str | None, stop: int) -> str:
 
 
 def _described(bag: Bag, robot: Robot, namespace: str | None) -> tuple[str, list[str]]:
-    """Return the name and the movable joints of the recorded URDF; '' and [] without one."""
+    """Return the name and the movable joints of the URDF in a recording.
+
+    They are '' and [] if the recording has no URDF. `namespace` is that of the recorded topics.
+    """
     topics = interface_topics(bag, namespace, robot.description.motor_topics)
     topic = topics.get('robot_description')
     for message in bag.messages([topic] if topic else []):

@@ -54,7 +54,7 @@ from musculoskeletal_ae.tables.table import Table, TableError
 from musculoskeletal_ae.tools.model_training import prepare, train_on_model
 from musculoskeletal_ae.tools.network_cache import network_file
 
-LEAST_OFFSET = 0.002  # do not show a smaller joint-sensor offset [rad]
+LEAST_OFFSET = 0.002  # do not report a smaller joint-sensor offset [rad]
 #: Warn that a held-out recording repeats what was learned if more than REPEATED_SHARE of its
 #: postures are closer than REPEATED [rad] to a learned one. Between two explorations of a neck of
 #: two joints with the same seed, 70 % of the postures were; with different seeds, 2 %.
@@ -75,7 +75,7 @@ class TableSource(NamedTuple):
 
     @property
     def use(self) -> str:
-        """How it is used, as a text for users."""
+        """Text for users that says whether the recording is held out or learned from."""
         return 'held out' if self.is_held_out else 'learned from'
 
 
@@ -332,7 +332,10 @@ def _learns_from_motion(robot: Robot, sources: list[TableSource], preset: str) -
 
 
 def _count(robot: Robot, sources: list[TableSource], enough: int, *, from_motion: bool) -> int:
-    """Count how many postures would be learned, up to `enough`."""
+    """Count how many postures would be learned, up to `enough`.
+
+    They are resting postures, or slow moments of a motion if `from_motion`.
+    """
     count = 0
     learned = [source for source in sources if not source.is_held_out]
     what = 'slow moments' if from_motion else 'resting postures'
@@ -360,7 +363,10 @@ def _learn_and_show(learner: Learner, source: TableSource) -> str:
 
 
 def _nothing_learned(learner: Learner, at_rest: bool) -> str:
-    """Return why no update took place, and what to record instead."""
+    """Return why no update took place, and what to record instead.
+
+    `at_rest` says whether the recording consists of resting postures only.
+    """
     rest = '' if at_rest else f' and rests in each for at least {REST_TIME:g} s'
     return (
         f'nothing was learned ({learner.updates} updates): {unchanged(learner)}. Record some '
@@ -479,8 +485,8 @@ def read(path: Path, robot: Robot, namespace: str | None = None) -> Pairs:
     """Read the paired messages of a bag; print progress, and warnings about unused messages.
 
     Args:
-        path: The bag.
-        robot: The recorded robot.
+        path: Path of the bag.
+        robot: The robot that the bag should fit.
         namespace: The namespace of the arm; required only if the bag has several.
 
     Raises:

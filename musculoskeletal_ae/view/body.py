@@ -23,11 +23,15 @@ from musculoskeletal_ae.robot import drawing
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.routes import ARC
 
-LARGEST_MESH = 50_000_000  # refuse a larger mesh file [bytes]
+LARGEST_MESH = 50_000_000  # draw no mesh whose file is larger [bytes]
 FORMATS = ('.stl', '.obj', '.ply', '.glb')
-POSTURES = 50  # draw this many random postures of each kind in `space`
-DASHES = 5  # draw each straight piece of a muscle as this many tubes; only dashed muscles have gaps
-#: red, green, blue at T_bias and at T_limit
+#: find the space in which the arm moves from this many postures with arbitrary joint angles, and
+#: from as many with all joints at their limits
+POSTURES = 50
+#: draw each straight piece of a muscle as this many tubes; only dashed muscles have gaps between
+#: them
+DASHES = 5
+#: colours of a muscle at T_bias (LOOSE) and at T_limit (TIGHT): red, green, blue
 ENDS = LOOSE, TIGHT = np.array([0, 114, 178]), np.array([230, 97, 0])
 
 
@@ -40,7 +44,8 @@ class DrawnState(IntEnum):
     RUPTURED = 3
 
 
-MARKS = ('', '? ', '⊘ ', '✂ ')  # text before the name of a muscle, by kind
+#: mark that precedes the name of a muscle on the page, by its `DrawnState`
+MARKS = ('', '? ', '⊘ ', '✂ ')
 #: red, green, blue of muscles that are not coloured by tension
 COLOURS = {
     DrawnState.SUSPECT: (200, 0, 130),
@@ -50,7 +55,10 @@ COLOURS = {
 
 
 def colours(robot: Robot, tension: Array, kinds: Ints) -> Array:
-    """Return the colours of muscles at T [N] (M,) as red, green and blue, uint8 (M, 3)."""
+    """Return the colours of muscles as red, green and blue, uint8 (M, 3).
+
+    They depend on T [N] (M,), except if the `DrawnState` in `kinds` (M,) has a colour of its own.
+    """
     rgb = LOOSE + drawing.tension_share(robot, tension)[:, None] * (TIGHT - LOOSE)
     for kind, colour in COLOURS.items():
         rgb[kinds == kind] = colour

@@ -47,7 +47,7 @@ BUTTONS = {
 }
 #: exert this force on the hand per distance by which the mouse drags it [N/m]
 PUSH_STIFFNESS = 200.0
-MOST_PUSH = 60.0  # exert at most this force by a push with the mouse [N]
+MOST_PUSH = 60.0  # limit the force of a push with the mouse to this [N]
 MOST_PAYLOAD = 5.0  # let visitors choose payloads of up to this mass [kg]
 #: requests after which values that are still being entered are not sent
 COMMANDS = (
@@ -233,7 +233,7 @@ class Controls:
                 self._set(key, self._settled[key])
 
     def follow(self, theta: Array | None, payload: float, played: Sequence[float] | None) -> None:
-        """Update the controls.
+        """Follow the arm, the emulator and the replay: update the controls to their state.
 
         Args:
             theta: The estimated θ [rad] (D,). The sliders show it when the arm rests, until a
@@ -287,8 +287,8 @@ class Controls:
     def push(self, event: Any) -> Array:
         """Draw the force that a visitor exerts by dragging; return the force [N], (3,).
 
-        The force is proportional to the length of the drag, up to MOST_PUSH; it is 0 when the drag
-        ends.
+        `event` is viser's event of the drag. The force is proportional to the length of the drag,
+        up to MOST_PUSH; it is 0 when the drag ends.
         """
         ends = np.array([event.start_position, event.end_position])
         force = PUSH_STIFFNESS * (ends[1] - ends[0])

@@ -25,11 +25,11 @@ from musculoskeletal_ae.view.visits import checked_visits
 
 #: show one panel in a window narrower than this, because two would hide the arm [pixels]
 NARROW = 900
-HOT = 80.0  # temperature at the right end of a bar [°C]
+HOT = 80.0  # temperature at the right end of a muscle's temperature bar [°C]
 
 
 class Page:
-    """One page, for any number of visitors.
+    """The web page of one arm, which any number of visitors may open at once.
 
     Attributes:
         looked_at: Event that is set while the page has visitors.
@@ -103,7 +103,7 @@ class Page:
             self.looked_at.clear()
 
     def close(self) -> None:
-        """Stop serving the page."""
+        """Stop serving the page, which ends all visits."""
         with contextlib.redirect_stdout(io.StringIO()):
             self._server.stop()
 
@@ -129,12 +129,12 @@ class Page:
         values: Sequence[float],
         is_urgent: bool = True,
     ) -> None:
-        """Show texts, bars and curves.
+        """Tell visitors the state of the arm by texts, bars and curves.
 
         Args:
             lines: Lines of status text.
             alarm: Text of the alarm box; '': no box.
-            states: T [N] and temperatures [°C], (2, M), for the bars; NaN where unknown.
+            states: Tensions T [N] and temperatures [°C], (2, M), for the bars; NaN where unknown.
             now: Time of `values` [s].
             values: Values of the curves: estimation error [rad], the measures A and d that detect
                 an anomaly, and the threshold of d; NaN where unknown.
@@ -149,7 +149,7 @@ class Page:
             readings.show(status, bars, self._history)
 
     def _muscles(self, tension: Array, temperature: Array) -> list[dict[str, Any]]:
-        """Return the template variables of each muscle's bar."""
+        """Return the template variables of each muscle's bar, at T [N] and temperature [°C]."""
         columns = {
             'rgb': map(
                 tuple, body.colours(self._robot, np.nan_to_num(tension), self.scene.kinds).tolist()
@@ -169,7 +169,10 @@ class Page:
         return text if self.controls is None else with_buttons(text)
 
     def notify(self, text: str, good: bool) -> None:
-        """Notify all visitors of the outcome of a request, naming buttons instead of services."""
+        """Notify all visitors that a request is done (`good`) or refused, with the text.
+
+        The text names buttons of the page instead of services.
+        """
         title, color = ('done', 'teal') if good else ('refused', 'red')
         for client in self._server.get_clients().values():
             client.add_notification(
@@ -187,7 +190,7 @@ class Page:
             self.controls.offer(nodes, explores)
 
     def follow(self, payload: float, played: Sequence[float] | None) -> None:
-        """Update the controls; see `Controls.follow`."""
+        """Update the sliders from the payload [kg] and the replay; see `Controls.follow`."""
         if self.controls is not None:
             self.controls.follow(self.scene.posture.get('estimated'), payload, played)
 

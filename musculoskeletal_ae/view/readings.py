@@ -18,11 +18,12 @@ from musculoskeletal_ae.view import body
 LEFT_PANEL = 350  # width of the left panel [pixels]
 ARMS = {'measured': (176, 180, 186), 'estimated': (0, 158, 115), 'simulated': (148, 103, 189)}
 ENVIRONMENT = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
-HTML: Any = ENVIRONMENT.get_template('page.html.jinja').module  # macros
-DURATION = 60.0  # show curves of this duration [s]
+#: the macros of the template, which write the HTML of the panel
+HTML: Any = ENVIRONMENT.get_template('page.html.jinja').module
+DURATION = 60.0  # show the curves of the last part of a run, of this duration [s]
 GREEN, BLUE = {'stroke': '#009e73', 'width': 2}, {'stroke': '#0072b2', 'width': 2}
 DASHED = {'stroke': '#c80082', 'width': 2, 'dash': [6, 4]}
-HEIGHT = 84  # height of a plot [pixels]
+HEIGHT = 84  # height of a plot of the curves [pixels]
 TIME_AXIS = {'incrs': [0.25 * DURATION], 'space': 30, 'size': 26}
 #: `incrs` lists the possible distances between ticks. uPlot takes the smallest one that covers at
 #: least `space` pixels, which is half of any `scale_top`. The same axes serve all scales, because
@@ -132,7 +133,7 @@ class ReadingsPanel:
             self._tops.append(1.0)
 
     def show(self, status: str, bars: str, history: History) -> None:
-        """Show the HTML texts and the curves."""
+        """Show the status and the muscles' bars, both HTML, and the curves of the history."""
         self._status.content, self._bars.content = status, bars
         for number, (curve, plot) in enumerate(self._plots):
             data = history.curve(curve.values)

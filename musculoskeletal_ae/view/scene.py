@@ -118,8 +118,8 @@ class Scene:
         """Draw arms and muscles.
 
         Args:
-            posture: θ [rad] (D,) of each arm to draw, by name of the arm.
-            tension: T [N] (M,); None hides the muscles.
+            posture: Joint angles θ [rad], (D,), of each arm to draw, by name of the arm.
+            tension: Tensions T [N] (M,); None hides the muscles.
             kinds: The `body.DrawnState` of each muscle, (M,).
 
         Returns:

@@ -419,7 +419,7 @@ def test_the_result_of_a_replayed_demonstration_is_reported(tool, graph, tmp_pat
     graph.wait(lambda: replay.process.poll() is not None, 'the end of the replay')
     output = replay.output()
     assert replay.process.returncode == (0 if takes else 1), output
-    why = 'the controller refused the trajectory: joint_trajectory: no posture yet'
+    why = 'the controller refused the trajectory: joint_trajectory: no posture estimated yet'
     assert ('joint_trajectory: 31 points' if takes else why) in output
 
 

@@ -250,7 +250,7 @@ def test_the_preset_decides_whether_exploration_takes_joints_to_their_limits(pre
 
 def test_a_subset_of_joints_waits_until_the_posture_of_the_others_is_known():
     bench = Bench()
-    with pytest.raises(MessageError, match='no posture yet'):
+    with pytest.raises(MessageError, match='no posture estimated yet'):
         bench.core.target({ROBOT.joints[0]: (0.1, 0.0)})
     bench.step()
     bench.core.target({ROBOT.joints[0]: (0.1, 0.0)})

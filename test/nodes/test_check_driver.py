@@ -74,7 +74,7 @@ def test_with_wait_check_driver_reports_faults_until_the_driver_is_right_and_mov
     graph.node.destroy_publisher(mistyped)
     commands = graph.listen(Float64MultiArray, 'muscle_length_command')
     start_driver(graph, faults=['bias:biceps_long:0.1'])
-    expected = ('fault: zero of biceps_long', 'change: ', 'fix the driver before moving')
+    expected = ('fault: zero of biceps_long', 'change: ', 'correct the faults of the driver before')
     graph.wait(lambda: all(text in waiting.output for text in expected), 'the fault')
     assert 'no fault found' not in waiting.output
     assert graph.set_parameter('hardware_emulator', 'faults', [''])[0]

@@ -27,12 +27,14 @@ from musculoskeletal_ae.importing.adapted_mjcf import HAND
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.robot import Robot
 
-GUIDES_EVERY = 5  # update the guides after this many steps
-HISTORY = 64  # permit no larger delay of a sensor, as a number of steps
-HOUR = 3600.0  # [s]
-BEDDING_TIME = 2.0 * HOUR  # let a new tendon lengthen with this time constant [s]
-NUDGE = 1e-7  # change the joint angles by this where MuJoCo's wrapping fails [rad]
-SLIP_TIME = 5.0 * HOUR  # let a tendon slip on its spool once in this time on average [s]
+#: update the bends of the tendons, and how far route points yield, only after this many steps
+GUIDES_EVERY = 5
+#: reject delays of sensors that exceed this many steps of 1 ms, which is the length of the history
+HISTORY = 64
+HOUR = 3600.0  # one hour in seconds
+BEDDING_TIME = 2.0 * HOUR  # time constant with which a new tendon lengthens under load [s]
+NUDGE = 1e-7  # change the joint angles by this if MuJoCo's wrapping returns NaN in a posture [rad]
+SLIP_TIME = 5.0 * HOUR  # mean time between two slips of a tendon on its spool [s]
 OTHER_ROUTE = 0.02  # refuse a file if the length of a muscle differs by more in most postures [m]
 
 
@@ -46,7 +48,7 @@ class ForeignBody:
         """Draw the elastic elements and sensor errors of the arm that `model` describes.
 
         Args:
-            robot: The robot.
+            robot: The robot, with the data sheets of the elastic elements.
             model: A MuJoCo model. Its joints and tendons must have the names of the robot's joints
                 and muscles.
             draw: The random draws of the individual.
@@ -138,7 +140,9 @@ def _individual_model(robot: Robot, draw: Draw) -> Any:
 
 
 def _imported_model(robot: Robot, file: Path, draw: Draw, deviates: bool) -> Any:
-    """Return the MuJoCo model of a file that `import_robot` wrote, with or without deviations.
+    """Return the MuJoCo model of a file that `import_robot` wrote.
+
+    If `deviates`, the model gets the deviations of the individual that `draw` selects.
 
     Raises:
         MusculoskeletalError: If the file is not the model of the robot.

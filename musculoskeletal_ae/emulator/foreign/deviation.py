@@ -27,11 +27,13 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.emulator.foreign.effects import NONE, Draw, Effects
 from musculoskeletal_ae.robot.robot import Robot
 
-ATTACHMENT = 0.1  # displace points by this σ, relative to the typical moment arm
-FARTHEST = 0.005  # displace points by no larger σ [m]
-SLACK = 0.05  # change tendon lengths by this σ, relative to the typical moment arm
-LONGEST = 0.002  # change tendon lengths by no larger σ [m]
-MASS = 0.1  # draw the logarithm of a mass with this σ
+#: standard deviation σ of the displacement of a point, relative to the typical moment arm
+ATTACHMENT = 0.1
+FARTHEST = 0.005  # limit σ of the displacement of a point to this [m]
+#: standard deviation σ of the error of a tendon's length, relative to the typical moment arm
+SLACK = 0.05
+LONGEST = 0.002  # limit σ of the error of a tendon's length to this [m]
+MASS = 0.1  # standard deviation σ of the logarithm of a body's mass, relative to the file
 #: draw offsets of tension sensors with this σ, relative to T_bias: modules that keep a low tension
 #: have sensors that can measure it
 ZERO = 0.1
@@ -123,7 +125,7 @@ def _is_inside(model: Any, site: int) -> bool:
 
 
 def change_masses(model: Any, draw: Draw) -> None:
-    """Change mass and inertia of each body by a random factor."""
+    """Multiply mass and inertia of each body of a MuJoCo model by a random factor, in place."""
     factor = np.exp(MASS * draw.rng('masses').normal(size=model.nbody))
     model.body_mass[:] *= factor
     model.body_inertia[:] *= factor[:, None]

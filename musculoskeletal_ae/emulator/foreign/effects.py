@@ -46,21 +46,21 @@ class Effects:
     #: share of the stretch that is delayed, most of it by up to 40 min, all of it by up to 12 h
     recovery: float = 0.45
     bedding: float = 0.005  # lengthening of a tendon in its first hours [m]
-    knot: float = 0.0034  # slip of one knot, once [m]
+    knot: float = 0.0034  # length by which a knot slips once, at a random time [m]
     guide_friction: float = 0.4  # relative tension loss along the route, joints at mid-range
     stiction: float = 0.34  # relative increase of friction at the start of a motion
     # Sensors
-    tension_gain: float = 0.05  # σ of the relative error of the gain
-    tension_zero: float = 5.0  # σ of the offset [N]
-    tension_bend: float = 0.02  # non-linearity, relative to the full scale
-    tension_drift: float = 0.2  # drift of the offset with temperature [N/K]
+    tension_gain: float = 0.05  # σ of the relative error of a tension sensor's gain
+    tension_zero: float = 5.0  # σ of the offset of a tension sensor [N]
+    tension_bend: float = 0.02  # non-linearity of a tension sensor, relative to the full scale
+    tension_drift: float = 0.2  # drift of a tension sensor's offset with temperature [N/K]
     spool_gain: float = 0.05  # relative error of the spool's radius
     spool_layer: float = 0.1  # relative increase of the radius by the second layer of tendon
     eccentricity: float = 0.0008  # eccentricity of the spool [m]
     spool_slip: float = 0.0011  # slip of a tendon on its spool, on average once in five hours [m]
-    length_drift: float = 0.001  # σ of the drift of the offset [m/h]
-    joint_zero: float = np.radians(2.0)  # σ of the offset [rad]
-    joint_bend: float = 0.01  # non-linearity, relative to the joint's range
+    length_drift: float = 0.001  # σ of the drift of a length sensor's offset [m/h]
+    joint_zero: float = np.radians(2.0)  # σ of the offset of a joint sensor [rad]
+    joint_bend: float = 0.01  # non-linearity of a joint sensor, relative to the joint's range
     backlash: float = np.radians(1.0)  # backlash of the joint sensor [rad]
     # Messages
     delay: float = 0.02  # delay of joint angles, and of lengths and tensions [s]

@@ -31,15 +31,16 @@ ARMATURE, DAMPING = 0.005, 0.4
 LENGTH_SPREAD, TURN_SPREAD = 0.005, np.radians(2.0)
 #: change logarithms of masses, and their centres [m], by these σ times `Effects.links`
 MASS_SPREAD, CENTRE_SPREAD = 0.15, 0.02
-THICKEST = 0.045  # permit no larger radius of the head of a bone, or of a muscle [m]
+THICKEST = 0.045  # limit the radius of the head of a bone, or of the belly of a muscle, to this [m]
 POSTURES = 300  # fit the radii of heads and muscles in this many random postures
 # Couple joints with this constraint stiffness (solimp). MuJoCo's default disregards the ratio of a
 # coupling: a prismatic joint that follows a revolute one would lag by centimetres.
 STIFF = [0.9999, 0.9999, 0.001, 0.5, 2.0]
-SPRING = 'spring'  # begin the names of springs that couple joints with this word
+SPRING = 'spring'  # first word of the names of springs that couple joints
 
-Place = tuple[int, Array]  # joint, and position in its frame [m]
-Obstacle = tuple[int, Array, Array]  # joint, and centre [m] and axis in its frame
+Place = tuple[int, Array]  # a place on a link: its joint, and the position in its frame [m]
+#: an object around which tendons wrap: its joint, and its centre [m] and axis in that joint's frame
+Obstacle = tuple[int, Array, Array]
 
 check_mujoco()
 mujoco.set_mju_user_warning(lambda _: None)  # the default writes a file to the current directory
@@ -49,7 +50,7 @@ def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
     """Return the compiled MuJoCo model of one individual of a robot directory.
 
     Args:
-        robot: The robot.
+        robot: The robot whose directory describes the body.
         draw: The random draws of the individual.
         again: How often the deviations of each muscle's route points are redrawn, (M,).
     """
@@ -121,7 +122,7 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
 
 
 def _drawn_springs(robot: Robot, draw: Draw) -> JointElasticity:
-    """Return the springs of an individual's joints."""
+    """Return the robot's joint springs with the random deviations that `draw` selects."""
     kin, drawn = robot.kinematics, draw.rng('springs').normal(size=(2, robot.joint_count))
     factor = np.exp(draw.sizes.springs * drawn[0])
     return kin.elasticity.deviating(factor, draw.sizes.spring_rest * drawn[1])
@@ -135,7 +136,7 @@ def _add_springs(robot: Robot, springs: JointElasticity, spec: Any) -> None:
     Each of them acts along the coordinate v · q of the joint positions q.
 
     Args:
-        robot: The robot.
+        robot: The robot that has the springs.
         springs: The springs in the units of the joints.
         spec: The MjSpec, to which the springs are added.
     """
@@ -167,7 +168,7 @@ def add_routes(robot: Robot, draw: Draw, again: Ints, spec: Any, bodies: list[An
     The objects are those of the description, and heads of bones or bellies of other muscles.
 
     Args:
-        robot: The robot.
+        robot: The robot whose directory describes the routes.
         draw: The random draws of the individual.
         again: How often the deviations of each muscle's route points are redrawn, (M,).
         spec: The MjSpec, to which tendons, sites and objects are added.
@@ -303,7 +304,11 @@ def _obstacle(
 
 
 def _add_round(body: Any, name: str, place: Array, axis: Array | None, radius: float) -> None:
-    """Add a sphere or a cylinder for tendons to wrap around, without collisions."""
+    """Add an object without collisions to a body, for tendons to wrap around.
+
+    In the frame of the body, it is a sphere around `place` [m], or a cylinder along `axis` if there
+    is one.
+    """
     kind, turn = mujoco.mjtGeom.mjGEOM_SPHERE, pin.Quaternion.Identity()
     if axis is not None:
         kind = mujoco.mjtGeom.mjGEOM_CYLINDER
@@ -364,7 +369,7 @@ def from_file(robot: Robot, file: Path) -> Any:
 
 
 def other_robot(robot: Robot, file: Path, problem: str) -> MusculoskeletalError:
-    """Return an error that says why a file does not describe a robot, and what to do."""
+    """Return the error for a MuJoCo file that is not the model of the robot, with the `problem`."""
     directory = robot.description.directory
     remedy = 'import the MuJoCo model again, and use the model.xml that import_robot writes'
     return MusculoskeletalError(

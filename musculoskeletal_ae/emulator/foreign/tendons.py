@@ -30,8 +30,9 @@ from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.robot import Robot
 
 # Modelling constants, chosen by hand. The magnitudes of the effects are in `effects.py`.
-SLIDING = 0.0003  # let friction build up over this sliding distance [m]
-BREAKING = 0.0005  # end stiction after this sliding distance [m]
+SLIDING = 0.0003  # let tendon friction build up over this sliding distance [m]
+#: let the increased friction at the start of a motion (stiction) end over this sliding distance [m]
+BREAKING = 0.0005
 STICKING = 0.5  # let stiction build up at rest with this time constant [s]
 #: let rubber change from one side of its hysteresis loop to the other over this elongation [m]
 LOOP = 0.003
@@ -55,7 +56,7 @@ class Springs:
         """Draw the laws, which deviate from the series elastic elements of the robot description.
 
         Args:
-            robot: The robot.
+            robot: The robot, with the data sheets of the elastic elements.
             at_zero: Tendon lengths at θ = 0 [m], (M,).
             draw: The random draws of the individual.
         """
@@ -152,7 +153,7 @@ def make_tendons(
     """Make the tendons' constants from random draws.
 
     Args:
-        robot: The robot.
+        robot: The robot, with the tension limits of its muscles.
         springs: The laws of the series elastic elements.
         at_zero: Lengths of the routes at θ = 0 [m], (M,).
         span: Lengths of the routes in N postures, relative to those at θ = 0 [m], (N, M).

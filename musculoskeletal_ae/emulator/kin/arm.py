@@ -33,10 +33,11 @@ from musculoskeletal_ae.robot.kinematics import joint_space_inertia
 from musculoskeletal_ae.robot.passive_torque import add_passive
 from musculoskeletal_ae.robot.robot import Robot
 
-SLIDING_DISTANCE = 0.0005  # let tendon friction build up over this sliding distance [m]
+#: let tendon friction build up to its full size over this sliding distance [m]
+SLIDING_DISTANCE = 0.0005
 #: give each joint module this inertia of rotor and bearings [kg·m²]; chosen by hand
 ARMATURE = 0.004
-STICKING_ANGLE = 0.003  # let joint friction build up over this angle [rad]
+STICKING_ANGLE = 0.003  # let joint friction build up to its full size over this angle [rad]
 VISCOUS = 0.5  # give each joint this viscous friction [N·m·s/rad]
 #: give the stops at joint limits this stiffness [N·m/rad] and damping [N·m·s/rad]
 STOP_STIFFNESS, STOP_DAMPING = 400.0, 2.0
@@ -256,7 +257,7 @@ class EmulatedArm(modules.Arm):
 
     @property
     def tendon_friction(self) -> Array:
-        """How strongly each tendon rubs along its route (friction μ), shape (M,)."""
+        """Share of tension that each tendon loses along its route (friction μ), shape (M,)."""
         return self.individual.tendon_friction.copy()
 
     @property

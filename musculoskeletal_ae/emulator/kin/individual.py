@@ -17,7 +17,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.robot.wrapping import WrapObjects
 
-THICKEST_BONE = 0.04  # permit no larger radius of a bone's head [m]
+THICKEST_BONE = 0.04  # limit the radius of a bone's head to this [m]
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Spread:
     spring_rest: float = 0.05
 
 
-#: make a body that equals the geometric model, without friction
+#: sizes with which an individual equals the geometric model and has no friction
 NOMINAL = Spread(**{field.name: 0.0 for field in fields(Spread)})
 
 
@@ -96,9 +96,11 @@ class Individual:
         relative_friction = rng.uniform(0.5, 1.5, len(self.joint_load))
         #: Coulomb torque of each joint [N·m], (D,)
         self.joint_friction: Array = spread.joint_friction * self.joint_load * relative_friction
-        #: errors of the sensors, each (M,): [m], [N] and a factor
+        #: errors of the length sensors: offsets [m], (M,)
         self.length_bias: Array = rng.normal(0.0, spread.length_bias, muscles)
+        #: errors of the tension sensors: offsets [N], (M,)
         self.tension_bias: Array = rng.normal(0.0, spread.tension_bias, muscles)
+        #: errors of the tension sensors: factors of the tension, (M,)
         self.tension_gain: Array = 1.0 + rng.normal(0.0, spread.tension_gain, muscles)
         self.length_at_zero: Array = self.absolute_lengths(np.zeros((1, robot.joint_count)))[0]
         drawn = np.random.default_rng([seed, 0x5B]).normal(size=(2, robot.joint_count))

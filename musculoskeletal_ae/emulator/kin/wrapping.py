@@ -30,11 +30,11 @@ from musculoskeletal_ae.robot.wrapping import (
 class Tree(NamedTuple):
     """Joints in pinocchio's order; joint 0 is the root link."""
 
-    parent: Ints  # (J,)
+    parent: Ints  # index of the joint that carries each joint, (J,)
     rotation: Array  # fixed orientation in the parent's frame, (J, 3, 3)
     translation: Array  # fixed position in the parent's frame [m], (J, 3)
     axis: Array  # axis in the joint's frame, (J, 3)
-    prismatic: Bools  # (J,)
+    prismatic: Bools  # whether each joint is prismatic, (J,)
 
 
 class WrappedRoutes(NamedTuple):
@@ -140,7 +140,7 @@ def wrapped_lengths(routes: WrappedRoutes, q: Array, placed: Placed) -> tuple[Ar
     """Return the route lengths of all muscles, and their derivatives, in N postures.
 
     Args:
-        routes: The routes.
+        routes: Routes with the objects around which they wrap.
         q: Positions of all joints of the tree [rad] or [m], (N, J−1).
         placed: Buffer for intermediate results.
 
@@ -180,8 +180,8 @@ def add_torque(
     """Add the torques that a force exerts on all joints between a body and the root link.
 
     Args:
-        tree: The joints.
-        placed: Their poses.
+        tree: The joints of the arm.
+        placed: Poses of the joints, as computed by `place`.
         joint: Index of the joint that carries the body.
         point: Point at which the force acts, in the root link's frame [m].
         force: The force in the axes of the root link, before it is multiplied by `scale`.
