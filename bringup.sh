@@ -244,6 +244,7 @@ logs=$(mktemp -d "$log_folder/bringup-$(date +%Y%m%d-%H%M%S)-XXXXXX") || exit 1
 ln -sfn "${logs##*/}" "$log_folder/latest_bringup" # beside colcon's latest_build
 export ROS_LOG_DIR=$logs
 say "logs in $logs"
+discover_many "$logs/udp.xml"
 
 # --- processes: start, watch, stop, always by pid ------------------------------------------------
 
