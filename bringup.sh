@@ -244,6 +244,7 @@ logs=$(mktemp -d "$log_folder/bringup-$(date +%Y%m%d-%H%M%S)-XXXXXX") || exit 1
 ln -sfn "${logs##*/}" "$log_folder/latest_bringup" # beside colcon's latest_build
 export ROS_LOG_DIR=$logs
 say "logs in $logs"
+discover_many "$logs/udp.xml"
 
 # --- processes: start, watch, stop, always by pid ------------------------------------------------
 
@@ -337,8 +338,16 @@ trap 'exit 129' HUP
 
 # Sets $checkpoint to a file in the cache of initial networks, which `train --from-bag` shares.
 train_once() {
+  local training
   checkpoint=$("$python" -m musculoskeletal_ae.tools.network_cache "$robot" "$preset" ${quick[@]:+quick}) || exit 1
+  # Of several bringup.sh that start at the same time, only one trains.
+  exec {training}>>"$checkpoint.lock" || exit 1
+  if ! flock -n "$training"; then
+    say 'waiting for another bringup.sh, which trains the same network'
+    until flock -w 1 "$training"; do :; done # in between, bash handles signals
+  fi
   if [ -s "$checkpoint" ]; then
+    exec {training}>&-
     say "initial network from an earlier run (without what was learned since): $checkpoint"
     return
   fi
@@ -347,6 +356,7 @@ train_once() {
   launch train --robot "$robot" --preset "$preset" --out "$checkpoint" "${quick[@]}" \
     >>"$logs/train.log" 2> >(tee -pa "$logs/train.log")
   wait_for train || died train $?
+  exec {training}>&-
 }
 
 # --- a MuJoCo model ------------------------------------------------------------------------------

@@ -228,3 +228,18 @@ use_udp() {
   [ "${ROS_AUTOMATIC_DISCOVERY_RANGE-}" != LOCALHOST ] ||
     export FASTRTPS_DEFAULT_PROFILES_FILE=${FASTRTPS_DEFAULT_PROFILES_FILE:-$repository/config/udp.xml}
 }
+
+# Lets as many processes of this machine discover each other as Fast DDS has ports for, which are 101.
+# With ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, rmw_fastrtps sends announcements to the ports of the
+# first 32 processes only. The profile that is written here names the other ports of the domain.
+discover_many() { # FILE
+  local id port peers=
+  [ "${FASTRTPS_DEFAULT_PROFILES_FILE-}" = "$repository/config/udp.xml" ] || return 0
+  [[ ${ROS_DOMAIN_ID:-0} =~ ^[0-9]+$ ]] || return 0 # rcl will refuse it
+  for ((id = 32; id <= 100; id++)); do
+    port=$((7400 + 250 * 10#${ROS_DOMAIN_ID:-0} + 10 + 2 * id)) # RTPS specification, 9.6.1.1
+    peers+="<locator><udpv4><address>127.0.0.1</address><port>$port</port></udpv4></locator>"
+  done
+  sed "s|<rtps>|&<builtin><initialPeersList>$peers</initialPeersList></builtin>|" \
+    "$FASTRTPS_DEFAULT_PROFILES_FILE" >"$1" && export FASTRTPS_DEFAULT_PROFILES_FILE=$1
+}

@@ -163,13 +163,6 @@ class System:
         names: tuple[str, ...],
         emulator: Sequence[str],
     ) -> None:
-        import rclpy
-        from rclpy.qos import qos_profile_sensor_data
-        from rclpy.signals import SignalHandlerOptions
-        from std_msgs.msg import Float64MultiArray
-
-        from musculoskeletal_ae.ros.executor import make_executor
-
         folder = Path(os.environ['AMENT_PREFIX_PATH'].split(':')[0]) / 'lib/musculoskeletal_ae'
         assignments = {name: [f'robot:={robot}', f'rate:={rate}'] for name in names}
         for name in assignments:
@@ -192,14 +185,41 @@ class System:
             if name in BARE:
                 command = [sys.executable, '-c', ALONE, name, robot, str(rate), *BARE[name]]
             self.nodes[name] = subprocess.Popen(command, **quiet)
+        self._listener = Listener(('muscle_states', 'muscle_length_command'))
+        self.stamps = self._listener.stamps
+
+    def end(self) -> None:
+        """End the nodes."""
+        with STOP.reacting(Reaction.REMEMBER):
+            end_processes(self.nodes.values(), signal.SIGINT)
+            self._listener.end()
+
+
+class Listener:
+    """A node that notes when the messages of topics were published.
+
+    Attributes:
+        stamps: Times [ns] of the messages so far, by topic.
+    """
+
+    def __init__(self, topics: Iterable[str]) -> None:
+        """Join the ROS graph, and listen in a thread."""
+        import rclpy
+        from rclpy.qos import qos_profile_sensor_data
+        from rclpy.signals import SignalHandlerOptions
+        from std_msgs.msg import Float64MultiArray
+
+        from musculoskeletal_ae.ros.executor import make_executor
+
         # With its own signal handlers, rclpy would end only its context on SIGTERM. The handlers of
         # `bench.__main__` end the whole bench.
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        self._rclpy, self._node = rclpy, rclpy.create_node('wire')
-        executor = make_executor()
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        self._node = rclpy.create_node('wire', context=self._context, enable_rosout=False)
+        executor = make_executor(self._context)
         executor.add_node(self._node)
         self.stamps: dict[str, list[int]] = defaultdict(list)
-        for topic in ('muscle_states', 'muscle_length_command'):
+        for topic in topics:
             # rclpy inspects the signature of a callback and cannot handle that of a `partial`, so
             # a default value binds the topic.
             def take(_: Any, info: dict[str, Any], topic: str = topic) -> None:
@@ -216,16 +236,14 @@ class System:
             with suppress(rclpy.executors.ExternalShutdownException):
                 executor.spin()
 
-        self._listener = Thread(target=listen)
-        self._listener.start()
+        self._thread = Thread(target=listen)
+        self._thread.start()
 
     def end(self) -> None:
-        """End all processes of the system, and leave the ROS graph."""
-        with STOP.reacting(Reaction.REMEMBER):
-            end_processes(self.nodes.values(), signal.SIGINT)
-            self._rclpy.try_shutdown()
-            self._listener.join()
-            self._node.destroy_node()
+        """Leave the ROS graph."""
+        self._context.try_shutdown()
+        self._thread.join()
+        self._node.destroy_node()
 
 
 class Wire(NamedTuple):
@@ -265,11 +283,27 @@ def measure(system: System, rate: float, seconds: float) -> Wire:
         name: 100.0 * (cpu(process.pid) - before[name]) / passed
         for name, process in system.nodes.items()
     }
-    states, commands = (
-        np.array(system.stamps[name]) for name in ('muscle_states', 'muscle_length_command')
-    )
+    states, commands = (system.stamps[name] for name in ('muscle_states', 'muscle_length_command'))
+    return Wire(*delays(states, commands, rate, passed), used)
+
+
+def delays(
+    state_stamps: Sequence[int], command_stamps: Sequence[int], rate: float, seconds: float
+) -> tuple[tuple[float, ...], float, float]:
+    """Return latency, late and missed messages, as in `Wire`.
+
+    Args:
+        state_stamps: Times of the messages of muscle_states [ns].
+        command_stamps: Times of those of muscle_length_command [ns].
+        rate: Rate of the emulator [Hz].
+        seconds: Time in which the messages were sent [s].
+
+    Raises:
+        MusculoskeletalError: If there are no messages.
+    """
+    states, commands = np.array(state_stamps), np.array(command_stamps)
     if not (len(states) and len(commands)):
-        problem = f'{len(states)} states and {len(commands)} commands arrived in {passed:.0f} s'
+        problem = f'{len(states)} states and {len(commands)} commands arrived in {seconds:.0f} s'
         raise MusculoskeletalError(
             f'{problem}; see the logs of the nodes, or repeat on an idle machine'
         )
@@ -278,8 +312,8 @@ def measure(system: System, rate: float, seconds: float) -> Wire:
     latency = (commands[after[known]] - states[known]) * 1e-6  # stamps in ns, latency in ms
     late = (latency > 2e3 / rate).sum() + (states[~known] < states[-1] - 2e9 / rate).sum()
     late = 100.0 * float(late) / len(states)
-    missed = 100.0 * max(0.0, 1.0 - len(states) / (rate * passed))
-    return Wire(tuple(np.percentile(latency, (50, 99, 100)).tolist()), late, missed, used)
+    missed = 100.0 * max(0.0, 1.0 - len(states) / (rate * seconds))
+    return tuple(np.percentile(latency, (50, 99, 100)).tolist()), late, missed
 
 
 def systems(

@@ -134,13 +134,7 @@ class Shell(Node):
         hardware = self.robot.description.directory.name
         self._diagnostics = Diagnostics(self, self._reception, hardware)
         self.twins = Twins(self._diagnostics.status_name, self._diagnostics.identity, self.awake)
-        self.create_subscription(
-            DiagnosticArray,
-            '/diagnostics',
-            lambda report: self.twins.take(report, time.monotonic()),
-            MANY_REPORTS,
-            raw=True,
-        )
+        self._reports_of_twins: Any = None  # the subscription, while there may be a twin
         self.create_timer(LOOK_PERIOD, self._look_around, clock=STEADY)
         self.create_timer(PERIOD, self._report_periodically, clock=STEADY)
         self._fault = '', -math.inf  # the last internal error, and its time [s]
@@ -462,6 +456,26 @@ class Shell(Node):
         self.on_intruders(self.intruders)
         self._report_changes()
 
+    def _look_for_twins(self) -> None:
+        """Read the reports of other nodes while the graph has several nodes of this node's name.
+
+        Otherwise, every node of every arm would receive the reports of all nodes in the graph: with
+        ten arms, 3600 a second.
+        """
+        parameters = f'{self.get_fully_qualified_name()}/get_parameters'  # a service of every node
+        has_namesake = self.count_services(parameters) > 1
+        if has_namesake and self._reports_of_twins is None:
+            self._reports_of_twins = self.create_subscription(
+                DiagnosticArray,
+                '/diagnostics',
+                lambda report: self.twins.take(report, time.monotonic()),
+                MANY_REPORTS,
+                raw=True,
+            )
+        elif not has_namesake and self._reports_of_twins is not None:
+            self.destroy_subscription(self._reports_of_twins)
+            self._reports_of_twins = None
+
     @property
     def intruders(self) -> str:
         """The nodes that must not run beside those of this arm, as a text; '' if there are none.
@@ -557,6 +571,7 @@ class Shell(Node):
     def _report_periodically(self) -> None:
         self._reception.measure_rates()
         self.needed.check_rates()
+        self._look_for_twins()
         self._report()
 
     def _report_changes(self) -> None:

@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads what the nodes of one arm report on /diagnostics.
+"""Reads what the nodes of arms report on /diagnostics.
 
 The nodes decide what is true; this module collects, sorts and prints their conditions. It adds one
 fact that a node cannot report itself: that a node has ended, or does not report any more.
+`Situation` has the reports of one arm, and `Arms` those of all arms in the ROS graph.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import time
 from collections.abc import Callable, Collection
 from typing import NamedTuple
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.node import Node as RosNode
 
 from musculoskeletal_ae import conditions
@@ -20,7 +22,7 @@ from musculoskeletal_ae.conditions import CONDITIONS, KINDS, LEVELS, Condition, 
 from musculoskeletal_ae.control.supervisor import Activity, StopState
 from musculoskeletal_ae.remedy import Step, sentence
 from musculoskeletal_ae.report import with_load
-from musculoskeletal_ae.ros.diagnostics import NODE_SILENCE
+from musculoskeletal_ae.ros.diagnostics import IDENTITY, NODE_SILENCE
 
 #: forget other nodes than NEEDED without a report for this time [s]; it exceeds NODE_SILENCE,
 #: because nodes of other packages may report less often
@@ -29,6 +31,9 @@ FORGET_TIME = 5.0
 NEEDED = 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim'
 OTHER = 'other_report'  # identifier of a report that lists no conditions
 SUMMARY = 'bringup_status'  # node that repeats the conditions of all others
+PAGE = 'page'  # value in the report of `view`: address of its page
+#: the addresses to which a list of arms may lead
+ADDRESS = re.compile(r'https?://[^\s/]+')
 #: modes in which a running arm does not explore
 NOT_EXPLORING = {
     each.value for each in Activity if each not in (Activity.EXPLORING, Activity.CALIBRATING)
@@ -80,6 +85,16 @@ class Reported(NamedTuple):
         return f'{text} (to end it: {sentence(steps)})' if steps else text
 
 
+class ArmSummary(NamedTuple):
+    """One line about an arm, for a list of arms."""
+
+    namespace: str  # '/' for the root
+    level: Level
+    text: str  # its most urgent warning or error; without any, what its controller does
+    learned: str  # numbers of samples and networks; '' without a learner
+    page: str  # address of its page; '' if there is none
+
+
 class Situation:
     """The newest report of each node in one namespace."""
 
@@ -109,17 +124,22 @@ class Situation:
                 del self._reports[name]
 
     def diagnosed(self, message: DiagnosticArray) -> None:
-        """Store the reports that a message of /diagnostics contains."""
+        """Store the reports of this namespace that a message of /diagnostics contains."""
         for status in message.status:
-            full_name, _, _ = status.name.partition(':')
-            namespace, _, name = full_name.rpartition('/')
-            if namespace == self._here and name != SUMMARY:
-                values = {value.key: value.value for value in status.values}
-                present = conditions.from_json(values.get(CONDITIONS, '[]'))
-                level = LEVELS[min(ord(status.level), len(LEVELS) - 1)]
-                if level != 'ok' and not present:  # a node of another package, such as a driver
-                    present = (Condition(OTHER, level, status.message, (), (name,)),)
-                self._reports[name] = NodeReport(values, present, status.message, self._clock())
+            namespace, name = _node_of(status)
+            if namespace == self._here:
+                self.reported(name, status)
+
+    def reported(self, name: str, status: DiagnosticStatus) -> None:
+        """Store the report of the node `name` of this namespace."""
+        if name == SUMMARY:
+            return
+        values = _values_of(status)
+        present = conditions.from_json(values.get(CONDITIONS, '[]'))
+        level = LEVELS[min(ord(status.level), len(LEVELS) - 1)]
+        if level != 'ok' and not present:  # a node of another package, such as a driver
+            present = (Condition(OTHER, level, status.message, (), (name,)),)
+        self._reports[name] = NodeReport(values, present, status.message, self._clock())
 
     def values(self, name: str) -> dict[str, str]:
         """Return the values that a node has reported; {} if it has not reported."""
@@ -194,6 +214,22 @@ class Situation:
         """Return the steps that end all conditions, in order."""
         return list(conditions.remedy_of(each.condition for each in self.conditions()))
 
+    def summary(self) -> ArmSummary:
+        """Return one line about the arm."""
+        page = self.values('view').get(PAGE, '')
+        page = page if ADDRESS.fullmatch(page) else ''
+        learned = ''
+        if self.has_learner:
+            learned = f'samples {self.count("samples")} · networks {self.count("checkpoints")}'
+        level, text = self.level(), self.doing or 'no controller'
+        if self.has_ended:
+            level, text = 'warn', 'all nodes have ended'
+        elif level != 'ok':
+            first, *others = [each for each in self.conditions() if each.condition.level != 'ok']
+            further = f' (and {len(others)} more)' if others else ''
+            text = f'{", ".join(first.nodes)}: {first.condition.text}{further}'
+        return ArmSummary(self._here or '/', level, text, learned, page)
+
     # -- single facts ---------------------------------------------------------------------------
 
     @property
@@ -225,6 +261,20 @@ class Situation:
     def is_stopped(self) -> bool:
         """Whether the controller reports that it is stopped."""
         return self.values('controller').get('mode') == StopState.STOPPED.value
+
+    @property
+    def has_reported(self) -> bool:
+        """Whether a node that an arm needs has reported."""
+        return any(name in NEEDED for name in self._reports)
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether all nodes that have reported, and that an arm needs, have left the ROS graph."""
+        needed = [name for name in self._reports if name in NEEDED]
+        if not needed or len(self.silent_nodes()) < len(needed):
+            return False
+        present = self._graph()
+        return not any(f'{self._here}/{name}' in present for name in needed)
 
     @property
     def has_learner(self) -> bool:
@@ -263,3 +313,62 @@ class Situation:
         if not self.has_learner or mode not in NOT_EXPLORING or advised:
             return ''
         return f'{mode}, not exploring'
+
+
+class Arms:
+    """The situations of all arms in the ROS graph, by namespace.
+
+    A namespace has an arm if a controller, an estimator, a learner, a sim or a hardware emulator of
+    this package has reported there.
+    """
+
+    def __init__(
+        self,
+        graph: Callable[[], Collection[str]] = frozenset,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Start without arms; the arguments are those of `Situation`."""
+        self._graph, self._clock = graph, clock
+        self._situations: dict[str, Situation] = {}
+
+    def diagnosed(self, message: DiagnosticArray) -> None:
+        """Store the reports of all arms that a message of /diagnostics contains."""
+        for status in message.status:
+            namespace, name = _node_of(status)
+            is_of_arm = name in NEEDED and IDENTITY in _values_of(status)
+            if is_of_arm or namespace in self._situations:
+                self.situation(namespace).reported(name, status)
+
+    def situation(self, namespace: str) -> Situation:
+        """Return the situation of the arm in a namespace, which may not have reported yet."""
+        key = namespace.rstrip('/')
+        if key not in self._situations:
+            self._situations[key] = Situation(key, self._graph, self._clock)
+        return self._situations[key]
+
+    def forget_ended(self) -> None:
+        """Forget the reports of nodes that may end at any time, and have ended."""
+        for situation in self._situations.values():
+            situation.forget_ended()
+
+    def summaries(self) -> list[ArmSummary]:
+        """Return one line about each arm that has reported, sorted by namespace."""
+        namespaces = sorted(self._situations, key=_with_padded_numbers)
+        situations = [self._situations[namespace] for namespace in namespaces]
+        return [each.summary() for each in situations if each.has_reported]
+
+
+def _node_of(status: DiagnosticStatus) -> tuple[str, str]:
+    """Return namespace and name of the node that a status describes; '' is the root namespace."""
+    full_name, _, _ = status.name.partition(':')
+    namespace, _, name = full_name.rpartition('/')
+    return namespace, name
+
+
+def _values_of(status: DiagnosticStatus) -> dict[str, str]:
+    return {value.key: value.value for value in status.values}
+
+
+def _with_padded_numbers(namespace: str) -> str:
+    """Return a key by which the namespace /arm2 comes before /arm10."""
+    return re.sub(r'\d+', lambda number: number[0].zfill(9), namespace)

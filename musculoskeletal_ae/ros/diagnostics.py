@@ -14,6 +14,7 @@ from musculoskeletal_ae.remedy import sentence
 from musculoskeletal_ae.report import Report
 
 MANY_REPORTS = QoSProfile(depth=50)  # QoS of /diagnostics, on which all nodes of the graph report
+IDENTITY = 'identity'  # value that is in the reports of this package's nodes only
 PERIOD = 1.0  # publish a report of each node at this interval [s]
 NODE_SILENCE = 2.0  # treat a node as ended or hanging if it has not reported for this time [s]
 
@@ -39,7 +40,7 @@ class Diagnostics:
         """Tell the state of the node: publish a report, and the rate of each topic that it uses."""
         rejected, rates = self._reception.rejected, self._reception.rates
         values = {'doing': report.doing} if report.doing else {}
-        values |= {**report.values, 'identity': self.identity}
+        values |= {**report.values, IDENTITY: self.identity}
         values |= {f'{topic} rate': f'{rate:.1f} Hz' for topic, rate in rates.items()}
         values['rejected'] = str(sum(rejected.values()))
         values |= {f'rejected {reason}': str(n) for reason, n in rejected.items()}

@@ -4,9 +4,13 @@
 The node subscribes only while somebody views the page. Once for each picture, it then takes the
 newest message of each topic, and all messages of /diagnostics. An executor would instead handle
 every message of every topic, which would take a tenth of a core.
+
+The page shows the arm of the node's namespace. If the ROS graph has other arms, it lists them all,
+with links to their pages.
 """
 
 import math
+import platform
 import queue
 import time
 import traceback
@@ -39,7 +43,7 @@ from musculoskeletal_ae.message_reading import (
     read_muscle_states,
     read_posture,
 )
-from musculoskeletal_ae.nodes.situation import Situation, figures, nodes_in_graph
+from musculoskeletal_ae.nodes.situation import PAGE, Arms, figures, nodes_in_graph
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.process_signals import STOP, Reaction, import_heavy
 from musculoskeletal_ae.reception import Reception
@@ -102,15 +106,17 @@ class View(Node):
         self.motors = MotorInterface(robot.description.motors)
         self.requests: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         address, request = (options.host, options.port), lambda *what: self.requests.put(what)
-        self.page = page.Page(robot, *address, options.read_only, request)
+        title = f'{self.get_namespace().strip("/")} {robot.description.directory.name}'.strip()
+        self.page = page.Page(robot, *address, options.read_only, request, title)
+        self.address = _address(options)
         for note in self.page.scene.notes:
             self.get_logger().warning(f'mesh omitted: {printable(note)}')
         self.awake = AwakeClock()
-        self.situation = Situation(
-            self.get_namespace(),
+        self.arms = Arms(
             lambda: nodes_in_graph(self),
             lambda: self.awake.at(time.monotonic()),
         )
+        self.situation = self.arms.situation(self.get_namespace())
         self.reception = Reception(lambda text: self.get_logger().warning(text), self.awake)
         hardware = robot.description.directory.name
         self.diagnostics = diagnostics.Diagnostics(self, self.reception, hardware)
@@ -161,7 +167,7 @@ class View(Node):
             ('anomaly', Float64, 'anomaly', NEWEST, lambda m: m.data),
             ('body', Float64MultiArray, 'body_state', LATCHED, body),
             ('mode', String, 'controller_mode', LATCHED, lambda m: m.data),
-            ('', DiagnosticArray, '/diagnostics', MANY, self.situation.diagnosed),
+            ('', DiagnosticArray, '/diagnostics', MANY, self.arms.diagnosed),
         ]  # fmt: skip
 
         def note(what: str, topic: str, read: Callable[[Any], Any], message: Any) -> None:
@@ -206,7 +212,7 @@ class View(Node):
                 self.reported_at = now
                 state = 'viewed' if is_viewed else 'the page has no visitors'
                 self.reception.measure_rates()
-                self.diagnostics.tell(Report(state, {}))
+                self.diagnostics.tell(Report(state, {PAGE: self.address}))
             self.page.send_entries()
             while not self.requests.empty():  # also after the last visitor has left
                 what, *value = self.requests.get()
@@ -232,7 +238,7 @@ class View(Node):
     def _show(self, now: float) -> None:
         """Show the newest messages; `now` is monotonic time [s]."""
         self._take()
-        self.situation.forget_ended()
+        self.arms.forget_ended()
         posture = {arm: at for arm in ARM_TOPICS if (at := self._newest(arm)) is not None}
         if (measured := posture.get('measured')) is not None and np.isnan(measured).any():
             # Draw joints without a working sensor at the estimated angle.
@@ -323,11 +329,12 @@ class View(Node):
             self._ask('controller/reset', then=note_reset, quiet=True)
 
     def _look(self) -> None:
-        """Show the controls for the nodes that are running, and request the emulator's state."""
+        """Show all arms and the controls for running nodes, and request the emulator's state."""
         running = {node for node, name in SIGNS.items() if self.clients_of[name].service_is_ready()}
         if any(push.get_subscription_count() for push in self.pushes):
             running.add('pushed')
         self.page.offer(running, self._newest('mode', math.inf) in EXPLORING)
+        self.page.list_arms(self.arms.summaries(), self.get_namespace())
         self._ask(GET, self._on_emulator_state, quiet=True, names=['faults', 'payload'])
 
     def _on_emulator_state(self, answer: Any) -> None:
@@ -430,13 +437,18 @@ def _parse(arguments: list[str]) -> Namespace:
     return parser.parse_args(arguments)
 
 
+def _address(options: Namespace) -> str:
+    """Return the address of the page, as a browser needs it."""
+    host = f'[{options.host}]' if ':' in options.host else options.host
+    names = {'127.0.0.1': 'localhost', '0.0.0.0': platform.node()}  # noqa: S104 - only read
+    return f'http://{names.get(host, host)}:{options.port}'
+
+
 def _view(options: Namespace, arguments: list[str]) -> int:
     robot = Robot.load(options.robot)
     start_ros(arguments)
     view = View(robot, options)
-    host = f'[{options.host}]' if ':' in options.host else options.host
-    name = 'localhost' if options.host == '127.0.0.1' else host
-    print(f'http://{name}:{options.port}', flush=True)
+    print(view.address, flush=True)
     try:
         with STOP.reacting(Reaction.REMEMBER):
             view.run()

@@ -38,7 +38,13 @@ class Page:
     """
 
     def __init__(
-        self, robot: Robot, host: str, port: int, read_only: bool, act: Callable[..., None]
+        self,
+        robot: Robot,
+        host: str,
+        port: int,
+        read_only: bool,
+        act: Callable[..., None],
+        title: str = '',
     ) -> None:
         """Serve the page.
 
@@ -48,6 +54,7 @@ class Page:
             port: Port to listen on.
             read_only: Whether to leave the controls out.
             act: Called with the requests of visitors (`controls`).
+            title: Name of the arm in the title of the page; '': that of its robot.
 
         Raises:
             MusculoskeletalError: If the port cannot be used.
@@ -68,7 +75,9 @@ class Page:
         # Discard what viser prints.
         with (
             contextlib.redirect_stdout(io.StringIO()),
-            checked_visits(host, f'{robot.description.directory.name} – musculoskeletal_ae'),
+            checked_visits(
+                host, f'{title or robot.description.directory.name} – musculoskeletal_ae'
+            ),
         ):
             server = self._server = viser.ViserServer(host, port, verbose=False)
         if server.get_port() != port:  # another process took the port first
@@ -77,6 +86,7 @@ class Page:
         # Visitors must not open a tunnel to the internet.
         server.request_share_url = lambda *_, **__: None  # type: ignore[method-assign]
         self._history = History()
+        self._arms = ''  # HTML of the list of arms; '' for a single arm
         self._readings: dict[int, ReadingsPanel] = {}  # by the client id of the visitor
         self._configure_panel()
         self.scene = Scene(server, robot)
@@ -142,7 +152,7 @@ class Page:
         """
         self._history.add(now, values)
         status, bars = (
-            str(HTML.status(alarm, lines, is_urgent)),
+            str(HTML.status(alarm, lines, is_urgent)) + self._arms,
             str(HTML.bars(self._muscles(*states))),
         )
         for readings in list(self._readings.values()):
@@ -188,6 +198,16 @@ class Page:
         """
         if self.controls is not None:
             self.controls.offer(nodes, explores)
+
+    def list_arms(self, arms: Sequence[Any], shown: str) -> None:
+        """List the arms of the ROS graph, unless there is only the one that the page shows.
+
+        Args:
+            arms: One line about each (`nodes.situation.ArmSummary`).
+            shown: Namespace of the arm that the page shows.
+        """
+        is_single = all(arm.namespace == shown for arm in arms)
+        self._arms = '' if is_single else str(HTML.arms(arms, shown))
 
     def follow(self, payload: float, played: Sequence[float] | None) -> None:
         """Update the sliders from the payload [kg] and the replay; see `Controls.follow`."""

@@ -3,6 +3,7 @@
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -223,6 +224,17 @@ def test_of_two_arms_one_learns_and_the_other_detects_a_rupture_and_names_a_dead
     # Even SIGKILL of bringup.sh must leave no process behind.
     graph.ended(left, signal.SIGKILL)
     assert left_behind(left) == ''
+
+
+def test_of_arms_that_start_at_the_same_time_one_trains_their_initial_network(bringup, tmp_path):
+    robot = tmp_path / 'own'
+    shutil.copytree(REPOSITORY / 'config' / 'arm26', robot)
+    options = ['--robot', str(robot), '--preset', 'paper', '--quick', '--no-learner']
+    runs = [bringup(*options, '--namespace', f'arm{number}') for number in (1, 2)]
+    for run in runs:
+        read_until(run, 'starting hardware_emulator')
+    outputs = [run.end(signal.SIGINT)[1] for run in runs]
+    assert sum('training the initial network' in output for output in outputs) == 1
 
 
 def has_learned(output):

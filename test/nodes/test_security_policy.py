@@ -54,9 +54,9 @@ def test_a_node_uses_exactly_the_rights_of_the_policy(graph, name, tmp_path):
     assert used == allowed - {'/tf'}  # published only with tf2_msgs and the parameter publish_tf
     used = names(node.get_subscriber_names_and_types_by_node(*own))
     allowed = {topic.replace(f'{name}/', '~/') for topic in rights(name, 'topics', 'subscribe')}
-    # A node subscribes to /clock only with use_sim_time, and to vision_joint_states only if a
-    # camera is the source of joint angles.
-    assert allowed - {'/clock', 'vision_joint_states'} <= used <= allowed
+    # A node subscribes to /clock only with use_sim_time, to vision_joint_states only if a camera is
+    # the source of joint angles, and to /diagnostics while the graph has a node of the same name.
+    assert allowed - {'/clock', 'vision_joint_states', '/diagnostics'} <= used <= allowed
     used = names(node.get_service_names_and_types_by_node(*own))
     of_goals = of_actions(name, 'cancel_goal', 'get_result', 'send_goal')
     assert used == rights(name, 'services', 'reply') | of_goals

@@ -82,6 +82,21 @@ def test_a_second_node_of_the_same_name_is_noticed_by_its_reports():
     assert twins.is_alone(0.4 + NODE_SILENCE)
 
 
+def test_only_beside_a_second_node_of_its_name_a_node_reads_the_reports_of_others(graph):
+    node = graph.host(EstimatorNode, robot='arm26')
+
+    def reads_reports():
+        topics = node.get_subscriber_names_and_types_by_node('estimator', graph.namespace)
+        return '/diagnostics' in dict(topics)
+
+    graph.spin(2.5)
+    assert not reads_reports() and not node.intruders
+    twin = graph.host(EstimatorNode, robot='arm26')
+    graph.wait(lambda: 'two nodes are named' in node.intruders, 'the second node to be noticed')
+    graph.end(twin)
+    graph.wait(lambda: not node.intruders and not reads_reports(), 'the end of the second node')
+
+
 def test_a_repeated_estimate_grows_old(graph, arm26, trained_file):
     controller = graph.host(ControllerNode, robot='arm26', checkpoint=trained_file)
     joints = graph.publisher(JointState, 'estimated_joint_states')

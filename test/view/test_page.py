@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from graph import Process, executable, no_number_of
+from nodes.test_bringup_status import diagnostics
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters
 from robots import write_robot
@@ -320,7 +321,8 @@ def test_nan_implausible_estimates_and_unknown_parameters_do_not_end_the_page(
 
         graph.wait(shown, 'the page to go on, with the tensions of the other muscles')
         page.wait_for('isolated: brachialis')
-        assert page.evaluate('document.title') == 'arm26 – musculoskeletal_ae'
+        name = graph.namespace.strip('/')
+        assert page.evaluate('document.title') == f'{name} arm26 – musculoskeletal_ae'
         assert 'brachialis' in page.text and 'nan' not in page.text
         assert 'Stop' not in page.text  # a page without controls
         rate = 'estimated_joint_states rate'
@@ -330,6 +332,31 @@ def test_nan_implausible_estimates_and_unknown_parameters_do_not_end_the_page(
     finally:
         page.close()
     assert graph.processes[-1].alive()
+
+
+@chromium
+def test_the_page_lists_all_arms_of_the_graph_with_links_to_their_pages(graph, view, tmp_path):
+    SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+    sides = [f'{graph.namespace}/{side}' for side in ('left', 'right')]
+    page = Browser(tmp_path / 'profile', f'http://127.0.0.1:{view("--read-only")}')
+    address, script = 'http://localhost:8082', '<script>alert(1)</script>'
+    reports = graph.publisher(DiagnosticArray, '/diagnostics')
+
+    def is_listed() -> bool:
+        for side, doing in zip(sides, ('exploring', script), strict=True):
+            reports.publish(diagnostics(f'{side}/controller', message=doing, identity='a'))
+        reports.publish(diagnostics(f'{sides[0]}/view', identity='b', page=address))
+        return all(text in page.text for text in (*sides, 'exploring', script))
+
+    try:
+        graph.wait(is_listed, 'both arms on the page')
+        assert (
+            page.evaluate(f'document.querySelector(\'a[href="{address}"]\').innerText') == sides[0]
+        )
+        page.close_notifications()
+        page.screenshot(SCREENSHOTS / 'arms.png')
+    finally:
+        page.close()
 
 
 def test_a_browser_can_change_only_the_values_of_controls(graph, arm26):
