@@ -67,7 +67,7 @@ class Plain(Node):
         self.out = self.create_publisher(Float64MultiArray, 'muscle_length_command', 10)
         self.create_subscription(Float64MultiArray, 'muscle_states', self.take, 10)
     def take(self, message):
-        l, T, _ = np.asarray(message.data).reshape(3, M)
+        l, T = np.asarray(message.data).reshape(-1, M)[:2]
         row = torch.zeros(1, D + 2 * M)
         row[0, D:D + M] = torch.as_tensor(T * TENSION_SCALE)
         row[0, D + M:] = torch.as_tensor(l * LENGTH_SCALE)

@@ -97,10 +97,11 @@ def read_muscle_states(
 def muscle_rows(message: Any, muscles: int) -> Array:
     """Return the rows of a message of muscle_states, (Q, M), without a check of their values.
 
-    Optional rows that the message lacks are NaN. A `message` that is an array has all rows.
+    Optional rows that the message lacks are NaN. A `message` may also be an array of its rows.
     """
     if isinstance(message, np.ndarray):
-        return message.astype(float)
+        lacking = len(QUANTITIES) - len(message)
+        return np.pad(message.astype(float), ((0, lacking), (0, 0)), constant_values=np.nan)
     lacking = 0
     for quantity in reversed(QUANTITIES):
         expected = muscles * (len(QUANTITIES) - lacking)

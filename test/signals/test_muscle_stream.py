@@ -57,13 +57,15 @@ def test_a_sound_message_becomes_a_sample_with_the_length_offset_removed():
     assert sample.time == 1.5 and sample.usable.all()
 
 
-def test_an_optional_quantity_is_one_entry_of_the_layout(monkeypatch):
+@pytest.mark.parametrize('isolated', [(), (1,)])
+def test_an_optional_quantity_is_one_entry_of_the_layout(monkeypatch, isolated):
     voltage = Quantity(
         'voltage', 'V', 'impossible voltage', lambda _: (5.0, 60.0), Presence.OPTIONAL
     )
     for module in (muscle_readings, message_reading, plausibility):
         monkeypatch.setattr(module, 'QUANTITIES', (*QUANTITIES, voltage))
-    stream, volts = MuscleStream(ROBOT), np.full(M, 24.0)
+    stream = MuscleStream(ROBOT, HEALTHY.with_isolated(isolated))
+    volts = np.full(M, 24.0)
     sample = stream.take(message([*resting(), volts]), 0.0)
     np.testing.assert_array_equal(sample.newest[-1], volts)
     for lacking in (resting(), np.array([*resting(), np.full(M, np.nan)])):
