@@ -79,6 +79,7 @@ class MuscleSample:
             length offset removed and motor-side tensions.
         jumped: Indices of the muscles whose new length after a jump is accepted with this message;
             usually none.
+        missing: Indices of the isolated muscles whose length or tension is NaN in this message.
         tension_spread: Standard deviation σ_T of T [N]; 0 for tension sensors and assumed tensions.
         delay: How late the message is, compared with the fastest one (`Arrival.delay`) [s].
     """
@@ -94,6 +95,7 @@ class MuscleSample:
     usable: Bools
     newest: Array
     jumped: tuple[int, ...] = ()
+    missing: tuple[int, ...] = ()
     tension_spread: Array | float = 0.0
     delay: float = 0.0
 
@@ -219,8 +221,7 @@ class MuscleStream:
             raise RejectionError(error.reason, str(error).partition(': ')[2], raw, pull) from error
         now = time if now is None else now
         self._delay = delay
-        if self.body.isolated:
-            self._fill_in(states)
+        missing = self._fill_in(states) if self.body.isolated else ()
         offsets = self.body.offsets
         newest = states.copy()
         newest[Row.LENGTH] -= offsets.offset
@@ -251,16 +252,18 @@ class MuscleStream:
             usable=self.body.used,
             newest=newest,
             jumped=self.jumps.newest,
+            missing=missing,
             tension_spread=self._transmission.spread(tension, sliding),
             delay=delay,
         )
 
-    def _fill_in(self, states: Array) -> None:
-        """Replace NaN in lengths and tensions of isolated muscles by 0, in place."""
+    def _fill_in(self, states: Array) -> tuple[int, ...]:
+        """Replace NaN in lengths and tensions of isolated muscles by 0; return these muscles."""
         lacking = np.isnan(states)
         lacking[Row.TENSION] &= self._robot.tension_source.is_known
         lacking[Row.TEMPERATURE :] = False  # temperatures and optional quantities may be NaN
         states[lacking] = 0.0
+        return tuple(np.flatnonzero(lacking.any(axis=0)).tolist())
 
     def _plausible_pull(self) -> Array | None:
         """Return the medians of plausible lengths and tensions, as in `RejectionError.pull`."""
