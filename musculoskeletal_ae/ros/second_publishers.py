@@ -12,7 +12,8 @@ that a second node runs:
 
 - Sequence numbers that decrease repeatedly, because messages of two nodes alternate.
 - A report on /diagnostics under our own name with another identity, after our first report. The
-  identity is a random number of the reporting node.
+  identity is a random number of the reporting node. A node reads reports only while the graph has
+  two nodes of its name.
 - Two publishers that have both been in the graph for longer than it keeps a killed publisher.
 """
 
