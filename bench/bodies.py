@@ -14,7 +14,7 @@ learner keeps, and DRAW the seed with which they are drawn. Names are
                             learner has no joint sensors
 
 Training rows of neck and arm come from every other pose or file, and test rows from those between.
-A line has the mean error ‖θ_est − θ‖ [rad] after some updates, the share of test errors in the 95 %
+A line has the mean error ‖θ_est − θ‖ [rad] after the updates, the share of test errors in the 95 %
 ellipsoid, the error of the lengths of network and body [mm], the size of the remainder [mm] and its
 constants, the processor time of an update [s], and the errors of the regressions. With --body, only
 the body is fitted, and θ is estimated by least squares on it, with the covariance that the fit
@@ -35,7 +35,7 @@ import torch
 
 from bench.learned_arm import initial
 from bench.recordings import clone_of
-from bench.recordings_learn import INITIAL_STEPS, STEPS, joined, tensions
+from bench.recordings_learn import INITIAL_STEPS, joined, tensions
 from bench.recordings_read import Files, Run, SoftLink, fitted, repositories
 from bench.regression import BASELINES
 from musculoskeletal_ae.arrays import Array
@@ -47,6 +47,7 @@ from musculoskeletal_ae.experiments.online_learning import teach
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, HELD_OUT_STREAM, record
 from musculoskeletal_ae.gauss_newton import minimise_each
 from musculoskeletal_ae.learning.calibration import Healthy
+from musculoskeletal_ae.learning.convergence import STEPS, Convergence
 from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import CAPACITY, Observations
@@ -217,16 +218,21 @@ def coupling(robot: Robot, theta: Array) -> Array:
     return changes
 
 
-def package(case: Case, updates: int, seed: int) -> str:
-    """Learn a case in `updates` updates, and return its errors as text.
+def package(case: Case, updates: int | None, seed: int) -> str:
+    """Learn a case, and return its errors as text.
 
-    `seed` is the random seed of the training.
+    Args:
+        case: The case.
+        updates: Number of updates; None to make updates until they have converged.
+        seed: Random seed of the training.
     """
     updater, times = BodyUpdater(case.robot, case.initial, seed), list[float]()
-    for _ in range(updates):
+    convergence = Convergence()
+    while not (convergence.is_reached if updates is None else len(times) == updates):
         begin = time.process_time()
         update = updater.update(Job(case.training, case.healthy, True, STEPS))
         times.append(time.process_time() - begin)
+        convergence.note(update, updater.body)
     mae, test, body = update.mae, case.test, updater.body
     end = test.end_tension(mae.transmission)
     error = mae.estimate(end, test.length).theta - test.theta
@@ -242,7 +248,7 @@ def package(case: Case, updates: int, seed: int) -> str:
         f'{np.linalg.norm(error, axis=1).mean():.4f} rad, {inside:.2f} inside, '
         f'lengths {by_network:.2f} and {by_body:.2f} mm, '
         f'remainder {1e3 * update.remainder.max():.2f} mm ({constants}), '
-        f'offsets up to {np.abs(body.zero).max():.4f} rad, '
+        f'offsets up to {np.abs(body.zero).max():.4f} rad, {len(times)} updates, '
         f'{np.mean(times[1:] or times):.2f} s per update'
     )
 
@@ -320,7 +326,8 @@ def main(argv: list[str]) -> None:
     parser.add_argument('--clones', type=Path, help='directory with clones of the recordings')
     help_cache = 'directory for first networks, and for samples of emulated arms'
     parser.add_argument('--cache', type=Path, required=True, help=help_cache)
-    parser.add_argument('--updates', type=whole(1, 100), default=6, help='number of updates')
+    text = 'number of updates; by default, as many as the network needs to converge'
+    parser.add_argument('--updates', type=whole(1, 100), help=text)
     parser.add_argument('--seed', type=whole(0, 10**6), default=0, help='seed of the training')
     parser.add_argument('--body', action='store_true', help='fit the body without a network')
     parser.add_argument('--baselines', action='store_true', help='also fit the regressions')

@@ -186,7 +186,7 @@ def models(
         what = 'lengths and efforts' if with_effort else 'lengths'
         yield f'this package, {what}', of_shifted(learned[key])
     if not isinstance(link, SoftLink):
-        geometric = package(link, directory, split.training, updates=0)
+        geometric = package(link, directory, split.training, learns=False)
         yield 'network of the geometric model, lengths', geometric
     if split.rests:
         robot = Robot.load(link.write(directory))

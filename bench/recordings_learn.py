@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 from bench.recordings_read import Body, Run, SoftLink
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.calibration import Healthy
+from musculoskeletal_ae.learning.convergence import STEPS, Convergence
 from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.learning.update import BodyUpdater
@@ -25,7 +26,7 @@ from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.load import Load
 
-INITIAL_STEPS, STEPS, UPDATES = 1000, 400, 8
+INITIAL_STEPS = 1000
 #: Assign this tension above T_bias [N] to a strong effort, which is the 95 % quantile of the
 #: efforts in the training data. Tensions are proportional to efforts.
 STRONG = 40.0
@@ -109,13 +110,14 @@ def package(
     training: Run,
     with_effort: bool = False,
     seed: int = 0,
-    updates: int = UPDATES,
+    learns: bool = True,
 ) -> Model:
     """Return a model that estimates θ by a network of this package.
 
     The body model is calibrated with the rest samples in `training`, and the network learns this
     body model. With efforts, the model uses the efforts as tensions. Without, tensions are unknown.
-    Without updates, the network is that of the geometric model.
+    Updates are made until they have converged. If `learns` is false, the network is that of the
+    geometric model.
     """
     robot = Robot.load(link.write(directory, 'sensor' if with_effort else 'none'))
     tension = tensions(robot, training, with_effort, not isinstance(link, SoftLink))
@@ -125,8 +127,11 @@ def package(
     mae = initial_mae(robot, steps=INITIAL_STEPS, seed=seed).mae
     updater = BodyUpdater(robot, mae, seed)
     nothing = Healthy(np.empty((0, 3 * robot.muscle_count), dtype=np.float32), 0.0, 0)
-    for _ in range(updates):
-        mae = updater.update(Job(observed, nothing, True, STEPS)).mae
+    convergence = Convergence()
+    while learns and not convergence.is_reached:
+        update = updater.update(Job(observed, nothing, True, STEPS))
+        convergence.note(update, updater.body)
+        mae = update.mae
 
     return lambda run: mae.estimate(tension(run), run.length).theta
 

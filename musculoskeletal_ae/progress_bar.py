@@ -45,6 +45,7 @@ class ProgressBar:
         note: Callable[[], str] | None = None,
         *,
         is_even: bool = False,
+        ends_early: bool = False,
     ) -> None:
         """Show the bar, if stderr is a terminal.
 
@@ -53,7 +54,9 @@ class ProgressBar:
             total: Sum of the parts that `add` will report.
             note: Returns a text on the present state, which is shown beside the progress.
             is_even: Whether all parts take the same time.
+            ends_early: Whether the task may end before all parts are done.
         """
+        self._about = 'at most about' if ends_early else 'about'
         self._least_share = 0.0 if is_even else ESTIMATE_SHARE
         self._title, self._total, self._note = title, total, note
         self._is_bar = is_bar_visible()
@@ -115,7 +118,7 @@ class ProgressBar:
         if now - begun < ESTIMATE_TIME or self._done - done < self._least_share * self._total:
             return ''
         left = (self._total - self._done) * self._recent_time / self._recent_parts
-        return f'about {left:.0f} s left'
+        return f'{self._about} {left:.0f} s left'
 
     def _print(self, text: str) -> None:
         print(text, file=sys.stderr, flush=True)

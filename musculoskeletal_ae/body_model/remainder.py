@@ -19,8 +19,9 @@ the parameters w of the body have been integrated out over their prior:
 
     l_i − l_i(θ, T; w̄_i) ~ N(0, J_i S_i² J_iᵀ + k + σ² diag(1/ω_i)),   J_i = ∂l_i/∂w_i
 
-S are the spreads of the prior, and ω the robust weights of the fit. If the body explains the
-lengths, a falls to nearly zero. If it does not, g approaches the true lengths with more samples.
+S are the spreads of the prior, and ω the robust weights of whole samples (`_robust_weights`). If
+the body explains the lengths, a falls to nearly zero. If it does not, g approaches the true lengths
+with more samples.
 
 The errors of g are correlated between muscles: if one slack tendon lets the link move, all other
 lengths change. The correlation is computed from the errors of each sample's lengths when they are
@@ -38,6 +39,7 @@ from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.gauss_newton import FREEDOM, student
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -236,11 +238,14 @@ def group_remainder(
 ) -> GroupRemainder:
     """Learn the remainder of one group from samples.
 
+    The remainder is learned twice: the errors with which the first one predicts left-out samples
+    give the robust weights for the second one.
+
     Args:
         robot: The whole robot.
         joints: Joints of the group.
         muscles: Muscles of the group.
-        lengths: The samples.
+        lengths: The samples, with the robust weights of the fit.
         start: Logarithms of the six constants (see UNITS) from which the search starts; None to
             start from STARTS.
     """
@@ -248,11 +253,30 @@ def group_remainder(
     scale = np.concatenate([ranges, robot.tension.limit[muscles]])
     if not robot.tension_source.is_known:
         scale[len(joints) :] = np.inf  # ignore the tensions
+    crossed = robot.routes.crossed[np.ix_(muscles, joints)]
+    inputs = np.hstack([lengths.theta, lengths.tension]) / scale
+    logarithms = _likeliest(lengths, scale, crossed, start)
+    left_out = _solved(lengths, inputs, crossed, logarithms)
+    lengths = lengths._replace(weight=_robust_weights(lengths.weight, left_out, logarithms))
+    logarithms = _likeliest(lengths, scale, crossed, logarithms)
+    weights, error, variance = _solved(lengths, inputs, crossed, logarithms)
+    correlation = _correlation(np.where(lengths.weight > 0.0, error / np.sqrt(variance), 0.0))
+    mean_noise = np.diag(_variances(lengths.weight.mean(axis=1), logarithms))
+    roots = tuple(
+        cholesky(_covariance(inputs, inputs, of_joints, logarithms) + mean_noise, lower=True)
+        for of_joints, _ in _alike(crossed)
+    )
+    return GroupRemainder(
+        joints, muscles, scale, crossed, logarithms, inputs, weights, correlation, roots
+    )
+
+
+def _likeliest(lengths: Lengths, scale: Array, crossed: Bools, start: Array | None) -> Array:
+    """Return the logarithms of the hyperparameters with the largest evidence, (6,)."""
     count = len(lengths.theta)
     rows = np.arange(count)
     if count > JUDGING:
         rows = np.linspace(0, count - 1, JUDGING).astype(int)
-    crossed = robot.routes.crossed[np.ix_(muscles, joints)]
     evidence = _Evidence(lengths.part(rows), scale, crossed)
     is_fresh = start is None or count < FEW_SAMPLES
     starts = [*([] if start is None else [start]), *(STARTS if is_fresh else [])]
@@ -263,26 +287,57 @@ def group_remainder(
         )
         for each in starts
     ]
-    logarithms = min(found, key=lambda result: result.fun).x
-    inputs = np.hstack([lengths.theta, lengths.tension]) / scale
-    weights, scores = (np.zeros((count, len(muscles))) for _ in range(2))
-    roots, mean_noise = list[Array](), _variances(lengths.weight.mean(axis=1), logarithms)
+    logarithms: Array = min(found, key=lambda result: result.fun).x
+    return logarithms
+
+
+class _Solution(NamedTuple):
+    """The solution for given hyperparameters, and its predictions of left-out lengths."""
+
+    weights: Array  # α, (N, M)
+    #: error of each length if it is predicted from all other samples [m], (N, M)
+    error: Array
+    variance: Array  # variance of this error [m²], (N, M)
+
+
+def _solved(lengths: Lengths, inputs: Array, crossed: Bools, logarithms: Array) -> _Solution:
+    count = len(inputs)
+    weights, variance = (np.empty((count, len(crossed))) for _ in range(2))
     for of_joints, alike in _alike(crossed):
         kernel = _covariance(inputs, inputs, of_joints, logarithms)
-        roots.append(cholesky(kernel + np.diag(mean_noise), lower=True))
         for m in alike:
             noise = _variances(lengths.weight[:, m], logarithms)
             covariance = kernel + lengths.by_body[m] @ lengths.by_body[m].T + np.diag(noise)
             inverse = cho_solve((cholesky(covariance, lower=True), True), np.eye(count))
             weights[:, m] = inverse @ lengths.deviation[m]
-            # If a length is predicted from all other samples, its error is α_n/(K⁻¹)_nn, with the
-            # variance 1/(K⁻¹)_nn.
-            used = lengths.weight[:, m] > 0.0
-            scores[used, m] = (weights[:, m] / np.sqrt(np.diag(inverse)))[used]
-    correlation = _correlation(scores)
-    return GroupRemainder(
-        joints, muscles, scale, crossed, logarithms, inputs, weights, correlation, tuple(roots)
-    )
+            # The error is α_n/(K⁻¹)_nn, and its variance 1/(K⁻¹)_nn.
+            variance[:, m] = 1.0 / np.diag(inverse)
+    return _Solution(weights, weights * variance, variance)
+
+
+def _robust_weights(weight: Array, left_out: _Solution, logarithms: Array) -> Array:
+    """Return robust weights ω (N, M) from the errors of left-out samples.
+
+        ω_n = (ν + M_n) / (ν + Σ_m ρ_nm²/v_nm)
+
+    This is the weight of a multivariate Student distribution, because a wrong joint angle changes
+    all lengths of a sample. M_n is the number of known lengths, and v the variance of the error ρ
+    if the sample had the weight 1. Residuals of g itself would hide a bad sample that g follows.
+    Weights of single lengths would let g follow some lengths of a bad sample and reject others. No
+    weight exceeds the largest one of a single length.
+
+    Args:
+        weight: The weights so far; those of unknown lengths are 0, and stay 0.
+        left_out: The predictions of left-out samples with these weights.
+        logarithms: Logarithms of the hyperparameters.
+    """
+    is_known, count = weight > 0.0, (weight > 0.0).sum(axis=1)
+    noise = _constants(logarithms)[5] ** 2 + JITTER
+    own = np.stack([_variances(each, logarithms) for each in weight.T], axis=1)
+    variance = np.maximum(left_out.variance - own + noise, noise)
+    squares = np.where(is_known, left_out.error**2 / variance, 0.0).sum(axis=1)
+    of_sample = (FREEDOM + count) / (FREEDOM + squares)
+    return np.where(is_known, np.minimum(of_sample, student(np.zeros(1)))[:, None], 0.0)
 
 
 def _correlation(scores: Array) -> Array:

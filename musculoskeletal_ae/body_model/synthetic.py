@@ -11,7 +11,8 @@ from musculoskeletal_ae.mae.default_training import highest_tensions
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
 
-#: draw this share of the samples with most tensions near T_bias, as on an arm that holds a posture
+#: draw this share of the samples with tensions as in an arm that holds a posture: most near T_bias,
+#: or, without tension sensors, those that are assumed
 HELD_SHARE = 0.5
 #: let postures exceed the joint limits by this share of the range, because friction or contact can
 #: move a joint slightly beyond a limit
@@ -75,10 +76,15 @@ def held_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
     """Draw random tensions [N] for `count` samples, (count, M).
 
     In a share HELD_SHARE of the samples, most tensions are near T_bias, as in an arm that holds a
-    posture. In all other samples, tensions are uniform from 0 to `highest_tensions`.
+    posture. Without tension sensors, the network's input is always `Actuation.assumed_tension`, so
+    these samples have exactly these tensions. In all other samples, tensions are uniform from 0 to
+    `highest_tensions`.
     """
     shape, highest = (count, robot.muscle_count), highest_tensions(robot, count, rng)
     anywhere = rng.uniform(0.0, 1.0, shape) * highest
-    lowest = robot.tension.bias * rng.uniform(0.7, 1.0, shape)
-    held = lowest + rng.uniform(0.0, 1.0, shape) ** 3 * (highest - lowest)
+    if robot.actuation.knows_tension:
+        lowest = robot.tension.bias * rng.uniform(0.7, 1.0, shape)
+        held = lowest + rng.uniform(0.0, 1.0, shape) ** 3 * (highest - lowest)
+    else:
+        held = np.broadcast_to(robot.actuation.assumed_tension, shape)
     return np.where(rng.uniform(size=(count, 1)) < HELD_SHARE, held, anywhere)

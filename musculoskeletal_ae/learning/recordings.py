@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learns from recorded readings, and measures the errors of a network on them.
 
-    bag, CSV file or arrays ─► Table ─► learn_table ─► Learner
+    bag, CSV file or arrays ─► Table ─► collect ─► Learner ─► complete ─► network
 
 Successive readings pass through the learner message by message, as on a running arm. Resting
-postures are stored as samples at once; the learner then makes UPDATES updates.
+postures are stored as samples at once. At the end, `complete` makes updates until the network
+represents the body that was fitted to all samples (`convergence`).
 """
 
 import math
@@ -20,6 +21,7 @@ from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.collector import SampleCollector
+from musculoskeletal_ae.learning.convergence import STEPS, Convergence
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.scheduler import LEAST_INTERVAL
@@ -32,9 +34,6 @@ from musculoskeletal_ae.signals.muscle_readings import muscle_reading
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 from musculoskeletal_ae.tables.table import Table
 
-#: Learn a table of resting postures in UPDATES updates of REST_STEPS training steps each. On a
-#: running arm, each rest causes an update of fewer steps.
-UPDATES, REST_STEPS = 8, 400
 #: learn from slow moments of the motion if a recording has fewer different resting postures
 LEAST_RESTS = 20
 
@@ -42,24 +41,71 @@ LEAST_RESTS = 20
 def learn_table(
     learner: Learner, table: Table, progress: Callable[[float], None] | None = None
 ) -> str:
-    """Learn from a table of resting postures or of recorded motion.
+    """Learn from a table: collect its samples, and make updates until the network has converged.
+
+    To learn from several tables, `collect` them first, and `complete` the network once.
 
     Args:
-        learner: The learner; create it with `steps=REST_STEPS` for resting postures.
-        table: The readings.
-        progress: Called with the work done since its last call, in the unit of `work`.
+        learner: The learner; its updates must run in this process.
+        table: The table.
+        progress: Called with the seconds or rows, and later the updates, since its last call.
 
     Returns:
         A warning for users if learning stopped before the end of the table, or has learned nothing;
         '' otherwise.
     """
+    stop = collect(learner, table, progress)
+    complete(learner, progress)
+    return stop or unchanged(learner)
+
+
+def collect(learner: Learner, table: Table, progress: Callable[[float], None] | None = None) -> str:
+    """Collect the samples of a table; successive readings also cause updates, as on a running arm.
+
+    `progress` is called with the seconds or rows since its last call (`work`).
+
+    Returns:
+        A warning if learning stopped before the end of the table, or ''.
+    """
     if table.at_rest:
-        learn_rests(learner, table.rows, progress)
-    else:
-        for segment in table.segments():
-            if stop := learn(learner, segment, progress):
-                return stop
-    return unchanged(learner)
+        collect_rests(learner, table.rows, progress)
+        return ''
+    for segment in table.segments():
+        if stop := learn(learner, segment, progress):
+            return stop
+    return ''
+
+
+def complete(learner: Learner, progress: Callable[[float], None] | None = None) -> Convergence:
+    """Make updates until the network represents the body that was fitted to all samples.
+
+    Nothing happens if there are too few samples.
+
+    Args:
+        learner: The learner; its updates must run in this process.
+        progress: Called with 1 after each update.
+
+    Returns:
+        Whether the updates have converged, and the errors on synthetic samples.
+    """
+    convergence, online_steps = Convergence(), learner.scheduler.steps
+    learner.scheduler.steps = STEPS
+    learner.use_body(learner.body.with_anomaly(Anomaly.NONE))
+    now = 0.0  # the caller's clock was that of the recording; a new one begins here
+    while not convergence.is_reached:
+        before = learner.updates
+        now += LEAST_INTERVAL
+        learner.scheduler.note_news()
+        learner.poll(now)
+        if learner.updates == before or learner.last_update is None:
+            break
+        convergence.note(learner.last_update, learner.trainer.body)
+        if progress is not None:
+            progress(1.0)
+        if learner.last_update.unchanged:
+            break
+    learner.scheduler.steps = online_steps
+    return convergence
 
 
 def unchanged(learner: Learner) -> str:
@@ -110,9 +156,9 @@ def count_postures(
 
 
 def work(table: Table) -> float:
-    """Return the work of `learn_table`: recorded seconds, or the updates for resting postures."""
+    """Return how much `collect` has to do: recorded seconds, or resting postures."""
     if table.at_rest:
-        return UPDATES
+        return len(table)
     return sum(float(without_pauses(np.diff(part.time)).sum()) for part in table.segments())
 
 
@@ -121,17 +167,19 @@ def without_pauses(steps: ArrayLike) -> Array:
     return np.minimum(steps, LONGEST_PAUSE / 1e9)
 
 
-def learn_rests(
+def collect_rests(
     learner: Learner, rests: Pairs, progress: Callable[[float], None] | None = None
 ) -> None:
-    """Learn resting postures: store them as samples, and make UPDATES updates.
+    """Store resting postures as samples.
 
     Implausible rows are not stored, but counted in `learner.collector.rejected`. The direction in
-    which the tendons slid before each rest is unknown.
+    which the tendons slid before each rest is unknown. `progress` is called with 1 for each row.
     """
     robot = learner.robot
     muscles, joints = MuscleStream(robot, learner.body), JointStream(robot)
     for row, length, tension in zip(rests.theta, rests.length, rests.tension, strict=True):
+        if progress is not None:
+            progress(1.0)
         muscles.reset()  # successive rows need not be near to each other
         joints.reset()
         theta = joints.take(0.0, row)
@@ -145,12 +193,6 @@ def learn_rests(
             continue
         still = np.zeros(robot.muscle_count)
         learner.accept(Sample(theta, sample.tension_read, sample.length, still))
-    learner.scheduler.restart(updates_to_repeat=learner.updates + UPDATES)
-    for update in range(UPDATES):
-        learner.poll((update + 1.0) * LEAST_INTERVAL)
-        if progress is not None:
-            progress(1.0)
-    learner.poll((UPDATES + 1.0) * LEAST_INTERVAL)
 
 
 def learn(

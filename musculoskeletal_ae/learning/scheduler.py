@@ -25,6 +25,7 @@ class UpdateScheduler:
 
     Attributes:
         least_samples: Number of samples required for an update.
+        steps: Number of training steps of each update.
         updates: Number of finished updates.
         last_update: The last finished update; None before the first.
         statistics_hold: Whether the detector's statistics are valid for the present arm. After a
@@ -36,7 +37,7 @@ class UpdateScheduler:
         self.updates = 0
         self.last_update: Update | None = None
         self.statistics_hold = True
-        self.least_samples, self._steps = least_samples, steps
+        self.least_samples, self.steps = least_samples, steps
         self._has_news = True
         self._began_at = -math.inf  # start of the last update [s]
         self._has_changed = False  # whether a muscle has changed since the start of the last update
@@ -71,7 +72,7 @@ class UpdateScheduler:
         self._has_news = self.updates + 1 < self._updates_to_repeat
         self._began_at, self._has_changed = now, False
         return Job(
-            samples.observations(), healthy.healthy(), self.statistics_hold, self._steps, isolated
+            samples.observations(), healthy.healthy(), self.statistics_hold, self.steps, isolated
         )
 
     def finish(self, update: Update) -> Mae:

@@ -24,20 +24,20 @@ from musculoskeletal_ae.exceptions import (
     GateError,
     MusculoskeletalError,
 )
+from musculoskeletal_ae.learning.convergence import MOST_UPDATES
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.recordings import (
     LEAST_RESTS,
-    REST_STEPS,
+    collect,
+    complete,
     count_postures,
     errors,
     isolated_in,
-    learn_table,
     table_errors,
     unchanged,
     work,
 )
 from musculoskeletal_ae.learning.rest import REST_TIME
-from musculoskeletal_ae.learning.scheduler import STEPS
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import DEFAULT_SEED
@@ -90,8 +90,7 @@ def train(args: Namespace) -> None:
     from_motion = not at_rest and _learns_from_motion(robot, sources, args.preset)
     mae = _initial_network(robot, args)
     CheckpointValidator(robot).check(mae)
-    steps = REST_STEPS if at_rest else STEPS
-    learner = Learner(robot, mae, args.preset, args.seed, steps=steps, from_motion=from_motion)
+    learner = Learner(robot, mae, args.preset, args.seed, from_motion=from_motion)
     # A recording that does not say which muscles were isolated belongs to the arm of this network.
     learner.use_body(learner.body.with_isolated(mae.isolated))
     before = [table_errors(mae, source.table) for source in sources]
@@ -99,9 +98,10 @@ def train(args: Namespace) -> None:
         for source in sources:
             if source.is_held_out:
                 continue
-            stop = _learn_and_show(learner, source)
-            if stop and stop != unchanged(learner):  # otherwise, an error at the end says so
+            if stop := _collect_and_show(learner, source):
                 warnings.append(f'{source.name}: {stop}')
+        if warning := _complete_and_show(learner):
+            warnings.append(warning)
     except KeyboardInterrupt as interrupt:
         raise KeyboardInterrupt(_keep(learner, args)) from interrupt
     for reason, count in learner.collector.rejected.items():
@@ -112,7 +112,7 @@ def train(args: Namespace) -> None:
         why = _nothing_learned(learner, at_rest)
         raise MusculoskeletalError(f'{why}; {args.out} was not written')
     checkpoint.save(learner.mae, args.out)  # first, so that no later error loses the training
-    print(f'{len(learner.samples)} samples, {learner.updates} updates')
+    print(_learned(learner))
     zero = (
         np.zeros(robot.joint_count) if learner.trainer.body is None else learner.trainer.body.zero
     )
@@ -137,8 +137,7 @@ def train(args: Namespace) -> None:
         anomalies = _anomalies(robot, source, learner.mae, args.preset)
         warnings += [f'{source.name} (held out): {text}' for text in anomalies]
     try:
-        if at_rest:  # otherwise, the networks were validated while they were learned
-            CheckpointValidator(robot).check(learner.mae)
+        CheckpointValidator(robot).check(learner.mae)
     except GateError as refused:
         warnings.append(f'the nodes would reject this network: {refused}')
     print(f'checkpoint: {args.out}')
@@ -349,17 +348,31 @@ def _count(robot: Robot, sources: list[TableSource], enough: int, *, from_motion
     return count
 
 
-def _learn_and_show(learner: Learner, source: TableSource) -> str:
-    """Learn from a recording and show the progress; return a warning, or ''."""
+def _collect_and_show(learner: Learner, source: TableSource) -> str:
+    """Collect the samples of a recording and show the progress; return a warning, or ''."""
     total = work(source.table)
-
-    def learned() -> str:
-        return f'{len(learner.samples)} samples, {learner.updates} updates'
-
-    with ProgressBar(f'learning from {source.name}', total, learned) as bar:
+    with ProgressBar(f'learning from {source.name}', total, lambda: _learned(learner)) as bar:
         what = f'{len(source.table)} postures' if source.table.at_rest else f'{total:.0f} s'
         bar.announce(f', a recording of {what}')
-        return learn_table(learner, source.table, bar.add)
+        return collect(learner, source.table, bar.add)
+
+
+def _complete_and_show(learner: Learner) -> str:
+    """Make updates until they have converged, and show the progress; return a warning, or ''."""
+    title = 'training the network on the learned body'
+    with ProgressBar(title, MOST_UPDATES, lambda: _learned(learner), ends_early=True) as bar:
+        bar.announce(f' until its error stops falling, in at most {MOST_UPDATES} updates')
+        convergence = complete(learner, bar.add)
+    if len(convergence.errors) < MOST_UPDATES or not convergence.is_falling:
+        return ''
+    return (
+        f'after {MOST_UPDATES} updates, the error of the network on the learned body still falls; '
+        'to continue, repeat the command with the network as --checkpoint'
+    )
+
+
+def _learned(learner: Learner) -> str:
+    return f'{len(learner.samples)} samples, {learner.updates} updates'
 
 
 def _nothing_learned(learner: Learner, at_rest: bool) -> str:

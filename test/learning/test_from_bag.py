@@ -254,7 +254,7 @@ def test_estimated_joint_sensor_offsets_are_shown_and_the_error_without_them(
 
     monkeypatch.setattr(recording_learning, 'read', lambda *_: recording)
     monkeypatch.setattr(recording_learning, 'count_postures', enough)
-    monkeypatch.setattr(recording_learning, 'learn_table', learned)
+    monkeypatch.setattr(recording_learning, 'collect', learned)
     arguments = ['--robot', 'arm26', '--from-bag', 'BAG', '--out', str(tmp_path / 'x.safetensors')]
     assert main([*arguments, '--checkpoint', trained_file]) == 0
     printed = capsys.readouterr().out
@@ -280,7 +280,7 @@ def test_ctrl_c_keeps_what_was_learned_and_leaves_the_earlier_network(
 
     monkeypatch.setattr(recording_learning, 'read', lambda *_: recording)
     monkeypatch.setattr(recording_learning, 'count_postures', enough)
-    monkeypatch.setattr(recording_learning, 'learn_table', interrupted)
+    monkeypatch.setattr(recording_learning, 'collect', interrupted)
     out, kept = tmp_path / 'out.safetensors', tmp_path / 'out.interrupted.safetensors'
     out.write_text('an earlier network')
     arguments = ['--robot', 'arm26', '--from-bag', 'BAG', '--out', str(out)]
@@ -370,7 +370,7 @@ def learned_from_bag(arm26, initial, monkeypatch, tmp_path):
     monkeypatch.setattr(model_training, 'initial_mae', trained)
     monkeypatch.setattr(recording_learning, 'read', lambda *_: recording)
     monkeypatch.setattr(recording_learning, 'count_postures', enough)
-    monkeypatch.setattr(recording_learning, 'learn_table', learned)
+    monkeypatch.setattr(recording_learning, 'collect', learned)
 
     def run(*options):
         out = str(tmp_path / 'out.safetensors')

@@ -4,8 +4,11 @@
 import numpy as np
 
 from musculoskeletal_ae.body_model.body_fit import BodyFit
+from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.body_model.synthetic import synthetic_samples
 from musculoskeletal_ae.emulator.kin.individual import Individual
 from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.mae.units import scale_vector
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -33,3 +36,12 @@ def test_a_body_is_fitted_to_lengths_whatever_torque_the_assumed_tension_would_g
         - true.muscle_lengths(held_out, assumed)
     ).mean()
     assert after < 0.4 * before
+
+
+def test_a_network_learns_mostly_the_tensions_that_it_will_get():
+    noise, rng = np.zeros(ROBOT.muscle_count), np.random.default_rng(0)
+    data = synthetic_samples(CalibratedBody(ROBOT), noise, 1000, rng)
+    first, last = ROBOT.joint_count, ROBOT.joint_count + ROBOT.muscle_count
+    tension = (data.entered / scale_vector(ROBOT.joint_count, ROBOT.muscle_count))[:, first:last]
+    is_assumed = np.isclose(tension, ROBOT.actuation.assumed_tension).all(axis=1)
+    assert 0.4 < is_assumed.mean() < 0.6  # the others show how tensions change the lengths

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.learning import recordings
+from musculoskeletal_ae.learning import convergence
 from musculoskeletal_ae.mae.checkpoint import load
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tables.csv_file import looks_like_a_sequence, read_csv
@@ -201,7 +201,7 @@ def test_rows_of_a_motion_without_times_are_noticed(arm26):
 @pytest.fixture
 def trained(trained_file, tmp_path, monkeypatch):
     """Return a function that runs `train --from-csv` with few updates."""
-    monkeypatch.setattr(recordings, 'UPDATES', 2)
+    monkeypatch.setattr(convergence, 'MOST_UPDATES', 2)
     out = tmp_path / 'out.safetensors'
 
     def run(*options):
