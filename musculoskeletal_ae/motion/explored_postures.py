@@ -10,6 +10,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import InfeasibleError, RobotDescriptionError
 from musculoskeletal_ae.robot.description import shown
+from musculoskeletal_ae.robot.equilibrium_states import has_followers
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension, least_tension
 
@@ -77,7 +78,8 @@ def explored_posture(robot: Robot, draw: Callable[[], Array]) -> tuple[Array, Ar
     """Return a random posture (D,) that the arm can hold, with tensions that hold it [N], (M,).
 
     If hardly any random posture is holdable, as in a hand with many joints, it is one near a random
-    posture in which joint stops support the joints that the muscles cannot hold.
+    posture in which springs and joint stops support the joints that the muscles cannot hold. A hand
+    with fewer muscles than joints can rest in such postures only.
 
     Args:
         robot: The robot.
@@ -86,9 +88,9 @@ def explored_posture(robot: Robot, draw: Callable[[], Array]) -> tuple[Array, Ar
     Raises:
         RobotDescriptionError: If no posture is found.
     """
+    tries = 0 if has_followers(robot) else TRIES_WITHOUT_STOPS
     try:
-        postures = (draw() for _ in range(TRIES_WITHOUT_STOPS))
-        return holdable_postures(robot, postures, 1)[0]
+        return holdable_postures(robot, (draw() for _ in range(tries)), 1)[0]
     except RobotDescriptionError:
         if found := supported_postures(robot, [draw() for _ in range(TRIES_WITH_STOPS)]):
             return found[0]
