@@ -88,9 +88,13 @@ def explored_posture(robot: Robot, draw: Callable[[], Array]) -> tuple[Array, Ar
     Raises:
         RobotDescriptionError: If no posture is found.
     """
-    tries = 0 if has_followers(robot) else TRIES_WITHOUT_STOPS
+    if has_followers(robot):
+        settling = (settled(robot, draw()) for _ in range(TRIES_WITHOUT_STOPS))
+        if (first := next((each for each in settling if each is not None), None)) is not None:
+            return first
     try:
-        return holdable_postures(robot, (draw() for _ in range(tries)), 1)[0]
+        postures = (draw() for _ in range(TRIES_WITHOUT_STOPS))
+        return holdable_postures(robot, postures, 1)[0]
     except RobotDescriptionError:
         if found := supported_postures(robot, [draw() for _ in range(TRIES_WITH_STOPS)]):
             return found[0]
@@ -101,7 +105,8 @@ def supported_postures(robot: Robot, postures: Iterable[Array]) -> list[tuple[Ar
     """Return postures near random ones that muscles and joint stops hold, with the tensions.
 
     The list is empty if the postures are nearly the same, or if nearly all joints lie at their
-    stops: the muscles of such an arm do not move it, or there are fewer of them than joints.
+    stops: the muscles of such an arm do not move it. Joints with springs and too few muscles often
+    lie at their stops, and are moved all the same.
     """
     found = [each for theta in postures if (each := settled(robot, theta)) is not None]
     if not found:
@@ -109,7 +114,8 @@ def supported_postures(robot: Robot, postures: Iterable[Array]) -> list[tuple[Ar
     theta = np.array([at for at, _ in found])
     spread = theta.std(axis=0) / (robot.upper - robot.lower)
     is_free = (theta > robot.lower + AT_STOP) & (theta < robot.upper - AT_STOP)
-    return found if spread.mean() > LEAST_SPREAD and is_free.mean() > LEAST_FREE else []
+    is_moved = has_followers(robot) or is_free.mean() > LEAST_FREE
+    return found if spread.mean() > LEAST_SPREAD and is_moved else []
 
 
 def settled(robot: Robot, theta: Array) -> tuple[Array, Array] | None:

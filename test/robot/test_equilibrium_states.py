@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A robot with fewer muscles than joints is learned from the postures in which it can rest."""
 
+from itertools import islice
+
 import bodies
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from robots import write_robot
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.training import rest_states
+from musculoskeletal_ae.motion.exploration import Exploration
 from musculoskeletal_ae.robot.equilibrium_states import has_followers, settled_states
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -35,6 +38,15 @@ def test_one_tendon_of_two_sprung_joints_determines_where_they_settle(finger):
     groups = found.theta.reshape(3, 20, 2)
     assert np.ptp(groups, axis=1).max() < 0.05  # the start does not matter
     assert (np.diff(groups.mean(axis=1), axis=0).sum(axis=1) > 0.2).all()  # more tension bends it
+
+
+def test_the_finger_explores_postures_in_which_it_can_rest(finger):
+    steps = [*islice(Exploration(finger, 1), 90)]
+    theta, tension = (np.array(part) for part in zip(*((s.theta, s.tension) for s in steps[1::3])))
+    settled = settled_states(finger, theta, tension)
+    assert len(settled.theta) == len(theta)
+    np.testing.assert_allclose(settled.theta, theta, atol=0.05)
+    assert (theta.std(axis=0) > 0.15 * (finger.upper - finger.lower)).all()
 
 
 def test_a_network_tells_two_angles_from_one_tendon_where_the_finger_can_rest(finger):
