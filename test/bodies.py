@@ -120,6 +120,34 @@ SNAPPING = """
 </mujoco>
 """
 
+#: a finger of two joints that springs extend and one tendon flexes
+UNDERACTUATED = """
+<mujoco model="underactuated">
+  <compiler angle="radian" autolimits="true"/>
+  <worldbody>
+    <site name="f0" pos="0.009 0 0.009"/>
+    <body name="proximal">
+      <joint name="mcp" axis="0 -1 0" range="0 1.5" damping="0.01" stiffness="0.03"
+        springref="-0.5"/>
+      <geom type="capsule" fromto="0 0 -0.01 0 0 -0.035" size="0.007" mass="0.015"/>
+      <site name="f1" pos="0.009 0 -0.009"/><site name="f2" pos="0.009 0 -0.036"/>
+      <body name="distal" pos="0 0 -0.045">
+        <joint name="pip" axis="0 -1 0" range="0 1.5" damping="0.01" stiffness="0.02"
+          springref="-0.7"/>
+        <geom type="capsule" fromto="0 0 -0.01 0 0 -0.03" size="0.006" mass="0.01"/>
+        <site name="f3" pos="0.009 0 -0.009"/>
+      </body>
+    </body>
+  </worldbody>
+  <tendon>
+    <spatial name="flexor">
+      <site site="f0"/><site site="f1"/><site site="f2"/><site site="f3"/>
+    </spatial>
+  </tendon>
+  <actuator><motor name="flexor" tendon="flexor" ctrlrange="-12 0"/></actuator>
+</mujoco>
+"""
+
 #: a pendulum that is far too heavy for its two tendons
 HEAVY = """
 <mujoco model="heavy">

@@ -28,6 +28,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.body_model import springs
 from musculoskeletal_ae.body_model.remainder import Remainder
+from musculoskeletal_ae.robot.description import Route, RoutePoint
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
@@ -127,6 +128,25 @@ class CalibratedBody:
     def shift(self, m: int) -> Array:
         """Return the shift δ of each of the P route points of muscle `m` [m], (P, 3)."""
         return self.parameters[m][self.layouts[m].attachment].reshape(-1, 3)
+
+    def link_shifts(self, m: int) -> list[Array]:
+        """Return how far one muscle's route points are displaced in their links' frames [m]."""
+        points = [p for p in self.robot.description.routes[m] if isinstance(p, RoutePoint)]
+        placed = (self.robot.kinematics.placement(p.link)[1] for p in points)
+        return [at.rotation.T @ shift for at, shift in zip(placed, self.shift(m), strict=True)]
+
+    def as_robot(self) -> Robot:
+        """Return a robot with the fitted route points and springs."""
+        routes = list[Route]()
+        for m, route in enumerate(self.robot.description.routes):
+            shifts = iter(self.link_shifts(m))
+            routes.append(
+                tuple(
+                    p._replace(xyz=p.xyz + next(shifts)) if isinstance(p, RoutePoint) else p
+                    for p in route
+                )
+            )
+        return self.robot.with_routes(routes).with_elasticity(self.elasticity)
 
     def elastic(self, m: int) -> SeriesElastic:
         """Return the fitted elastic constants of muscle `m`, as arrays of shape ()."""

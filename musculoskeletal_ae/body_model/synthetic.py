@@ -9,11 +9,13 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.mae.default_training import highest_tensions
 from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.robot.equilibrium_states import equilibrium_states, has_followers
 from musculoskeletal_ae.robot.robot import Robot
 
 #: draw this share of the samples with tensions as in an arm that holds a posture: most near T_bias,
 #: or, without tension sensors, those that are assumed
 HELD_SHARE = 0.5
+SEARCHED = 40  # search equilibria from this many random postures
 #: let postures exceed the joint limits by this share of the range, because friction or contact can
 #: move a joint slightly beyond a limit
 MARGIN = 0.02
@@ -62,6 +64,11 @@ def synthetic_samples(
     shape = count, robot.muscle_count
     theta = robot.random_postures(count, rng, MARGIN)
     tension = held_tensions(robot, count, rng)
+    if has_followers(robot):
+        equilibria = count // 2
+        found = equilibrium_states(body.as_robot(), equilibria, rng, SEARCHED)
+        if found is not None:
+            theta[:equilibria], tension[:equilibria] = found
     # Draw directions mostly near −1 and 1, where sliding leaves them most of the time.
     direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, shape))
     read = body.transmission.reading(tension, np.zeros(shape))

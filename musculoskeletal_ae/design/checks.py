@@ -217,6 +217,16 @@ def judge(setting: Setting) -> RobotCheck:
     return replace(result, faults=faults, warnings=tuple(_flipping_muscles(robot, arms)))
 
 
+def counted_arm(arms: Array) -> Array:
+    """Return the smallest moment arm that counts at each joint [m], (D,).
+
+    Args:
+        arms: Moment arms in N postures [m], (N, M, D).
+    """
+    longest = np.abs(arms).max(axis=(0, 1))
+    return np.clip(COUNTED_ARM_SHARE * longest, LEAST_COUNTED_ARM, COUNTED_ARM)
+
+
 def measure(setting: Setting) -> RobotCheck:
     """Measure tensions, stiffness and moment arms in given postures, without judging them."""
     robot, _, jacobian, _, torque, *_ = setting
@@ -245,8 +255,7 @@ def _at_tensions(
     """
     robot, theta, jacobian, hessian, *_ = setting
     arms = -jacobian
-    longest = np.abs(arms).max(axis=(0, 1))
-    matters = np.clip(COUNTED_ARM_SHARE * longest, LEAST_COUNTED_ARM, COUNTED_ARM)
+    matters = counted_arm(arms)
     held = np.isfinite(tension[:, 0])
     stiffness, one_sided = np.full((2, len(theta)), np.nan)
     k = robot.muscle_stiffness(theta[held], tension[held])

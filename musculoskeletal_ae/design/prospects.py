@@ -14,6 +14,7 @@ from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.design.checks import COUNTED_ARM_SHARE, LEAST_COUNTED_ARM
 from musculoskeletal_ae.motion.explored_postures import supported_postures
 from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
+from musculoskeletal_ae.robot.equilibrium_states import has_followers
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
@@ -65,7 +66,7 @@ class Prospects(NamedTuple):
         moved = robot.joint_count - len(idle)
         if robot.muscle_count < moved:
             problem = 'cannot tell the angles of'
-            reason = 'only postures in which springs and muscles balance could be estimated'
+            reason = 'the arm is learned only where springs, weight and muscles balance'
             counts_of = f'the lengths of {robot.muscle_count} muscles', f'{moved} joints'
             lines.append(f'warning: {counts_of[0]} {problem} {counts_of[1]}; {reason}')
         if self.is_pointless:
@@ -74,7 +75,10 @@ class Prospects(NamedTuple):
             lines.append(f'warning: {counts}: {problem}{lack}; {remedy}')
         elif self.share < POINTLESS_SHARE:
             near = f'near {self.supported} of {NEAR_POSTURES} of them'
-            text = f'the arm explores postures {near} in which joint stops support some joints'
+            balance = 'springs, weight or joint stops balance the muscles'
+            support = 'joint stops support some joints'
+            how = balance if has_followers(robot) else support
+            text = f'the arm explores postures {near} in which {how}'
             lines.append(f'warning: {counts}; {text}{lack}')
         elif self.share < HARD_SHARE:
             lines.append(f'warning: {counts}, and only these are explored{lack}')

@@ -109,7 +109,7 @@ def _moved(
             stay if one of their muscles keeps its points.
     """
     shifts, routes = dict[Place, list[Array]](), robot.description.routes
-    own = [iter(_link_shifts(robot, body, m)) for m in range(robot.muscle_count)]
+    own = [iter(body.link_shifts(m)) for m in range(robot.muscle_count)]
     of_points = [[next(own[m]) if isinstance(p, RoutePoint) else None for p in route]
                  for m, route in enumerate(routes)]  # fmt: skip
     fixed = set[Place]()
@@ -133,10 +133,3 @@ def _moved(
             items[i], changed = point._replace(xyz=point.xyz + shift), True
         result.append(tuple(items) if changed else route)
     return tuple(result)
-
-
-def _link_shifts(robot: Robot, body: CalibratedBody, muscle: int) -> list[Array]:
-    """Return the displacement of each route point of a muscle in the frame of its link [m]."""
-    points = [p for p in robot.description.routes[muscle] if isinstance(p, RoutePoint)]
-    pairs = zip(points, body.shift(muscle), strict=True)
-    return [robot.kinematics.placement(p.link)[1].rotation.T @ shift for p, shift in pairs]

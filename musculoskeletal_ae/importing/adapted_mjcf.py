@@ -42,6 +42,8 @@ REFERENCES: dict[str, dict[str, tuple[str, ...]]] = {
 #: elements and attributes that belong to the actuators and sensors of the user's model
 OF_ACTUATORS = 'actuator', 'sensor', 'keyframe', 'tuple', 'general'
 ACTUATION = 'actuatorfrclimited', 'actuatorfrcrange', 'actuatorgroupdisable', 'actuation'
+#: attributes of `size` that MuJoCo does not accept beside `memory`
+OLDER_SIZES = 'njmax', 'nconmax', 'nstack'
 
 
 class AdaptedModel:
@@ -90,6 +92,7 @@ class AdaptedModel:
         self._exclude_parents()
         self._replace_actuators()
         self._add_hand()
+        self._unify_size()
         compiler, folder = self._section('compiler'), Path(spec.modelfiledir).absolute()
         compiler.set('meshdir', str(folder / spec.compiler.meshdir))
         compiler.set('texturedir', str(folder / spec.compiler.texturedir))
@@ -109,6 +112,16 @@ class AdaptedModel:
         for parent in [*self.root.iter()]:
             for child in [each for each in parent if is_removed(each)]:
                 parent.remove(child)
+
+    def _unify_size(self) -> None:
+        """Remove the older limits of memory from a file that also states `memory`.
+
+        MuJoCo writes both if different included files state them, but does not read such a file.
+        """
+        size = self._section('size')
+        if size.get('memory'):
+            for older in OLDER_SIZES:
+                size.attrib.pop(older, None)
 
     def _rename(self) -> None:
         """Give all bodies, joints and tendons the names that they have in the robot directory."""

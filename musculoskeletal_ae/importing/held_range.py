@@ -11,10 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.design.checks import TOLERATED_SHARE, Setting, measure
+from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.design.checks import TOLERATED_SHARE, Setting, counted_arm, measure
+from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import holding_tension
 
 POSTURES = 600  # check the muscles in this many random postures
+FIRST = 100  # reduce no range if none of this many postures can be held
 PARTS = 20  # divide the range of a joint into this many equal parts
 #: keep a part of the range if its share of held postures is at least this, relative to the best one
 KEPT_SHARE = 0.5
@@ -34,14 +38,18 @@ def held_ranges(robot: Robot) -> list[HeldRange]:
     if not sprung.any():
         return []
     theta = robot.random_postures(POSTURES, np.random.default_rng(2))
+    if not _one_sided(-robot.routes.muscle_jacobian(theta))[sprung].any():
+        return []
+    # The second derivatives of many muscles take half a minute, so look for a held posture first.
+    if not any(_can_hold(robot, at) for at in theta[:FIRST]):
+        return []
     check = measure(Setting.of(robot, theta))
     # An unstable posture cannot be held either: near the axis, a tendon pulls itself past it.
-    arms, held = check.moment_arms, check.held & (check.stiffness > 0.0)
-    is_two_sided = (arms.max(axis=1) > check.matters) & (arms.min(axis=1) < -check.matters)
+    held = check.held & (check.stiffness > 0.0)
+    if not held.any():
+        return []
     ranges = list[HeldRange]()
-    for j in np.flatnonzero(sprung).tolist():
-        if np.mean(~is_two_sided[:, j]) <= TOLERATED_SHARE or not held.any():
-            continue
+    for j in np.flatnonzero(sprung & _one_sided(check.moment_arms)).tolist():
         low, high = robot.lower[j], robot.upper[j]
         part = np.clip((PARTS * (theta[:, j] - low) / (high - low)).astype(int), 0, PARTS - 1)
         count = np.bincount(part, minlength=PARTS)
@@ -58,3 +66,24 @@ def held_ranges(robot: Robot) -> list[HeldRange]:
         ends = [radian * (low + edge / PARTS * (high - low)) for edge in (first, last + 1)]
         ranges.append(HeldRange(robot.joints[j], *(float(f'{end:.4g}') for end in ends)))
     return ranges
+
+
+def _one_sided(arms: Array) -> Bools:
+    """Return whether the muscles pull each joint in one direction only, in too many postures.
+
+    Args:
+        arms: Moment arms in N postures [m], (N, M, D).
+    """
+    least = counted_arm(arms)
+    is_two_sided = (arms.max(axis=1) > least) & (arms.min(axis=1) < -least)
+    result: Bools = np.mean(~is_two_sided, axis=0) > TOLERATED_SHARE
+    return result
+
+
+def _can_hold(robot: Robot, theta: Array) -> bool:
+    """Return whether the muscles can hold a posture θ [rad], (D,)."""
+    try:
+        holding_tension(robot, theta)
+    except InfeasibleError:
+        return False
+    return True

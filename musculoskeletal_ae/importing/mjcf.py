@@ -352,6 +352,8 @@ class _Reader:
 
     def _tendons(self) -> None:
         m, source = self.model, self.source
+        if not m.ntendon:
+            raise ValueError('it has no tendon, and only tendons become muscles')
         driven = defaultdict(list)
         for a in range(m.nu):
             if m.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON:

@@ -39,9 +39,11 @@ from musculoskeletal_ae.mae.training import (
     TrainedNetwork,
     one_thread,
     random_states,
+    rest_states,
     shuffled,
 )
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, State, scale_vector
+from musculoskeletal_ae.robot.equilibrium_states import has_followers
 from musculoskeletal_ae.robot.groups import Group, parts
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -67,6 +69,8 @@ OVERLOAD_SHARE = 0.2
 #: Let samples of θ exceed each joint limit by up to this fraction of the range. A network is least
 #: accurate at the edge of its training data, and arms do rest at their limits.
 POSTURE_MARGIN = 0.05
+#: draw this share of the states of a robot with fewer muscles than joints from its equilibria
+REST_SHARE = 0.5
 #: Draw the twin of a sample, by which the muscle Jacobian is trained, at this distance from it, in
 #: standard deviations of θ. Over this distance, routes are almost linear, and float32 still
 #: resolves the difference.
@@ -129,10 +133,18 @@ def blocks(groups: Iterable[Group]) -> dict[Group, tuple[int, ...]]:
 def overload_states(robot: Robot, count: int, rng: np.random.Generator) -> State:
     """Return random states of the geometric model, some of which exceed the tension limit.
 
-    `highest_tensions` describes the range of the tensions.
+    `highest_tensions` describes the range of the tensions. If the robot has fewer muscles than
+    joints somewhere, a share REST_SHARE of the states are equilibria (`rest_states`): from them the
+    network learns θ, and from the others it learns G around them.
     """
     highest = highest_tensions(robot, count, rng)
-    return random_states(robot, count, rng, highest, margin=POSTURE_MARGIN)
+    anywhere = random_states(robot, count, rng, highest, margin=POSTURE_MARGIN)
+    if not has_followers(robot):
+        return anywhere
+    at_rest = rest_states(robot, count, rng)
+    is_at_rest = rng.uniform(size=(count, 1)) < REST_SHARE
+    chosen = (np.where(is_at_rest, *pair) for pair in zip(at_rest, anywhere, strict=True))
+    return State(*chosen)
 
 
 def highest_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import to_mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, anomaly, residuals
-from musculoskeletal_ae.mae.training import Progress, TrainedNetwork, random_states
+from musculoskeletal_ae.mae.training import Progress, TrainedNetwork, rest_states
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -64,7 +64,7 @@ def completed(robot: Robot, trained: TrainedNetwork, preset: str, seed: int) -> 
     )
     mae = to_mae(network, robot.joints, robot.muscles, preset, history)
     rng = np.random.default_rng([seed, 1])
-    _, tension, length = random_states(robot, HELD_OUT_STATES, rng, robot.tension.limit)
+    _, tension, length = rest_states(robot, HELD_OUT_STATES, rng)
     error = residuals(mae.estimate(tension, length), tension, length)
     statistics = AnomalyStatistics.of(error, calibrated=False)
     statistics = replace(statistics, thresholds={'norm': float(anomaly(error).max())})

@@ -18,6 +18,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network
 from musculoskeletal_ae.mae.units import Mask, State
+from musculoskeletal_ae.robot.equilibrium_states import equilibrium_states, has_followers
 from musculoskeletal_ae.robot.robot import Robot
 
 TINY = 1e-12  # add this to the square of a norm, so that its gradient is finite at zero
@@ -49,6 +50,18 @@ def random_states(
     theta = robot.random_postures(count, rng, margin)
     tension = rng.uniform(lowest, highest, (count, robot.muscle_count))
     return State(theta, tension, robot.muscle_lengths(theta, tension))
+
+
+def rest_states(robot: Robot, count: int, rng: np.random.Generator) -> State:
+    """Return random states in which the robot can rest, with T up to T_limit.
+
+    A robot with enough muscles can rest anywhere; others rest in equilibria only
+    (`robot/equilibrium_states.py`).
+    """
+    found = equilibrium_states(robot, count, rng) if has_followers(robot) else None
+    if found is None:
+        return random_states(robot, count, rng, robot.tension.limit)
+    return State(*found, robot.muscle_lengths(*found))
 
 
 def shuffled(samples: Array, batch: int, rng: np.random.Generator) -> Iterator[Array]:

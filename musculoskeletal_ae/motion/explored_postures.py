@@ -10,6 +10,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import InfeasibleError, RobotDescriptionError
 from musculoskeletal_ae.robot.description import shown
+from musculoskeletal_ae.robot.equilibrium_states import has_followers
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension, least_tension
 
@@ -81,8 +82,9 @@ def pressing_tension(robot: Robot, theta: Array, rng: np.random.Generator) -> Ar
 def explored_posture(robot: Robot, draw: Callable[[], Array]) -> tuple[Array, Array]:
     """Return a random posture that the arm can hold, with tensions that hold it.
 
-    In a hand with many joints, hardly any random posture is holdable. The returned posture is then
-    one in which joint stops support the joints that the muscles cannot hold.
+    If hardly any random posture is holdable, as in a hand with many joints, it is one near a random
+    posture in which springs and joint stops support the joints that the muscles cannot hold. A hand
+    with fewer muscles than joints can rest in such postures only.
 
     Args:
         robot: The robot.
@@ -94,6 +96,10 @@ def explored_posture(robot: Robot, draw: Callable[[], Array]) -> tuple[Array, Ar
     Raises:
         RobotDescriptionError: If no posture is found.
     """
+    if has_followers(robot):
+        settling = (settled(robot, draw()) for _ in range(TRIES_WITHOUT_STOPS))
+        if (first := next((each for each in settling if each is not None), None)) is not None:
+            return first
     try:
         postures = (draw() for _ in range(TRIES_WITHOUT_STOPS))
         return holdable_postures(robot, postures, 1)[0]
@@ -106,8 +112,9 @@ def explored_posture(robot: Robot, draw: Callable[[], Array]) -> tuple[Array, Ar
 def supported_postures(robot: Robot, postures: Iterable[Array]) -> list[tuple[Array, Array]]:
     """Return postures near given ones that muscles and joint stops hold, with the tensions.
 
-    The list is empty if the postures that were found are nearly equal, or if nearly all joints lie
-    at their stops: such an arm could not be moved by its muscles.
+    The list is empty if the postures are nearly the same, or if nearly all joints lie at their
+    stops: the muscles of such an arm do not move it. Joints with springs and too few muscles often
+    lie at their stops, and are moved all the same.
     """
     found = [each for theta in postures if (each := settled(robot, theta)) is not None]
     if not found:
@@ -115,7 +122,8 @@ def supported_postures(robot: Robot, postures: Iterable[Array]) -> list[tuple[Ar
     theta = np.array([at for at, _ in found])
     spread = theta.std(axis=0) / (robot.upper - robot.lower)
     is_free = (theta > robot.lower + AT_STOP) & (theta < robot.upper - AT_STOP)
-    return found if spread.mean() > LEAST_SPREAD and is_free.mean() > LEAST_FREE else []
+    is_moved = has_followers(robot) or is_free.mean() > LEAST_FREE
+    return found if spread.mean() > LEAST_SPREAD and is_moved else []
 
 
 def settled(robot: Robot, theta: Array) -> tuple[Array, Array] | None:

@@ -15,7 +15,14 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.figures import save_plot
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import Trained, initial_mae
-from musculoskeletal_ae.mae.training import OUTPUTS, PairError, pair_errors, random_states, train_on
+from musculoskeletal_ae.mae.training import (
+    OUTPUTS,
+    PairError,
+    pair_errors,
+    random_states,
+    rest_states,
+    train_on,
+)
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.progress_bar import ProgressBar
@@ -65,7 +72,7 @@ def train(args: Namespace) -> None:
     # This random stream differs from that of the training, so all states are held out.
     rng = np.random.default_rng([args.seed, 2])
     limit, most = robot.tension.limit, robot.tension.max
-    states = random_states(robot, HELD_OUT_STATES, rng, limit)
+    states = rest_states(robot, HELD_OUT_STATES, rng)
     planned = pair_errors(trained.mae, states)
     off = trained.mae.estimate(states.tension, states.length).theta - states.theta
     print(

@@ -9,6 +9,7 @@ import time
 from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
@@ -29,6 +30,7 @@ from musculoskeletal_ae.exporting.mjcf import export_into
 from musculoskeletal_ae.importing import convert
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
+from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import train_on
 from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
@@ -37,6 +39,16 @@ from musculoskeletal_ae.tools.model_training import train_on_model
 HELD_OUT = 60.0  # measure the error in a motion of this duration, from which nothing is learned [s]
 #: options of `train --mujoco` that are passed on to `import_robot`
 CHAIN = 'joints', 'muscles', 'without', 'base', 'end'
+
+
+class Learned(NamedTuple):
+    """What an emulated arm has learned."""
+
+    mae: Mae  # the learned network
+    before: float  # error of the initial network on the held-out motion [rad]
+    after: float  # error of the learned network on the held-out motion [rad]
+    samples: int  # number of samples that were learned
+    speed: float  # speed of the exploration, as a multiple of real time
 
 
 def train(args: Namespace) -> None:
@@ -54,27 +66,42 @@ def train(args: Namespace) -> None:
     train_on(args.device)
     robot = _imported(args, robot_folder)
     initial = train_on_model(robot, args).mae
-
-    def new_arm() -> Arm:
-        return make_arm(robot, args.seed, str(robot_folder / 'model.xml'), deviates=True)
-
-    held_out = record(new_arm(), initial, HELD_OUT_STREAM + args.seed, HELD_OUT)
-    learner = Learner(robot, initial, args.preset, args.seed)
-    settings = Settings(preset=args.preset)
-    loop = ClosedLoop(new_arm(), initial, settings, EXPLORATION_STREAM + args.seed)
-    start = time.perf_counter()
-    teach(learner, _shown(loop, learner, 60.0 * args.minutes))
-    speed = 60.0 * args.minutes / (time.perf_counter() - start)
-    checkpoint.save(learner.mae, args.out)
-    before, after = (estimation_error(mae, held_out) for mae in (initial, learner.mae))
-    unit, count = robot.units.distance_unit, len(learner.samples)
-    print(f'{args.minutes:g} min of exploration at {speed:.1f} times real time, {count} samples')
-    print(f'error on {HELD_OUT:g} s of held-out motion: {before:.4f} → {after:.4f} {unit}')
-    report = export_into(robot, learner.mae, args.mujoco, model_folder, args.seed)
+    learned = learn(robot, initial, robot_folder / 'model.xml', args.seed, args.minutes)
+    checkpoint.save(learned.mae, args.out)
+    speed, count = f'{learned.speed:.1f} times real time', f'{learned.samples} samples'
+    print(f'{args.minutes:g} min of exploration at {speed}, {count}')
+    errors = f'{learned.before:.4f} → {learned.after:.4f} {robot.units.distance_unit}'
+    print(f'error on {HELD_OUT:g} s of held-out motion: {errors}')
+    report = export_into(robot, learned.mae, args.mujoco, model_folder, args.seed)
     print(next(line for line in report.splitlines() if line.startswith('muscles that keep')))
     print(f'robot: {robot_folder}')
     print(f'learned model: {model_folder / args.mujoco.name} (report.txt beside it)')
     print(f'checkpoint: {args.out}')
+
+
+def learn(robot: Robot, initial: Mae, model: Path, seed: int, minutes: float) -> Learned:
+    """Let the emulated arm of an imported file explore and learn.
+
+    Args:
+        robot: The imported robot.
+        initial: Its initial network.
+        model: The `model.xml` that the import wrote.
+        seed: Selects the emulated arm, which deviates from the file.
+        minutes: Duration of the exploration [min].
+    """
+
+    def new_arm() -> Arm:
+        return make_arm(robot, seed, str(model), deviates=True)
+
+    held_out = record(new_arm(), initial, HELD_OUT_STREAM + seed, HELD_OUT)
+    learner = Learner(robot, initial, initial.preset, seed)
+    settings = Settings(preset=initial.preset)
+    loop = ClosedLoop(new_arm(), initial, settings, EXPLORATION_STREAM + seed)
+    start = time.perf_counter()
+    teach(learner, _shown(loop, learner, 60.0 * minutes))
+    speed = 60.0 * minutes / (time.perf_counter() - start)
+    before, after = (estimation_error(mae, held_out) for mae in (initial, learner.mae))
+    return Learned(learner.mae, before, after, len(learner.samples), speed)
 
 
 def _imported(args: Namespace, folder: Path) -> Robot:

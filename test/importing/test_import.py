@@ -362,6 +362,21 @@ def test_a_model_without_routes_is_refused_with_the_dropped_muscles(tmp_path):
         read_source(file)
 
 
+def test_a_model_without_tendons_is_refused_because_it_has_none(tmp_path):
+    file = put(tmp_path, 'none.xml', '<mujoco><worldbody><body><joint/><geom size=".1"/></body>'
+               '</worldbody></mujoco>')  # fmt: skip
+    with pytest.raises(SourceError, match='it has no tendon'):
+        read_source(file)
+
+
+def test_sizes_of_included_files_do_not_prevent_the_import(tmp_path):
+    put(tmp_path, 'part.xml', '<mujoco><size njmax="500" nconmax="200"/></mujoco>')
+    sized = '<include file="part.xml"/><size memory="2M"/><worldbody>'
+    file = put(tmp_path, 'whole.xml', LINKS.replace('<worldbody>', sized, 1))
+    put(tmp_path / 'parts', 'tip.obj', TIP)
+    assert import_robot(file, tmp_path / 'out').robot.muscles == ('out', 'in')
+
+
 def wires_and_weight(tmp_path, name, text):
     """Return the muscle lengths of an imported SDF (N, M), and its holding torques (N, D)."""
     put(tmp_path, 'model.sdf', text)

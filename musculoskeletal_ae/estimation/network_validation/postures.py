@@ -37,9 +37,11 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import Mask
+from musculoskeletal_ae.robot.equilibrium_states import equilibrium_states, has_followers
 from musculoskeletal_ae.robot.robot import Robot
 
 POSTURES = 64  # check a network on this many fixed random states of the geometric model
+SEARCHED = 60  # search equilibria from this many random postures
 #: name of the error of the scale: the factor by which all route lengths differ from the model's
 SCALE = 'scale of l by ①'
 
@@ -188,6 +190,8 @@ class PostureCheck:
     def _states(self, count: int) -> tuple[Array, Array, Array]:
         """Draw random states of the geometric model, always the same for the same `count`.
 
+        Every second state of a robot with fewer muscles than joints is an equilibrium.
+
         Returns:
             Joint angles [rad], (N, D); tensions [N], (N, M); muscle lengths [m], (N, M).
         """
@@ -195,6 +199,11 @@ class PostureCheck:
         theta = robot.random_postures(count, rng)
         share = rng.uniform(size=(count, robot.muscle_count))
         tension = robot.tension.bias + share * (robot.tension.limit - robot.tension.bias)
+        if has_followers(robot):
+            # The tensions determine θ by ② where the robot can rest, and not elsewhere.
+            rests = equilibrium_states(robot, len(theta[::2]), rng, SEARCHED)
+            if rests is not None:
+                theta[::2], tension[::2] = rests
         return theta, tension, robot.muscle_lengths(theta, tension)
 
     @cached_property
