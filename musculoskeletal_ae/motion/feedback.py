@@ -1,15 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feedback: corrects the estimated posture error, and at rest reduces needless tension.
 
-`MotionFeedback` works while the arm moves and settles, `RestFeedback` afterwards.
+`MotionFeedback` works while the arm moves and settles, `RestFeedback` afterwards. Both shift the
+desired posture (`Shift`), which acts in two ways (`tension_plan.TensionPlan`):
+
+    l = ①(θ + δ, T),   −Gᵀ T = τ + k u,   k = SUPPORT σ/CORRECTION
+
+The lengths are those of the posture shifted by δ. A muscle at T_bias cannot answer by pulling less.
+If few muscles pull with more than T_bias, other lengths therefore exert almost no torque in some
+directions, and friction holds the arm there, wherever it is. For this reason, the planned tensions
+support the shift u by a torque. At the bound of a shift, the torque is SUPPORT times σ, the
+residual torque of the healthy moving arm (`estimation/healthy_torque.py`). σ contains the friction
+and the errors of the learned body that the arm has shown. A network that does not know σ supports
+no shift.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.command import Pull
+from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
@@ -17,8 +31,11 @@ from musculoskeletal_ae.robot.tension import least_tension
 #: to the limit than this
 REPLAN = 5.0
 CORRECTION = 0.3  # correct no joint by more than this [rad], because the estimate may be wrong
-#: treat smaller posture errors as 0 [rad]: they are about as large as the error of the estimate,
-#: and an arm with friction would otherwise never come to rest
+#: let planned tensions support a shift of CORRECTION by this multiple of the residual torque of the
+#: healthy arm; a larger one hardly helps, and costs tension (notes/friction_limits.md)
+SUPPORT = 2.0
+#: Treat posture errors as 0 that are smaller than this [rad], or than the standard deviation of the
+#: estimate: they may be errors of the estimate, and an arm with friction would never come to rest.
 DEADBAND = 0.03
 #: compute which tension is needless at intervals of at least this [s]
 RELIEF_INTERVAL = 0.1
@@ -27,6 +44,28 @@ PROPORTIONAL = 0.7
 INTEGRAL = 4.0  # gain k_i of the feedback in motion, which removes lasting posture errors [1/s]
 #: count the arm as resting once the feedback in motion has been off for this time [s]
 SETTLING = 0.5
+
+
+class Shift(NamedTuple):
+    """A shift of the desired posture by the feedback."""
+
+    length: Array  # δ: by this, the posture is shifted whose lengths are commanded [rad], (D,)
+    torque: Array  # u: the planned tensions support this shift [rad], (D,)
+
+
+def supporting_stiffness(mae: Mae) -> Array | float:
+    """Return the torque k by which planned tensions support each radian of a shift.
+
+    Args:
+        mae: The network, which contains the residual torque of the healthy arm.
+
+    Returns:
+        The torques [N·m/rad], (D,); 0 if the residual torque is not known.
+    """
+    if mae.touch is None or not mae.touch.calibrated:
+        return 0.0
+    stiffness: Array = SUPPORT * mae.touch.spread / CORRECTION
+    return stiffness
 
 
 def depends_on_limit(tension: Array, before: Array, limit: Array) -> bool:
@@ -48,18 +87,26 @@ class RestFeedback:
     """Slowly corrects the posture and reduces needless tension while the arm rests.
 
         dc/dt = gain (θ_target − θ_estimated),   |c| ≤ CORRECTION
+        du/dt = gain (c − u)                     where the support helps
+              = −gain u                          elsewhere
         dr/dt = gain (T − T*)/K_stiff,           |r| ≤ R             where T > T*
               = gain min(T_end − T*, 0)/K_stiff                      elsewhere
         (T and T_end are clipped to T_bias … T_limit; R is `Actuation.largest_relief`)
         T*    = argmin ‖T*‖²   subject to   Gᵀ T* = Gᵀ T_end,   T_bias ≤ T* ≤ T_limit
-        l_target = ①(θ_target, T_planned) + G c + l_comp(T_planned) + r
+        l_target = ①(θ_target + c, T_planned) + l_comp(T_planned) + r
 
     T is the measured motor-side tension, T_end the bone-side tension, and T_planned the tension of
-    the plan. ①(θ, T) is the network's prediction of the muscle lengths, G their derivative ∂l/∂θ.
+    the plan, which supports the shift u. ①(θ, T) is the network's prediction of the muscle lengths,
+    G their derivative ∂l/∂θ.
 
     Correction c: because of friction and network errors, the arm comes to rest beside its target.
-    The estimated posture shows most of this error (arXiv 2405.11808). Errors below DEADBAND count
-    as 0.
+    The estimated posture shows most of this error (arXiv 2405.11808). Errors of a joint count as 0
+    below DEADBAND, and below the standard deviation of its estimate: pushing against friction
+    because of a wrong estimate costs tension and moves the arm away from its target.
+
+    Supported shift u: the support helps a joint whose error counts and whose correction c is below
+    its bound. It is released once the joint has arrived, because friction then holds the joint. It
+    is also released if not even the bound of c moves the joint, because then it only costs tension.
 
     Relief r: friction and network errors also make antagonistic muscles pull against each other,
     because a length error causes a tension error of K_stiff times the length error. T* exerts the
@@ -73,11 +120,14 @@ class RestFeedback:
 
     Attributes:
         correction: c [rad], (D,).
+        supported: u [rad], (D,).
         relief: r [m], (M,).
     """
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
+        #: errors of each joint that are not corrected [rad], (D,)
+        self._dead_band: Array = np.full(robot.joint_count, DEADBAND)
         self.reset()
         self.moving()
 
@@ -88,14 +138,27 @@ class RestFeedback:
         """
         self._robot = robot
 
+    def use_network(self, mae: Mae) -> None:
+        """Use the standard deviations of the estimate that a network knows."""
+        variance = np.zeros(self._robot.joint_count)
+        if mae.covariance is not None:
+            variance = np.diag(mae.covariance)
+        self._dead_band = np.maximum(DEADBAND, np.sqrt(variance))
+
     def reset(self) -> None:
-        """Reset the corrections c and r to zero."""
+        """Reset c, u and r to zero."""
         self.correction: Array = np.zeros(self._robot.joint_count)
+        self.supported: Array = np.zeros(self._robot.joint_count)
         self.relief: Array = np.zeros(self._robot.muscle_count)
 
     def moving(self) -> None:
         """Record that the arm moves, which interrupts the integration until it has settled."""
         self._rested = self._unsolved = 0.0
+
+    @property
+    def shift(self) -> Shift:
+        """The present shift of the held posture."""
+        return Shift(self.correction, self.supported)
 
     def step(
         self, error: Array, jacobian: Array, pull: Pull, limit: Array, gain: float, dt: float
@@ -113,15 +176,20 @@ class RestFeedback:
         self._rested += dt
         if self._rested <= SETTLING or gain == 0.0:
             return False
-        beyond = np.where(np.abs(error) < DEADBAND, 0.0, error)
+        is_off = np.abs(error) >= self._dead_band
+        beyond = np.where(is_off, error, 0.0)
         correction = self.correction + gain * dt * beyond
         self.correction = np.clip(correction, -CORRECTION, CORRECTION)
         self._unsolved += dt
         if self._unsolved >= RELIEF_INTERVAL and self._robot.tension_source.is_known:
             actuation, bias = self._robot.actuation, self._robot.tension.bias
             lowest, largest = actuation.kept_tension, actuation.largest_relief
-            share = gain * self._unsolved / actuation.tension_per_length(pull.motor)
+            change = gain * self._unsolved
+            share = change / actuation.tension_per_length(pull.motor)
             self._unsolved = 0.0
+            helps = is_off & (np.abs(self.correction) < CORRECTION)
+            goal = np.where(helps, self.correction, 0.0)
+            self.supported = self.supported + change * (goal - self.supported)
             bone = np.clip(pull.bone, lowest, limit)
             least = least_tension(jacobian, -jacobian.T @ bone, bias, limit).tension
             motor = np.clip(pull.motor, lowest, limit)
@@ -129,22 +197,14 @@ class RestFeedback:
             self.relief = np.clip(self.relief + share * needless, -largest, largest)
         return True
 
-    def shift(self, jacobian: Array) -> Array:
-        """Return the correction of the lengths, G c + r [m], (M,).
-
-        Args:
-            jacobian: Muscle Jacobian G at the target [m/rad], (M, D).
-        """
-        return jacobian @ self.correction + self.relief
-
 
 class MotionFeedback:
     """Corrects the estimated posture error e while the arm moves along a trajectory and settles.
 
-    The desired posture is shifted by k_p e + c, with dc/dt = k_i e and the gains k_p and k_i. The
-    integral c is stored in the rest feedback (`RestFeedback.correction`) and therefore persists
-    from one motion to the next. While the limiter holds a muscle back, no entry of c grows, so that
-    c does not wind up.
+    The shift is δ = u = k_p e + c, with dc/dt = k_i e and the gains k_p and k_i. The integral c is
+    stored in the rest feedback (`RestFeedback.correction`) and therefore persists from one motion
+    to the next. While the limiter holds a muscle back, no entry of c grows, so that c does not wind
+    up.
     """
 
     def __init__(self, rest: RestFeedback) -> None:
@@ -152,8 +212,8 @@ class MotionFeedback:
         #: present shift of the desired posture [rad], (D,)
         self._shift: Array = np.zeros_like(rest.correction)
 
-    def step(self, error: Array, is_held_back: bool, dt: float) -> Array:
-        """Return the angles [rad], (D,), by which to shift the desired posture.
+    def step(self, error: Array, is_held_back: bool, dt: float) -> Shift:
+        """Return the shift of the desired posture.
 
         Args:
             error: Posture error, desired − estimated θ [rad], (D,).
@@ -169,8 +229,8 @@ class MotionFeedback:
         # Bound the shift as well, so that a suddenly wrong estimate cannot move the arm far.
         shift = rest.correction + PROPORTIONAL * error
         self._shift = np.clip(shift, -CORRECTION, CORRECTION)
-        return self._shift
+        return Shift(self._shift, self._shift)
 
     def continue_at_rest(self) -> None:
-        """Use the present shift as the correction from which the rest feedback continues."""
-        self._rest.correction = self._shift
+        """Let the rest feedback continue from the present shift."""
+        self._rest.correction = self._rest.supported = self._shift

@@ -5,8 +5,9 @@ At each message, for the desired θ, θ̇, θ̈ (`trajectory`) and with the netw
 muscle lengths,
 
     τ = M(θ) θ̈ + h(θ, θ̇)                                       rigid bodies (pinocchio's RNEA)
-    T = argmin ‖T‖²   subject to  −Gᵀ T = τ,  T_low ≤ T ≤ T_limit,         bone-side tension
-    l = ①(θ + k_p e + c, T),   e = θ − θ_estimated,   dc/dt = k_i e,   |c|, |k_p e + c| ≤ CORRECTION
+    δ = k_p e + c,   e = θ − θ_estimated,   dc/dt = k_i e,   |c|, |δ| ≤ CORRECTION       `feedback`
+    T = argmin ‖T‖²   subject to  −Gᵀ T = τ + k δ,  T_low ≤ T ≤ T_limit,   bone-side tension
+    l = ①(θ + δ, T)
     l_target = l + l_comp(T e^{μ s}) + λ dl/dt
 
 Tendon friction: the motor-side tension is T e^{μ s}. Here s is the direction in which the tendon
@@ -21,8 +22,8 @@ Position-controlled modules turn without tension and only lag by λ. For them, l
 K_stiff λ dl/dt are 0.
 
 A trajectory that is too fast for the muscle modules is slowed as a whole before it starts
-(`slowness`). The follower also holds the end of the trajectory. G and T then stay constant, and the
-rest feedback (`feedback.RestFeedback`) continues from c.
+(`slowness`). The follower also holds the end of the trajectory. The rest feedback
+(`feedback.RestFeedback`) then continues from δ, and the plan changes only with it.
 
 Where no tension is known, T is `Actuation.assumed_tension` in every posture, as in the samples from
 which the network was learned (doc/explanation/method.md).
@@ -33,8 +34,6 @@ the chosen stiffness.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
@@ -63,13 +62,6 @@ SETTLING = 0.8
 HELD_BACK = 1e-4
 
 
-class HeldPosture(NamedTuple):
-    """The plan with which the follower holds the end of a trajectory; it is computed only once."""
-
-    length: Array  # length command l_target without feedback [m], (M,)
-    jacobian: Array  # muscle Jacobian G at the end of the trajectory [m/rad], (M, D)
-
-
 class Follower(ActivityControl):
     """Follows trajectories, and holds the end of the last trajectory.
 
@@ -85,7 +77,8 @@ class Follower(ActivityControl):
         self.progress, self.plan = Progress(robot), TensionPlan(robot, settings)
         self.winches, self.feedback = Winches(robot), RestFeedback(robot)
         self._motion_feedback = MotionFeedback(self.feedback)
-        self._held: HeldPosture | None = None  # None while the arm moves or settles
+        #: l_target at rest without the relief r [m], (M,); None while the arm moves or settles
+        self._held: Array | None = None
         #: ramp that reduces the difference between the last command and the present plan to 0
         self._blend: Ramp | None = None
         self._desired: Array | None = None  # the last desired command [m], (M,)
@@ -104,6 +97,7 @@ class Follower(ActivityControl):
     def use_network(self, mae: Mae) -> None:
         """Use another network; the command changes without a jump."""
         self.plan.use_network(mae)
+        self.feedback.use_network(mae)
         self.plan_anew()
 
     # -- requests -------------------------------------------------------------------------------
@@ -220,13 +214,14 @@ class Follower(ActivityControl):
 
     def _resting(self, inputs: Inputs) -> Array:
         """Return the length command [m], (M,), while the arm rests at the end of its trajectory."""
-        feedback, mae, plan = self.feedback, inputs.mae, self.plan
-        if self._held is None:
+        feedback, plan, trajectory = self.feedback, self.plan, self.progress.trajectory
+        assert trajectory is not None
+        if is_new := self._held is None:
             self._motion_feedback.continue_at_rest()
-            theta = self.progress.desired.theta
-            jacobian = mae.muscle_jacobian(theta, plan.tension.bone)
-            self._held = HeldPosture(plan.length(mae, theta), jacobian)
-        length, jacobian = self._held
-        gain = 0.0 if plan.is_stiff else FEEDBACK_GAIN
-        feedback.step(self.progress.error, jacobian, inputs.pull, inputs.limit, gain, inputs.dt)
-        return length + feedback.shift(jacobian)
+        before, gain = feedback.shift, 0.0 if plan.is_stiff else FEEDBACK_GAIN
+        error, limit = self.progress.error, inputs.limit
+        feedback.step(error, plan.jacobian, inputs.pull, limit, gain, inputs.dt)
+        if is_new or not np.array_equal(before, feedback.shift):
+            self._held = plan.step(trajectory, self.progress.time, feedback.shift, 0.0, inputs)
+        assert self._held is not None
+        return self._held + feedback.relief

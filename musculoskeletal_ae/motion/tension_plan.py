@@ -16,7 +16,7 @@ from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.assumed_friction import FRICTION, tendon_friction
-from musculoskeletal_ae.motion.feedback import depends_on_limit
+from musculoskeletal_ae.motion.feedback import Shift, depends_on_limit, supporting_stiffness
 from musculoskeletal_ae.motion.methods import Solution, stiffness_command
 from musculoskeletal_ae.motion.slowness import SHARE
 from musculoskeletal_ae.motion.trajectory import Trajectory
@@ -105,12 +105,16 @@ class TensionPlan:
     Attributes:
         effort: Torque in addition to inverse dynamics [N·m], (D,).
         tension: The tensions of the last setpoint.
+        jacobian: Muscle Jacobian G at the last setpoint [m/rad], (M, D).
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self._robot, self._settings = robot, settings
         self.effort: Array = np.zeros(robot.joint_count)
         self.tension = PlannedTension.at_bias(robot)
+        self.jacobian: Array = np.zeros((robot.muscle_count, robot.joint_count))
+        #: torque k by which tensions support each radian of a shift [N·m/rad], (D,)
+        self._support: Array | float = 0.0
         self._limit: Array = robot.tension.limit  # tension limit of the present plan [N], (M,)
         #: friction coefficient μ of each tendon, (M,)
         self._friction: Array = np.full(robot.muscle_count, FRICTION)
@@ -124,7 +128,8 @@ class TensionPlan:
         self._stiffening.use(robot, settings)
 
     def use_network(self, mae: Mae) -> None:
-        """Use the tendon friction that a network has learned."""
+        """Use the tendon friction and the residual torque that a network has learned."""
+        self._support = supporting_stiffness(mae)
         self._friction = tendon_friction(self._robot, mae)
 
     def reset(self) -> None:
@@ -151,20 +156,20 @@ class TensionPlan:
         return is_other
 
     def step(
-        self, trajectory: Trajectory, time: float, shift: Array, lag: float, inputs: Inputs
+        self, trajectory: Trajectory, time: float, shift: Shift, lag: float, inputs: Inputs
     ) -> Array:
         """Plan the next setpoint of a trajectory, and return its length command [m], (M,).
 
         Args:
             trajectory: The trajectory that the arm follows.
             time: Time since the start of the trajectory [s].
-            shift: Shift of θ by the feedback [rad], (D,).
+            shift: Shift of θ by the feedback.
             lag: Time λ by which the muscle modules lag behind their commands [s].
             inputs: What the activity may read at this control step.
         """
         robot, mae, dt = self._robot, inputs.mae, inputs.dt
         at = trajectory.sample(time + 0.5 * dt)
-        jacobian = mae.muscle_jacobian(at.theta, self.tension.bone)
+        self.jacobian = jacobian = mae.muscle_jacobian(at.theta, self.tension.bone)
         speed = jacobian @ at.velocity
         self._sliding = slid(self._sliding, -np.tanh(speed / TURNING), speed * dt)
         torque = robot.kinematics.inverse_dynamics(*at) + self.effort
@@ -176,14 +181,16 @@ class TensionPlan:
             limit = inputs.limit
             near = self._stiffening.step(mae, trajectory, time, self.effort, limit, dt)
         if actuation.knows_tension:
-            tension, missing_torque = least_tension(
-                jacobian, torque, np.minimum(low, inputs.limit) / loss, inputs.limit / loss, near
-            )
+            limits = np.minimum(low, inputs.limit) / loss, inputs.limit / loss
+            supporting = torque + self._support * shift.torque
+            tension, missing_torque = least_tension(jacobian, supporting, *limits, near)
+            if missing_torque.any():  # report only what is missing without the feedback
+                missing_torque = least_tension(jacobian, torque, *limits, near).missing_torque
             self.tension = PlannedTension(tension, tension * loss, missing_torque)
         else:
             assumed = actuation.assumed_tension
             self.tension = PlannedTension(assumed, assumed, self.tension.missing_torque)
-        return self.length(mae, at.theta + shift) + lag * speed
+        return self.length(mae, at.theta + shift.length) + lag * speed
 
     def length(self, mae: Mae, theta: Array) -> Array:
         """Return the length command [m], (M,), that exerts the planned tensions at rest.

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from exact_mae import ExactMae
 from robots import write_robot
 
 from musculoskeletal_ae.control.command import Pull
@@ -115,6 +116,16 @@ def test_errors_within_the_dead_band_are_not_corrected(robot):
     assert not feedback.correction.any()
     step(feedback, robot, 2.0 * error, holding(robot))
     assert feedback.correction == pytest.approx(GAIN * DT * 2.0 * error)
+
+
+def test_errors_below_the_standard_deviation_of_the_estimate_are_not_corrected(robot):
+    feedback, mae = rested(robot), ExactMae(robot)
+    deviation = np.array([3.0 * DEADBAND, 0.5 * DEADBAND])
+    mae.covariance = np.diag(deviation**2)
+    feedback.use_network(mae)
+    error = np.full(robot.joint_count, 2.0 * DEADBAND)
+    step(feedback, robot, error, holding(robot))
+    assert feedback.correction == pytest.approx(GAIN * DT * error * [0.0, 1.0])
 
 
 def test_60_mm_of_a_prismatic_joint_count_as_one_radian(tmp_path):

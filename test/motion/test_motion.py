@@ -22,9 +22,10 @@ from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion import hand as hand_motion
-from musculoskeletal_ae.motion.feedback import CORRECTION
+from musculoskeletal_ae.motion.feedback import CORRECTION, SUPPORT
 from musculoskeletal_ae.motion.hand import HAND_SPEED, Hand
 from musculoskeletal_ae.motion.methods import StiffnessModel
 from musculoskeletal_ae.motion.reach import NOTABLE, ReachLimits
@@ -329,6 +330,33 @@ def test_feedback_demands_bounded_tension_when_the_estimate_does_not_move(bench)
     (length, _), limits = rest_readings(ROBOT, REST), ROBOT.tension
     demanded = np.array([ROBOT.actuation.demanded(length, c.value) for c in bench.step(400)])
     assert 0.9 < (demanded / limits.limit).max() <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize('time', [90.0, 0.0])
+def test_rest_feedback_pushes_in_every_direction_until_the_arm_has_arrived(time):
+    # Lengths alone exert almost no torque in directions in which few muscles pull harder than
+    # T_bias: the others cannot be relaxed any further. Without a measured residual torque, there
+    # are only the lengths.
+    mae, spread = ExactMae(ROBOT), np.array([0.6, 0.3])
+    mae.touch = TouchStatistics(mae.friction, spread, time)
+    bench = Bench(mae)
+
+    def support():
+        tension = bench.follower.plan.tension.bone
+        torque = -mae.muscle_jacobian(REST, tension).T @ tension
+        return torque - ROBOT.kinematics.holding_torque(REST)
+
+    bench.target(REST)
+    bench.step(200)
+    bench.theta = REST - 0.1  # friction holds the arm beside its target
+    bench.step(400)
+    torque = SUPPORT * spread if time else np.zeros(2)
+    supported = bench.follower.feedback.supported
+    assert (supported > 0.05).all()
+    np.testing.assert_allclose(support(), torque * supported / CORRECTION, atol=0.01)
+    bench.theta = REST  # the arm arrives, and friction holds it there
+    bench.step(1000)
+    np.testing.assert_allclose(support(), 0.0, atol=0.01)
 
 
 @pytest.mark.parametrize('trajectory', [True, False])
