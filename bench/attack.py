@@ -47,7 +47,7 @@ JITTER = 0.03
 RELIEF = 0.3  # let paying out exceed the rate limit for this time after an excess tension [s]
 SILENT = 10.0  # report a node under attack that has not reported on /diagnostics for this time [s]
 GROWTH = 1.2  # report a node whose memory exceeds this multiple of its memory at the age YOUNG
-YOUNG = 300.0  # measure the memory of a node for GROWTH at this age [s]
+YOUNG = 300.0  # compare later memory of a node with that at this age [s]
 #: Report a tension that exceeds ABOVE times tension.limit for longer than MOMENT [s].
 ABOVE, MOMENT = 1.1, 0.5
 STILL = 0.002  # report a muscle of a stopped arm that is wound in by more than this [m]

@@ -98,9 +98,9 @@ class BusyLoop(Lab):
 def watch(
     robot: Robot, reality: str, seed: int, initial: Mae, load: float, seconds: float
 ) -> Result:
-    """Let an individual explore for `seconds` [s], and return what happened.
+    """Let an emulated arm explore for `seconds` [s], and return what happened.
 
-    `reality` and `seed` name the individual; `load` is the number of other processes.
+    `reality` and `seed` select the arm; `load` is the number of processes that compete with it.
     """
     return BusyLoop(make_arm(robot, seed, reality), initial, seed, load).watch(seconds)
 

@@ -357,7 +357,7 @@ def main(argv: list[str]) -> None:
     parser.add_argument('--seeds', type=seeds, default=(0, 1, 2), help='seeds of the individuals')
     parser.add_minutes('duration of the exploration', 10.0)
     parser.add_quick('short initial training and held-out motion, to try things out')
-    text = 'measure the CPU time of each node instead of learning'
+    text = 'measure the CPU time of each node, and do not measure the learning'
     parser.add_argument('--nodes', action='store_true', help=text)
     text = 'duration of the measurement with --nodes [s]'
     parser.add_argument('--seconds', type=number(1.0, 3600.0), default=30.0, metavar='S', help=text)

@@ -60,7 +60,7 @@ COLUMNS = {
     'nominal': '② nominal [rad a joint]',
     'before': 'before [rad a joint]',
     'after': 'after',
-    'oracle': 'oracle',
+    'oracle': 'trained on the true arm',
     'training': 'training [s]',
     'update': 'update [s]',
     'estimate': 'estimate [µs]',
@@ -145,8 +145,10 @@ def draw(rows: dict[str, Row], file: Path) -> None:
     figure, panels = plots.new_figure(13.0, 4.6, 1, 3)
     joints = [int(body.split('x')[0]) for body in rows]
     kinds = (
-        ('error of ② per joint [rad]', {'before': 'before learning', 'after': 'after ten minutes',
-                                        'oracle': 'oracle', 'nominal': 'on the geometric model'}),
+        ('error of the estimate per joint [rad]', {
+            'before': 'before learning', 'after': 'after ten minutes',
+            'oracle': 'trained on the true arm', 'nominal': 'on the geometric model',
+        }),
         ('time on one core [s]', {'training': 'initial training', 'update': 'update',
                                   'solve': 'control solve', 'estimate': 'estimate'}),
         ('size [MB]', {'memory': 'largest memory of the process', 'checkpoint': 'checkpoint'}),

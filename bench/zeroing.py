@@ -152,7 +152,7 @@ def measure(robot: Robot, folder: Path, seed: int) -> dict[str, dict[str, Any]]:
 
 
 def line(seed: int, how: str, got: dict[str, Any], good: bool) -> str:
-    """Return one result as a line for people."""
+    """Return one result as a line of the printed table."""
     return (
         f'individual {seed}, {how:8s} error {got["before_rad"]:.4f} → {got["after_rad"]:.4f} rad '
         f'(× {got["ratio"]:.2f}) after {got["seconds"]:.0f} s; largest error of an offset '

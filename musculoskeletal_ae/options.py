@@ -193,7 +193,7 @@ class Parser(argparse.ArgumentParser):
         self.add_argument('--end', metavar='NAME', help=text)
 
     def add_plot(self, text: str) -> None:
-        """Add `--plot`, the file of a picture for `save_plot`; the text says what it shows."""
+        """Add `--plot`, the image file that `save_plot` writes; `text` says what it shows."""
         self.add_argument('--plot', type=picture, metavar='FILE.png', help=f'draw {text}')
 
 

@@ -49,9 +49,11 @@ class Event(Enum):
     LATCHING_CAUSE = 'any other cause'
     CLEARED = 'no cause for 0.2 s'
     RELEASED = 'hold_time is over and the arm is released'
-    SUSPECT = 'the estimator verifies a suspect muscle'
-    NOT_VERIFIED = 'the estimator has ended or verifies no muscle, or another cause needs a reset'
-    VERIFIED = 'the verification has ended the anomaly, and no cause needs a reset'
+    SUSPECT = 'the estimator checks whether a suspect muscle is faulty'
+    NOT_VERIFIED = (
+        'the estimator has ended or checks no muscle, or another stop cause needs a reset'
+    )
+    VERIFIED = 'the check has ended the anomaly, and no stop cause needs a reset'
     NOTHING_PRESENT = 'no cause is present'
     RESET = 'controller/reset without a cause present'
 

@@ -204,7 +204,7 @@ class JointSensorCheck:
         if self._mae is None or self._since < SPACING - 1e-9 or np.isnan(theta).all():
             return
         has_moved = (np.abs(estimate - self._counted_at) > MOVED).any()
-        # Look for readings that are far off even while the arm stands still.
+        # Also while the arm stands still, look for readings that are far from the estimate.
         usual = 0.0 if self._usual is None else self._usual.deviation
         is_far = np.abs(theta - estimate - usual) > GROSS
         if not (has_moved or (is_far & ~self.trust.is_doubted).any()):

@@ -11,7 +11,8 @@ from musculoskeletal_ae.robot.robot import Robot
 # If the end effector cannot come closer, the camera sees another marker or is not calibrated.
 #: reject a pose if the end effector stays further than this from its position [m]
 MARKER_DISTANCE = 0.05
-#: reject a pose if the orientation of the end effector differs by more than this angle [rad]
+#: reject a pose if the orientation of the end effector differs from the estimated one by more than
+#: this angle [rad]
 MARKER_ANGLE = 0.3
 
 

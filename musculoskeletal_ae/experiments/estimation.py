@@ -233,9 +233,9 @@ def grasp_and_cut(_: Study, rows: Rows) -> Plot:
     plots.tidy(panels[2], 'time [s]', 'd [healthy std. dev.]', legend='right')
     figure.suptitle(f'individual {seed}')
     return figure, (
-        'Estimation error, anomaly A, and the distance d on which the detector decides, for '
-        f'the same recording before and after learning. The arm grasps {PAYLOAD:g} kg (dashed); '
-        f'then {ruptured} ruptures (yellow) and is repaired.'
+        'Estimation error, anomaly A, and the distance d that the detector compares with its '
+        'threshold, for the same recording before and after learning. The arm grasps '
+        f'{PAYLOAD:g} kg (dashed); then {ruptured} ruptures (yellow) and is repaired.'
     )
 
 

@@ -56,9 +56,9 @@ ERRORS = 'before_rad', 'after_rad'  # numbers whose range over the trainings is 
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Measure networks with other hidden layers on the first individual.
+    """Measure networks whose hidden layers differ from the default, on the first emulated arm.
 
-    The result of every other individual is empty.
+    The result of every other arm is empty.
     """
     if seed != study.seeds[0]:
         return Measured({}, {})

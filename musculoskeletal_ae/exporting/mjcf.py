@@ -137,7 +137,8 @@ def export_into(robot: Robot, mae: Mae, file: Path, out: Path, seed: int = 0) ->
     if own.isdisjoint(places):
         raise refuse(
             file,
-            f'no site is at a route point of {robot.description.directory}; import this file again',
+            f'it has no site at a route point of {robot.description.directory}; import this file '
+            'again, because the robot was imported from another version of it',
         )
     with new_directory(out, refuse):
         robot = robot.with_elasticity(mae.elasticity)

@@ -71,7 +71,7 @@ def read_mjcf(file: Path, root: ET.Element) -> Source:
     mujoco.set_mju_user_warning(warnings.append)
     try:
         spec = mujoco.MjSpec.from_file(str(file))
-        spec.compiler.fusestatic = False  # keep all bodies, because the links are bodies
+        spec.compiler.fusestatic = False  # do not merge bodies without joints: each becomes a link
         model = spec.compile()
     except (ValueError, mujoco.FatalError) as error:
         raise refuse(file, f'MuJoCo cannot load it: {" ".join(str(error).split())}') from error

@@ -5,13 +5,14 @@
                                    threshold of A = margin · (1 + n_few/samples) · max A
 
 e are the residuals of a message: the tensions and lengths that the network restores from it, minus
-the measured ones. A is the size of e (`mae.residuals`). μ and Σ are mean and covariance of e,
-margin is `MARGIN`, and n_few is `FEW_SAMPLES`.
+the measured ones. A is one number for the magnitude of e (`mae.residuals`). μ and Σ are mean and
+covariance of e, margin is `MARGIN`, and n_few is `FEW_SAMPLES`.
 
 A reservoir keeps a uniform random selection of all messages, from motion and from rest. Each new
 network gets the statistics of its own residuals on these messages. The thresholds use the maximum,
-because friction gives d heavy tails. This maximum includes messages that were not used to
-compute Σ. Single messages far beyond all others are regarded as sensor glitches and excluded.
+because friction gives d heavy tails. The maximum is also taken over messages that were
+not used to compute Σ, so that it is not too low for new messages. Single messages far beyond all
+others are regarded as sensor glitches and excluded.
 
 If joint sensors read all angles, the network also learns from every second recent message
 (`update`). The other recent messages serve to validate its estimates.

@@ -63,7 +63,7 @@ class Convergence:
     def is_reached(self) -> bool:
         """Whether no more updates are needed.
 
-        Without a body (preset `paper`), LEAST_UPDATES are made.
+        Without a learned body, LEAST_UPDATES are made.
         """
         count = len(self.errors)
         return count >= MOST_UPDATES or (count >= LEAST_UPDATES and not self.is_falling)

@@ -63,7 +63,7 @@ class NetworkTrainer:
         return float(np.mean(losses[len(losses) // 2 :]))
 
     def move(self, length: Array) -> None:
-        """Move all lengths that the network computes by `length` [m], (M,), without training."""
+        """Add `length` [m], (M,), to all lengths that the network computes, without training."""
         for network in (self.network, self._raw):
             network.mean[-len(length) :] += torch.as_tensor(LENGTH_SCALE * length)
 

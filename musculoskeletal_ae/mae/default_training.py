@@ -102,7 +102,7 @@ def size(group: Group) -> float:
 
 
 def default_steps(groups: Iterable[Group]) -> int:
-    """Return the number of mini-batches of initial training for blocks of these groups."""
+    """Return how many mini-batches a network with one block per group needs to begin with."""
     return min(grown(STEPS, groups, 1.5), MOST_STEPS)
 
 

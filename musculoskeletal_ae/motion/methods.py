@@ -151,9 +151,9 @@ class StiffnessModel(NamedTuple):
 
     @classmethod
     def read(cls, robot: Robot, mae: Mae, theta: Array, tension: Array) -> StiffnessModel:
-        """Read the model from the network's lengths around the posture θ [rad] and T [N].
+        """Read the model from the lengths that the network computes near one state of the arm.
 
-        θ has the shape (D,), and T the shape (M,).
+        The state is that of the joint angles θ [rad], (D,), and the tensions T [N], (M,).
         """
 
         def jacobian(postures: Array) -> Array:

@@ -131,7 +131,7 @@ class ControllerNode(Shell):
         super().destroy_node()
 
     def _settings(self) -> Settings:
-        """Return the settings in the parameters, checked for the robot and its driver."""
+        """Return the settings from the parameters, after a check that the robot permits them."""
         settings = Settings(**{name: self.parameter(name) for name in parameters_of(Settings)})
         check_settings(self.robot, settings)
         with naming_parameter('method'):

@@ -120,7 +120,7 @@ class EstimatorNode(Shell):
 
     def _accepted(self, mae: Mae) -> None:
         self.candidates.publish(mae)
-        # The calibration waits for the first network.
+        # The length calibration needs a network, so it begins with the first one.
         if Evidence.NOT_CALIBRATED in self.core.trust.evidence:
             self.core.calibrate_lengths(self.posture)
             self._publish_body()

@@ -26,7 +26,6 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
-from musculoskeletal_ae.robot.tension import least_tension
 
 STEPS = 30  # move towards an equilibrium in at most this many steps
 REUSED = 5  # compute the stiffness that tensions cause in every fifth of these steps
@@ -88,6 +87,9 @@ def equilibrium_states(
     Returns:
         The equilibria; None if none was found.
     """
+    # Most arms have no followers, so nodes that solve no other quadratic programme need no solver.
+    from musculoskeletal_ae.robot.tension import least_tension
+
     theta, limits = robot.random_postures(searched, rng), robot.tension
     tension = rng.uniform(limits.bias, limits.limit, (searched, robot.muscle_count))
     jacobian, torque = robot.routes.muscle_jacobian(theta), robot.kinematics.holding_torque(theta)

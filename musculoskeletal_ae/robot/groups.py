@@ -102,7 +102,9 @@ def parts(crossed: Bools, group: Group) -> tuple[Group, ...]:
 
 
 def _components(crossed: Bools) -> Ints:
-    """Return for each joint the first joint to which muscles link it, directly or not, (D,).
+    """Return the group of each joint, (D,): the lowest index of a joint in it.
+
+    Joints that a muscle crosses together are in one group.
 
     `crossed` (M, D) says which joints each muscle crosses.
     """

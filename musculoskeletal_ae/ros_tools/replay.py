@@ -409,8 +409,8 @@ def parse(arguments: list[str]) -> Namespace:
     add('--clock', action='store_true', help='publish the recorded time on /clock')
     add('--loop', action='store_true', help='start again after the end of the recording')
     text = (
-        f'go on at once where nothing was recorded for more than {LONGEST_PAUSE / 1e9:g} s; the '
-        'recorded time on /clock then jumps'
+        f'skip gaps of more than {LONGEST_PAUSE / 1e9:g} s in the recording; the recorded time on '
+        '/clock then jumps'
     )
     add('--skip-pauses', action='store_true', help=text)
     start = 'start this far into the bag [s]'

@@ -46,7 +46,9 @@ class Limits(NamedTuple):
     # A module's temperature changes by at most `temperature_step + temperature_rate · dt` in the
     # time dt since the last accepted temperature. The first temperature is accepted after later
     # readings have differed from it by at most `temperature_step` for the time `glitch`.
-    temperature_step: float = 5.0  # constant part of the largest change of a temperature [°C]
+    temperature_step: float = (
+        5.0  # largest change between readings, apart from its rise with time [°C]
+    )
     temperature_rate: float = 50.0  # largest rate of a temperature [°C/s]
     #: reject a length that exceeds the modelled range within the joint limits by more than this
     #: [m]; healthy lengths exceed the range if tendons wrap, are wound in with slack, or are

@@ -139,7 +139,7 @@ def test_motors_whose_positions_wrap_around_do_not_pass_the_check(robot, tmp_pat
     arm.write(tmp_path / 'bag')
     with_motors = str(robot().description.directory)
     faults = check_bag(tmp_path / 'bag', with_motors).faults
-    assert any('were rejected: length jumped. See check_driver' in fault for fault in faults)
+    assert any('were rejected: length jumped. Run check_driver' in fault for fault in faults)
 
 
 @pytest.mark.parametrize('factor', [-1.0, 1000.0, np.nan])

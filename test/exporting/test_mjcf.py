@@ -115,7 +115,7 @@ def test_learned_points_are_written_into_the_users_file_and_all_else_stays(learn
 def test_another_file_is_refused(learned):
     robot, _, mae, folder = learned
     (folder / 'other.xml').write_text('<mujoco><worldbody/></mujoco>')
-    with pytest.raises(MusculoskeletalError, match='no site is at a route point'):
+    with pytest.raises(MusculoskeletalError, match='no site at a route point'):
         export_into(robot, mae, folder / 'other.xml', folder / 'refused')
 
 

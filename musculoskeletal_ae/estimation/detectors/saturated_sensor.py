@@ -46,7 +46,8 @@ BEYOND = 0.05
 #: the reading before. Otherwise, a repeated reading is no sign of saturation.
 VARYING = 0.5
 MEMORY = 10.0  # average the share of differing readings over this time (time constant) [s]
-#: check only readings above this multiple of T_bias: an ideal module may hold exactly T_bias
+#: check only readings above this multiple of T_bias: an ideal module may hold exactly T_bias, and
+#: its constant reading would look saturated
 LEAST = 1.5
 
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks a candidate network on fixed random states of the geometric model.
 
-    ①         restores θ, T and l of the geometric model, and its G
-    ②, ③      restore θ, T and l, where l is computed by ①
-
 ①, ② and ③ are the masks of the network: with ① it computes the muscle lengths l from joint angles
 θ and tensions T, with ② θ from T and l, and with ③ T from θ and l. G is the muscle Jacobian ∂l/∂θ.
+
+    ①         must reproduce θ, T, l and G of the geometric model
+    ②, ③      must reproduce θ, T and l, if they are given the l of ①
 
 The lengths of a real arm differ from the model's by centimetres, so ② and ③ are compared with the
 lengths of ① rather than with the model's. Most of the difference is elongation, because a series
