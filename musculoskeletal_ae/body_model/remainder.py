@@ -238,8 +238,8 @@ def group_remainder(
 ) -> GroupRemainder:
     """Learn the remainder of one group from samples.
 
-    The remainder is learned twice: the errors with which the first one predicts left-out samples
-    give the robust weights for the second one.
+    The robust weights follow from the errors with which the last remainder predicts left-out
+    samples. With few samples, or without a last remainder, it is learned twice.
 
     Args:
         robot: The whole robot.
@@ -255,7 +255,9 @@ def group_remainder(
         scale[len(joints) :] = np.inf  # ignore the tensions
     crossed = robot.routes.crossed[np.ix_(muscles, joints)]
     inputs = np.hstack([lengths.theta, lengths.tension]) / scale
-    logarithms = _likeliest(lengths, scale, crossed, start)
+    if start is None or len(inputs) < FEW_SAMPLES:
+        start = _likeliest(lengths, scale, crossed, start)
+    logarithms = start
     left_out = _solved(lengths, inputs, crossed, logarithms)
     lengths = lengths._replace(weight=_robust_weights(lengths.weight, left_out, logarithms))
     logarithms = _likeliest(lengths, scale, crossed, logarithms)
