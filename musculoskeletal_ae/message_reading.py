@@ -100,15 +100,16 @@ def muscle_rows(message: Any, muscles: int) -> Array:
     Optional rows that the message lacks are NaN. A `message` may also be an array of its rows.
     """
     if isinstance(message, np.ndarray):
-        lacking = len(QUANTITIES) - len(message)
-        return np.pad(message.astype(float), ((0, lacking), (0, 0)), constant_values=np.nan)
-    lacking = 0
-    for quantity in reversed(QUANTITIES):
-        expected = muscles * (len(QUANTITIES) - lacking)
-        if quantity.presence is not Presence.OPTIONAL or len(message.data) >= expected:
-            break
-        lacking += 1
-    values = _values(message, len(QUANTITIES) - lacking, muscles)
+        values = message.astype(float)
+        lacking = len(QUANTITIES) - len(values)
+    else:
+        lacking = 0
+        for quantity in reversed(QUANTITIES):
+            expected = muscles * (len(QUANTITIES) - lacking)
+            if quantity.presence is not Presence.OPTIONAL or len(message.data) >= expected:
+                break
+            lacking += 1
+        values = _values(message, len(QUANTITIES) - lacking, muscles)
     return np.pad(values, ((0, lacking), (0, 0)), constant_values=np.nan) if lacking else values
 
 

@@ -28,7 +28,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.body_model import springs
 from musculoskeletal_ae.body_model.remainder import Remainder
-from musculoskeletal_ae.robot.description import Route, RoutePoint
+from musculoskeletal_ae.robot.description import RoutePoint
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
@@ -137,16 +137,8 @@ class CalibratedBody:
 
     def as_robot(self) -> Robot:
         """Return a robot with the fitted route points and springs."""
-        routes = list[Route]()
-        for m, route in enumerate(self.robot.description.routes):
-            shifts = iter(self.link_shifts(m))
-            routes.append(
-                tuple(
-                    p._replace(xyz=p.xyz + next(shifts)) if isinstance(p, RoutePoint) else p
-                    for p in route
-                )
-            )
-        return self.robot.with_routes(routes).with_elasticity(self.elasticity)
+        shifts = (shift for m in range(self.robot.muscle_count) for shift in self.link_shifts(m))
+        return self.robot.with_moved_points(shifts).with_elasticity(self.elasticity)
 
     def elastic(self, m: int) -> SeriesElastic:
         """Return the fitted elastic constants of muscle `m`, as arrays of shape ()."""

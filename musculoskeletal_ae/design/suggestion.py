@@ -19,7 +19,7 @@ from musculoskeletal_ae.design import checks
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_yaml
 from musculoskeletal_ae.progress_bar import ProgressBar
-from musculoskeletal_ae.robot.description import RoutePoint, refusal, written
+from musculoskeletal_ae.robot.description import refusal, written
 from musculoskeletal_ae.robot.drawing import draw_arm, save_picture
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -58,7 +58,7 @@ def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array
     setting = checks.Setting.of(robot, theta)
 
     def check(change: Array) -> checks.RobotCheck:
-        return checks.measure(setting.rerouted(moved(robot, change)))
+        return checks.measure(setting.rerouted(robot.with_moved_points(change)))
 
     flips = np.maximum(checks.main_actions(check(unchanged).moment_arms)[1], FAILING_SHARE)
 
@@ -99,22 +99,6 @@ def suggest(robot: Robot, reach: float, postures: int, seed: int) -> tuple[Array
     return change, before, lacks(change)
 
 
-def moved(robot: Robot, change: Array) -> Robot:
-    """Return a copy of a robot in which via points are moved by `change` [m] (P, 3).
-
-    The displacements are in the frames of the links.
-    """
-    shifts = iter(change)
-    routes = [
-        tuple(
-            item._replace(xyz=item.xyz + next(shifts)) if isinstance(item, RoutePoint) else item
-            for item in route
-        )
-        for route in robot.description.routes
-    ]
-    return robot.with_routes(routes)
-
-
 def lacking(check: checks.RobotCheck) -> float:
     """Return how much is lacking for the requirements of `check_robot`, as a number without unit.
 
@@ -147,7 +131,7 @@ def write(robot: Robot, change: Array, out: Path) -> None:
     Raises:
         RobotDescriptionError: If other files of the directory cannot be copied.
     """
-    here, after = robot.description.directory, moved(robot, change)
+    here, after = robot.description.directory, robot.with_moved_points(change)
     document = read_yaml(here / 'muscles.yaml', refusal)
     for muscle, route in zip(document['muscles'], after.description.routes, strict=True):
         muscle['route'] = [written(item) for item in route]

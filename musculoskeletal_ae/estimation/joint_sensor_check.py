@@ -130,7 +130,8 @@ class JointSensorCheck:
         self._compared.clear()
         if not self._messages:
             return
-        theta, tension, length = map(np.array, zip(*(each[1:4] for each in self._messages)))
+        readings = ((each.theta, each.tension, each.length) for each in self._messages)
+        theta, tension, length = map(np.array, zip(*readings))
         estimate = mae.estimate(tension, np.nan_to_num(length)).theta
         used = ~np.isin(np.arange(length.shape[1]), mae.isolated)
         # Messages in which a muscle was isolated that is used now cannot be compared.
@@ -254,8 +255,10 @@ class JointSensorCheck:
         count = np.isfinite(deviation).sum(axis=0)
         is_known = count >= ENOUGH
         middle = np.where(is_known, _median(deviation), 0.0)
-        arrived = np.array([message.deviation for message in self._messages])[: len(earlier)]
-        arrived = np.where(np.isnan(deviation), np.nan, arrived)[-ENOUGH:]
+        newest = deviation[-ENOUGH:]  # of the earlier messages
+        messages = islice(self._messages, len(earlier) - len(newest), len(earlier))
+        arrived = np.array([message.deviation for message in messages]).reshape(newest.shape)
+        arrived = np.where(np.isnan(newest), np.nan, arrived)
         spread = TO_SIGMA * _median(np.abs(arrived - _median(arrived)))
         usual_residual = _median(residual)
         residual_spread = TO_SIGMA * _median(np.abs(residual - usual_residual))

@@ -16,6 +16,7 @@ from musculoskeletal_ae.robot.actuation import ACTUATIONS, Actuation
 from musculoskeletal_ae.robot.description import (
     RobotDescription,
     Route,
+    RoutePoint,
     TensionRange,
     load_description,
 )
@@ -149,6 +150,18 @@ class Robot:
         changed.groups = groups(changed.routes.crossed)
         changed.actuation = type(self.actuation)(changed)
         return changed
+
+    def with_moved_points(self, shifts: Iterable[Array]) -> Robot:
+        """Return a copy whose route points are moved, as `with_routes` does.
+
+        Args:
+            shifts: Displacement of each point in the frame of its link [m], (3,), muscle by muscle.
+        """
+        each = iter(shifts)
+        return self.with_routes(
+            tuple(p._replace(xyz=p.xyz + next(each)) if isinstance(p, RoutePoint) else p for p in r)
+            for r in self.description.routes
+        )
 
     def with_elasticity(self, elasticity: JointElasticity | None) -> Robot:
         """Return a copy with learned springs and dampers.

@@ -240,10 +240,10 @@ def _has_wrong_scale(time: Array, theta: Array, is_outside: Bools) -> bool:
 
 
 def _interrupting(which: Ints, readings: Array, largest: Array) -> list[int]:
-    """Return the numbers of the constants (repeated values) that interrupt other readings.
+    """Return which of the repeated values are read between other, changing readings.
 
     Args:
-        which: Number of the constant that each message has, (N,).
+        which: Number of the repeated value in each message, (N,).
         readings: The messages [rad], (N, K).
         largest: Largest possible change from each message to the next one [rad], (N − 1,).
     """

@@ -47,8 +47,8 @@ def test_networks_states_and_stops_of_two_arms_are_apart(pair, trained, trained_
     left.wait(lambda: version(left) == '7', 'the network of the left arm')
     assert left.call(Trigger, 'controller/stop').success
     left.wait(lambda: 'operator_stop' in left.report('controller').identifiers, 'the stop')
-    seen = len(right.received['/diagnostics'])
-    right.wait(lambda: len(right.received['/diagnostics']) > seen + 8, 'reports of both arms')
+    earlier = len(right.received['/diagnostics'])
+    right.wait(lambda: len(right.received['/diagnostics']) > earlier + 8, 'reports of both arms')
     right.next('muscle_length_command', 20)
     assert version(right) == before
     assert right.report('controller').message == 'exploring'
