@@ -224,7 +224,8 @@ if [ $hardware = false ] && [ $network = false ]; then
   export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
   unset ROS_STATIC_PEERS
 fi
-use_udp
+# shellcheck source=.ci/udp.sh
+. "$repository/.ci/udp.sh"
 [ ${#parameters[@]} = 0 ] || "$python" -m musculoskeletal_ae.nodes.parameters "${parameters[@]}" || exit
 if [ -n "$bag" ]; then
   say "reading $bag"

@@ -66,7 +66,7 @@ setup(
         (f'share/{NAME}', ['package.xml']),
         # `ros2 run musculoskeletal_ae bringup.sh`; the other files belong to it.
         (f'lib/{NAME}', ['bringup.sh']),
-        (f'share/{NAME}/.ci', ['.ci/environment.sh', '.ci/compile.py']),
+        (f'share/{NAME}/.ci', ['.ci/environment.sh', '.ci/udp.sh', '.ci/compile.py']),
         *bag_files(),
         *config_files(),
     ],

@@ -27,7 +27,8 @@ say 'mypy'
 
 # Use a private ROS graph, separate from the network and from other runs on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
-use_udp
+# shellcheck source=.ci/udp.sh
+. "$repository/.ci/udp.sh"
 export ROS_DOMAIN_ID=$(($$ % 25 * 4 + 1)) # and the next three, one for each process of pytest
 export ROS_LOG_DIR=$repository/log/test
 # Because many tests wait for messages in real time, it takes four processes of pytest to keep two

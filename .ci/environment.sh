@@ -219,16 +219,6 @@ environment_setup() { # [test]
   COLCON_PYTHON_EXECUTABLE=$(readlink -f "$python") . "$repository/install/setup.bash"
 }
 
-# Makes Fast DDS use UDP only. After the kill of a node, its shared memory may prevent a successor on
-# the same ports from receiving messages (eProsima/Fast-DDS 4737, 5053, 5469). On one machine, UDP is
-# not slower. With ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, rmw_fastrtps adds shared memory in spite
-# of FASTDDS_BUILTIN_TRANSPORTS; the profile file keeps messages out of it.
-use_udp() {
-  export FASTDDS_BUILTIN_TRANSPORTS=${FASTDDS_BUILTIN_TRANSPORTS:-UDPv4}
-  [ "${ROS_AUTOMATIC_DISCOVERY_RANGE-}" != LOCALHOST ] ||
-    export FASTRTPS_DEFAULT_PROFILES_FILE=${FASTRTPS_DEFAULT_PROFILES_FILE:-$repository/config/udp.xml}
-}
-
 # Lets as many processes of this machine discover each other as Fast DDS has ports for, which are 101.
 # With ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, rmw_fastrtps sends announcements to the ports of the
 # first 32 processes only. The profile that is written here names the other ports of the domain.

@@ -295,8 +295,8 @@ def check_system(name: str, folder: Path, tests: tuple[str, ...]) -> str:
     output = site.run(
         'tests',
         *SET_UP,
-        'use_udp',
         'export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST OMP_NUM_THREADS=1',
+        '. .ci/udp.sh',
         f'"$python" -m pytest -q -p no:cacheprovider {" ".join(tests)}',
         on_platform=True,
     )

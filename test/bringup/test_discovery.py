@@ -16,7 +16,7 @@ DOMAIN = '101'  # the other tests use domains up to 100
 PROFILE = """
 repository=$0
 . "$repository/.ci/environment.sh"
-use_udp
+. "$repository/.ci/udp.sh"
 discover_many "$1"
 printf '%s' "$FASTRTPS_DEFAULT_PROFILES_FILE"
 """
