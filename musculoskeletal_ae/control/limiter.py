@@ -123,7 +123,7 @@ class CommandLimiter:
         """
         if self.command is None:
             return
-        before, self.command, self._last_length = self.command, None, None
+        before, self.command = self.command, None
         kind, self.command = before.kind, self.last(before.kind, sample)
         if not may_pull_harder:
             softer = np.maximum if kind == LENGTH else np.minimum

@@ -144,6 +144,16 @@ def test_across_changes_between_lengths_and_tensions_no_demand_and_no_length_mak
             last_length, elapsed = sent, 0.0
 
 
+def test_a_length_after_a_pause_between_tensions_is_near_the_last_published_length():
+    limiter, settings, now = CommandLimiter(ROBOT, Settings()), Settings(), sample(0.0, BIAS)
+    for _ in range(300):  # slack
+        last = limiter.limit(Command(LENGTH, np.full(COUNT, 0.1)), now, LIMIT, DT).value
+    limiter.limit(Command(TENSION, ROBOT.tension.bias), now, LIMIT, DT)
+    limiter.restart(now, may_pull_harder=False)
+    sent = limiter.limit(Command(LENGTH, np.full(COUNT, -0.1)), now, LIMIT, DT).value
+    assert (last - sent <= settings.rate_limit * 2 * DT + 1e-9).all()
+
+
 @pytest.mark.parametrize('kind', [LENGTH, TENSION])
 def test_a_command_that_is_not_finite_is_not_published_and_the_last_one_stays(kind):
     limiter, now = CommandLimiter(ROBOT, Settings()), sample(0.0, BIAS)
