@@ -1,29 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of the learned estimate on recorded and emulated bodies, beside those of regressions.
+"""Errors of the learned estimate on emulated bodies, beside those of regressions.
 
-    python -m bench bodies neck:20 arm+effort:100:0 kin_0 foreign_1 --clones DIR --cache DIR
+    python -m bench bodies kin_0 foreign_1 kin_0+coupled:25:0 --cache DIR
 
-A case is NAME[:COUNT[:DRAW]]. COUNT is the number of training samples, by default as many as the
-learner keeps, and DRAW the seed with which they are drawn. Names are
+A case is INDIVIDUAL[+OPTION][:COUNT[:DRAW]]. COUNT is the number of training samples, by default as
+many as the learner keeps, and DRAW the seed with which they are drawn.
 
-    neck, arm, stand        recordings of `bench recordings` without payload, whose clones are in
-                            --clones; with `+effort`, efforts of the motors are the tensions
     kin_SEED, foreign_SEED  rest samples of an emulated arm that explored for 5 minutes, tested on
                             another minute. With `+coupled`, a smooth function of all joints with a
                             standard deviation of 6 mm is added to each length. With `+blind`, the
                             learner has no joint sensors
 
-Training rows of neck and arm come from every other pose or file, and test rows from those between.
 A line has the mean error ‖θ_est − θ‖ [rad] after the updates, the share of test errors in the 95 %
 ellipsoid, the error of the lengths of network and body [mm], the size of the remainder [mm] and its
 constants, the processor time of an update [s], and the errors of the regressions. With --body, only
 the body is fitted, and θ is estimated by least squares on it, with the covariance that the fit
-expects. This takes a quarter of the time. notes/real_bodies.md contains the figures.
+expects. This takes a quarter of the time. notes/real_bodies.md contains the figures;
+`bench recordings` measures recorded robots.
 """
 
 from __future__ import annotations
 
-import tempfile
+import re
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -34,9 +32,6 @@ import numpy as np
 import torch
 
 from bench.learned_arm import initial
-from bench.recordings import clone_of
-from bench.recordings_learn import INITIAL_STEPS, joined, tensions
-from bench.recordings_read import Files, Run, SoftLink, fitted, repositories
 from bench.regression import BASELINES
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.body_fit import BodyFit
@@ -48,13 +43,11 @@ from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, HELD_OU
 from musculoskeletal_ae.gauss_newton import minimise_each
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.convergence import STEPS, Convergence
-from musculoskeletal_ae.learning.job import Job
+from musculoskeletal_ae.learning.job import Job, Update
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import CAPACITY, Observations
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.learning.update import BodyUpdater
-from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.robot.robot import Robot
@@ -64,14 +57,12 @@ ROBOT = 'musashi_left_arm'  # robot that the emulated cases use
 #: let an emulated arm explore for EXPLORED, and test on a held-out motion of HELD_OUT [s]
 EXPLORED, HELD_OUT = 300.0, 60.0
 THINNED = 10  # use only every tenth message of the held-out motion for the test
-MOST_ROWS = 1500  # test on at most this many rows
 #: standard deviation of the coupling of joints that `+coupled` adds to each length [m]
 COUPLING = 0.006
 MOST_FITTED = 150  # fit at most this many test rows by least squares, because each fit is slow
 #: constants of least squares: step of finite differences [rad], typical step as a share of the
 #: joint ranges, and number of iterations after which it ends
 DIFFERENCE, USUAL_STEP, ROUNDS = 1e-4, 0.1, 15
-RECORDINGS = {'neck': 'soft_neck', 'arm': 'soft_arm', 'stand': 'continuum_stand'}
 
 
 class Case(NamedTuple):
@@ -97,59 +88,6 @@ def _observed(theta: Array, tension: Array, length: Array) -> Observations:
 
 def _nothing(robot: Robot) -> Healthy:
     return Healthy(np.empty((0, 3 * robot.muscle_count), dtype=np.float32), 0.0, 0)
-
-
-def _divided(name: str, clones: Path) -> tuple[SoftLink, Run, Run]:
-    """Return the link of the recording `name`, and its rows for training and for the test.
-
-    Rows with payload are left out. With `stand`, training and test use the same rows.
-    """
-    for repository in repositories():
-        if repository.recording != RECORDINGS[name]:
-            continue
-        clone = clone_of(repository, clones, fetch=False)
-        if clone is None:
-            raise MusculoskeletalError(
-                f'{clones} has no clone of {repository.name}; run python -m bench recordings with '
-                '--fetch'
-            )
-        recording = repository.read(Files(clone))
-        assert isinstance(recording.link, SoftLink)  # as all in RECORDINGS are
-        runs = [run for run in recording.runs if not run.load > 0.0]
-        if name == 'arm':
-            return recording.link, joined(runs[0::2]), joined(runs[1::2])
-        run = runs[0]
-        if name == 'stand':
-            return recording.link, run, run
-        pose = np.searchsorted(run.rests[:, 1], np.arange(len(run.length)), side='right')
-        held_out = (pose % 2 == 1) & (pose < len(run.rests))
-        return recording.link, run.at(~held_out), run.at(held_out)
-    raise AssertionError(name)
-
-
-def recorded(name: str, count: int, draw: int, clones: Path, cache: Path) -> Case:
-    """Return the case of a recording; its first network is cached in `cache`.
-
-    `name` is that of the recording. `draw` is the random seed with which `count` of its training
-    rows are drawn.
-    """
-    file = cache / f'initial_{name}_{count}_{draw}.safetensors'
-    name, _, effort = name.partition('+')
-    link, every, test = _divided(name, clones)
-    order = np.random.default_rng([draw, count]).permutation(len(every.length))
-    training = every.at(order[:count])
-    if test is every:
-        test = every.at(order[count:])
-        link, at_zero = fitted(link, training)
-        training, test = (replace(run, length=run.length - at_zero) for run in (training, test))
-    test = test.at(slice(None, None, max(1, len(test.length) // MOST_ROWS)))
-    with tempfile.TemporaryDirectory() as folder:
-        robot = Robot.load(link.write(Path(folder), 'sensor' if effort else 'none'))
-    tension = tensions(robot, training, bool(effort))
-    learned, asked = (_observed(run.theta, tension(run), run.length) for run in (training, test))
-    if not file.exists():
-        checkpoint.save(initial_mae(robot, steps=INITIAL_STEPS, seed=0).mae, file)
-    return Case(robot, checkpoint.load(file, robot), learned, asked, _nothing(robot))
 
 
 def emulated(name: str, count: int, draw: int, cache: Path) -> Case:
@@ -227,12 +165,16 @@ def package(case: Case, updates: int | None, seed: int) -> str:
         seed: Random seed of the training.
     """
     updater, times = BodyUpdater(case.robot, case.initial, seed), list[float]()
-    convergence = Convergence()
-    while not (convergence.is_reached if updates is None else len(times) == updates):
+
+    def make_update() -> Update:
         begin = time.process_time()
-        update = updater.update(Job(case.training, case.healthy, True, STEPS))
+        made = updater.update(Job(case.training, case.healthy, True, STEPS))
         times.append(time.process_time() - begin)
-        convergence.note(update, updater.body)
+        return made
+
+    until_converged = Convergence().updates(make_update, lambda: updater.body)
+    wanted = until_converged if updates is None else (make_update() for _ in range(updates))
+    *_, update = wanted
     mae, test, body = update.mae, case.test, updater.body
     end = test.end_tension(mae.transmission)
     error = mae.estimate(end, test.length).theta - test.theta
@@ -298,32 +240,25 @@ def regressions(case: Case) -> str:
     return ', '.join(texts)
 
 
-def read_case(text: str, clones: Path | None, cache: Path) -> Case:
-    """Read NAME[:COUNT[:DRAW]], and return the case that it names.
+def read_case(text: str, cache: Path) -> Case:
+    """Read INDIVIDUAL[+OPTION][:COUNT[:DRAW]], and return the case that it names.
 
     Raises:
-        MusculoskeletalError: If there is no such case, or its data are not given.
+        MusculoskeletalError: If there is no such case.
     """
     name, *numbers = text.split(':')
-    legal = f'{", ".join(RECORDINGS)}, kin_SEED or foreign_SEED, then :COUNT and :DRAW'
-    try:
-        count, draw = ([int(number) for number in numbers] + [CAPACITY, 0][len(numbers) :])[:2]
-    except ValueError as error:
-        raise MusculoskeletalError(f'case {text!r}: expected {legal}') from error
-    if name.partition('+')[0] in RECORDINGS:
-        if clones is None:
-            raise MusculoskeletalError(f'case {text!r} is a recording; give --clones')
-        return recorded(name, count, draw, clones, cache)
-    if name.startswith(('kin_', 'foreign_')):
-        return emulated(name, count, draw, cache)
-    raise MusculoskeletalError(f'case {text!r}: expected {legal}')
+    known = re.fullmatch(r'(kin|foreign)_\d+(\+(coupled|blind))*', name)
+    if not known or len(numbers) > 2 or not all(number.isdecimal() for number in numbers):
+        legal = 'kin_SEED or foreign_SEED, then +coupled or +blind, then :COUNT and :DRAW'
+        raise MusculoskeletalError(f'case {text!r}: expected {legal}')
+    count, draw = ([int(number) for number in numbers] + [CAPACITY, 0][len(numbers) :])[:2]
+    return emulated(name, count, draw, cache)
 
 
 def main(argv: list[str]) -> None:
     """Learn each case that the command line names, and print a line with its errors."""
     parser = Parser('bodies', (__doc__ or '').partition('\n')[0])
-    parser.add_argument('cases', nargs='+', metavar='CASE', help='NAME[:COUNT[:DRAW]]')
-    parser.add_argument('--clones', type=Path, help='directory with clones of the recordings')
+    parser.add_argument('cases', nargs='+', metavar='CASE', help='INDIVIDUAL[:COUNT[:DRAW]]')
     help_cache = 'directory for first networks, and for samples of emulated arms'
     parser.add_argument('--cache', type=Path, required=True, help=help_cache)
     text = 'number of updates; by default, as many as the network needs to converge'
@@ -335,7 +270,7 @@ def main(argv: list[str]) -> None:
     torch.set_num_threads(1)
     args.cache.mkdir(parents=True, exist_ok=True)
     for text in args.cases:
-        case = read_case(text, args.clones, args.cache)
+        case = read_case(text, args.cache)
         line = body_alone(case) if args.body else package(case, args.updates, args.seed)
         also = f'; {regressions(case)}' if args.baselines else ''
         print(f'{text} ({len(case.training)} samples): {line}{also}', flush=True)

@@ -1,17 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains models on public recordings of other tendon-driven robots, and compares their errors.
+"""Learns public recordings of other people's tendon-driven robots, beside models that know none.
 
-    python -m bench recordings --clones DIR [--out DIR] [--only NAME]
+    python -m bench recordings --clones DIR [--out DIR] [--only NAME] [--counts N …] [--draws N]
 
 DIR has one clone for each repository of `recordings_read.repositories`, named OWNER+NAME or NAME
 (a working tree or a git directory). A repository without a clone is cloned into DIR if --fetch is
 given, and left out otherwise. None of the data is stored. The results are result.json and
-tables.md, which `python doc/make.py` writes into doc/results.md.
+tables.md, which `python doc/make.py` writes into the documents. Each finished case is added to
+result.json, so the bench may be interrupted, or measure a part; --again measures cases again that
+are there.
 
-Every model is trained on the rest samples of the training runs. It is tested on all rows of other
-runs (neck), files (arm) or poses (stand). For neck and arm, polynomials are also fitted to all rows
-of the training runs. All constants are in `recordings_learn`; none was chosen by an error on test
-rows.
+`recordings_cases` divides each recording into training and test rows. All models of a case learn
+the same rows, from lengths alone or from lengths and efforts:
+
+- geometry: the network of the geometric model, without learning
+- the regressions of `regression`, whose constants are chosen with the training rows alone
+- statics of a soft link, where its payload is known (`Statics`)
+- this package, as `train --from-csv` learns
+
+No constant was chosen by an error on test rows, except those that doc/results.md names.
 """
 
 from __future__ import annotations
@@ -19,193 +26,95 @@ from __future__ import annotations
 import json
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
-from bench.recordings_baselines import baselines
+from bench.recordings_cases import COUNTS, DRAWS, Case, cases
 from bench.recordings_learn import (
     Model,
     Statics,
     bend_gain,
+    described,
     effort_slope,
     error,
-    joined,
+    network,
     package,
     payload_share,
-    polynomial,
+    regression,
+    tensions,
 )
-from bench.recordings_read import (
-    Files,
-    Recording,
-    Repository,
-    Run,
-    SoftLink,
-    fitted,
-    repositories,
-)
+from bench.recordings_read import Files, Recording, Repository, SoftLink, repositories
+from bench.regression import BASELINES
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.options import Parser
+from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.robot.robot import Robot
 
-HALF = slice(0, None, 2)  # rests that are used for training: every other one
-ALL_ROWS = ', of all rows'
-#: label of the one row that stands for all polynomials fitted to all rows of the training runs
-OF_ALL_ROWS = 'best polynomial of all training rows (chosen by its test error)'
+GEOMETRY, STATICS, PACKAGE = 'geometry', 'statics', 'this package'
+LENGTHS, EFFORTS = 'lengths', 'lengths and efforts'
 
 
 class Result(NamedTuple):
-    """The error of one model on one split."""
+    """The error of one model in one draw of a case."""
 
     recording: str
-    split: str
+    case: str
     samples: int
+    draw: int
+    inputs: str  # LENGTHS or EFFORTS
     model: str
     error_rad: float
 
-
-class Split(NamedTuple):
-    """One way to divide a recording into training and test data."""
-
-    name: str
-    training: Run  # the training data, which contain rest samples only
-    test: Run  # the test data, with all rows
-    #: `training` by run, to which `Statics` is fitted; empty if it is not fitted to this split
-    rests: list[Run]
-    #: all rows of the training runs or poses, not only rests; polynomials are fitted to them as
-    #: well
-    full: Run | None = None
+    @property
+    def place(self) -> tuple[str, str, int, str]:
+        """Recording, case, draw and inputs, which all models of a measurement share."""
+        return self.recording, self.case, self.draw, self.inputs
 
 
-def neck_splits(recording: Recording) -> Iterator[Split]:
-    """Yield splits of the recording of the soft neck, a link that three tendons bend.
+class First:
+    """First networks by the robot that they belong to: equal robots have equal networks."""
 
-    The training data have one payload or two. The test data have the same payload in other poses,
-    or another payload.
-    """
-    none, half, whole = recording.runs
-    own = none.at_rest(HALF)
-    # The rests of every other pose (HALF) are for training, so test on all rows of the poses
-    # between. A pose extends from the end of the previous rest to the end of its own rest.
-    pose = np.searchsorted(none.rests[:, 1], np.arange(len(none.length)), side='right')
-    others = (pose % 2 == 1) & (pose < len(none.rests))
-    yield Split('0 g → other poses, 0 g', own, none.at(others), [], none.at(~others))
-    for test in (half, whole):
-        yield Split(f'0 g → {test.name}', own, test, [], none)
-    for first, second, test in ((none, whole, half), (none, half, whole), (half, whole, none)):
-        rests = [first.at_rest(HALF), second.at_rest(HALF)]
-        name = f'{first.name}, {second.name} → {test.name}'
-        yield Split(name, joined(rests), test, rests, joined([first, second]))
+    def __init__(self) -> None:
+        """Begin without networks."""
+        self._known = dict[tuple[Any, bool], tuple[Robot, Mae]]()
+
+    def of(self, case: Case, with_effort: bool) -> tuple[Robot, Mae]:
+        """Return the robot of a case, and a network of its geometric model."""
+        key = case.body, with_effort
+        if key not in self._known:
+            with tempfile.TemporaryDirectory() as folder:
+                self._known[key] = described(case.body, Path(folder) / 'robot', with_effort)
+        return self._known[key]
 
 
-def arm_splits(recording: Recording) -> Iterator[Split]:
-    """Yield splits of the recording of the soft arm, a link that three tendons bend.
-
-    The test data are other files with the same payload, or files with other payloads.
-    """
-    files = {load: [run for run in recording.runs if run.load == load] for load in (0.0, 0.5)}
-    others = [run for run in recording.runs if run.load not in files]
-    bare, held_out = files[0.0][0::2], files[0.0][1::2]
-    own = joined([run.at_rest() for run in bare])
-    yield Split('0 g → other files, 0 g', own, joined(held_out), [], joined(bare))
-    both = files[0.0] + files[0.5]
-    rests = joined([run.at_rest() for run in both])
-    yield Split('0 g, 500 g → 200 g, 300 g', rests, joined(others), [], joined(both))
+def models(case: Case, with_effort: bool, first: First) -> Iterator[tuple[str, Model]]:
+    """Yield every model of a case with its name."""
+    robot, mae = first.of(case, with_effort)
+    is_link = isinstance(case.body, SoftLink)
+    yield GEOMETRY, network(mae, tensions(robot, case.training, with_effort, not is_link))
+    for name, fit in BASELINES.items():
+        yield name, regression(fit, case.training, with_effort)
+    if case.rests and not with_effort:
+        yield STATICS, Statics(robot, [*case.rests]).posture
+    yield PACKAGE, package(case, robot, mae, with_effort)
 
 
-def stand_splits(recording: Recording) -> Iterator[Split]:
-    """Yield splits of the recording of the test stand for a continuum robot.
-
-    The training data are 20 or 100 poses. The test data are all other poses.
-    """
-    run = recording.runs[0]
-    order = np.random.default_rng(0).permutation(len(run.length))
-    for count in (20, 100):
-        name = f'{count} poses → all others'
-        yield Split(name, run.at(order[:count]), run.at(order[count:]), [])
-
-
-def platform_splits(recording: Recording) -> Iterator[Split]:
-    """Yield splits of the recordings of the cable platform.
-
-    The training data are 20, 50 or all rests of one run. The test data are all rows of the others.
-    """
-    first, *others = recording.runs
-    rests, test = first.at_rest(), joined(others)
-    order = np.random.default_rng(0).permutation(len(rests.length))
-    for count in (20, 50, len(order)):
-        which = 'all' if count == len(order) else count
-        training = rests.at(order[:count])
-        yield Split(f'{which} rests of one run → other runs', training, test, [])
-
-
-SPLITS: dict[str, Callable[[Recording], Iterator[Split]]] = {
-    'soft_neck': neck_splits,
-    'soft_arm': arm_splits,
-    'continuum_stand': stand_splits,
-    'cable_platform': platform_splits,
-}
-
-
-def models(
-    recording: Recording, split: Split, directory: Path, learned: dict[tuple[str, bool], Model]
-) -> Iterator[tuple[str, Model]]:
-    """Yield every model of a split with its name.
-
-    `learned` caches the models of the package, because several splits have the same training rows.
-    """
-    efforts = (False, True) if split.training.effort.size else (False,)
-    for with_effort in efforts:
-        what = 'lengths and efforts' if with_effort else 'lengths'
-        for degree in (1, 2, 3):
-            fit = polynomial(split.training, degree, with_effort)
-            yield f'polynomial of degree {degree}, {what}', fit
-        if split.full is not None:
-            for degree in (1, 2, 3):
-                fit = polynomial(split.full, degree, with_effort)
-                yield f'polynomial of degree {degree}, {what}{ALL_ROWS}', fit
-        for label, model in baselines(split.training, with_effort):
-            yield f'{label}, {what}', model
-    link, at_zero = recording.link, np.zeros(split.training.length.shape[1])
-    if isinstance(link, SoftLink) and link.name == 'continuum_stand':
-        link, at_zero = fitted(link, split.training)
-
-    def shifted(run: Run) -> Run:
-        return replace(run, length=run.length - at_zero)
-
-    def of_shifted(model: Model) -> Model:
-        return lambda run: model(shifted(run))
-
-    for with_effort in efforts:
-        key = split.name.partition(' → ')[0], with_effort
-        if key not in learned:
-            learned[key] = package(link, directory, shifted(split.training), with_effort)
-        what = 'lengths and efforts' if with_effort else 'lengths'
-        yield f'this package, {what}', of_shifted(learned[key])
-    if not isinstance(link, SoftLink):
-        geometric = package(link, directory, split.training, learns=False)
-        yield 'network of the geometric model, lengths', geometric
-    if split.rests:
-        robot = Robot.load(link.write(directory))
-        yield 'statics with learned springs, payload known', Statics(robot, split.rests).posture
-
-
-def learn(repository: Repository, files: Files) -> tuple[list[Result], dict[str, Any]]:
-    """Learn from one repository; return all models' errors, and `observations` on its runs."""
-    recording = repository.read(files)
-    name, results = recording.link.name, list[Result]()
-    learned = dict[tuple[str, bool], Model]()
-    with tempfile.TemporaryDirectory() as folder:
-        for split in SPLITS[name](recording):
-            for label, model in models(recording, split, Path(folder) / 'robot', learned):
-                off = error(model, split.test)
-                off = round(off, 4)
-                results.append(Result(name, split.name, len(split.training.length), label, off))
-                print(f'{name}: {split.name}: {label}: {off:.4f} rad', flush=True)
-    return results, observations(recording)
+def measured(case: Case, with_effort: bool, first: First) -> list[Result]:
+    """Return the errors of all models in a case."""
+    inputs = EFFORTS if with_effort else LENGTHS
+    results = []
+    for name, model in models(case, with_effort, first):
+        off = round(error(model, case.test), 5)
+        results.append(
+            Result(
+                case.body.name, case.name, len(case.training.length), case.draw, inputs, name, off
+            )
+        )
+    return results
 
 
 def observations(recording: Recording) -> dict[str, Any]:
@@ -239,28 +148,34 @@ def observations(recording: Recording) -> dict[str, Any]:
 def table(results: list[Result]) -> str:
     """Return the errors of one recording as a Markdown table.
 
-    The polynomials that were fitted to all rows share one row of the table, which contains the
-    smallest of their errors for each split. The best model from the rest samples is in bold.
+    An error is the mean over the draws, with their standard deviation if there are several. The
+    best model of each row is in bold. The last column has the error of the package divided by the
+    smallest one of the other models.
     """
-    errors, samples = dict[tuple[str, str], float](), dict[str, int]()
+    errors, samples = dict[tuple[str, str], dict[str, list[float]]](), dict[str, int]()
     for result in results:
-        label = OF_ALL_ROWS if result.model.endswith(ALL_ROWS) else result.model
-        before = errors.get((result.split, label), np.inf)
-        errors[result.split, label] = min(before, result.error_rad)
-        samples[result.split] = result.samples
-    labels = [*dict.fromkeys(label for _, label in errors if label != OF_ALL_ROWS)]
-    best = {s: min(e for (k, m), e in errors.items() if k == s and m in labels) for s in samples}
-    heads = [f'{split} ({count} rests)' for split, count in samples.items()]
-    lines = [f'| mean error [rad] | {" | ".join(heads)} |', '|---' * (len(heads) + 1) + '|']
-    if any(label == OF_ALL_ROWS for _, label in errors):
-        labels.append(OF_ALL_ROWS)
-    for label in labels:
-        cells = []
-        for split in samples:
-            value = errors.get((split, label), np.nan)
-            text = '–' if np.isnan(value) else f'{value:.3f}' if value < 1.0 else '> 1'
-            cells.append(f'**{text}**' if value == best[split] else text)
-        lines.append(f'| {label} | {" | ".join(cells)} |')
+        row = errors.setdefault((result.case, result.inputs), {})
+        row.setdefault(result.model, []).append(result.error_rad)
+        samples[result.case] = result.samples
+    order = [GEOMETRY, *BASELINES, STATICS, PACKAGE]
+    names = [name for name in order if any(name in row for row in errors.values())]
+    heads = ['mean error [rad]', 'inputs', *names, 'ratio']
+    lines = [f'| {" | ".join(heads)} |', '|---' * len(heads) + '|']
+    for (case, inputs), row in errors.items():
+        means = {name: float(np.mean(values)) for name, values in row.items()}
+        least = min(means.values())
+        cells = [f'{case} ({samples[case]})' if case.startswith('rests') else case, inputs]
+        for name in names:
+            if name not in means:
+                cells.append('–')
+                continue
+            text = f'{means[name]:.4f}' if means[name] < 1.0 else '> 1'
+            text = f'**{text}**' if means[name] == least else text
+            spread = np.std(row[name], ddof=1) if len(row[name]) > 1 else None
+            cells.append(text if spread is None or means[name] > 1.0 else f'{text} ± {spread:.4f}')
+        others = [mean for name, mean in means.items() if name != PACKAGE]
+        cells.append(f'{means[PACKAGE] / min(others):.2f}')
+        lines.append(f'| {" | ".join(cells)} |')
     return '\n'.join(lines)
 
 
@@ -275,6 +190,46 @@ def tables(document: dict[str, Any]) -> str:
             head = f'**{link}** ({repository.licence}): {repository.robot}.'
             parts.append(f'{head}\n\n{table(own)}')
     return '\n\n'.join(parts)
+
+
+class Document:
+    """The results in a folder: result.json, to which measurements are added, and tables.md."""
+
+    def __init__(self, folder: Path) -> None:
+        """Begin with the results that the folder has."""
+        self._folder, self.results = folder, list[Result]()
+        self.also = dict[str, Any]()
+        if (file := folder / 'result.json').exists():
+            content = json.loads(file.read_text('utf-8'))
+            self.results = [Result(**row) for row in content['errors']]
+            self.also = content['also']
+
+    def has(self, case: Case, inputs: str) -> bool:
+        """Return whether a case was measured."""
+        place = case.body.name, case.name, case.draw, inputs
+        return any(result.place == place for result in self.results)
+
+    def add(self, results: list[Result]) -> None:
+        """Add the results of a measurement in the place of older ones, and write all."""
+        places = {result.place for result in results}
+        self.results = [result for result in self.results if result.place not in places] + results
+        self.write()
+
+    def write(self) -> None:
+        """Write the results, cases with payloads first, then by number of rows and by draw."""
+        self.results.sort(key=self._order)
+        document = {'errors': [result._asdict() for result in self.results], 'also': self.also}
+        text = json.dumps(document, indent=1, ensure_ascii=False)
+        self._folder.mkdir(parents=True, exist_ok=True)
+        (self._folder / 'result.json').write_text(text + '\n', encoding='utf-8')
+        (self._folder / 'tables.md').write_text(tables(document) + '\n', encoding='utf-8')
+
+    @staticmethod
+    def _order(result: Result) -> tuple[str, bool, int, str, str, int]:
+        is_drawn = not result.case.startswith('rests')
+        number = result.samples if is_drawn else 0
+        name = result.case if is_drawn else ''
+        return result.recording, is_drawn, number, name, result.inputs, result.draw
 
 
 def clone_of(repository: Repository, clones: Path, fetch: bool) -> Path | None:
@@ -298,15 +253,24 @@ def clone_of(repository: Repository, clones: Path, fetch: bool) -> Path | None:
 
 
 def main(argv: list[str]) -> int:
-    """Train and test models on all repositories that have clones; return 1 if there is none."""
+    """Learn and test all cases of repositories that have clones, and write the tables."""
     parser = Parser('recordings', "Learns public recordings of other people's robots.")
     parser.add_argument('--clones', type=Path, required=True, help='directory with the clones')
     parser.add_argument('--fetch', action='store_true', help='clone missing data from GitHub')
     text = 'use only repositories whose name contains this text'
     parser.add_argument('--only', default='', metavar='TEXT', help=text)
+    text = 'numbers of random rows to learn; 0: no random rows'
+    parser.add_argument('--counts', type=whole(0, 10**6), nargs='+', default=[*COUNTS], help=text)
+    text = 'number of random draws of each number of rows'
+    parser.add_argument('--draws', type=whole(1, 100), default=DRAWS, help=text)
+    text = 'which inputs to use; by default all that the recording has'
+    parser.add_argument('--inputs', choices=(LENGTHS, EFFORTS), help=text)
+    text = 'measure cases again that the output has'
+    parser.add_argument('--again', action='store_true', help=text)
     parser.add_out('DIR', default=Path('doc/results/recordings'))
     args = parser.parse_args(argv)
-    rows, shown = list[dict[str, Any]](), dict[str, Any]()
+    torch.set_num_threads(1)
+    document, is_any = Document(args.out), False
     for repository in repositories():
         clone = clone_of(repository, args.clones, args.fetch)
         if args.only not in repository.name or clone is None:
@@ -315,20 +279,26 @@ def main(argv: list[str]) -> int:
             )
             print(f'{repository.name}: left out, because {reason}')
             continue
-        results, also = learn(repository, Files(clone))
-        rows += [result._asdict() for result in results]
-        shown[repository.name] = also
-        for key, value in also.items():
-            print(f'{key}: {value}')
-    if not rows:
+        is_any, recording, first = True, repository.read(Files(clone)), First()
+        document.also[repository.name] = observations(recording)
+        counts = [count for count in args.counts if count]
+        for case in cases(recording, counts, args.draws):
+            for with_effort in (False, True) if case.training.effort.size else (False,):
+                inputs = EFFORTS if with_effort else LENGTHS
+                if args.inputs not in (None, inputs):
+                    continue
+                if document.has(case, inputs) and not args.again:
+                    continue
+                results = measured(case, with_effort, first)
+                document.add(results)
+                errors = ', '.join(f'{each.model} {each.error_rad:.4f}' for each in results)
+                where = f'{case.body.name}: {case.name}, draw {case.draw}, {inputs}'
+                print(f'{where}: {errors}', flush=True)
+    if not is_any:
         raise MusculoskeletalError(
             f'no repository of the bench is cloned in {args.clones} and matches '
             '--only; add --fetch to clone them, or change --only'
         )
-    args.out.mkdir(parents=True, exist_ok=True)
-    document = {'errors': rows, 'also': shown}
-    text = json.dumps(document, indent=1, ensure_ascii=False)
-    (args.out / 'result.json').write_text(text + '\n', encoding='utf-8')
-    (args.out / 'tables.md').write_text(tables(document) + '\n', encoding='utf-8')
-    print(tables(document))
+    document.write()
+    print(tables({'errors': [result._asdict() for result in document.results]}))
     return 0

@@ -1,30 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models that estimate θ in recordings: a network of this package, and others for comparison.
+"""Models that estimate θ in recordings: this package, and the statics of a soft link.
 
-Every model maps lengths (and efforts) to θ. All are trained on rest samples; `polynomial` may also
-receive all rows of a run.
+Every model maps lengths (and efforts) to θ. `regression` has the models that know nothing of a
+robot.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import combinations_with_replacement
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
 
+from bench.recordings_cases import Case
 from bench.recordings_read import Body, Run, SoftLink
+from bench.regression import Predict
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.calibration import Healthy
-from musculoskeletal_ae.learning.convergence import STEPS, Convergence
-from musculoskeletal_ae.learning.job import Job
-from musculoskeletal_ae.learning.samples import Observations
-from musculoskeletal_ae.learning.update import BodyUpdater
+from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.recordings import learn_table
 from musculoskeletal_ae.mae.initial_training import initial_mae
+from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.load import Load
+from musculoskeletal_ae.tables.table import Table
 
 INITIAL_STEPS = 1000
 #: Assign this tension above T_bias [N] to a strong effort, which is the 95 % quantile of the
@@ -40,46 +40,14 @@ def error(model: Model, run: Run) -> float:
     return float(np.linalg.norm(np.nan_to_num(model(run) - run.theta), axis=1).mean())
 
 
-def joined(runs: list[Run]) -> Run:
-    """Return the rows of several runs as one."""
-    length, effort, theta = (
-        np.concatenate([getattr(run, part) for run in runs])
-        for part in ('length', 'effort', 'theta')
-    )
-    return Run('', float('nan'), length, effort, theta, runs[0].rests[:0])
-
-
-def polynomial(training: Run, degree: int, with_effort: bool, ridge: float = 0.0) -> Model:
-    """Return the least-squares polynomial for θ, of lengths or of lengths and efforts.
-
-    `ridge` is the penalty of each squared coefficient, except the constant, as a share of the rows.
-    """
+def regression(fit: Callable[[Array, Array], Predict], training: Run, with_effort: bool) -> Model:
+    """Return a regression for θ from lengths, or from lengths and efforts; unmeasured θ stays 0."""
 
     def inputs(run: Run) -> Array:
         return np.hstack([run.length, run.effort]) if with_effort else run.length
 
-    values = inputs(training)
-    mean, scale = values.mean(axis=0), values.std(axis=0) + 1e-12
-
-    def terms(run: Run) -> Array:
-        x = (inputs(run) - mean) / scale
-        columns = [
-            x[:, list(which)].prod(axis=1)
-            for power in range(degree + 1)
-            for which in combinations_with_replacement(range(x.shape[1]), power)
-        ]
-        return np.stack(columns, axis=1)
-
-    rows, theta = terms(training), np.nan_to_num(training.theta)
-    if ridge:
-        penalty = np.full(rows.shape[1], np.sqrt(ridge * len(rows)))
-        penalty[0] = 0.0
-        rows, theta = (
-            np.vstack([rows, np.diag(penalty)]),
-            np.pad(theta, ((0, len(penalty)), (0, 0))),
-        )
-    weight = np.linalg.lstsq(rows, theta, rcond=1e-10)[0]
-    return lambda run: np.asarray(terms(run) @ weight)
+    predict = fit(inputs(training), np.nan_to_num(training.theta))
+    return lambda run: predict(inputs(run))
 
 
 def tensions(
@@ -104,35 +72,40 @@ def tensions(
     return scaled
 
 
-def package(
-    link: Body,
-    directory: Path,
-    training: Run,
-    with_effort: bool = False,
-    seed: int = 0,
-    learns: bool = True,
-) -> Model:
-    """Return a model that estimates θ by a network of this package.
+def described(body: Body, directory: Path, with_effort: bool) -> tuple[Robot, Mae]:
+    """Write and load the robot of a body; return it with a network of its geometric model.
 
-    The body model is calibrated with the rest samples in `training`, and the network learns this
-    body model. With efforts, the model uses the efforts as tensions. Without, tensions are unknown.
-    Updates are made until they have converged. If `learns` is false, the network is that of the
-    geometric model.
+    With efforts, the robot measures tensions; without, tensions are unknown.
     """
-    robot = Robot.load(link.write(directory, 'sensor' if with_effort else 'none'))
-    tension = tensions(robot, training, with_effort, not isinstance(link, SoftLink))
-    pulls = tension(training)
-    known, still = np.ones(pulls.shape, dtype=bool), np.zeros_like(pulls)
-    observed = Observations(training.theta, pulls, training.length, still, known)
-    mae = initial_mae(robot, steps=INITIAL_STEPS, seed=seed).mae
-    updater = BodyUpdater(robot, mae, seed)
-    nothing = Healthy(np.empty((0, 3 * robot.muscle_count), dtype=np.float32), 0.0, 0)
-    convergence = Convergence()
-    while learns and not convergence.is_reached:
-        update = updater.update(Job(observed, nothing, True, STEPS))
-        convergence.note(update, updater.body)
-        mae = update.mae
+    robot = Robot.load(body.write(directory, 'sensor' if with_effort else 'none'))
+    return robot, initial_mae(robot, steps=INITIAL_STEPS, seed=0).mae
 
+
+def package(case: Case, robot: Robot, mae: Mae, with_effort: bool, seed: int = 0) -> Model:
+    """Return a model that estimates θ by the network that the package learns from a case.
+
+    It learns as `train --from-csv` does, with one row for each resting posture. With efforts, it
+    uses the efforts as tensions.
+
+    Args:
+        case: The case.
+        robot: The robot of the case.
+        mae: The first network.
+        with_effort: Whether efforts are used.
+        seed: Random seed of the training.
+    """
+    tension = tensions(robot, case.training, with_effort, not isinstance(case.body, SoftLink))
+    learner = Learner(robot, mae, seed=seed)
+    rows = case.training
+    known = tension(rows) if with_effort else None
+    warning = learn_table(learner, Table.of(robot, rows.theta, rows.length, known))
+    if warning:
+        print(f'{case.name}: {warning}', flush=True)
+    return network(learner.mae, tension)
+
+
+def network(mae: Mae, tension: Callable[[Run], Array]) -> Model:
+    """Return a model that estimates θ by a network, with tensions from the function `tension`."""
     return lambda run: mae.estimate(tension(run), run.length).theta
 
 

@@ -324,6 +324,7 @@ TABLES = {
     'methods': comparison.methods,
     'capabilities': capabilities_table,
     'recordings': recordings_tables,
+    'random_rows': comparison.random_rows,
     'conditions': pages.conditions,
 }
 

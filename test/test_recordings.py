@@ -9,8 +9,8 @@ import pytest
 from scipy.io import savemat
 
 from bench.recordings import Result, main, table
-from bench.recordings_baselines import baselines
-from bench.recordings_learn import Statics, effort_slope, error, joined, polynomial
+from bench.recordings_cases import DRAWS, cases, drawn, joined
+from bench.recordings_learn import Statics, effort_slope, error, regression
 from bench.recordings_platform import (
     ATTACHED,
     ENTRY,
@@ -20,7 +20,8 @@ from bench.recordings_platform import (
     cable_length,
     cable_platform,
 )
-from bench.recordings_read import Files, Run, SoftLink, fitted, soft_arm
+from bench.recordings_read import Files, Recording, Run, SoftLink, fitted, soft_arm
+from bench.regression import BASELINES
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -52,7 +53,8 @@ def test_statics_predict_a_payload_that_was_not_trained(link):
     assert np.linalg.norm(none.theta - whole.theta, axis=1).mean() > 0.02
     model = Statics(link, [none, half])
     assert error(model.posture, whole) < 0.006
-    assert error(polynomial(joined([none, half]), 1, False), whole) > 0.02
+    fit = BASELINES['polynomial']
+    assert error(regression(fit, joined([none, half]), False), whole) > 0.02
 
 
 def test_a_clone_may_be_a_working_tree_or_a_git_directory(tmp_path):
@@ -103,11 +105,35 @@ def test_the_slope_of_the_effort_is_the_stiffness_against_the_bend():
     assert effort_slope(run, np.array(AZIMUTHS)) == pytest.approx(2.5)
 
 
-def test_the_table_marks_the_best_model_of_each_split():
-    errors = ('a', 'x', 0.1), ('a', 'y', 0.2), ('b', 'y', 0.3), ('b', 'z, of all rows', 0.2)
-    lines = table([Result('r', split, 9, model, off) for split, model, off in errors]).split('\n')
-    assert lines[2:4] == ['| x | **0.100** | – |', '| y | 0.200 | **0.300** |']
-    assert lines[4].endswith('| – | 0.200 |')
+def test_the_table_has_mean_and_spread_of_the_draws_and_the_ratio_to_the_best_rival():
+    errors = ('GP', 0.1, 0.3), ('this package', 0.14, 0.16)
+    results = [
+        Result('r', '20 random rows', 20, draw, 'lengths', model, off)
+        for model, *offs in errors
+        for draw, off in enumerate(offs)
+    ]
+    results.append(Result('r', 'rests', 9, 0, 'lengths', 'this package', 0.4))
+    results.append(Result('r', 'rests', 9, 0, 'lengths', 'geometry', 2.0))
+    lines = table(results).split('\n')
+    assert lines[0] == '| mean error [rad] | inputs | geometry | GP | this package | ratio |'
+    assert lines[2:] == [
+        '| 20 random rows | lengths | – | 0.2000 ± 0.1414 | **0.1500** ± 0.0141 | 0.75 |',
+        '| rests (9) | lengths | > 1 | – | **0.4000** | 0.20 |',
+    ]
+
+
+def test_random_rows_are_learned_from_every_other_pose_and_tested_on_the_poses_between():
+    rows = np.arange(120.0)
+    spans = np.stack([np.arange(8, 128, 10), np.arange(10, 130, 10)], axis=1)
+    run = Run('0 g', 0.0, rows[:, None], np.zeros((120, 0)), np.zeros((120, 2)), spans)
+    recording = Recording(SoftLink('soft_neck', (0.0,), (0.1,), 0.1, 0.1, 1.0), [run] * 3)
+    one, other = (drawn(recording, 20, draw) for draw in (0, 1))
+    assert (one.training.length // 10 % 2 == 0).all() and (one.test.length // 10 % 2 == 1).all()
+    assert len(one.training.length) == 20
+    assert set(one.training.length.ravel()) != set(other.training.length.ravel())
+    every = [case for case in cases(recording, [20, 100, 400], DRAWS) if 'random' in case.name]
+    # There are fewer than 100 rows; all of them are learned once.
+    assert [len(case.training.length) for case in every] == [20, 20, 20, 60]
 
 
 def test_the_cable_of_a_swivelling_pulley_is_a_tangent_arc_and_a_straight_line():
@@ -143,14 +169,3 @@ def test_runs_of_the_platform_have_lengths_relative_to_its_middle(tmp_path):
     assert len(run.rests) == 3
     robot = Robot.load(Platform().write(tmp_path / 'robot'))
     assert (robot.joint_count, robot.muscle_count) == (6, 4)
-
-
-def test_baselines_estimate_a_smooth_function():
-    rng = np.random.default_rng(0)
-    length = rng.uniform(-1.0, 1.0, (120, 2))
-    theta = np.stack([np.sin(2.0 * length[:, 0]), length[:, 0] * length[:, 1]], axis=1)
-    run = Run('', 0.0, length, np.zeros((120, 0)), theta, np.zeros((0, 2), int))
-    training, test = run.at(slice(0, 60)), run.at(slice(60, None))
-    linear = error(polynomial(training, 1, False), test)
-    for _, model in baselines(training, False):
-        assert error(model, test) < 0.2 * linear

@@ -255,12 +255,14 @@ def group_remainder(
         scale[len(joints) :] = np.inf  # ignore the tensions
     crossed = robot.routes.crossed[np.ix_(muscles, joints)]
     inputs = np.hstack([lengths.theta, lengths.tension]) / scale
-    if start is None or len(inputs) < FEW_SAMPLES:
-        start = _likeliest(lengths, scale, crossed, start)
-    logarithms = start
-    left_out = _solved(lengths, inputs, crossed, logarithms)
-    lengths = lengths._replace(weight=_robust_weights(lengths.weight, left_out, logarithms))
-    logarithms = _likeliest(lengths, scale, crossed, logarithms)
+    is_few = len(inputs) < FEW_SAMPLES
+    if start is None or is_few:
+        known = [] if start is None else [start]
+        start = _likeliest(lengths, scale, crossed, [*known, *STARTS], ROUNDS)
+    starts, rounds = ([start, *STARTS], ROUNDS) if is_few else ([start], FEW_ROUNDS)
+    left_out = _solved(lengths, inputs, crossed, start)
+    lengths = lengths._replace(weight=_robust_weights(lengths.weight, left_out, start))
+    logarithms = _likeliest(lengths, scale, crossed, starts, rounds)
     weights, error, variance = _solved(lengths, inputs, crossed, logarithms)
     correlation = _correlation(np.where(lengths.weight > 0.0, error / np.sqrt(variance), 0.0))
     mean_noise = np.diag(_variances(lengths.weight.mean(axis=1), logarithms))
@@ -273,16 +275,18 @@ def group_remainder(
     )
 
 
-def _likeliest(lengths: Lengths, scale: Array, crossed: Bools, start: Array | None) -> Array:
-    """Return the logarithms of the hyperparameters with the largest evidence, (6,)."""
+def _likeliest(
+    lengths: Lengths, scale: Array, crossed: Bools, starts: Sequence[Array], rounds: int
+) -> Array:
+    """Return the logarithms of the hyperparameters with the largest evidence, (6,).
+
+    A search of at most `rounds` iterations begins at each of `starts`.
+    """
     count = len(lengths.theta)
     rows = np.arange(count)
     if count > JUDGING:
         rows = np.linspace(0, count - 1, JUDGING).astype(int)
     evidence = _Evidence(lengths.part(rows), scale, crossed)
-    is_fresh = start is None or count < FEW_SAMPLES
-    starts = [*([] if start is None else [start]), *(STARTS if is_fresh else [])]
-    rounds = ROUNDS if is_fresh else FEW_ROUNDS
     found = [
         minimize(
             evidence, each, jac=True, method='L-BFGS-B', bounds=BOUNDS, options={'maxiter': rounds}

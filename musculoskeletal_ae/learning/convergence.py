@@ -14,6 +14,8 @@ On a running arm, each rest causes an update instead (`scheduler`).
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
 import numpy as np
 
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
@@ -46,7 +48,7 @@ def model_error(update: Update, body: CalibratedBody) -> float:
 
 
 class Convergence:
-    """Whether the updates of a network have converged.
+    """Makes updates of a network until they have converged.
 
     Attributes:
         errors: `model_error` after each update [rad]; NaN if the preset fits no body.
@@ -55,9 +57,24 @@ class Convergence:
     def __init__(self) -> None:
         self.errors = list[float]()
 
-    def note(self, update: Update, body: CalibratedBody | None) -> None:
-        """Note the network of an update, and the body to which it was trained."""
-        self.errors.append(np.nan if body is None else model_error(update, body))
+    def updates(
+        self, make_update: Callable[[], Update | None], body: Callable[[], CalibratedBody | None]
+    ) -> Iterator[Update]:
+        """Make and yield updates until the network represents the body.
+
+        Args:
+            make_update: Makes one update from all samples; None if there are too few.
+            body: Returns the body of the last update; None if the preset fits no body.
+        """
+        while not self.is_reached:
+            update = make_update()
+            if update is None:
+                return
+            fitted = body()
+            self.errors.append(np.nan if fitted is None else model_error(update, fitted))
+            yield update
+            if update.unchanged:
+                return
 
     @property
     def is_reached(self) -> bool:

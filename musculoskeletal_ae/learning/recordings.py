@@ -22,6 +22,7 @@ from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.collector import SampleCollector
 from musculoskeletal_ae.learning.convergence import STEPS, Convergence
+from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.scheduler import LEAST_INTERVAL
@@ -88,22 +89,22 @@ def complete(learner: Learner, progress: Callable[[float], None] | None = None) 
     Returns:
         Whether the updates have converged, and the errors on synthetic samples.
     """
-    convergence, online_steps = Convergence(), learner.scheduler.steps
-    learner.scheduler.steps = STEPS
+    convergence = Convergence()
+    online_steps, learner.scheduler.steps = learner.scheduler.steps, STEPS
     learner.use_body(learner.body.with_anomaly(Anomaly.NONE))
     now = 0.0  # the caller's clock was that of the recording; a new one begins here
-    while not convergence.is_reached:
+
+    def make_update() -> Update | None:
+        nonlocal now
         before = learner.updates
         now += LEAST_INTERVAL
         learner.scheduler.note_news()
         learner.poll(now)
-        if learner.updates == before or learner.last_update is None:
-            break
-        convergence.note(learner.last_update, learner.trainer.body)
+        return None if learner.updates == before else learner.last_update
+
+    for _ in convergence.updates(make_update, lambda: learner.trainer.body):
         if progress is not None:
             progress(1.0)
-        if learner.last_update.unchanged:
-            break
     learner.scheduler.steps = online_steps
     return convergence
 
