@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.conditions import ConditionKind, FindingReaction, Revokes
+from musculoskeletal_ae.conditions import ConditionKind, Revokes
 from musculoskeletal_ae.estimation.estimate import Estimate, estimate
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
@@ -40,8 +40,8 @@ class Finding:
     others: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse kinds that only warn, because a finding latches an anomaly."""
-        if self.kind.reaction in (None, FindingReaction.WARN):
+        """Refuse kinds that are no findings, because a finding latches an anomaly."""
+        if self.kind.reaction is None:
             raise ValueError(
                 f'{self.kind.identifier} has no reaction that stops the arm or isolates a muscle; '
                 'report it as a condition instead'
