@@ -46,14 +46,13 @@ from bench.processes import end_processes, memory
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.faults import KINDS, read_fault
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.message_reading import muscle_rows
 from musculoskeletal_ae.nodes.parameters import PARAMETERS
 from musculoskeletal_ae.nodes.situation import Situation
 from musculoskeletal_ae.process_signals import STOP
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros.messages import LATCHED, bytes_message
 from musculoskeletal_ae.ros_tools.ros_tool import Spinner, message_class
-from musculoskeletal_ae.signals.muscle_readings import Row
+from musculoskeletal_ae.signals.muscle_readings import raw_muscle_states
 
 NODES = ('hardware_emulator', 'estimator', 'controller', 'learner', 'sim', 'bringup_status')
 RUN = 'import sys; from musculoskeletal_ae.ros import running; running.run(sys.argv.pop(1))'
@@ -256,9 +255,7 @@ class Attack:
                 number, value = info['publication_sequence_number'], np.array(message.data)
                 self.commands.append(Command(stamp, number, self.life, topic, value))
             elif topic == 'muscle_states':
-                self.loads.append(
-                    (stamp, muscle_rows(message, self.robot.muscle_count)[Row.TENSION])
-                )
+                self.loads.append((stamp, raw_muscle_states(message, self.robot).tension))
 
         self.node.create_subscription(kind, topic, take, qos)  # type: ignore[arg-type]
 
@@ -402,10 +399,7 @@ class Attack:
     def is_warm(self) -> bool:
         """Return whether a winding was warmer than WARM in the last genuine message."""
         states = self.genuine.get('muscle_states')
-        return (
-            states is None
-            or not muscle_rows(states, self.robot.muscle_count)[Row.TEMPERATURE].max() <= WARM
-        )
+        return states is None or not raw_muscle_states(states, self.robot).temperature.max() <= WARM
 
     # -- attacking ------------------------------------------------------------------------------
 

@@ -41,6 +41,7 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.state import StateStore
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.signals.body_state import BodyState
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
 CORES = 2  # number of cores of the simulated computer
 #: let a process wait for the processor for this mean time, for each process per core [s]
@@ -128,7 +129,7 @@ class Process:
 class Packet(NamedTuple):
     """What the driver publishes in one period."""
 
-    states: Array  # lengths [m], tensions [N] and temperatures [°C], (3, M)
+    muscles: MuscleReadings
     theta: Array | None  # joint angles [rad], (D,), with NaN for missing ones; None: no message
 
 
@@ -255,9 +256,8 @@ class Lab:
                 self.arm.command_length(value)
             self._command = None
         read = self.arm.sense()
-        states = np.array([read.length, read.tension, read.temperature])
-        for packet in self.wire.readings(now, Packet(states, read.theta)):
-            content = packet.states, packet.theta
+        for packet in self.wire.readings(now, Packet(read.muscles, read.theta)):
+            content = packet.muscles, packet.theta
             for process in (self._estimating, self.controlling, self._learning):
                 process.send(Message(now, content))
 

@@ -23,6 +23,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings, Quantity
 
 Rng = np.random.Generator
 
@@ -135,13 +136,13 @@ class Mishap:
 # -- changes of readings and commands --------------------------------------------------------------
 
 
-def on_states(change: Callable[[float, Array], None]) -> ReadingFault:
-    """Return a fault that changes a copy of the muscle states, (3, M), in place."""
+def on_muscles(change: Callable[[float, MuscleReadings], None]) -> ReadingFault:
+    """Return a fault that changes a copy of the readings of the muscle modules in place."""
 
     def fault(now: float, packet: Packet) -> list[Packet]:
-        states = packet.states.copy()
-        change(now, states)
-        return [packet._replace(states=states)]
+        muscles = packet.muscles.copy()
+        change(now, muscles)
+        return [packet._replace(muscles=muscles)]
 
     return fault
 
@@ -322,13 +323,13 @@ def hot_motor(lab: Lab, rng: Rng) -> Case:
 
 # -- sensors of the modules ------------------------------------------------------------------------
 
-LENGTH, TENSION, TEMPERATURE = 0, 1, 2
+LENGTH, TENSION = MuscleReadings.length, MuscleReadings.tension
 
 
-def frozen(row: int) -> Callable[[Lab, Rng], Case]:
+def frozen(quantity: Quantity) -> Callable[[Lab, Rng], Case]:
     """Return a mishap by which one reading of a muscle freezes, with an effect once it changes.
 
-    `row` is the row of the reading in muscle_states.
+    `quantity` is the quantity that is read.
     """
 
     def begin(lab: Lab, rng: Rng) -> Case:
@@ -336,15 +337,15 @@ def frozen(row: int) -> Callable[[Lab, Rng], Case]:
         kept: list[float] = []
         gap = [0.0]
 
-        def freeze(_: float, states: Array) -> None:
-            value = float(states[row, muscle])
+        def freeze(_: float, muscles: MuscleReadings) -> None:
+            value = float(quantity.of(muscles)[muscle])
             if not kept:
                 kept.append(value)
             gap[0] = max(gap[0], abs(value - kept[0]))
-            states[row, muscle] = kept[0]
+            quantity.of(muscles)[muscle] = kept[0]
 
-        lab.wire.reading_faults.append(on_states(freeze))
-        shown = SHOWN_TENSION if row == TENSION else SHOWN_LENGTH
+        lab.wire.reading_faults.append(on_muscles(freeze))
+        shown = SHOWN_TENSION if quantity is TENSION else SHOWN_LENGTH
         return Case(name, _clear, (name,), is_visible=lambda _: gap[0] > shown)
 
     return begin
@@ -354,10 +355,10 @@ def tension_saturates(lab: Lab, _: Rng) -> Case:
     """The supply of the tension amplifiers drops, so that no reading exceeds 150 N."""
     highest = 150.0
 
-    def clip(_: float, states: Array) -> None:
-        np.minimum(states[TENSION], highest, out=states[TENSION])
+    def clip(_: float, muscles: MuscleReadings) -> None:
+        muscles.tension = np.minimum(muscles.tension, highest)
 
-    lab.wire.reading_faults.append(on_states(clip))
+    lab.wire.reading_faults.append(on_muscles(clip))
     return Case(
         f'{highest:.0f} N', _clear, (),
         is_visible=lambda lab: bool((lab.arm.tension > highest + SHOWN_TENSION).any()),
@@ -365,12 +366,12 @@ def tension_saturates(lab: Lab, _: Rng) -> Case:
 
 
 def changed(
-    row: int, change: Callable[[float, float], float], low: float, high: float, unit: str,
+    quantity: Quantity, change: Callable[[float, float], float], low: float, high: float, unit: str,
     is_signed: bool = True,
 ) -> Callable[[Lab, Rng], Case]:  # fmt: skip
     """Return a mishap by which one reading of a muscle is changed by a random size.
 
-    `row` is the row of the reading in muscle_states. `change` gets the true value and the size,
+    `quantity` is the quantity that is read. `change` gets the true value and the size,
     which is drawn between `low` and `high`, and is negative at random if `is_signed`.
     """
 
@@ -378,14 +379,14 @@ def changed(
         muscle, name = _any(rng, lab.arm.robot.muscles)
         size = rng.uniform(low, high) * (_sign(rng) if is_signed else 1.0)
 
-        shown, error = SHOWN_TENSION if row == TENSION else SHOWN_LENGTH, [0.0]
+        shown, error = SHOWN_TENSION if quantity is TENSION else SHOWN_LENGTH, [0.0]
 
-        def falsify(_: float, states: Array) -> None:
-            value = float(states[row, muscle])
-            states[row, muscle] = change(value, size)
-            error[0] = abs(float(states[row, muscle]) - value)
+        def falsify(_: float, muscles: MuscleReadings) -> None:
+            value = float(quantity.of(muscles)[muscle])
+            quantity.of(muscles)[muscle] = change(value, size)
+            error[0] = abs(float(quantity.of(muscles)[muscle]) - value)
 
-        lab.wire.reading_faults.append(on_states(falsify))
+        lab.wire.reading_faults.append(on_muscles(falsify))
         return Case(
             f'{name}, {size:.3g} {unit}', _clear, (name,),
             is_visible=lambda _: not error[0] <= shown,
@@ -412,10 +413,10 @@ def nothing(_: float, __: float) -> float:
 def no_temperatures(lab: Lab, _: Rng) -> Case:
     """The driver stops reading temperatures."""
 
-    def lose(_: float, states: Array) -> None:
-        states[TEMPERATURE] = np.nan
+    def lose(_: float, muscles: MuscleReadings) -> None:
+        muscles.temperature = np.nan
 
-    lab.wire.reading_faults.append(on_states(lose))
+    lab.wire.reading_faults.append(on_muscles(lose))
     return Case('all', _clear)
 
 
@@ -424,10 +425,10 @@ def exchanged_tensions(lab: Lab, rng: Rng) -> Case:
     robot = lab.arm.robot
     a, b = _two(rng, robot.muscles)
 
-    def swap(_: float, states: Array) -> None:
-        states[TENSION, [a, b]] = states[TENSION, [b, a]]
+    def swap(_: float, muscles: MuscleReadings) -> None:
+        muscles.tension[[a, b]] = muscles.tension[[b, a]]
 
-    lab.wire.reading_faults.append(on_states(swap))
+    lab.wire.reading_faults.append(on_muscles(swap))
     names = robot.muscles[a], robot.muscles[b]
     return Case(
         ' and '.join(names), _clear, names,
@@ -441,11 +442,11 @@ def copied_length(lab: Lab, rng: Rng) -> Case:
     a, b = _two(rng, robot.muscles)
     gap = [0.0]
 
-    def copy(_: float, states: Array) -> None:
-        gap[0] = abs(states[LENGTH, a] - states[LENGTH, b])
-        states[LENGTH, a] = states[LENGTH, b]
+    def copy(_: float, muscles: MuscleReadings) -> None:
+        gap[0] = abs(muscles.length[a] - muscles.length[b])
+        muscles.length[a] = muscles.length[b]
 
-    lab.wire.reading_faults.append(on_states(copy))
+    lab.wire.reading_faults.append(on_muscles(copy))
     return Case(
         f'{robot.muscles[a]} as {robot.muscles[b]}', _clear, (robot.muscles[a],),
         is_visible=lambda _: gap[0] > SHOWN_LENGTH,
@@ -457,15 +458,15 @@ def lost_counts(lab: Lab, rng: Rng) -> Case:
     muscle, name = _any(rng, lab.arm.robot.muscles)
     share, state = rng.uniform(0.05, 0.2), {'last': math.nan, 'lost': 0.0}
 
-    def lose(_: float, states: Array) -> None:
-        value = float(states[LENGTH, muscle])
+    def lose(_: float, muscles: MuscleReadings) -> None:
+        value = float(muscles.length[muscle])
         moved = 0.0 if math.isnan(state['last']) else value - state['last']
         state['last'] = value
         if moved > 0.0 and state['lost'] < 0.1:
             state['lost'] += share * moved
-        states[LENGTH, muscle] = value - state['lost']
+        muscles.length[muscle] = value - state['lost']
 
-    lab.wire.reading_faults.append(on_states(lose))
+    lab.wire.reading_faults.append(on_muscles(lose))
     return Case(
         f'{name}, {100 * share:.0f} %', _clear, (name,),
         is_visible=lambda _: state['lost'] > SHOWN_LENGTH,
@@ -477,10 +478,12 @@ def noisy_tensions(lab: Lab, rng: Rng) -> Case:
     """A welder nearby adds noise to all tension readings."""
     size, noise = rng.uniform(5.0, 15.0), rng.spawn(1)[0]
 
-    def disturb(_: float, states: Array) -> None:
-        states[TENSION] = np.maximum(states[TENSION] + noise.normal(0.0, size, states.shape[1]), 0)
+    def disturb(_: float, muscles: MuscleReadings) -> None:
+        muscles.tension = np.maximum(
+            muscles.tension + noise.normal(0.0, size, len(muscles.length)), 0
+        )
 
-    lab.wire.reading_faults.append(on_states(disturb))
+    lab.wire.reading_faults.append(on_muscles(disturb))
     return Case(f'{size:.0f} N for 10 s', _clear, lasts=10.0)
 
 
@@ -627,15 +630,15 @@ def driver_exchanges(lab: Lab, rng: Rng) -> Case:
     a, b = _two(rng, robot.muscles)
     back = lab.now + _driver_restarts(lab)
 
-    def swap(_: float, states: Array) -> None:
-        states[:, [a, b]] = states[:, [b, a]]
+    def swap(_: float, muscles: MuscleReadings) -> None:
+        muscles.rows[:, [a, b]] = muscles.rows[:, [b, a]]
 
     def swap_command(_: float, value: Array) -> Array:
         value = value.copy()
         value[[a, b]] = value[[b, a]]
         return value
 
-    lab.wire.reading_faults.append(on_states(swap))
+    lab.wire.reading_faults.append(on_muscles(swap))
     lab.wire.command_faults.append(swap_command)
     names = robot.muscles[a], robot.muscles[b]
     return Case(' and '.join(names), _clear, names, is_visible=_since(back))
@@ -646,15 +649,15 @@ def driver_reverses(lab: Lab, rng: Rng) -> Case:
     muscle, name = _any(rng, lab.arm.robot.muscles)
     back = lab.now + _driver_restarts(lab)
 
-    def reverse(_: float, states: Array) -> None:
-        states[LENGTH, muscle] *= -1.0
+    def reverse(_: float, muscles: MuscleReadings) -> None:
+        muscles.length[muscle] *= -1.0
 
     def reverse_command(_: float, value: Array) -> Array:
         value = value.copy()
         value[muscle] *= -1.0
         return value
 
-    lab.wire.reading_faults.append(on_states(reverse))
+    lab.wire.reading_faults.append(on_muscles(reverse))
     lab.wire.command_faults.append(reverse_command)
     return Case(name, _clear, (name,), is_visible=_since(back))
 
@@ -664,15 +667,15 @@ def driver_zeroes(lab: Lab, _: Rng) -> Case:
     back = lab.now + _driver_restarts(lab)
     zero: list[Array] = []
 
-    def shift(_: float, states: Array) -> None:
+    def shift(_: float, muscles: MuscleReadings) -> None:
         if not zero:
-            zero.append(states[LENGTH].copy())
-        states[LENGTH] -= zero[0]
+            zero.append(muscles.length.copy())
+        muscles.length -= zero[0]
 
     def shift_command(_: float, value: Array) -> Array:
         return value + zero[0] if zero else value
 
-    lab.wire.reading_faults.append(on_states(shift))
+    lab.wire.reading_faults.append(on_muscles(shift))
     lab.wire.command_faults.append(shift_command)
     return Case('all', _clear, is_visible=_since(back), settled_by=(Step.CALIBRATE_LENGTHS,))
 
@@ -681,10 +684,10 @@ def driver_in_mm(lab: Lab, _: Rng) -> Case:
     """The driver restarts with lengths in millimetres, in states and in commands."""
     back = lab.now + _driver_restarts(lab)
 
-    def scale(_: float, states: Array) -> None:
-        states[LENGTH] *= 1e3
+    def scale(_: float, muscles: MuscleReadings) -> None:
+        muscles.length *= 1e3
 
-    lab.wire.reading_faults.append(on_states(scale))
+    lab.wire.reading_faults.append(on_muscles(scale))
     lab.wire.command_faults.append(lambda _, value: 1e-3 * value)
     return Case('all', _clear, is_visible=_since(back))
 

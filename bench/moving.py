@@ -40,7 +40,7 @@ def record(
         order: Seed of the postures.
     """
     arm, rng = make_arm(robot, seed, reality), np.random.default_rng([order, 7])
-    rows, start = list[tuple[Array, Array, Array]](), arm.sense().length
+    rows, start = list[tuple[Array, Array, Array]](), arm.sense().muscles.length
     while len(rows) * PERIOD < seconds:
         posture = robot.random_postures(1, rng)
         pull = rng.uniform(*TENSIONS, (1, robot.muscle_count))
@@ -52,7 +52,7 @@ def record(
             arm.command_length(start + (goal - start) * share)
             arm.step(PERIOD)
             now = arm.sense()
-            rows.append((now.theta.copy(), now.length.copy(), now.tension.copy()))
+            rows.append((now.theta.copy(), now.muscles.length, now.muscles.tension))
         start = goal
     theta, length, tension = (np.array(part, float) for part in zip(*rows, strict=True))
     unknown = np.full(length.shape, -1)

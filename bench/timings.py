@@ -44,7 +44,6 @@ from musculoskeletal_ae.paper import control as paper
 from musculoskeletal_ae.paper.constants import CONTROL_WEIGHTS, TORQUE_UNITS
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
-from musculoskeletal_ae.signals.muscle_readings import muscle_reading
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 #: time a batch of this many arms; end a round of calls after about this time [s]
@@ -387,7 +386,7 @@ def message_times(robot: Robot, mae: Mae, preset: str) -> list[Timed]:
         now = 100.0 + n / RATE
         arm.step(1.0 / RATE)
         reading = timed('emulated arm: readings', arm.sense)
-        theta, message = reading.theta, muscle_reading(robot, **reading.muscles)
+        theta, message = reading
         timed('estimator: joint angles', partial(estimator.joints, theta, now))
         output = timed('estimator: muscle states', partial(estimator.take, message, now, now))
         timed('controller: muscle states', partial(controller.take, message, now))

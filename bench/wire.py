@@ -109,7 +109,7 @@ def kind(topic):
 def message(topic):
     if kind(topic) is JointState:
         return JointState(name=robot.joints, position=[0.0] * robot.joint_count)
-    rows = 3 if topic.endswith('muscle_states') else 1
+    rows = len(QUANTITIES) if topic.endswith('muscle_states') else 1
     return Float64MultiArray(data=array('d', [0.0] * rows * robot.muscle_count))
 rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
 node = rclpy.create_node(name)

@@ -29,7 +29,7 @@ from bench.learned_arm import initial, learned_arm
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.emulator.faults import Readings
+from musculoskeletal_ae.emulator.faults import ArmReadings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
 from musculoskeletal_ae.estimation.estimator import Estimator, Output
@@ -40,6 +40,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.signals.wiring import Wiring
 
@@ -60,13 +61,12 @@ class Driver:
         self.arm, self.wiring = arm, Wiring.straight(arm.robot.muscle_count)
         self.offset = np.zeros(arm.robot.muscle_count)
 
-    def sense(self) -> Readings:
+    def sense(self) -> ArmReadings:
         """Return the readings as the driver publishes them."""
         read, into = self.arm.sense(), list(self.wiring.order)
-        length = np.array(self.wiring.sign) * read.length[into] + self.offset
-        return read._replace(
-            length=length, tension=read.tension[into], temperature=read.temperature[into]
-        )
+        muscles = MuscleReadings.of_rows(read.muscles.rows[:, into])
+        muscles.length = np.array(self.wiring.sign) * muscles.length + self.offset
+        return read._replace(muscles=muscles)
 
     def command(self, target: Array) -> None:
         """Pass target lengths [m] on to the muscles, (M,)."""
@@ -90,7 +90,7 @@ class Loop:
         estimator, controller = self.estimator, self.controller
         if self._has_sensors:
             estimator.joints(read.theta, now)
-        message = read.message(self.driver.arm.robot)
+        message = read.muscles
         with suppress(RejectionError):
             output = estimator.take(message, now, now)
         if estimator.body is not controller.stream.body:

@@ -69,14 +69,13 @@ class Loop:
         now, read, estimator, control = self.time, self.arm.sense(), self.estimator, self.controller
         if joints:
             estimator.joints(read.theta, now)
-        message = read.message(self.arm.robot)
-        estimate = estimator.take(message, now, now)
+        estimate = estimator.take(read.muscles, now, now)
         zeros = estimator.body.offsets
         if zeros != self._zeros:
             control.use_body(estimator.body)
             self._zeros = zeros
         if estimate is not None:
-            control.take(message, now)
+            control.take(read.muscles, now)
             control.estimated(estimate.state.theta, now)
             if estimate.detected:
                 self.alarms += 1

@@ -99,7 +99,6 @@ def stops() -> str:
 #: the column "reaction" of the table of conditions, explained above the table in diagnostics.md
 REVOKED = {Revokes.ONE: 'revokes its offset', Revokes.ALL: 'revokes all offsets'}
 REACTIONS = {
-    FindingReaction.WARN: 'reports',
     FindingReaction.STOP: 'stops',
     FindingReaction.ISOLATE: 'stops or isolates',
     FindingReaction.ISOLATE_AT_ONCE: 'stops or isolates at once',

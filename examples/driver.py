@@ -66,7 +66,8 @@ class Bus:
         self.read_at = now
         reading = self.arm.sense()
         # If your modules have no temperature sensors, return NaN for each muscle instead.
-        return -reading.length / SPOOL, reading.tension, reading.temperature, reading.theta
+        muscles = reading.muscles
+        return -muscles.length / SPOOL, muscles.tension, muscles.temperature, reading.theta
 
     def regulate(self, tension: np.ndarray) -> None:
         """Make every motor regulate its tendon to a tension [N] (M,)."""

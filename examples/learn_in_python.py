@@ -71,17 +71,18 @@ for theta in robot.random_postures(options.postures, rng):
         break
     tension = rng.uniform(40.0, 120.0, robot.muscle_count)
     goal = robot.muscle_lengths(theta[None], tension[None])[0]
-    direction, start = FrictionDirection(), arm.sense().length
+    direction, start = FrictionDirection(), arm.sense().muscles.length
     for step in range(150):  # move for 0.5 s, then rest for 1 s
         time += PERIOD
         arm.command_length(start + (goal - start) * min(1.0, step / 50))
         arm.step(PERIOD)
         read = arm.sense()
-        sliding = direction.step(read.length)
-        learner.step(time, read.theta, read.tension, read.length)
+        muscles = read.muscles
+        sliding = direction.step(muscles.length)
+        learner.step(time, read.theta, muscles.tension, muscles.length)
     estimates = [
         # Bone-side tension: T minus the tendon friction that the network has learned.
-        mae.estimate(mae.transmission.end(read.tension, sliding), read.length).theta
+        mae.estimate(mae.transmission.end(muscles.tension, sliding), muscles.length).theta
         for mae in (initial, learner.mae)
     ]
     errors.append([np.linalg.norm(estimate - read.theta) for estimate in estimates])

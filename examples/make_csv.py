@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from musculoskeletal_ae.emulator.faults import Readings
+from musculoskeletal_ae.emulator.faults import ArmReadings
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -35,16 +35,16 @@ lines = [';'.join(['t [ms]'] * options.moving + ['shoulder (deg)', 'q2', *names]
 time = 0.0
 
 
-def write(read: Readings) -> None:
+def write(read: ArmReadings) -> None:
     """Append a line with the readings, in degrees, millimetres and newtons."""
     angles = np.degrees(read.theta)
-    length = 1e3 * (read.length + encoder_zero)
-    cells = [*angles, *length, *read.tension]
+    length = 1e3 * (read.muscles.length + encoder_zero)
+    cells = [*angles, *length, *read.muscles.tension]
     text = [f'{cell:.3f}' for cell in cells]
     lines.append(';'.join([f'{1e3 * time:.0f}'] * options.moving + text))
 
 
-start = arm.sense().length
+start = arm.sense().muscles.length
 count = 60 if options.moving else options.postures
 for theta in robot.random_postures(count, rng):
     tension = rng.uniform(40.0, 120.0, robot.muscle_count)

@@ -63,9 +63,8 @@ class Stop(NamedTuple):
 
 
 class FindingReaction(Enum):
-    """Consequence of a finding: what the estimator does about it."""
+    """Consequence of a finding: what the estimator does about it, besides reporting it."""
 
-    WARN = 'reports it'
     STOP = 'latches an anomaly, which stops the arm'
     ISOLATE = (
         'latches an anomaly, which stops the arm; with `on_anomaly: isolate`, isolates and '
@@ -338,7 +337,6 @@ class ConditionKind(Enum):
         'learned',
         'joint sensors are not used, because they disagree with the muscle lengths',
         (Step.CHECK_JOINT_SENSOR,),
-        reaction=FindingReaction.WARN,
     )
     JOINT_READINGS_IMPOSSIBLE = Declaration(
         'joint_readings_impossible',
@@ -402,7 +400,6 @@ class ConditionKind(Enum):
         'the constants of the thermal model of a cool module have changed',
         'a cool module heats or cools otherwise than before',
         (Step.CHECK_MODULE,),
-        reaction=FindingReaction.WARN,
     )
 
     # -- the body: isolated muscles, length offsets, network ------------------------------------

@@ -20,8 +20,6 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.joint_units import JointUnits
-from musculoskeletal_ae.robot.tension_source import TENSION_SENSOR, TensionSource
-from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Presence, Row
 
 #: reject a message with more entries in an array, or a trajectory with more joints × points; no arm
 #: needs nearly as many
@@ -36,8 +34,6 @@ LEAST_GRAVITY, MOST_GRAVITY = 3.0, 30.0
 #: point
 LAST_VELOCITY = 1e-6
 MOST_EFFORT = 1000.0  # reject a request for a higher torque or force of one joint [N·m or N]
-#: replace larger values of isolated muscles by NaN, because they could overflow when squared
-MOST_ISOLATED = 1e6
 UNIT_TOLERANCE = 0.01  # reject a quaternion whose norm deviates further from 1
 
 
@@ -47,7 +43,7 @@ def read_array(message: Any, rows: int, columns: int, owner: str = 'muscle') -> 
     The data must be finite. The layout may be empty; otherwise it must match, and the label of the
     columns is `owner`.
     """
-    values = _values(message, rows, columns, owner)
+    values = read_rows(message, rows, columns, owner)
     finite = np.isfinite(values)
     if not finite.all():
         place = np.flatnonzero(~finite)[0]
@@ -56,64 +52,7 @@ def read_array(message: Any, rows: int, columns: int, owner: str = 'muscle') -> 
     return values[0] if rows == 1 else values
 
 
-def read_muscle_states(
-    message: Any,
-    muscles: int,
-    isolated: Sequence[int] | Ints = (),
-    unknown: float = 0.0,
-    source: TensionSource = TENSION_SENSOR,
-    names: Sequence[str] = (),
-) -> Array:
-    """Return the readings of a Float64MultiArray, (Q, M), one row for each of `QUANTITIES`.
-
-    Motor currents are converted to T_read [N]. Values that are not measured are NaN, where this is
-    legal. Values of isolated muscles are not checked: values that are not finite or beyond
-    ±MOST_ISOLATED are replaced by NaN where this is legal, otherwise by `unknown`. If the modules
-    have no source of tension, tensions are not checked either, and are returned as NaN. An error
-    states the name of the muscle if `names` has it, otherwise its number.
-    """
-    values = muscle_rows(message, muscles)
-    usable = np.isfinite(values)
-    values[Row.TENSION] = source.from_message(values[Row.TENSION])
-    usable[Row.TENSION] |= not source.is_known
-    if len(isolated) == 0 and usable.all():
-        return values
-    replaced = ~(np.abs(values) < MOST_ISOLATED) & np.isin(np.arange(muscles), isolated)
-    replaced[Row.TENSION] &= source.is_known
-    values[replaced] = unknown
-    usable |= replaced
-    for row, quantity in enumerate(QUANTITIES):
-        if quantity.presence is not Presence.REQUIRED:
-            values[row, replaced[row]] = np.nan
-            usable[row] |= np.isnan(values[row])
-    if not usable.all():
-        row, muscle = np.argwhere(~usable)[0]
-        name = names[muscle] if len(names) else f'muscle {muscle}'
-        stated = f'{QUANTITIES[row].name} of {name} is {values[row, muscle]}'
-        raise MessageError('not finite', f'{stated}; expected a finite number')
-    return values
-
-
-def muscle_rows(message: Any, muscles: int) -> Array:
-    """Return the rows of a message of muscle_states, (Q, M), without a check of their values.
-
-    Optional rows that the message lacks are NaN. A `message` may also be an array of its rows.
-    """
-    if isinstance(message, np.ndarray):
-        values = message.astype(float)
-        lacking = len(QUANTITIES) - len(values)
-    else:
-        lacking = 0
-        for quantity in reversed(QUANTITIES):
-            expected = muscles * (len(QUANTITIES) - lacking)
-            if quantity.presence is not Presence.OPTIONAL or len(message.data) >= expected:
-                break
-            lacking += 1
-        values = _values(message, len(QUANTITIES) - lacking, muscles)
-    return np.pad(values, ((0, lacking), (0, 0)), constant_values=np.nan) if lacking else values
-
-
-def _values(message: Any, rows: int, columns: int, owner: str = 'muscle') -> Array:
+def read_rows(message: Any, rows: int, columns: int, owner: str = 'muscle') -> Array:
     """Return the data of a Float64MultiArray as (rows, columns), with size and layout checked.
 
     `owner` is the legal label of the columns.

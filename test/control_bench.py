@@ -28,18 +28,18 @@ COLD = np.full(ROBOT.muscle_count, 30.0)
 def sample(length, tension, robot=ROBOT, temperature=30.0):
     """Return a sample of the muscle stream; a number applies to all muscles."""
     rows = [np.broadcast_to(row, robot.muscle_count) for row in (length, tension, temperature)]
-    states = np.array(rows, dtype=float)
+    read = reading(rows)
     return MuscleSample(
         time=0.0,
-        length=states[0],
-        length_read=states[0],
-        tension_read=states[1],
-        motor_tension=states[1],
-        bone_tension=states[1],
+        length=read.length,
+        length_read=read.length,
+        tension_read=read.tension,
+        motor_tension=read.tension,
+        bone_tension=read.tension,
         sliding=np.zeros(robot.muscle_count),
-        temperature=states[2],
+        temperature=read.temperature,
         usable=robot.used,
-        newest=states,
+        newest=read,
     )
 
 

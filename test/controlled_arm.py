@@ -10,11 +10,12 @@ from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.arrival import LONGEST_STEP
 from musculoskeletal_ae.awake_clock import PAUSE
-from musculoskeletal_ae.message_reading import read_array, read_muscle_states
+from musculoskeletal_ae.message_reading import read_array
 from musculoskeletal_ae.nodes.controller import ControllerNode
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.nodes.learner import LearnerNode
+from musculoskeletal_ae.signals.muscle_readings import read_muscle_states
 
 RATE = 50.0  # rate of the arm's messages [Hz]; 100 Hz would take twice the processor time
 RATE_LIMIT = 0.2  # rate limit of length commands [m/s]
@@ -116,7 +117,7 @@ class ControlledArm:
         return np.array(self.graph.next('joint_states').position)
 
     def tension(self):
-        return read_muscle_states(self.graph.next('muscle_states'), self.robot.muscle_count)[1]
+        return read_muscle_states(self.graph.next('muscle_states'), self.robot).tension
 
     def goes_to(self, theta, within=0.3):
         theta = np.asarray(theta)

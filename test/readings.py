@@ -3,13 +3,10 @@
 
 import numpy as np
 
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
-def reading(states, robot=None):
-    """Return a reading: the rows of l [m], T [N] and temperature [°C], (3, M).
 
-    A `robot` that measures motor currents reports currents instead of tensions.
-    """
-    rows = np.array(states, dtype=float)
-    if robot is not None:
-        rows[1] = robot.tension_source.to_message(rows[1])
-    return rows
+def reading(states):
+    """Return the readings with these l [m], T [N] and temperatures [°C], (3, M)."""
+    length, tension, temperature = np.array(states, dtype=float)
+    return MuscleReadings(length=length, tension=tension, temperature=temperature)

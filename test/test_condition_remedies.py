@@ -189,7 +189,7 @@ def test_modules_leave_their_safe_state_when_commands_arrive():
     arm = make_arm(Robot.load('arm26'))
     arm.step(1.0)
     assert arm.safe
-    arm.command_length(arm.sense().length)
+    arm.command_length(arm.sense().muscles.length)
     arm.step(0.01)
     assert not arm.safe
 

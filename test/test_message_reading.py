@@ -2,6 +2,7 @@
 """Rules for the validity and the order of messages. The tests need no graph."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,6 @@ from musculoskeletal_ae.message_reading import (
     joints_not_finite,
     read_array,
     read_imu,
-    read_muscle_states,
     read_names,
     read_pose,
     read_posture,
@@ -29,8 +29,12 @@ from musculoskeletal_ae.message_reading import (
     without_orientation,
 )
 from musculoskeletal_ae.robot.joint_units import JointUnits
+from musculoskeletal_ae.robot.tension_source import TENSION_SENSOR
 from musculoskeletal_ae.ros.messages import array_message, posture_message
+from musculoskeletal_ae.signals.muscle_readings import read_muscle_states
 
+# Stands in for a robot with two muscles.
+TWO = SimpleNamespace(muscle_count=2, muscles=('triceps', 'biceps'), tension_source=TENSION_SENSOR)
 UNITS = JointUnits(('a', 'b'), [False, False])
 
 
@@ -75,7 +79,7 @@ def test_names_have_commas_between_and_may_have_spaces_within():
     ],
 )
 def test_a_wrong_array_is_rejected_by_reason(message, reason):
-    for read in (lambda: read_array(message, 3, 2), lambda: read_muscle_states(message, 2)):
+    for read in (lambda: read_array(message, 3, 2), lambda: read_muscle_states(message, TWO)):
         with pytest.raises(MessageError) as error:
             read()
         assert error.value.reason == reason
@@ -87,21 +91,22 @@ def test_labels_of_a_layout_may_be_empty():
 
 def test_a_temperature_that_is_not_measured_is_nan_and_nothing_else_is():
     values = [1.0, 2.0, 3.0, 4.0, math.nan, 25.0]
-    np.testing.assert_array_equal(read_muscle_states(muscle_array(values), 2).ravel(), values)
-    with pytest.raises(MessageError, match='tension of muscle 1'):
-        read_muscle_states(muscle_array([1.0, 2.0, 3.0, math.nan, 25.0, 25.0]), 2)
+    np.testing.assert_array_equal(
+        read_muscle_states(muscle_array(values), TWO).rows.ravel(), values
+    )
+    with pytest.raises(MessageError, match='tension of biceps is nan'):
+        read_muscle_states(muscle_array([1.0, 2.0, 3.0, math.nan, 25.0, 25.0]), TWO)
 
 
-@pytest.mark.parametrize('unknown', [0.0, math.nan])
-def test_values_of_isolated_muscles_are_ignored(unknown):
-    legal = [[unknown, 2.0], [3.0, 4.0], [math.nan, 25.0]]
+def test_values_of_isolated_muscles_are_ignored():
+    legal = [[math.nan, 2.0], [3.0, 4.0], [math.nan, 25.0]]
     broken = muscle_array([math.nan, 2.0, 3.0, 4.0, math.inf, 25.0])
-    np.testing.assert_array_equal(read_muscle_states(broken, 2, [0], unknown), legal)
+    np.testing.assert_array_equal(read_muscle_states(broken, TWO, [0]).rows, legal)
     absurd = muscle_array([1e80, 2.0, 3.0, 4.0, -1e300, 25.0])
-    np.testing.assert_array_equal(read_muscle_states(absurd, 2, [0], unknown), legal)
-    np.testing.assert_array_equal(read_muscle_states(absurd, 2).ravel(), absurd.data)
+    np.testing.assert_array_equal(read_muscle_states(absurd, TWO, [0]).rows, legal)
+    np.testing.assert_array_equal(read_muscle_states(absurd, TWO).rows.ravel(), absurd.data)
     with pytest.raises(MessageError, match='not finite'):
-        read_muscle_states(broken, 2, [1])
+        read_muscle_states(broken, TWO, [1])
 
 
 def test_measured_joints_are_matched_by_name_and_foreign_ones_ignored():
@@ -205,7 +210,7 @@ def test_messages_are_known_by_their_fields_whatever_library_made_them():
 
     values = np.arange(6.0).reshape(3, 2)
     recorded = decode(bag_array(values), ARRAY)
-    np.testing.assert_array_equal(read_muscle_states(recorded, 2), values)
+    np.testing.assert_array_equal(read_muscle_states(recorded, TWO).rows, values)
     recorded = decode(bag_joints(['b', 'a'], [2.0, 1.0]), JOINT_STATE)
     assert read_posture(recorded, UNITS).tolist() == [1.0, 2.0]
 

@@ -56,8 +56,8 @@ class Hardware:
         self.arm.step(min(round(now - self.read_at, 3), 0.1))
         self.read_at = now
         reading = self.arm.sense()
-        angle = self.direction * reading.length / SPOOL_RADIUS + self.zero
-        torque = -self.direction * reading.tension * SPOOL_RADIUS
+        angle = self.direction * reading.muscles.length / SPOOL_RADIUS + self.zero
+        torque = -self.direction * reading.muscles.tension * SPOOL_RADIUS
         states = {joint: {'position': q} for joint, q in zip(self.robot.joints, reading.theta)}
         for motor, q, tau in zip(self.motors, angle, torque):
             states[motor] = {'position': q, 'effort': tau}

@@ -239,7 +239,7 @@ def _fit(bag: Bag, name: str, namespace: str | None) -> _Fit:
     if streams.judged_joints.text and not joint_faults:
         left_out.append(joint_text)
     rejected_faults = _rejected(bag, streams)
-    if not len(streams.muscles.time) and not len(streams.joints.time):
+    if not len(streams.muscle_times) and not len(streams.joints.time):
         problem = f'the bag has neither joint_states nor muscle_states that fit {name}'
         return _Fit([problem, *joint_faults], left_out)
     pairs = streams.pairs()

@@ -21,7 +21,6 @@ from musculoskeletal_ae.bags.topics import EARLIER, interface_topics
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.message_reading import (
     joints_not_finite,
-    muscle_rows,
     read_array,
     read_names,
     read_posture,
@@ -31,7 +30,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
 from musculoskeletal_ae.signals.joint_series import JointSeries, judge_series
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
-from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Row
+from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, MuscleReadings, raw_muscle_states
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream
 from musculoskeletal_ae.signals.pairing import Pairing
 
@@ -62,7 +61,8 @@ class Streams(NamedTuple):
     """Sensor data and commands of one arm; missing topics are empty series."""
 
     joints: Series  # usable joint angles [rad], (N, D); NaN where a joint has no usable reading
-    muscles: Series  # the quantities of muscle modules (`signals/muscle_readings.py`), (N, Q, M)
+    muscle_times: Array  # times of the readings of muscle modules since the bag's start [s], (N,)
+    muscles: MuscleReadings  # these N readings; lengths without offset, plausible temperatures
     length_commands: Series  # target lengths of the muscle modules [m], (N, M)
     tension_commands: Series  # target tensions of the muscle modules [N], (N, M)
     isolated: Series  # 1 for isolated muscles, else 0, (N, M)
@@ -81,7 +81,7 @@ class Streams(NamedTuple):
         messages without matching joint angles are left out, but not those beside a false reading,
         because their lengths and tensions are right.
         """
-        time = self.muscles.time
+        time = self.muscle_times
         period = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
         is_beside = np.zeros(len(time), dtype=bool)
         if len(self.false_joints):
@@ -103,8 +103,8 @@ class Streams(NamedTuple):
                 continue
             theta.append(unknown if paired.theta is None else paired.theta)
             muscle.append(paired.message)
-        values, time = self.muscles.values[muscle], time[muscle]
-        length, tension = values[:, Row.LENGTH], values[:, Row.TENSION]
+        readings, time = self.muscles.at(muscle), time[muscle]
+        length, tension = readings.length, readings.tension
         isolated = np.full(length.shape, -1)
         if len(self.isolated.time):
             isolated[:] = self.isolated.values[_latched(self.isolated.time, time)]
@@ -149,7 +149,7 @@ class _ArmStreams:
                 not finite and therefore not used.
         """
         self._robot, self._ignore = robot, ignore
-        self._interface = MotorInterface(robot.description.motors)
+        self._interface = MotorInterface(robot.description.motors, robot.tension_source)
         self._muscle_stream = MuscleStream(robot)
         self.had_offsets: list[bool] = []
         #: lowest and highest recorded value of each tension, (M,) each, if they are not used
@@ -184,13 +184,12 @@ class _ArmStreams:
             self._note_unused_tension(reading)
         sample = stream.take(reading, now, delay=arrival.delay)
         self.had_offsets.append(stream.body.offsets.known)
-        values = sample.newest.copy()
-        values[Row.LENGTH], values[Row.TENSION] = sample.length, sample.tension_read
-        values[Row.TEMPERATURE] = sample.temperature
-        return values
+        return sample.newest.replace(
+            length=sample.length, tension=sample.tension_read, temperature=sample.temperature
+        ).rows
 
     def _note_unused_tension(self, reading: Any) -> None:
-        tension = muscle_rows(reading, self._robot.muscle_count)[Row.TENSION]
+        tension = raw_muscle_states(reading, self._robot).tension
         low, high = self._unused_tension
         self._unused_tension[:] = np.fmin(low, tension), np.fmax(high, tension)
 
@@ -331,10 +330,11 @@ def read_streams(
         reason = f'{labels["muscle_states"]}: length offsets unknown'
         reception.rejected[reason] += int((~is_known).sum())
         states = Series(states.time[is_known], states.values[is_known])
+    readings = MuscleReadings.of_rows(states.values)
     judged = judge_series(robot, joints.time, joints.values)
     is_usable, times_read = np.isfinite(judged.theta).any(axis=1), joints.time
     joints = Series(joints.time[is_usable], judged.theta[is_usable])
-    series = joints, states, lengths, tensions, arm.isolated()
+    series = joints, states.time, readings, lengths, tensions, arm.isolated()
     false = times_read[~is_usable]
     return Streams(*series, reception.rejected, reception.ignored, notes, judged, false)
 

@@ -54,6 +54,7 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly, BodyState
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence, check_posture
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
 WINDOW = 3  # take the median of this many messages, so that a single outlier has no effect
@@ -180,8 +181,8 @@ class Controller:
         self.mae: Mae | None = None
         self.stream = MuscleStream(robot, window=WINDOW)
         self.sample: MuscleSample | None = None
-        #: l [m] and T [N], (2, M), of the newest message if it was rejected, else None
-        self.rejected_pull: Array | None = None
+        #: plausible readings if the newest message was rejected (`RejectionError`), else None
+        self.rejected: MuscleReadings | None = None
         #: Estimated θ [rad], (D,), computed with the present length offsets. None while there is no
         #: such estimate, for example after the start of a length calibration; the arm then does not
         #: move.
@@ -242,7 +243,7 @@ class Controller:
         """Check and filter a message of muscle_states, and use its values from now on.
 
         Args:
-            message: The message, or its rows (`muscle_reading`).
+            message: The message of `muscle_states`, or `MuscleReadings`.
             now: Time of reception by the steady clock [s].
             delay: How late the message is (`Arrival.delay`) [s].
 
@@ -254,14 +255,15 @@ class Controller:
         except RejectionError as error:
             # The tensions of a rejected message may be right. If one is too high, limiter and
             # watchdog have to react.
-            if error.pull is not None:
-                self.rejected_pull = error.pull
-                self.watchdog.take_rejected(error.pull[1], self.stream.body.used, now, delay)
+            if error.plausible is not None:
+                self.rejected = error.plausible
+                tension = error.plausible.tension
+                self.watchdog.take_rejected(tension, self.stream.body.used, now, delay)
             raise
         self._use_sample(sample, now)
 
     def _use_sample(self, sample: MuscleSample, now: float) -> None:
-        self.sample, self.rejected_pull = sample, None
+        self.sample, self.rejected = sample, None
         if sample.jumped:
             self._jumped_at = now
         self.watchdog.take_sample(sample, now)
@@ -682,7 +684,7 @@ class Controller:
             limit = np.minimum(limit, gentle_limit(self.robot))
         is_winding = self.is_following and self.supervisor.is_running
         lead = self.activities.follower.winches.lead if is_winding else 0.0
-        return self.limiter.limit(desired, self.sample, limit, dt, lead, self.rejected_pull)
+        return self.limiter.limit(desired, self.sample, limit, dt, lead, self.rejected)
 
     # -- requests -------------------------------------------------------------------------------
 

@@ -66,6 +66,7 @@ from musculoskeletal_ae.control.command import (
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.model_errors import LARGEST
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 POSTURES = 200  # sample this many random postures to find the longest length of each muscle
@@ -191,7 +192,7 @@ class CommandLimiter:
         tension_limit: Array,
         dt: float,
         lead: Array | float = 0.0,
-        rejected: Array | None = None,
+        rejected: MuscleReadings | None = None,
     ) -> Command | None:
         """Limit a command and record the result as published.
 
@@ -203,8 +204,7 @@ class CommandLimiter:
             dt: Time since the last command [s].
             lead: Length by which each command may lead the measured length while the muscle winds
                 in, λ max(0, −dl/dt) [m], (M,).
-            rejected: l [m] and T [N], (2, M), as in `RejectionError.pull`, if the newest message
-                was rejected; else None.
+            rejected: `RejectionError.plausible` if the newest message was rejected; else None.
 
         Returns:
             The limited command. None if it is not finite; the last command then stays valid.
@@ -250,7 +250,7 @@ class CommandLimiter:
         bias = self._robot.description.tension.bias
         return np.maximum(limit - CONFIDENCE * sample.tension_spread, np.minimum(limit, bias))
 
-    def _relieved(self, rejected: Array, sample: MuscleSample, limit: Array) -> Array:
+    def _relieved(self, rejected: MuscleReadings, sample: MuscleSample, limit: Array) -> Array:
         """Return lower bounds of the length commands [m], (M,), due to rejected messages.
 
         A module compares l_target with its own reading of l. If this reading jumps, the module
@@ -258,17 +258,16 @@ class CommandLimiter:
         tension is too high has to follow the jump. For all other muscles, the bound is −∞.
 
         Args:
-            rejected: Lengths l [m] and tensions T [N], (2, M); −∞ where they are implausible.
+            rejected: Readings of rejected messages; −∞ where they are implausible.
             sample: The last accepted muscle states.
             limit: Tension limit [N], (M,).
         """
-        length, tension = rejected
-        tension = np.where(sample.usable, tension, -np.inf)
+        tension = np.where(sample.usable, rejected.tension, -np.inf)
         too_tense = tension > self._robot.description.tension.limit
         depth = self._robot.actuation.depth(
             np.where(too_tense, tension, 0.0), np.zeros_like(tension), limit
         )
-        relieved: Array = np.where(too_tense, length - depth, -np.inf)
+        relieved: Array = np.where(too_tense, rejected.length - depth, -np.inf)
         return relieved
 
     def _tension_rate(self, time: float, tension: Array) -> Array:

@@ -25,7 +25,6 @@ from musculoskeletal_ae.control.command import LENGTH, TENSION, Command
 from musculoskeletal_ae.control.limiter import CommandLimiter
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_readings import Row
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 PAYING_OUT = 1.5  # pay the muscles out for at least this time before a suspect is wound in [s]
@@ -136,7 +135,7 @@ class SafeStop:
         """
         if self._wound_from is None:
             self._wound_from = command
-        length, tension = sample.newest[[Row.LENGTH, Row.TENSION], muscle]
+        length, tension = sample.newest.length[muscle], sample.newest.tension[muscle]
         actuation = self._robot.actuation
         if actuation.rise(muscle, length, command, tension) > LARGEST_RISE:
             return command

@@ -168,7 +168,7 @@ class HeatLimit:
         # The tension sensor of an isolated muscle may be faulty. Assume T_bias instead, because its
         # module is commanded to exert no more, except briefly during a verification.
         bias = robot.description.tension.bias
-        tension = np.where(robot.used, sample.newest[1], bias)
+        tension = np.where(robot.used, sample.newest.tension, bias)
         tension = np.where(np.isnan(tension), sample.motor_tension, tension)
         self.heat.step(tension, sample.temperature, elapsed)
 

@@ -22,7 +22,6 @@ from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.message_reading import (
     joints_not_finite,
-    read_muscle_states,
     read_posture,
 )
 from musculoskeletal_ae.report import distinct
@@ -32,7 +31,14 @@ from musculoskeletal_ae.signals import joint_sensors, wiring
 from musculoskeletal_ae.signals.joint_series import judge_series
 from musculoskeletal_ae.signals.limits import length_range
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
-from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Presence, Row, possible_readings
+from musculoskeletal_ae.signals.muscle_readings import (
+    QUANTITIES,
+    MuscleReadings,
+    Presence,
+    Quantity,
+    possible_readings,
+    read_muscle_states,
+)
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement
 
 #: report a fault if a larger share of the messages repeats the previous message exactly
@@ -119,22 +125,22 @@ class Listening:
         if posture is not None:
             self._theta = robot.units.to_theta(np.array(posture))
         self._not_finite: Counter[str] = Counter()  # positions that are not finite, by joint
-        #: readings (3, M) of each message of muscle_states, and how many messages of joint_states
-        #: arrived before it
-        self._read: list[tuple[Array, int]] = []
+        #: readings of each message of muscle_states, and how many messages of joint_states arrived
+        #: before it
+        self._read: list[tuple[MuscleReadings, int]] = []
         #: times [s] of the joint messages, which are those of the muscles before them, and θ (D,)
         self._angles_read: list[tuple[float, Array]] = []
         self._now = 0.0  # time of the newest message of the muscles [s]
         #: errors of the rejected messages, by topic and reason
         self._rejected: dict[tuple[str, str], list[MessageError]] = {}
-        #: lowest and highest possible values of each quantity, (Q, M)
-        self._low, self._high = (each[: len(Row)] for each in possible_readings(robot))
+        #: lowest and highest possible readings
+        self._low, self._high = possible_readings(robot)
         (low, high), beyond = length_range(robot), BEYOND[not zeroed]
-        self._low[Row.LENGTH], self._high[Row.LENGTH] = low - beyond, high + beyond
-        self._low[Row.TEMPERATURE], self._high[Row.TEMPERATURE] = TEMPERATURES
+        self._low.length, self._high.length = low - beyond, high + beyond
+        self._low.temperature, self._high.temperature = TEMPERATURES
         # T computed from currents may be wrong by drive friction and an unknown scale.
         if not robot.tension_source.is_current:
-            self._low[Row.TENSION] = -0.02 * robot.tension.max
+            self._low.tension = -0.02 * robot.tension.max
 
     @property
     def count(self) -> int:
@@ -160,11 +166,7 @@ class Listening:
         topic = 'motors' if self._motors.is_ros2_control else 'muscle_states'
         with self._rejecting(topic):
             reading = self._motors.reading(message)
-            states = read_muscle_states(
-                reading, self._robot.muscle_count, source=self._robot.tension_source
-            )
-            # The check ignores other rows.
-            self._read.append((states[: len(Row)], len(self._angles_read)))
+            self._read.append((read_muscle_states(reading, self._robot), len(self._angles_read)))
 
     def joints(self, message: object) -> None:
         """Record a message of joint_states, whose angles are then compared with the lengths."""
@@ -199,20 +201,21 @@ class Listening:
         if not self.count:
             verdict.failed('silent', topic=self._motors.state_topic)
             return verdict
-        states = np.array([each for each, _ in self._read])
+        read = MuscleReadings.stack(each for each, _ in self._read)
         theta = self._angles_at_readings(verdict)
         self._pace.judge(verdict, now)
         if self._motors.is_ros2_control:
             verdict.notes.append(MOTOR_NOTE)
-        self._judge_repetition(verdict, states)
-        if len(states) and self._judge_values(verdict, np.median(states, axis=0)):
-            self._judge_rest(verdict, np.median(states, axis=0))
+        self._judge_repetition(verdict, read)
+        usual = MuscleReadings.of_rows(np.median(read.rows, axis=0)) if len(read) else None
+        if usual is not None and self._judge_values(verdict, usual):
+            self._judge_rest(verdict, usual)
             known = np.flatnonzero(np.isfinite(theta).all(axis=1))
             if len(known):
                 few = np.linspace(0, len(known) - 1, min(len(known), MOST_SAMPLES)).astype(int)
-                length, tension = states[known[few], :2].swapaxes(0, 1)
-                tension = self._robot.actuation.known_tension(tension)
-                self._judge_lengths_and_joints(verdict, theta[known[few]], length, tension)
+                some = read.at(known[few])
+                tension = self._robot.actuation.known_tension(some.tension)
+                self._judge_lengths_and_joints(verdict, theta[known[few]], some.length, tension)
             else:
                 lacking = np.isnan(theta).all(axis=0)
                 unknown = ', '.join(np.array(self._robot.joints)[lacking])
@@ -253,48 +256,50 @@ class Listening:
         at: Array = angles[[count for _, count in self._read]].reshape(-1, unknown.shape[1])
         return at
 
-    def _judge_repetition(self, verdict: Verdict, states: Array) -> None:
-        if len(states) > 10:
+    def _judge_repetition(self, verdict: Verdict, read: MuscleReadings) -> None:
+        if len(read) > 10:
             # A driver may publish more often than it reads the modules. Temperatures are not
             # compared, because they may stay the same.
-            rows = len(self._robot.tension_source.measured(states[0, :2]))
-            same: Bools = states[1:, :rows] == states[:-1, :rows]
-            repeated, stuck = same.all(axis=(1, 2)).mean(), same.all(axis=(0, 1))
-            if repeated > MOST_REPEATED:
-                columns = states[:, :rows].reshape(len(states), -1).T
+            values = read.length
+            if self._robot.tension_source.is_known:
+                values = np.hstack([values, read.tension])
+            same: Bools = values[1:] == values[:-1]
+            is_stuck = same.all(axis=0).reshape(-1, self._robot.muscle_count).all(axis=0)
+            if same.all(axis=1).mean() > MOST_REPEATED:
+                columns = values.T
                 if 1 < max(len(np.unique(column)) for column in columns) <= QUIET:
                     verdict.notes.append(
                         'the readings hardly change; move the arm to check whether each message '
                         'is new'
                     )
                 else:
-                    verdict.failed('repeated', share=100.0 * repeated)
-            elif stuck.any():
-                verdict.failed('stuck', *np.flatnonzero(stuck).tolist())
+                    verdict.failed('repeated', share=100.0 * same.all(axis=1).mean())
+            elif is_stuck.any():
+                verdict.failed('stuck', *np.flatnonzero(is_stuck).tolist())
 
-    def _judge_values(self, verdict: Verdict, states: Array) -> bool:
+    def _judge_values(self, verdict: Verdict, usual: MuscleReadings) -> bool:
         """Judge by the ranges of possible values whether rows, units and signs are right.
 
         Return False if they are wrong; the fault is then in the verdict.
 
         Args:
             verdict: Receives the results.
-            states: Medians of the published readings, (Q, M).
+            usual: Medians of the published readings.
         """
         fault, units = '', list[str]()  # the first possible fault, and the units that explain it
-        for what, texts, meant in _readings(states):
+        for what, texts, meant in _interpretations(usual):
             if fault and what != fault:
                 break
             possible = self._possible(meant)
             # Without a command, T must be close to T_bias in the right interpretation.
-            pulls = np.median(meant[Row.TENSION] / self._robot.tension.bias)
-            warm = meant[Row.TEMPERATURE][~np.isnan(meant[Row.TEMPERATURE])]
+            pulls = np.median(meant.tension / self._robot.tension.bias)
+            warm = meant.temperature[~np.isnan(meant.temperature)]
             is_usual = PULLS[0] < pulls < PULLS[1] and (
                 not len(warm) or USUAL[0] < np.median(warm) < USUAL[1]
             )
             if 'unit' in texts:
                 # All muscles share a unit, so a single impossible value has another cause.
-                wrong = np.count_nonzero(~self._possible(states).all(axis=0))
+                wrong = np.count_nonzero(~self._possible(usual).all(axis=0))
                 is_usual = is_usual and wrong > min(1, self._robot.muscle_count - 1)
             if possible.all() and (not what or is_usual):
                 if 'unit' in texts:
@@ -305,7 +310,7 @@ class Listening:
                     verdict.failed(self._of_source(what), **texts)
                     return False
                 verdict.passed('unit')
-                if np.isnan(states[Row.TEMPERATURE]).any():
+                if np.isnan(usual.temperature).any():
                     verdict.notes.append(
                         'temperatures are not measured (NaN), so nothing protects the motors from '
                         'heat'
@@ -317,23 +322,29 @@ class Listening:
                 unit = unit.replace('N', 'A')
             verdict.failed(self._of_source(fault), unit=unit)
             return False
-        for row, m in np.argwhere(~possible).tolist():
-            value, low, high = distinct(states[row, m], self._low[row, m], self._high[row, m])
-            what = self._of_source(QUANTITIES[row].name)
-            verdict.failed(what, m, value=f'{value}, possible {low} to {high},')
+        for quantity, is_possible in zip(QUANTITIES, possible, strict=True):
+            for m in np.flatnonzero(~is_possible).tolist():
+                published = (quantity.of(each)[m] for each in (usual, self._low, self._high))
+                value, low, high = distinct(*published)
+                what = self._of_source(quantity.name)
+                verdict.failed(what, m, value=f'{value}, possible {low} to {high},')
         return False
 
-    def _possible(self, states: Array) -> Bools:
-        """Return which of the readings `states` (Q, M) are possible at rest, (Q, M)."""
-        possible: Bools = (states >= self._low) & (states <= self._high)
-        # Friction can make single currents negative, but not all of them by so much.
-        pushes = states[Row.TENSION] < -PULLS[0] * self._robot.tension.bias
-        if self._robot.tension_source.is_current and pushes.all():
-            possible[Row.TENSION] = False
-        for row, quantity in enumerate(QUANTITIES[: len(Row)]):
-            if quantity.presence is not Presence.REQUIRED:
-                possible[row] |= np.isnan(states[row])
-        possible[Row.TENSION] |= not self._robot.tension_source.is_known
+    def _possible(self, readings: MuscleReadings) -> Bools:
+        """Return which readings are possible at rest, (Q, M)."""
+        return np.array([self._possible_values(each, readings) for each in QUANTITIES])
+
+    def _possible_values(self, quantity: Quantity, readings: MuscleReadings) -> Bools:
+        """Return which readings of a quantity are possible at rest, (M,)."""
+        values, source = quantity.of(readings), self._robot.tension_source
+        possible: Bools = (values >= quantity.of(self._low)) & (values <= quantity.of(self._high))
+        if quantity is MuscleReadings.tension:
+            # Friction can make single currents negative, but not all of them by so much.
+            pushes = values < -PULLS[0] * self._robot.tension.bias
+            all_push = source.is_current and bool(pushes.all())
+            return (possible & (not all_push)) | (not source.is_known)
+        if quantity.presence is not Presence.REQUIRED:
+            possible |= np.isnan(values)
         return possible
 
     def _of_source(self, fault: str) -> str:
@@ -345,25 +356,25 @@ class Listening:
             return fault
         return fault.replace('tension', 'current')
 
-    def _judge_rest(self, verdict: Verdict, states: Array) -> None:
+    def _judge_rest(self, verdict: Verdict, usual: MuscleReadings) -> None:
         """Judge the tensions and temperatures of modules that have received no command.
 
         Args:
             verdict: Receives the results.
-            states: Medians of the published l, T and temperatures, (3, M).
+            usual: Medians of the published readings.
         """
         bias = self._robot.tension.bias
         # With position-controlled modules, T depends on the posture, so it is not compared.
         bias = self._robot.actuation.choose(bias, np.full_like(bias, np.nan))
         for unit, newtons in TENSION_UNITS.items():
-            if (np.abs(newtons * states[Row.TENSION] / bias - 1.0) < UNIT_TOLERANCE).all():
+            if (np.abs(newtons * usual.tension / bias - 1.0) < UNIT_TOLERANCE).all():
                 verdict.failed('tension unit', unit=unit)
                 return
         tolerated = np.minimum(RESTING_TENSION, RESTING_SHARE * bias)
-        for m in np.flatnonzero(np.abs(states[Row.TENSION] - bias) > tolerated).tolist():
-            verdict.failed('resting tension', m, got=states[Row.TENSION, m], bias=bias[m])
-        if np.nanmax(states[Row.TEMPERATURE], initial=-math.inf) > HOTTEST_AT_REST:
-            hottest = np.nanmax(states[Row.TEMPERATURE])
+        for m in np.flatnonzero(np.abs(usual.tension - bias) > tolerated).tolist():
+            verdict.failed('resting tension', m, got=usual.tension[m], bias=bias[m])
+        hottest = np.nanmax(usual.temperature, initial=-math.inf)
+        if hottest > HOTTEST_AT_REST:
             verdict.notes.append(
                 f'a module at rest reports {hottest:.0f} °C; check that the driver publishes °C, '
                 'not °F'
@@ -631,32 +642,33 @@ class Listening:
         return float(np.minimum(fit[rows, best], inverse).sum())
 
 
-def _readings(states: Array) -> Iterator[tuple[str, dict[str, str], Array]]:
+def _interpretations(
+    published: MuscleReadings,
+) -> Iterator[tuple[str, dict[str, str], MuscleReadings]]:
     """Yield interpretations of a message's values, from the literal one to the least likely.
 
     Each interpretation is a tuple: the name of the driver fault that would explain it ('' for
-    none), the values for the texts about this fault, and the readings, (Q, M), that the driver
+    none), the values for the texts about this fault, and the readings that the driver
     should have published. If no interpretation gives possible values, the
     last one is the literal one again, so that the values are reported as they were published.
 
     Args:
-        states: The published values, (Q, M).
+        published: The published values.
     """
-    yield '', {}, states
-    count = len(states)
-    celsius = states.copy()
-    celsius[Row.TEMPERATURE] -= 273.15
-    yield 'kelvin', {}, celsius
-    yield 'by muscle', {}, states.reshape(-1, count).T
-    for order in map(list, permutations(range(count))):
-        rows = ', '.join(QUANTITIES[order.index(i)].name for i in range(count))
-        yield 'rows', {'rows': rows}, states[order]
-    for row, (what, units) in enumerate(UNITS.items()):
+    yield '', {}, published
+    yield 'kelvin', {}, published.replace(temperature=published.temperature - 273.15)
+    # Only the rows that each message has can be in another order.
+    expected = [each for each in QUANTITIES if each.presence is not Presence.OPTIONAL]
+    rows = [each.of(published) for each in expected]
+    by_muscle = np.reshape(rows, (-1, len(rows))).T
+    names = [each.name for each in expected]
+    yield 'by muscle', {}, published.replace(**dict(zip(names, by_muscle)))
+    for order in permutations(names):
+        meant = published.replace(**dict(zip(order, rows)))
+        yield 'rows', {'rows': ', '.join(order)}, meant
+    for what, units in UNITS.items():
         for unit, factor in units.items():
-            scaled = states.copy()
-            scaled[row] *= factor
+            scaled = published.replace(**{what: factor * getattr(published, what)})
             yield f'{what} unit', {'unit': unit}, scaled
-    pushing = states.copy()
-    pushing[Row.TENSION] *= -1.0
-    yield 'tension sign', {}, pushing
-    yield '', {}, states
+    yield 'tension sign', {}, published.replace(tension=-published.tension)
+    yield '', {}, published

@@ -14,12 +14,12 @@ from typing import Literal
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.driver.order import JOINTS_BETTER, judge_order, wrong_side
 from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.report import is_overloaded
 from musculoskeletal_ae.signals.joint_sensors import corrected, judge, sign_notes
-from musculoskeletal_ae.signals.muscle_readings import Row
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.signals.wiring import WiringJudgement
 
 #: time for paying out a released muscle, and for settling after a target has moved back [s]
@@ -83,13 +83,14 @@ class MotionTest(ABC):
         #: whether each muscle has been tested in this run, and no fault was found, (M,)
         self._is_verified: Bools = np.zeros(robot.muscle_count, dtype=bool)
         self._now = 0.0
-        self._recent: deque[tuple[float, Array]] = deque()
+        #: times [s] and readings of the messages of the last MEAN seconds
+        self._recent: deque[tuple[float, MuscleReadings]] = deque()
         #: target lengths of the muscles [m], (M,); NaN before l is known
         self._target: Array = np.full(robot.muscle_count, np.nan)
         #: last time at which each muscle was within its limits [s]
         self._tame_at: Array = np.zeros(robot.muscle_count)
-        #: θ (D,), states (3, M) and tested muscle of each message, −1 while the arm is held
-        self._history: list[tuple[Array, Array, int]] = []
+        #: θ (D,), readings and tested muscle of each message, −1 while the arm is held
+        self._history: list[tuple[Array, MuscleReadings, int]] = []
         self._run = self._sequence()
 
     @property
@@ -97,25 +98,28 @@ class MotionTest(ABC):
         """The present step of the test, for messages: `hold`, or the name of a muscle."""
         return 'hold' if self._tested is None else self._robot.muscles[self._tested]
 
-    def step(self, states: Array, now: float, theta: Array | None = None) -> Array | None:
+    def step(
+        self, readings: MuscleReadings, now: float, theta: Array | None = None
+    ) -> Array | None:
         """Continue the test with the newest readings, and return the next command.
 
         The command is l_target [m], (M,), or None if nothing is to be published.
 
         Args:
-            states: Readings, (Q, M); only l [m], T [N] and temperature [°C] are used.
+            readings: The readings of the newest message.
             now: Time [s].
             theta: θ of the joint sensors [rad], (D,), with NaN if unknown; None without sensors.
         """
-        self._now, states = now, states[: len(Row)]
+        self._now = now
         if theta is not None:
             segment = -1 if self._tested is None else self._tested
-            self._history.append((theta, states, segment))
-        self._recent.append((now, states))
+            self._history.append((theta, readings, segment))
+        self._recent.append((now, readings))
         while now - self._recent[0][0] > MEAN:
             self._recent.popleft()
         self.done = self.done or next(self._run, self) is self
-        return None if self.done or np.isnan(self._target).any() else self._command(states[0])
+        is_silent = self.done or np.isnan(self._target).any()
+        return None if is_silent else self._command(readings.length)
 
     # -- differences between the kinds of modules -----------------------------------------------
 
@@ -136,12 +140,12 @@ class MotionTest(ABC):
         """Move muscle m, and check how its readings respond."""
 
     @abstractmethod
-    def _run_away(self, states: Array, start: Array) -> RunAwayError | None:
+    def _run_away(self, newest: MuscleReadings, start: MuscleReadings) -> RunAwayError | None:
         """Return the error of a muscle that runs away, or None.
 
         Args:
-            states: Lengths [m], tensions [N] and temperatures [°C] of the newest message, (3, M).
-            start: The newest message when the present wait began, (3, M).
+            newest: The readings of the newest message.
+            start: The readings of the newest message when the present wait began.
         """
 
     @abstractmethod
@@ -206,24 +210,29 @@ class MotionTest(ABC):
             return 'commands'  # the readings were checked while a hand moved the arm
         if not self._knows_joints():
             return None
-        theta, states, tested = map(np.array, zip(*self._history, strict=True))
-        messages = theta, states[:, 0], states[:, 1]
-        faults = judge(self._robot, *messages, segments=tested).faults
-        return wrong_side(self._robot, *messages, tested, winds, faults)
+        theta, length, tension, tested = self._columns()
+        faults = judge(self._robot, theta, length, tension, segments=tested).faults
+        return wrong_side(self._robot, theta, length, tension, tested, winds, faults)
+
+    def _columns(self) -> tuple[Array, Array, Array, Ints]:
+        """Return θ (N, D), l and T (N, M) and tested muscle (N,) of all messages."""
+        theta, readings, tested = zip(*self._history, strict=True)
+        stacked = MuscleReadings.stack(readings)
+        return np.array(theta), stacked.length, stacked.tension, np.array(tested)
 
     def _judge_joints(self) -> None:
         """Judge the joint sensors by the lengths, unless the lengths are wrong."""
         verdict, robot = self.verdict, self._robot
         if not self._history or {'order', 'unit', 'sign'} & verdict.wrong:
             return
-        theta, states, tested = map(np.array, zip(*self._history, strict=True))
+        theta, length, tension, tested = self._columns()
         if not self._knows_joints():
             verdict.notes.append('θ of some joints is unknown, so signs of θ were not checked')
             return
-        judgement = judge(robot, theta, states[:, 0], states[:, 1], segments=tested)
-        order = judge_order(robot, theta, states[:, 0], states[:, 1], tested)
+        judgement = judge(robot, theta, length, tension, segments=tested)
+        order = judge_order(robot, theta, length, tension, tested)
         meant = corrected(theta, judgement.faults, robot.units)
-        of_joints = judge_order(robot, meant, states[:, 0], states[:, 1], tested)
+        of_joints = judge_order(robot, meant, length, tension, tested)
         # A fault of the joint sensors is preferred, because it can look like exchanged antagonists.
         if order.is_faulty and (
             not judgement.faults or order.misfit < JOINTS_BETTER * of_joints.misfit
@@ -267,10 +276,10 @@ class MotionTest(ABC):
         Raises:
             RunAwayError: If a muscle runs away meanwhile.
         """
-        end, start = self._now + duration, self._recent[-1][1]
+        end, start = self._now + duration, self._newest
         while self._now < end:
             yield
-            if error := self._run_away(self._recent[-1][1], start):
+            if error := self._run_away(self._newest, start):
                 raise error
 
     def _since(self, last: float) -> float:
@@ -302,16 +311,18 @@ class MotionTest(ABC):
         is_wild = self._now - self._tame_at > MOMENT
         return int(is_wild.argmax()) if is_wild.any() else None
 
-    def _readings(self) -> Array:
-        """Return the readings of the last MEAN seconds, (N, 3, M).
+    @property
+    def _newest(self) -> MuscleReadings:
+        """The readings of the newest message."""
+        return self._recent[-1][1]
 
-        Each reading consists of lengths [m], tensions [N] and temperatures [°C].
-        """
-        return np.array([states for _, states in self._recent])
+    def _readings(self) -> MuscleReadings:
+        """Return the readings of the last MEAN seconds, (N, M) of each quantity."""
+        return MuscleReadings.stack(readings for _, readings in self._recent)
 
     def _noise(self) -> Array:
         """Return the standard deviations of the tensions [N], (M,), in the last MEAN seconds."""
-        return np.std(self._readings()[:, 1], axis=0)
+        return np.std(self._readings().tension, axis=0)
 
     def _go(self, m: int, goal: float) -> Wait:
         """Move the target of muscle m to `goal` [m], then wait until the muscle has settled.

@@ -31,6 +31,7 @@ from musculoskeletal_ae.driver.motion import (
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
 #: first step of a muscle's target length inwards, from which the latency is measured [m]
 STEP = 0.003
@@ -86,19 +87,23 @@ class Positioning(MotionTest):
 
     def _hold(self) -> Wait:
         yield from self._wait(RELEASE)
-        length, tension = self._mean()[:2]
-        self._most = np.maximum(self._highest, tension + RISE)
-        self._target[:] = length
+        mean = self._mean()
+        self._most = np.maximum(self._highest, mean.tension + RISE)
+        self._target[:] = mean.length
         yield from self._wait(SETTLE)
-        held = self._mean()
-        if winds := self._exchanged(held[0]):
+        held = self._mean().length
+        if winds := self._exchanged(held):
             raise WrongOrderError(winds)
-        for m in np.flatnonzero(np.abs(held[0] - self._target) > FOLLOWS).tolist():
-            off = 1e3 * (held[0] - self._target)[m]
+        for m in np.flatnonzero(np.abs(held - self._target) > FOLLOWS).tolist():
+            off = 1e3 * (held - self._target)[m]
             self.verdict.failed('position hold', m, off=off)
 
-    def _run_away(self, states: Array, start: Array) -> RunAwayError | None:  # noqa: ARG002
-        length, tension = states[:2]
+    def _run_away(
+        self,
+        newest: MuscleReadings,
+        start: MuscleReadings,  # noqa: ARG002
+    ) -> RunAwayError | None:
+        length, tension = newest.length, newest.tension
         far = np.abs(length - self._target) > RUN_AWAY
         m = self._lasting((tension > self._highest + RUN_AWAY_TENSION) | far)
         if self._tested is None and (tension > self._most).any():
@@ -111,7 +116,7 @@ class Positioning(MotionTest):
         return RunAwayError(m, 'position ran away', detail=detail)
 
     def _release(self, error: RunAwayError) -> Wait:
-        self._winds = self._exchanged(self._recent[-1][1][0]) if self._tested is None else {}
+        self._winds = self._exchanged(self._newest.length) if self._tested is None else {}
         # The module that follows the command of an exchanged muscle is paid out as well.
         m = [error.muscle, *self._winds]
         self._target[m] += self._robot.actuation.release[m]
@@ -152,10 +157,9 @@ class Positioning(MotionTest):
             return {}
         return dict(zip(movers[nearest].tolist(), movers.tolist(), strict=True))
 
-    def _mean(self) -> Array:
-        """Return the mean of the last readings: l [m], T [N] and temperature [°C], (3, M)."""
-        mean: Array = self._readings().mean(axis=0)
-        return mean
+    def _mean(self) -> MuscleReadings:
+        """Return the mean of the last readings."""
+        return MuscleReadings.of_rows(self._readings().rows.mean(axis=0))
 
     # -- checks ---------------------------------------------------------------------------------
 
@@ -166,7 +170,7 @@ class Positioning(MotionTest):
         self._target[m] = start - STEP
         while self._now - begun < HOLD:
             yield from self._wait(1e-9)
-            if not latency and abs(self._recent[-1][1][0, m] - home[0, m]) > answer:
+            if not latency and abs(self._newest.length[m] - home.length[m]) > answer:
                 latency = self._now - begun
         last = self._now
         while self._target[m] > start - FURTHEST and self._may_go_on(m):
@@ -175,7 +179,7 @@ class Positioning(MotionTest):
             yield from self._wait(1e-9)
         yield from self._wait(HOLD)
         wound, asked = self._mean(), start - self._target[m]
-        moved = (home - wound)[0]
+        moved = home.length - wound.length
         others = np.abs(moved) * (np.arange(len(moved)) != m)
         if abs(moved[m]) < SHARES[0] * STEP * 0.5:
             yield from self._go(m, start)
@@ -184,7 +188,7 @@ class Positioning(MotionTest):
                 raise WrongOrderError({m: other})
             verdict.failed('no answer', m)
             return
-        pulled = wound[1, m] - home[1, m]
+        pulled = wound.tension[m] - home.tension[m]
         if not SHARES[0] < moved[m] / asked < SHARES[1]:
             detail = (
                 f'l fell by {1e3 * moved[m]:.1f} mm while l_target fell by {1e3 * asked:.1f} mm'
@@ -203,7 +207,7 @@ class Positioning(MotionTest):
             verdict.passed('sign', m)
         yield from self._go(m, start)
         yield from self._go(m, start + OUTWARDS)
-        out = self._mean()[0, m] - home[0, m]
+        out = self._mean().length[m] - home.length[m]
         if out < SHARES[0] * OUTWARDS:
             verdict.failed('position outwards', m, out=1e3 * out, asked=1e3 * OUTWARDS)
         else:
@@ -213,4 +217,4 @@ class Positioning(MotionTest):
 
     def _may_go_on(self, m: int) -> bool:
         """Return whether muscle m may be wound in further; True if its tension is unknown."""
-        return not float(self._readings()[:, 1, m].mean()) > self._highest[m]
+        return not float(self._readings().tension[:, m].mean()) > self._highest[m]

@@ -49,6 +49,7 @@ from musculoskeletal_ae.driver.motion import (
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
 #: demand at least this above T_bias, because noise hides the response to less [N]
 LEAST_ABOVE_BIAS = 20.0
@@ -91,7 +92,7 @@ class _Reading(NamedTuple):
 
     length: Array
     tension: Array
-    third: Array  # third row of the message, the temperatures
+    temperature: Array
     demand: Array  # tension that the law demands, at most tension.max
 
 
@@ -179,12 +180,12 @@ class Winding(MotionTest):
         for m in off:
             self.verdict.failed('hold', m, got=held.tension[m], asked=held.demand[m])
 
-    def _run_away(self, states: Array, start: Array) -> RunAwayError | None:
+    def _run_away(self, newest: MuscleReadings, start: MuscleReadings) -> RunAwayError | None:
         """Return the error of a muscle that exceeds its demand or shortens too far; else None.
 
-        `states` and `start` are the newest readings and those when the present wait began, (3, M).
+        `newest` and `start` are the newest readings and those when the present wait began.
         """
-        length, tension = states[:2]
+        length, tension = newest.length, newest.tension
         tensions = self._robot.tension
         verified = np.minimum(np.maximum(tensions.limit, self._most), tensions.max)
         asked = np.minimum(
@@ -197,16 +198,16 @@ class Winding(MotionTest):
             unverified = tension - self._alarm
         if (unverified > 0.0).any():
             m = int(np.nanargmax(unverified))
-            recent = self._readings()[:, 1, m]
+            recent = self._readings().tension[:, m]
             crossings = np.count_nonzero(np.diff(recent > recent.mean()))
             if self._tested is None and crossings > OSCILLATES:
                 return RunAwayError(m, 'hums', swing=np.std(recent))
         if m is not None:
             detail = f'T rose to {tension[m]:.0f} N, but the demand was {asked[m]:.0f} N'
-            rose = float(length[m] - start[0][m])
+            rose = float(length[m] - start.length[m])
             fault = 'rising' if rose > RESPONSE[1] else 'ran away'
             return RunAwayError(m, fault, detail=detail, rose=1e3 * rose)
-        fell = start[0] - length
+        fell = start.length - length
         if fell.max() > RUN_AWAY:
             detail = f'l fell by {1e3 * fell.max():.0f} mm'
             return RunAwayError(int(fell.argmax()), 'ran away', detail=detail)
@@ -223,9 +224,9 @@ class Winding(MotionTest):
         if self._suspects:
             yield from self._pay_out()
             return
-        start, before = self._now, self._recent[-1][1][1]
+        start, before = self._now, self._newest.tension
         while (passed := self._now - start) < RELEASE:
-            length, tension = self._recent[-1][1][:2]
+            length, tension = self._newest.length, self._newest.tension
             if passed > 0.5 * LATEST and (tension > before.max() + self._response).any():
                 break
             self._target = length + min(PAY_OUT[0] + PAY_OUT[1] * passed, 2.0 * RUN_AWAY)
@@ -238,9 +239,9 @@ class Winding(MotionTest):
 
         Every target moves beyond the largest l. If a tension still rises, commands end.
         """
-        start, before = self._now, self._recent[-1][1][1]
+        start, before = self._now, self._newest.tension
         while (passed := self._now - start) < RELEASE:
-            length, tension = self._recent[-1][1][:2]
+            length, tension = self._newest.length, self._newest.tension
             if passed > 0.5 * LATEST and (tension > before.max() + self._response).any():
                 self._suspects = []
                 break
@@ -253,7 +254,7 @@ class Winding(MotionTest):
         Each of them must then follow the command of another muscle, which demands the excess, and
         no two of them the same one. If every muscle pulls, the order is therefore not wrong.
         """
-        length, tension = self._recent[-1][1][:2]
+        length, tension = self._newest.length, self._newest.tension
         demand = self._demanded(length)
         excess = tension - demand
         pulls = excess > self._tolerance
@@ -305,7 +306,7 @@ class Winding(MotionTest):
             return
         self._searches_order = True
         self._is_searched[:] = False
-        clear = float(self._recent[-1][1][0].max()) + CLEAR
+        clear = float(self._newest.length.max()) + CLEAR
         self._target[:] = clear
         yield from self._wait(RELEASE)
         tested, self._tested = self._tested, None  # from now on, ALARM limits every tension
@@ -345,11 +346,11 @@ class Winding(MotionTest):
             self._target[m] -= speed * self._since(last)
             last = self._now
             yield from self._wait(1e-9)
-            rose = (self._recent[-1][1][1] - before.tension) / answer
+            rose = (self._newest.tension - before.tension) / answer
             m_rose = int(rose.argmax())
             count = count + 1 if rose[m_rose] > 1.0 and m_rose in (found, None) else 0
             found = m_rose if rose[m_rose] > 1.0 else None
-        reached = self._recent[-1][1][1]
+        reached = self._newest.tension
         self._target[m] = clear
         self._is_searched[m] = False
         yield from self._wait(RELEASE)
@@ -390,10 +391,10 @@ class Winding(MotionTest):
     def _mean(self) -> _Reading:
         readings = self._readings()
         # The demand is averaged, because it is a nonlinear function of the noisy l.
-        demand = self._demanded(readings[:, 0])
+        demand = self._demanded(readings.length)
         clipped = np.minimum(demand, self._robot.tension.max).mean(axis=0)
-        length, tension, third, *_ = readings.mean(axis=0)
-        return _Reading(length, tension, third, clipped)
+        mean = MuscleReadings.of_rows(readings.rows.mean(axis=0))
+        return _Reading(mean.length, mean.tension, mean.temperature, clipped)
 
     def _off(self, reading: _Reading) -> Bools:
         """Return a mask (M,) of the muscles whose tension is not the one that the law demands."""
@@ -425,7 +426,7 @@ class Winding(MotionTest):
         self._target[m] = before.length[m] - further
         start = last = self._now
         while True:
-            length = self._recent[-1][1][0]
+            length = self._newest.length
             lacking = self._demanded(length)[m] < level
             going_on = lacking and home - self._target[m] < FURTHEST + further
             if self._now - start >= HOLD and not going_on:
@@ -434,7 +435,7 @@ class Winding(MotionTest):
                 self._target[m] -= SPEED * self._since(last)
             last = self._now
             yield from self._wait(1e-9)
-            length, tension = self._recent[-1][1][:2, m]
+            length, tension = self._newest.length[m], self._newest.tension[m]
             pulled = abs(tension - before.tension[m]) > answer
             answered = pulled or before.length[m] - length > 2.0 * RESPONSE[1]
             if answered and not latency and not hidden:
@@ -497,7 +498,7 @@ class Winding(MotionTest):
             note = f'{self._robot.muscles[m]}: the arm moved, so the control law was not checked'
             self.verdict.notes.append(note)
             return
-        if abs(last.third[m] - home.third[m]) > 0.7 * asked and abs(got) < 0.3 * asked:
+        if abs(last.temperature[m] - home.temperature[m]) > 0.7 * asked and abs(got) < 0.3 * asked:
             failed('third row', m)
         elif not SLOPES[0] < got / asked < SLOPES[1]:
             failed('gain', m, got=got, asked=asked)
@@ -555,14 +556,15 @@ class Winding(MotionTest):
                 yield
                 gone += SPEED * self._since(last)
                 last = self._now
-                readings = np.array([states[:2, m] for _, states in self._recent])
-                if (np.ptp(readings, axis=0) == 0.0).any():
+                readings = self._readings()
+                length, tension = readings.length[:, m], readings.tension[:, m]
+                if np.ptp(length) == 0.0 or np.ptp(tension) == 0.0:
                     return None
                 self._target[m] = home_length + direction * gone
-                rise = float(readings[-1, 1] - home.tension[m])
+                rise = float(tension[-1] - home.tension[m])
                 if abs(rise) > answer:
                     onset = self._target[m] + rise / self._robot.stiffness[m]
-                    return float(onset), float(readings[-1, 0])
+                    return float(onset), float(length[-1])
             yield from self._go(m, home_length)
         return None
 

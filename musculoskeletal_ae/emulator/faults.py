@@ -18,7 +18,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, muscle_reading
+from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, MuscleReadings
 
 SPEED_LIMIT = 0.25  # fastest speed of a muscle module's motor [m/s]; chosen by hand
 TURN = 6.2832  # reject a larger turn of the base [rad]: a full turn leaves the base upright
@@ -73,22 +73,11 @@ KINDS = {
 LEGAL = 'KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]; kinds: ' + ', '.join(KINDS)
 
 
-class Readings(NamedTuple):
+class ArmReadings(NamedTuple):
     """What all sensors of an arm read at one moment."""
 
     theta: Array  # joint angles [rad], (D,)
-    length: Array  # muscle lengths [m], (M,)
-    tension: Array  # muscle tensions [N], (M,)
-    temperature: Array  # housing temperatures of the modules [°C], (M,)
-
-    @property
-    def muscles(self) -> dict[str, Array]:
-        """The readings of the muscle modules by the names of their quantities, (M,) each."""
-        return {name: value for name, value in self._asdict().items() if name != 'theta'}
-
-    def message(self, robot: Robot) -> Array:
-        """Return the readings of the muscle modules as the rows of a message, (Q, M)."""
-        return muscle_reading(robot, **self.muscles)
+    muscles: MuscleReadings
 
 
 #: names of the quantities whose sensors can be emulated as faulty
@@ -170,8 +159,8 @@ class Faults:
         self._robot, self._rng = robot, rng
         self._faults: tuple[EmulatedFault, ...] = ()
         self._frozen: dict[tuple[str, int], float] = {}
-        self._reordered: Readings | None = None  # readings that are sent after the next ones
-        self._queue: list[tuple[float, Readings]] = []
+        self._reordered: ArmReadings | None = None  # readings that are sent after the next ones
+        self._queue: list[tuple[float, ArmReadings]] = []
         self._time = 0.0  # time since the start [s]
         self._begins: dict[tuple[object, ...], float] = {}  # begin of each drift [s], by its key
         #: time of the next change of each burst [s], and whether the burst is present, by its key
@@ -247,10 +236,12 @@ class Faults:
         self._bursts[fault.key] = until, is_present
         return is_present
 
-    def apply(self, readings: Readings) -> Readings:
+    def apply(self, readings: ArmReadings) -> ArmReadings:
         """Apply all sensor faults to readings, and return the result."""
-        values = {name: getattr(readings, name).copy() for name in (*SENSED, 'theta')}
-        values['tension'] = np.minimum(values['tension'], self.ceiling)
+        theta, muscles = readings.theta.copy(), readings.muscles.copy()
+        muscles.tension = np.minimum(muscles.tension, self.ceiling)
+        # These arrays are views, which are changed in place.
+        values = {each.name: each.of(muscles) for each in QUANTITIES} | {'theta': theta}
         kinds = 'exchange', 'bias', 'drift', 'burst', 'spike', 'dead_sensor', 'nan_sensor', 'freeze'
         for fault in self._of(*kinds):
             is_in_burst = fault.kind == 'burst' and self._is_in_burst(fault)
@@ -279,7 +270,7 @@ class Faults:
                 elif self._rng.random() < SPIKE_SHARE:
                     hit = which == self._rng.choice(which)
                     value[which[hit]] += size[hit]
-        return readings._replace(**values)
+        return ArmReadings(theta, muscles)
 
     def _delay(self) -> float:
         return sum(fault.size for fault in self._of('delay'))
@@ -287,7 +278,7 @@ class Faults:
     def _happens(self, name: str) -> bool:
         return any(self._rng.random() < fault.size for fault in self._of(name))
 
-    def deliver(self, readings: Readings, now: float) -> list[Readings]:
+    def deliver(self, readings: ArmReadings, now: float) -> list[ArmReadings]:
         """Send `readings` at the time `now` [s], with all faults of communication applied.
 
         Readings can be lost, duplicated, delayed or swapped with the next ones.

@@ -25,7 +25,7 @@ import pinocchio as pin
 from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.emulator.faults import SPEED_LIMIT, Faults, Readings
+from musculoskeletal_ae.emulator.faults import SPEED_LIMIT, ArmReadings, Faults
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.joint_units import SLIDE
 from musculoskeletal_ae.robot.kinematics import Kinematics
@@ -477,32 +477,29 @@ class Arm(ABC):
         """Turn the gravity of the simulation as for a base turned by `mount` (`Faults.mount`)."""
 
     @abstractmethod
-    def _raw_readings(self) -> tuple[Array, Array, Array, Array]:
-        """Return the readings of all sensors without noise, rounding and faults.
+    def _raw_readings(self) -> ArmReadings:
+        """Return the readings of all sensors without noise, rounding and faults."""
 
-        Returns:
-            Joint angles [rad], (D,); lengths [m], tensions [N] and temperatures [°C], each (M,).
-        """
-
-    def sense(self) -> Readings:
+    def sense(self) -> ArmReadings:
         """Read all sensors once, with noise, bias, resolution and faults."""
-        theta, length, tension, housing = self._raw_readings()
+        theta, muscles = self._raw_readings()
         ruptured, rng = self._muscle.ruptured > 0.0, self._rng
         # Let the sensor of a ruptured tendon read 0, and no tension sensor less than 0.
         finest = TENSION_NOISE_SHARE * self.robot.description.tension.bias
         fineness = np.minimum(1.0, finest / TENSION_NOISE)
         noise, resolution = fineness * TENSION_NOISE, fineness * TENSION_RESOLUTION
-        measured = noisy(np.where(ruptured, 0.0, tension), noise, resolution, rng)
-        readings = Readings(
-            noisy(theta, ANGLE_NOISE, ANGLE_RESOLUTION, rng),
-            noisy(length, LENGTH_NOISE, LENGTH_RESOLUTION, rng),
-            np.where(ruptured, 0.0, np.maximum(measured, 0.0)),
-            noisy(housing, TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION, rng),
+        measured = noisy(np.where(ruptured, 0.0, muscles.tension), noise, resolution, rng)
+        theta = noisy(theta, ANGLE_NOISE, ANGLE_RESOLUTION, rng)
+        read = muscles.replace(
+            length=noisy(muscles.length, LENGTH_NOISE, LENGTH_RESOLUTION, rng),
+            tension=np.where(ruptured, 0.0, np.maximum(measured, 0.0)),
+            temperature=noisy(muscles.temperature, TEMPERATURE_NOISE, TEMPERATURE_RESOLUTION, rng),
         )
         if self.robot.tension_source.is_current:
-            readings = readings._replace(tension=self._read_currents(tension))
-        readings = self.faults.apply(readings)
-        return readings._replace(tension=self.robot.tension_source.known(readings.tension))
+            read.tension = self._read_currents(muscles.tension)
+        readings = self.faults.apply(ArmReadings(theta, read))
+        readings.muscles.tension = self.robot.tension_source.known(readings.muscles.tension)
+        return readings
 
     def _read_currents(self, tension: Array) -> Array:
         """Read the tensions that noisy motor currents indicate [N], (M,).

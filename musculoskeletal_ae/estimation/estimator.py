@@ -347,7 +347,7 @@ class Estimator:
         """Take a message of muscle_states: estimate the state, and check for faults.
 
         Args:
-            message: The message, or its rows (`muscle_reading`).
+            message: The message of `muscle_states`, or `MuscleReadings`.
             time: Time of the message [s].
             now: Time on the steady clock [s].
             delay: How late the message is, compared with the fastest one [s].
@@ -362,8 +362,8 @@ class Estimator:
             sample = self.stream.take(message, time, now, delay)
         except RejectionError as error:
             self._rejected.note(str(error), now)
-            if error.states is not None:
-                self._handle(self.health.read(error.states, self.body.used, now), now)
+            if error.readings is not None:
+                self._handle(self.health.read(error.readings, self.body.used, now), now)
             raise
         return self._use_sample(sample, now)
 

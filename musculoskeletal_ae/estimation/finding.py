@@ -10,10 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.conditions import ConditionKind, FindingReaction, Revokes
+from musculoskeletal_ae.conditions import ConditionKind, Revokes
 from musculoskeletal_ae.estimation.estimate import Estimate, estimate
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 #: discard the messages of this time before a fault was detected [s], because the fault may have
@@ -39,8 +40,8 @@ class Finding:
     others: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse kinds that only warn, because a finding latches an anomaly."""
-        if self.kind.reaction in (None, FindingReaction.WARN):
+        """Refuse kinds that are no findings, because a finding latches an anomaly."""
+        if self.kind.reaction is None:
             raise ValueError(
                 f'{self.kind.identifier} has no reaction that stops the arm or isolates a muscle; '
                 'report it as a condition instead'
@@ -115,7 +116,7 @@ def observe(
         sliding=unknown,
         temperature=unknown,
         usable=usable,
-        newest=np.array([length, motor_tension, unknown]),
+        newest=MuscleReadings(length=length, tension=motor_tension),
     )
     estimated = estimate(mae, bone_tension, length, state)
     return Observation(sample, estimated, demand, dt, command=command)
@@ -137,11 +138,16 @@ class Detector:
     def accept(self, muscles: Iterable[int]) -> None:
         """Consider these muscles (indices) healthy in their present state."""
 
-    def read(self, states: Array, usable: Bools, now: float) -> Finding | None:  # noqa: ARG002
+    def read(
+        self,
+        readings: MuscleReadings,  # noqa: ARG002
+        usable: Bools,  # noqa: ARG002
+        now: float,  # noqa: ARG002
+    ) -> Finding | None:
         """Check the raw readings of a message, even of a rejected one; return a finding or None.
 
         Args:
-            states: Raw l [m], T [N] and temperature [°C], (3, M).
+            readings: The raw readings.
             usable: Whether each muscle is used, (M,).
             now: Time of the message on a steady clock [s].
         """

@@ -7,7 +7,7 @@ The estimator, offline learning (`train --from-bag`) and the experiments use the
 
 from collections.abc import Iterable
 
-from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.estimation.detectors.frozen_sensor import FrozenSensor
 from musculoskeletal_ae.estimation.detectors.length_disagreement import LengthDisagreement
 from musculoskeletal_ae.estimation.detectors.length_jump import LengthJump
@@ -20,6 +20,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.heat import Heat
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
 
 class HealthMonitor:
@@ -72,13 +73,13 @@ class HealthMonitor:
         for detector in self._detectors:
             detector.accept(muscles)
 
-    def read(self, states: Array, usable: Bools, now: float) -> Finding | None:
+    def read(self, readings: MuscleReadings, usable: Bools, now: float) -> Finding | None:
         """Check the raw readings of a message, even of a rejected one; return the first finding.
 
         `Detector.read` describes the arguments. Without a finding, the result is None.
         """
-        self._exchange.read(states, now)
-        findings = [detector.read(states, usable, now) for detector in self._detectors]
+        self._exchange.read(readings, now)
+        findings = [detector.read(readings, usable, now) for detector in self._detectors]
         return next(filter(None, findings), None)
 
     def step(self, observation: Observation) -> Finding | None:

@@ -13,7 +13,7 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.control.command import LENGTH
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.emulator.faults import Readings
+from musculoskeletal_ae.emulator.faults import ArmReadings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.settings import EstimatorSettings
@@ -100,7 +100,7 @@ class ClosedLoop:
         """Advance by one message; return a row of a recording."""
         arm, core, read, now = self.arm, self.core, self._read, self._now
         with suppress(MessageError):  # the nodes count and drop bad messages
-            core.take(read.message(arm.robot), now)
+            core.take(read.muscles, now)
             core.estimated(self.estimate(read, now), now)
         command = core.step(now)
         if command is not None:
@@ -110,16 +110,16 @@ class ClosedLoop:
         arm.step(SAMPLE_TIME)
         reading = arm.sense()
         self._read, self._now = reading, now + SAMPLE_TIME
-        sent = read.length if command is None else command.value
-        return arm.theta, reading.theta, reading.length, reading.tension, sent
+        sent = read.muscles.length if command is None else command.value
+        return arm.theta, reading.theta, reading.muscles.length, reading.muscles.tension, sent
 
-    def estimate(self, read: Readings, now: float) -> Array:
+    def estimate(self, read: ArmReadings, now: float) -> Array:
         """Estimate θ [rad] (D,) from the readings at `now` [s], and pass on the body state.
 
         Raises:
             MessageError: If the message cannot be used.
         """
-        output = self.estimator.take(read.message(self.arm.robot), now, now)
+        output = self.estimator.take(read.muscles, now, now)
         if self.estimator.body is not self.core.stream.body:
             self.core.use_body(self.estimator.body)
         assert output is not None
@@ -200,7 +200,7 @@ def record(
     planned, rows = 0.0, list[tuple[Array, ...]]()
     # The first ramp starts at the present lengths, so that the command does not jump.
     robot, read = arm.robot, arm.sense()
-    command = read.length
+    command = read.muscles.length
     for step in Exploration(robot, stream, PAPER_PRESET) if isinstance(stream, int) else stream:
         if planned >= duration - 1e-9:
             break
@@ -210,14 +210,15 @@ def record(
             off = script(arm, SAMPLE_TIME * len(rows)) if script else None
             share = min(1.0, (tick + 1) * SAMPLE_TIME / (RAMP_SHARE * step.duration))
             command = start + share * (goal - start)
-            demand = robot.actuation.demanded(read.length, command)
+            demand = robot.actuation.demanded(read.muscles.length, command)
             if off is None or demand is None:
                 arm.command_length(command if off is None else command + off * PAID_OUT)
             else:
                 arm.command_tension(np.where(off, 0.0, demand))
             arm.step(SAMPLE_TIME)
             read = arm.sense()
-            rows.append((arm.theta, read.theta, read.length, read.tension, command))
+            muscles = read.muscles
+            rows.append((arm.theta, read.theta, muscles.length, muscles.tension, command))
     return Recording(*columns(rows))
 
 

@@ -31,7 +31,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
-from musculoskeletal_ae.emulator.faults import Readings
+from musculoskeletal_ae.emulator.faults import ArmReadings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
 from musculoskeletal_ae.experiments import plots
@@ -78,7 +78,7 @@ class IsolatingLoop(ClosedLoop):
         """Indices of the muscles that the controller does not use."""
         return self.core.stream.body.isolated
 
-    def estimate(self, read: Readings, now: float) -> Array:
+    def estimate(self, read: ArmReadings, now: float) -> Array:
         """Estimate θ [rad] (D,), and note the end of a verification and the error."""
         core, before = self.estimator, self.core.stream.body
         theta = super().estimate(read, now)

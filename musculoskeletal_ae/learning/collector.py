@@ -149,7 +149,7 @@ class SampleCollector:
 
         Args:
             time: Time of reception [s].
-            message: The message, or its rows (`muscle_reading`).
+            message: The message of `muscle_states`, or `MuscleReadings`.
             delay: How late the message is (`Arrival.delay`) [s].
 
         Returns:

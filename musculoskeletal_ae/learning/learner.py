@@ -47,7 +47,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.joint_trust import JointTrust
 from musculoskeletal_ae.signals.limits import LIMITS
-from musculoskeletal_ae.signals.muscle_readings import muscle_reading
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, RejectionError
 from musculoskeletal_ae.signals.pairing import Paired
 
@@ -148,7 +148,7 @@ class Learner:
         if theta is not None:
             self.joints(time, theta)
         with suppress(RejectionError):  # it is counted in `rejected`
-            self.take(muscle_reading(self.robot, length=length, tension=tension), time)
+            self.take(MuscleReadings(length=length, tension=tension), time)
         return self.poll(time)
 
     def joints(self, time: float, theta: Array) -> None:
@@ -163,7 +163,7 @@ class Learner:
         """Take a message of muscle_states, and learn from it.
 
         Args:
-            message: The message, or its rows (`muscle_reading`).
+            message: The message of `muscle_states`, or `MuscleReadings`.
             time: Time of reception [s].
             delay: How late the message is (`Arrival.delay`) [s].
 

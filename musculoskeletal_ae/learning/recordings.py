@@ -31,7 +31,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly
 from musculoskeletal_ae.signals.friction import directions
 from musculoskeletal_ae.signals.joint_stream import JointStream
-from musculoskeletal_ae.signals.muscle_readings import muscle_reading
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 from musculoskeletal_ae.tables.table import Table
 
@@ -147,7 +147,7 @@ def count_postures(
         collector.joints(time, theta)
         paired = None
         with suppress(RejectionError):
-            paired = collector.take(time, muscle_reading(robot, length=length, tension=tension))
+            paired = collector.take(time, MuscleReadings(length=length, tension=tension))
         if paired is not None:
             collector.collect(paired)
         progress()
@@ -185,7 +185,7 @@ def collect_rests(
         joints.reset()
         theta = joints.take(0.0, row)
         try:
-            sample = muscles.take(muscle_reading(robot, length=length, tension=tension), 0.0)
+            sample = muscles.take(MuscleReadings(length=length, tension=tension), 0.0)
         except RejectionError as error:
             learner.collector.rejected[error.reason] += 1
             continue
@@ -225,7 +225,7 @@ def learn(
         if learner.mae is not newest:
             _decide(estimator, learner.mae, at)
             newest = learner.mae
-        reading = muscle_reading(learner.robot, length=length, tension=tension)
+        reading = MuscleReadings(length=length, tension=tension)
         learner.joints(at, theta)
         with suppress(RejectionError):  # the learner counts it
             output = estimator.take(reading, at, at)

@@ -32,7 +32,7 @@ from musculoskeletal_ae.ros.messages import (
 )
 from musculoskeletal_ae.ros.second_publishers import COMMANDS, MOTOR_COMMAND
 from musculoskeletal_ae.signals.motor_interface import STATES
-from musculoskeletal_ae.signals.muscle_readings import muscle_reading
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
 MARKER_RATE = 10.0  # publish markers at this rate [Hz]
 NAME_HEIGHT = 0.018  # height of the letters with which the muscles' names are drawn [m]
@@ -169,23 +169,21 @@ class ArmNode(Shell):
             publisher = self.create_publisher(String, 'robot_description', LATCHED)
             publisher.publish(String(data=self.robot.description.urdf))
 
-    def publish_state(self, theta: Array, **values: Array) -> None:
+    def publish_state(self, theta: Array, muscles: MuscleReadings) -> None:
         """Publish the state of the arm.
 
         Args:
             theta: Joint angles θ [rad], (D,).
-            values: The readings of the muscle modules, as for `muscle_reading`; among them `length`
-                and `tension`.
+            muscles: The readings of the muscle modules.
         """
         stamp, motors, joints = self.get_clock().now().to_msg(), self._motors, self._joints
         if motors is not None and is_heard(motors):
-            effort = self.robot.tension_source.to_message(values['tension'])
-            message = motor_message(self.motors, values['length'], effort, stamp)
+            message = motor_message(self.motors, muscles.length, muscles.tension, stamp)
             if motors is joints:
                 add_joints(message, self.robot.units, theta)
             motors.publish(message)
         if joints is not None and joints is not motors and is_heard(joints):
             joints.publish(posture_message(self.robot.units, theta, stamp))
         if self._muscles is not None and is_heard(self._muscles):
-            rows = muscle_reading(self.robot, **values)
+            rows = muscles.to_message(self.robot.tension_source)
             self._muscles.publish(array_message(rows, 'quantity', 'muscle'))

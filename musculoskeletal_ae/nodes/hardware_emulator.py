@@ -96,7 +96,7 @@ class HardwareEmulatorNode(ArmNode):
             return
         self.reading = self.arm.sense()
         for reading in self.arm.faults.deliver(self.reading, now):
-            self.publish_state(reading.theta, **reading.muscles)
+            self.publish_state(*reading)
         if self.imu is not None:
             self._publish_imu(self.imu)
         if self.sensors.marker_rate > 0.0 and now >= self.pose_due:
@@ -139,7 +139,9 @@ class HardwareEmulatorNode(ArmNode):
 
     def status(self) -> Report:
         """Return what the emulated arm does, with its values."""
-        hottest = np.fmax.reduce(self.reading.temperature)  # NaN only if all temperatures are NaN
+        hottest = np.fmax.reduce(
+            self.reading.muscles.temperature
+        )  # NaN only if all temperatures are NaN
         values = {'hottest module': f'{hottest:.1f} °C', 'real-time factor': f'{self.pace:.2f}'}
         is_obeying = not (self.arm.has_diverged or self.arm.safe)
         return Report('following commands' if is_obeying else '', values)

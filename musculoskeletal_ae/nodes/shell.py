@@ -110,7 +110,7 @@ class Shell(Node):
         check_names(parameter_overrides(self))
         self.robot = Robot.load(self.parameter('robot'))
         self.rate: float = self.parameter('rate')  # rate of the muscle modules [Hz]
-        self.motors = MotorInterface(self.robot.description.motors)
+        self.motors = MotorInterface(self.robot.description.motors, self.robot.tension_source)
         #: topics of a ros2_control robot, by the names of the topics that they replace
         self._wires = {STATES: self.motors.state_topic, MOTOR_COMMAND: self.motors.command_topic}
         #: name of the root link's frame in published messages

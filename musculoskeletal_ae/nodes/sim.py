@@ -26,6 +26,7 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
 from musculoskeletal_ae.ros.messages import RELIABLE
 from musculoskeletal_ae.ros.second_publishers import MOTOR_COMMAND
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
 from musculoskeletal_ae.simulation.simulation import Simulation
 
@@ -97,9 +98,8 @@ class SimNode(ArmNode):
         state = arm.step(elapsed)
         temperature = np.full(self.robot.muscle_count, TEMPERATURE)
         read = arm.mae.transmission.reading(state.tension[0], state.slid[0])
-        self.publish_state(
-            state.theta[0], length=state.length[0], tension=read, temperature=temperature
-        )
+        muscles = MuscleReadings(length=state.length[0], tension=read, temperature=temperature)
+        self.publish_state(state.theta[0], muscles)
 
     def _lines(self) -> list[Line]:
         if self.arm is None:

@@ -234,7 +234,7 @@ class Situation:
 
     @property
     def suspects(self) -> tuple[str, ...]:
-        """Names of the muscles and joints in which the estimator has found a fault."""
+        """Names of the muscles to which the estimator attributes a finding."""
         estimator = self._reports.get('estimator')
         present = () if estimator is None else estimator.conditions
         kinds = [(KINDS.get(each.identifier), each.subjects) for each in present]

@@ -50,28 +50,13 @@ class TensionSource:
             return self
         return TensionSource(self.kind, self.newton_per_ampere[muscles])
 
-    def from_message(self, values: Array) -> Array:
-        """Return the tensions in a message [N], (M,); NaN if the robot does not measure tensions.
-
-        `values` are tensions [N] or motor currents [A], (M,), depending on `kind`.
-        """
-        scale = self.newton_per_ampere
-        return self.known(values if scale is None else values * scale)
+    def to_newtons(self, values: Array) -> Array:
+        """Convert the values of a message, (M,): tensions [N] or currents [A], to tensions [N]."""
+        return values if self.newton_per_ampere is None else values * self.newton_per_ampere
 
     def known(self, tension: Array) -> Array:
         """Return `tension` [N], (..., M), or NaN if the robot does not measure tensions."""
         return tension if self.is_known else np.full_like(tension, np.nan)
-
-    def measured(self, rows: Array) -> Array:
-        """Return the rows of quantities that the robot measures.
-
-        Args:
-            rows: Row 0 has lengths, row 1 tensions, (2, ...).
-
-        Returns:
-            Both rows, or only row 0 if the robot does not measure tensions.
-        """
-        return rows if self.is_known else rows[:1]
 
     def to_message(self, tension: Array) -> Array:
         """Convert tensions [N], (M,), to the values of a message: tensions [N] or currents [A]."""

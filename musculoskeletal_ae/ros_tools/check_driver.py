@@ -75,7 +75,7 @@ class CheckDriver:
         self.robot, self.options = robot, options
         self.has_listened = False
         kind: Any = import_heavy('musculoskeletal_ae.signals.motor_interface').MotorInterface
-        self.motors: MotorInterface = kind(robot.description.motors)
+        self.motors: MotorInterface = kind(robot.description.motors, robot.tension_source)
         command = self.motors.command_topic or 'muscle_length_command'
         resolve = self.node.resolve_topic_name
         self.topic, self.command = resolve(self.motors.state_topic), resolve(command)
@@ -170,11 +170,7 @@ class CheckDriver:
     def wind(self, verdict: Verdict) -> None:
         """Wind the tested muscles in slightly; add the faults of their responses to the verdict."""
         winding = _winding(self.robot, verdict, self.options)
-        read = partial(
-            import_heavy('musculoskeletal_ae.message_reading').read_muscle_states,
-            muscles=self.robot.muscle_count,
-            source=self.robot.tension_source,
-        )
+        readings = import_heavy('musculoskeletal_ae.signals.muscle_readings')
         publisher = self.node.create_publisher(Float64MultiArray, self.command, RELIABLE)
         self.spin_until(publisher.get_subscription_count, 3.0)
         if not publisher.get_subscription_count():
@@ -187,7 +183,7 @@ class CheckDriver:
             nonlocal trying
             now = time.monotonic()
             try:
-                states = read(self.motors.reading(message))
+                states = readings.read_muscle_states(self.motors.reading(message), self.robot)
             except MusculoskeletalError:
                 return
             arrival.use(now)

@@ -40,7 +40,6 @@ from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.message_reading import (
     read_array,
-    read_muscle_states,
     read_posture,
 )
 from musculoskeletal_ae.nodes.situation import PAGE, Arms, figures, nodes_in_graph
@@ -55,6 +54,7 @@ from musculoskeletal_ae.ros.messages import LATCHED, RELIABLE, joint_message
 from musculoskeletal_ae.ros_tools.ros_tool import ROS_HELP, message_class, run_tool, start_ros
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState
 from musculoskeletal_ae.signals.motor_interface import STATES, MotorInterface
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings, read_muscle_states
 
 #: QoS of topics of which only the newest message counts
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -103,7 +103,7 @@ class View(Node):
                 'the page needs viser; install it with: pip install -r requirements.txt'
             ) from error
         self.robot = robot
-        self.motors = MotorInterface(robot.description.motors)
+        self.motors = MotorInterface(robot.description.motors, robot.tension_source)
         self.requests: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         address, request = (options.host, options.port), lambda *what: self.requests.put(what)
         title = f'{self.get_namespace().strip("/")} {robot.description.directory.name}'.strip()
@@ -146,11 +146,9 @@ class View(Node):
     def _subscribe(self) -> None:
         robot, units = self.robot, self.robot.units
 
-        def muscles(message: Any) -> Array:
+        def muscles(message: Any) -> MuscleReadings:
             reading = self.motors.reading(message)
-            return read_muscle_states(
-                reading, robot.muscle_count, self._isolated(), math.nan, robot.tension_source
-            )
+            return read_muscle_states(reading, robot, self._isolated())
 
         def body(message: Any) -> BodyState:
             return BodyState.of_rows(read_array(message, ROWS, robot.muscle_count))
@@ -246,11 +244,11 @@ class View(Node):
             posture['measured'] = filled
             if np.isnan(filled).any():
                 del posture['measured']
-        states = self._newest('muscles')
-        self.page.draw(posture, None if states is None else states[1], self._kinds())
+        muscles = self._newest('muscles')
+        self.page.draw(posture, None if muscles is None else muscles.tension, self._kinds())
         if now >= self.texts_at + TEXT_PERIOD:
             self.texts_at = now
-            self._tell(posture, states)
+            self._tell(posture, muscles)
         if now >= self.graph_at + GRAPH_PERIOD:
             self.graph_at = now
             self._look()
@@ -270,7 +268,7 @@ class View(Node):
         body = self._newest('body', math.inf)
         return np.array([] if body is None else body.isolated, dtype=int)
 
-    def _tell(self, posture: dict[str, Array], states: Array | None) -> None:
+    def _tell(self, posture: dict[str, Array], muscles: MuscleReadings | None) -> None:
         situation, anomaly = self.situation, self._newest('anomaly')
         error, error_text = math.nan, ''
         if {'measured', 'estimated'} <= posture.keys():
@@ -284,12 +282,12 @@ class View(Node):
         lines = [
             figures('measured' in posture, error_text, anomaly) + shown_distance,
             f'{learned} · {situation.doing or "–"}',
-            f'waiting for {self.motors.state_topic}' if states is None else situation.hint(),
+            f'waiting for {self.motors.state_topic}' if muscles is None else situation.hint(),
         ]
         trouble = self.page.with_buttons(situation.trouble())
         if len(isolated := self._isolated()):
             lines.append(f'isolated: {self.robot.names(isolated)}')
-        shown = np.full((2, self.robot.muscle_count), np.nan) if states is None else states[1:3]
+        shown = muscles or MuscleReadings(length=np.full(self.robot.muscle_count, np.nan))
         values = error, anomaly, distance, situation.number('estimator', 'd limit')
         now, is_urgent = time.monotonic(), situation.level() == 'error'
         self.page.tell([*filter(None, lines)], trouble, shown, now, values, is_urgent)

@@ -22,7 +22,8 @@ from musculoskeletal_ae.arrival import is_later, nanoseconds
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.message_reading import joint_names, read_array
 from musculoskeletal_ae.robot.motors import ARRAY, JOINT_STATE, NO_MOTORS, Motors
-from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Row
+from musculoskeletal_ae.robot.tension_source import TENSION_SENSOR, TensionSource
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
 STATES = 'muscle_states'  # topic of the readings of a robot with a driver
 
@@ -40,13 +41,15 @@ class MotorInterface:
         command_topic: Topic of the motor commands, or '' if there are none.
     """
 
-    def __init__(self, motors: Motors | None) -> None:
+    def __init__(self, motors: Motors | None, source: TensionSource = TENSION_SENSOR) -> None:
         """Start without a message.
 
         Args:
             motors: How the motors are connected to the muscles; None for a robot with a driver,
                 which publishes muscle_states.
+            source: Whether the efforts are tensions or motor currents.
         """
+        self._source = source
         self.topics = NO_MOTORS if motors is None else motors.topics
         self.is_ros2_control = motors is not None
         self.state_topic = self.topics.states or STATES
@@ -72,7 +75,7 @@ class MotorInterface:
         self._stamp = 0  # the last stamp [ns]; 0 before the first
 
     def reading(self, message: Any) -> Any:
-        """Return the reading in a message of `state_topic`, as rows of muscle_states, (Q, M).
+        """Return the `MuscleReadings` in a message of `state_topic`.
 
         Messages of muscle_states are returned unchanged.
 
@@ -94,13 +97,13 @@ class MotorInterface:
             raise MessageError('repeated stamp', detail)
         self._stamp = stamp
         position = np.array(message.position, dtype=float)[self._places]
-        rows = np.full((len(QUANTITIES), len(position)), np.nan)
         with np.errstate(over='ignore'):  # a result that overflows is later rejected as not finite
-            rows[Row.LENGTH] = self._length_per_position * (position - self._zero)
-            if len(message.effort):
-                effort = np.array(message.effort, dtype=float)[self._places]
-                rows[Row.TENSION] = self._tension_per_effort * (effort - self._effort_zero)
-        return rows
+            length = self._length_per_position * (position - self._zero)
+            if not len(message.effort):
+                return MuscleReadings(length=length)
+            effort = np.array(message.effort, dtype=float)[self._places]
+            tension = self._tension_per_effort * (effort - self._effort_zero)
+            return MuscleReadings(length=length, tension=self._source.to_newtons(tension))
 
     def command(self, length: Array) -> Array:
         """Return the motor positions that command lengths, in the order of the motor commands.
@@ -132,7 +135,7 @@ class MotorInterface:
             length: Lengths [m], (M,).
             tension: Tensions [N], (M,).
         """
-        effort = tension / self._tension_per_effort + self._effort_zero
+        effort = self._source.to_message(tension) / self._tension_per_effort + self._effort_zero
         return self._motors, self._position(length), effort
 
     def _position(self, length: Array) -> Array:

@@ -1,25 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a muscle module reports: one row for each quantity, in the order of `QUANTITIES`.
+"""The readings of muscle modules: one value for all quantities, from message to message.
 
-A message of `muscle_states` has these rows, with one column for each muscle. Readings that did not
-arrive as a message are passed on as an array of these rows (`muscle_reading`).
+`MuscleReadings` is also the table of the quantities: each of its entries declares the name, unit
+and possible values of one quantity, in the order of the rows of `muscle_states`. Only this file
+knows that order. All other code takes a quantity by its name, such as `readings.length`.
 
-To add a quantity, add its entry to `QUANTITIES`. Messages may then have its row; its values are
-checked, and `MuscleSample.newest` contains them. What else a quantity needs if the emulator reports
-it, or if a part of the package uses it, is in doc/explanation/architecture.md ("How to add …").
+    message ─► read_muscle_states ─► MuscleReadings ─► to_message ─► message
+
+To add a quantity, add its entry to `MuscleReadings`. Messages may then have its row; its values are
+checked, emulated faults and recordings keep them, and `MuscleSample.newest` contains them. What
+else a quantity needs if the emulator measures it is in doc/explanation/architecture.md ("How to add
+…").
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from enum import Enum, IntEnum
-from typing import NamedTuple
+from collections.abc import Callable, Collection, Iterable, Sequence
+from enum import Enum
+from typing import Any, overload
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools, Ints, median_of_rows
+from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.message_reading import read_rows
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension_source import TensionSource
 from musculoskeletal_ae.signals.limits import LIMITS, longest_lengths, reading_range
+
+#: replace larger values of isolated muscles by NaN, because they could overflow when squared
+MOST_ISOLATED = 1e6
 
 
 class Presence(Enum):
@@ -30,11 +41,11 @@ class Presence(Enum):
     OPTIONAL = 'a value that is not measured is NaN, and messages may lack the row'
 
 
-class Quantity(NamedTuple):
-    """A quantity that muscle modules report.
+class Quantity:
+    """An entry of `MuscleReadings`: a quantity that muscle modules report.
 
     Attributes:
-        name: Its name in texts for users, and as an argument of `muscle_reading`.
+        name: Its name in texts for users, and as an attribute of `MuscleReadings`.
         unit: Its unit in texts for users, such as 'N'.
         reason: Reason, for users, under which messages with impossible values are counted.
         possible: Function of the robot that returns the lowest and the highest possible value of
@@ -43,10 +54,36 @@ class Quantity(NamedTuple):
     """
 
     name: str
-    unit: str
-    reason: str
-    possible: Callable[[Robot], tuple[Array | float, Array | float]]
-    presence: Presence = Presence.REQUIRED
+
+    def __init__(
+        self,
+        unit: str,
+        reason: str,
+        possible: Callable[[Robot], tuple[ArrayLike, ArrayLike]],
+        presence: Presence = Presence.REQUIRED,
+    ) -> None:
+        self.unit, self.reason, self.possible, self.presence = unit, reason, possible, presence
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+        names = [each for each, value in vars(owner).items() if isinstance(value, Quantity)]
+        self._row = names.index(name)
+
+    @overload
+    def __get__(self, readings: None, owner: type) -> Quantity: ...
+    @overload
+    def __get__(self, readings: MuscleReadings, owner: type | None = None) -> Array: ...
+    def __get__(
+        self, readings: MuscleReadings | None, owner: type | None = None
+    ) -> Quantity | Array:
+        return self if readings is None else readings.rows[..., self._row, :]
+
+    def __set__(self, readings: MuscleReadings, value: ArrayLike) -> None:
+        readings.rows[..., self._row, :] = value
+
+    def of(self, readings: MuscleReadings) -> Array:
+        """Return this quantity of some readings, (..., M)."""
+        return self.__get__(readings)
 
 
 def _possible_lengths(robot: Robot) -> tuple[Array, Array]:
@@ -58,44 +95,143 @@ def _possible_temperatures(_: Robot) -> tuple[float, float]:
     return LIMITS.lowest_temperature, LIMITS.highest_temperature
 
 
-#: the rows of a message of `muscle_states`, in this order
-QUANTITIES: tuple[Quantity, ...] = (
-    Quantity('length', 'm', 'length beyond what the joints allow', _possible_lengths),
-    Quantity('tension', 'N', 'tension beyond the maximum', reading_range),
-    Quantity(
-        'temperature', '°C', 'impossible temperature', _possible_temperatures,
-        Presence.MEASURED_OR_NAN,
-    ),
-)  # fmt: skip
+class MuscleReadings:
+    """What the muscle modules read at one moment or at several ones; NaN where it is unknown.
 
+    Each quantity is an array (M,), or (N, M) for the readings of N messages. Tensions are in N,
+    also of robots that measure motor currents.
 
-class Row(IntEnum):
-    """Index of each quantity's row in a message of `muscle_states`."""
-
-    LENGTH = 0
-    TENSION = 1
-    TEMPERATURE = 2
-
-
-def possible_readings(robot: Robot) -> tuple[Array, Array]:
-    """Return the lowest and the highest possible value of each quantity, (Q, M) each."""
-    possible = np.empty((2, len(QUANTITIES), robot.muscle_count))
-    for row, quantity in enumerate(QUANTITIES):
-        possible[0, row], possible[1, row] = quantity.possible(robot)
-    return possible[0], possible[1]
-
-
-def muscle_reading(robot: Robot, **values: Array) -> Array:
-    """Return a reading of all muscle modules: the rows of a message of `muscle_states`, (Q, M).
-
-    Args:
-        robot: The robot; if its modules report motor currents, tensions are converted to currents.
-        values: The values of each quantity by its name, (M,), with tensions in N. Quantities that
-            are not given are NaN.
+    Attributes:
+        rows: All quantities in one array (..., Q, M), for operations that treat them alike.
     """
-    rows = np.full((len(QUANTITIES), robot.muscle_count), np.nan)
-    for row, quantity in enumerate(QUANTITIES):
-        if quantity.name in values:
-            rows[row] = values[quantity.name]
-    rows[Row.TENSION] = robot.tension_source.to_message(rows[Row.TENSION])
-    return rows
+
+    __slots__ = ('rows',)
+
+    length = Quantity('m', 'length beyond what the joints allow', _possible_lengths)
+    tension = Quantity('N', 'tension beyond the maximum', reading_range)
+    temperature = Quantity(
+        '°C', 'impossible temperature', _possible_temperatures, Presence.MEASURED_OR_NAN
+    )
+
+    def __init__(self, **values: Array) -> None:
+        """Keep a copy of the values of each quantity by its name, (..., M); others are NaN."""
+        *first, muscles = next(iter(values.values())).shape
+        self.rows: Array = np.full((*first, len(QUANTITIES), muscles), np.nan)
+        for name, value in values.items():
+            setattr(self, name, value)
+
+    @classmethod
+    def of_rows(cls, rows: Array) -> MuscleReadings:
+        """Return the readings in an array (..., Q, M), which is not copied."""
+        readings = cls.__new__(cls)
+        readings.rows = rows
+        return readings
+
+    @classmethod
+    def stack(cls, readings: Iterable[MuscleReadings]) -> MuscleReadings:
+        """Return the readings of several messages as one value, whose arrays are (N, M)."""
+        return cls.of_rows(np.array([each.rows for each in readings]))
+
+    @classmethod
+    def median(cls, readings: Collection[MuscleReadings]) -> MuscleReadings:
+        """Return the median of some messages; NaN where any of them is NaN."""
+        if len(readings) == 1:
+            return next(iter(readings))
+        return cls.of_rows(median_of_rows(np.array([each.rows for each in readings])))
+
+    def __len__(self) -> int:
+        """Return the number of messages, of readings that `stack` has returned."""
+        return len(self.rows)
+
+    def at(self, messages: Any) -> MuscleReadings:
+        """Return the readings of some messages, which an index, a mask or a slice selects."""
+        return MuscleReadings.of_rows(self.rows[messages])
+
+    def copy(self) -> MuscleReadings:
+        """Return a copy, whose quantities may be assigned without changing this object."""
+        return MuscleReadings.of_rows(self.rows.copy())
+
+    def replace(self, **values: ArrayLike) -> MuscleReadings:
+        """Return a copy with other values of some quantities, by their names."""
+        readings = self.copy()
+        for name, value in values.items():
+            setattr(readings, name, value)
+        return readings
+
+    def to_message(self, source: TensionSource) -> Array:
+        """Return the rows of a message of `muscle_states`, (Q, M)."""
+        return self.replace(tension=source.to_message(self.tension)).rows
+
+
+#: the quantities of muscle modules, in the order of the rows of a message
+QUANTITIES = tuple(each for each in vars(MuscleReadings).values() if isinstance(each, Quantity))
+
+
+def first(which: Bools) -> tuple[Quantity, int]:
+    """Return the quantity and the muscle of the first true element of `which`, (Q, M)."""
+    row, muscle = np.argwhere(which)[0].tolist()
+    return QUANTITIES[row], muscle
+
+
+def possible_readings(robot: Robot) -> tuple[MuscleReadings, MuscleReadings]:
+    """Return the lowest and the highest possible readings."""
+    low = MuscleReadings.of_rows(np.empty((len(QUANTITIES), robot.muscle_count)))
+    high = low.copy()
+    for quantity in QUANTITIES:
+        lowest, highest = quantity.possible(robot)
+        quantity.__set__(low, lowest)
+        quantity.__set__(high, highest)
+    return low, high
+
+
+def raw_muscle_states(message: Any, robot: Robot) -> MuscleReadings:
+    """Return the readings in a message of `muscle_states` without a check of their values.
+
+    Motor currents are converted to T_read [N]. Optional rows that the message lacks are NaN. A
+    `message` may also be `MuscleReadings`, which are copied.
+    """
+    if isinstance(message, MuscleReadings):
+        return message.copy()
+    muscles, count = robot.muscle_count, len(QUANTITIES)
+    while QUANTITIES[count - 1].presence is Presence.OPTIONAL:
+        if len(message.data) >= count * muscles:
+            break
+        count -= 1
+    rows = np.full((len(QUANTITIES), muscles), np.nan)
+    rows[:count] = read_rows(message, count, muscles)
+    readings = MuscleReadings.of_rows(rows)
+    readings.tension = robot.tension_source.to_newtons(readings.tension)
+    return readings
+
+
+def read_muscle_states(
+    message: Any, robot: Robot, isolated: Sequence[int] | Ints = ()
+) -> MuscleReadings:
+    """Return the readings in a message of `muscle_states` after checking that they are finite.
+
+    Values that are not measured are NaN, where this is legal. Values of isolated muscles are not
+    checked: values that are not finite or beyond ±MOST_ISOLATED are replaced by NaN. If the modules
+    have no source of tension, tensions are not checked either, and are returned as NaN. Otherwise,
+    the conversions are those of `raw_muscle_states`.
+    """
+    readings = raw_muscle_states(message, robot)
+    source, values = robot.tension_source, readings.rows
+    if not source.is_known:
+        readings.tension = np.nan
+    is_legal = np.isfinite(values)
+    if len(isolated) == 0 and is_legal.all():
+        return readings
+    is_isolated = np.isin(np.arange(robot.muscle_count), isolated)
+    values[~(np.abs(values) < MOST_ISOLATED) & is_isolated] = np.nan
+    may_be_nan = [
+        [quantity.presence is not Presence.REQUIRED]
+        if quantity is not MuscleReadings.tension
+        else [not source.is_known]
+        for quantity in QUANTITIES
+    ]
+    is_legal |= is_isolated | (np.isnan(values) & may_be_nan)
+    if not is_legal.all():
+        quantity, muscle = first(~is_legal)
+        stated = f'{quantity.name} of {robot.muscles[muscle]} is {quantity.of(readings)[muscle]}'
+        raise MessageError('not finite', f'{stated}; expected a finite number')
+    return readings

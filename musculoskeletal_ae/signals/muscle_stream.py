@@ -9,9 +9,9 @@ names the reason and the value; for a level also the legal range. A temperature 
 implausibly fast does not reject a message: the sample has the last accepted temperature. Nodes,
 bags and experiments all use `MuscleStream`; `signals/limits.py` has the limits. Values of isolated
 muscles are not checked. A rejected message may contain valid tensions, for example if only a length
-jumped. `RejectionError.pull` contains these tensions for the limiter. After a jump, messages are
-rejected until the new level has lasted (`length_jumps`). While the length offsets are unknown, no
-message is rejected because of a jump or the level of a length.
+jumped. `RejectionError.plausible` contains these tensions for the limiter. After a jump, messages
+are rejected until the new level has lasted (`length_jumps`). While the length offsets are unknown,
+no message is rejected because of a jump or the level of a length.
 """
 
 from __future__ import annotations
@@ -24,16 +24,19 @@ from typing import Any
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools, median_of_rows
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.arrival import longer_pause
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.message_reading import muscle_rows, read_muscle_states
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.friction import FrictionDirection, Transmission
 from musculoskeletal_ae.signals.length_jumps import LengthJumps
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence
-from musculoskeletal_ae.signals.muscle_readings import Row
+from musculoskeletal_ae.signals.muscle_readings import (
+    MuscleReadings,
+    raw_muscle_states,
+    read_muscle_states,
+)
 from musculoskeletal_ae.signals.plausibility import LevelCheck, TemperatureCheck
 
 
@@ -42,17 +45,20 @@ class RejectionError(MessageError):
 
     Attributes:
         reason: Short text for users under which rejected messages are counted.
-        states: The raw readings, (Q, M); None if the message had another shape.
-        pull: Lengths [m], with the length offset removed, and measured tensions [N], together
-            (2, M). They are medians of the last messages, including rejected ones; −∞ where they
-            are implausible. None if there are not enough messages.
+        readings: The raw readings; None if the message had another shape.
+        plausible: The medians of the last messages, including rejected ones, with the length offset
+            removed; −∞ where they are implausible. None if there are not enough messages.
     """
 
     def __init__(
-        self, reason: str, detail: str, states: Array | None = None, pull: Array | None = None
+        self,
+        reason: str,
+        detail: str,
+        readings: MuscleReadings | None = None,
+        plausible: MuscleReadings | None = None,
     ) -> None:
         super().__init__(reason, detail)
-        self.states, self.pull = states, pull
+        self.readings, self.plausible = readings, plausible
 
 
 @dataclass(frozen=True)
@@ -75,8 +81,8 @@ class MuscleSample:
         sliding: Direction in which each tendon slid last: 1 when wound in, −1 when paid out.
         temperature: Plausible temperature of the module's housing [°C]; NaN where it is unknown.
         usable: Which muscles are not isolated.
-        newest: The readings of the last message alone, without the median filter, (Q, M), with the
-            length offset removed and motor-side tensions.
+        newest: The readings of the last message alone, without the median filter, with the length
+            offset removed and motor-side tensions.
         jumped: Indices of the muscles whose new length after a jump is accepted with this message;
             usually none.
         missing: Indices of the isolated muscles whose length or tension is NaN in this message.
@@ -93,7 +99,7 @@ class MuscleSample:
     sliding: Array
     temperature: Array
     usable: Bools
-    newest: Array
+    newest: MuscleReadings
     jumped: tuple[int, ...] = ()
     missing: tuple[int, ...] = ()
     tension_spread: Array | float = 0.0
@@ -110,8 +116,7 @@ class MuscleSample:
 
     def shifted(self, offset: Array) -> MuscleSample:
         """Return the same sample with lengths reduced by `offset` [m], (M,)."""
-        newest = self.newest.copy()
-        newest[Row.LENGTH] -= offset
+        newest = self.newest.replace(length=self.newest.length - offset)
         return replace(self, length=self.length - offset, newest=newest)
 
 
@@ -137,9 +142,9 @@ class MuscleStream:
         self.use_transmission(Transmission(np.zeros(robot.muscle_count)))
         self._levels = LevelCheck(robot)
         self._temperatures = TemperatureCheck(robot.muscle_count)
-        #: readings of the last messages that were accepted, and of all last messages, (Q, M) each
-        self._accepted: deque[Array] = deque(maxlen=window)
-        self._received: deque[Array] = deque(maxlen=window)
+        #: readings of the last messages that were accepted, and of all last messages
+        self._accepted: deque[MuscleReadings] = deque(maxlen=window)
+        self._received: deque[MuscleReadings] = deque(maxlen=window)
         self._implausible = Persistence()
         self.jumps = LengthJumps(robot)
         self.reset()
@@ -190,10 +195,10 @@ class MuscleStream:
     def take(
         self, message: Any, time: float, now: float | None = None, delay: float = 0.0
     ) -> MuscleSample:
-        """Check and convert a message, or its rows (`muscle_reading`).
+        """Check and convert a message, or readings that arrived otherwise.
 
         Args:
-            message: The message.
+            message: The message of `muscle_states`, or `MuscleReadings`.
             time: Time of reception by the caller's clock [s].
             now: Time of reception by a steady clock [s]; None if `time` is by a steady clock.
             delay: How late the message is, compared with the fastest one (`Arrival.delay`) [s].
@@ -201,54 +206,46 @@ class MuscleStream:
         Raises:
             RejectionError: If the message is invalid or implausible.
         """
-        muscle_count = self._robot.muscle_count
         try:
-            states = read_muscle_states(
-                message,
-                muscle_count,
-                self.body.isolated,
-                unknown=np.nan,
-                source=self._robot.tension_source,
-                names=self._robot.muscles,
-            )
+            received = read_muscle_states(message, self._robot, self.body.isolated)
         except MessageError as error:
-            raw = pull = None
+            raw = plausible = None
             with suppress(MessageError):  # a message of another shape has no readings
-                raw = muscle_rows(message, muscle_count)
+                raw = raw_muscle_states(message, self._robot)
                 self._follow(raw, time if now is None else now, delay)
                 self._received.append(raw)
-                pull = self._plausible_pull()
-            raise RejectionError(error.reason, str(error).partition(': ')[2], raw, pull) from error
+                plausible = self._plausible()
+            detail = str(error).partition(': ')[2]
+            raise RejectionError(error.reason, detail, raw, plausible) from error
         now = time if now is None else now
         self._delay = delay
-        missing = self._fill_in(states) if self.body.isolated else ()
+        missing = self._fill_in(received) if self.body.isolated else ()
         offsets = self.body.offsets
-        newest = states.copy()
-        newest[Row.LENGTH] -= offsets.offset
-        self._received.append(states)
-        problem = self._problem(states, newest, now)
+        newest = received.replace(length=received.length - offsets.offset)
+        self._received.append(received)
+        problem = self._problem(received, newest, now)
         self._implausible.note('' if problem is None else ': '.join(problem), now - delay)
         if problem is not None:
-            raise RejectionError(*problem, states, self._plausible_pull())
+            raise RejectionError(*problem, received, self._plausible())
         pause = longer_pause(time - self._time, self._sample_delay, delay)
         if time < self._time or pause > LIMITS.pause:
             self._direction.reset()
         self._time, self._sample_delay = time, delay
-        self._accepted.append(states)
-        read = states if len(self._accepted) == 1 else median_of_rows(np.array(self._accepted))
-        length, tension = read[Row.LENGTH] - offsets.offset, read[Row.TENSION]
+        self._accepted.append(received)
+        read = MuscleReadings.median(self._accepted)
+        length, tension = read.length - offsets.offset, read.tension
         sliding = self._direction.step(length)
-        newest[Row.TENSION] = self._transmission.motor(newest[Row.TENSION], sliding)
+        newest.tension = self._transmission.motor(newest.tension, sliding)
         known = self._robot.actuation.known_tension
         return MuscleSample(
             time=time,
             length=length,
-            length_read=read[Row.LENGTH],
+            length_read=read.length,
             tension_read=known(tension),
             motor_tension=known(self._transmission.motor(tension, sliding)),
             bone_tension=known(self._transmission.end(tension, sliding)),
             sliding=sliding,
-            temperature=self._temperatures.step(read[Row.TEMPERATURE], now - delay),
+            temperature=self._temperatures.step(read.temperature, now - delay),
             usable=self.body.used,
             newest=newest,
             jumped=self.jumps.newest,
@@ -257,49 +254,51 @@ class MuscleStream:
             delay=delay,
         )
 
-    def _fill_in(self, states: Array) -> tuple[int, ...]:
+    def _fill_in(self, readings: MuscleReadings) -> tuple[int, ...]:
         """Replace NaN in lengths and tensions of isolated muscles by 0; return these muscles."""
-        lacking = np.isnan(states)
-        lacking[Row.TENSION] &= self._robot.tension_source.is_known
-        lacking[Row.TEMPERATURE :] = False  # temperatures and optional quantities may be NaN
-        states[lacking] = 0.0
-        return tuple(np.flatnonzero(lacking.any(axis=0)).tolist())
+        has_no_length = np.isnan(readings.length)
+        has_no_tension = np.isnan(readings.tension) & self._robot.tension_source.is_known
+        readings.length[has_no_length] = 0.0
+        readings.tension[has_no_tension] = 0.0
+        return tuple(np.flatnonzero(has_no_length | has_no_tension).tolist())
 
-    def _plausible_pull(self) -> Array | None:
-        """Return the medians of plausible lengths and tensions, as in `RejectionError.pull`."""
+    def _plausible(self) -> MuscleReadings | None:
+        """Return the medians of plausible readings, as in `RejectionError.plausible`."""
         if len(self._received) < (self._received.maxlen or 0):
             return None
-        offset, plausible = self.body.offsets.offset, self._levels.plausible_pull
-        return median_of_rows(np.array([plausible(states, offset) for states in self._received]))
+        offset, plausible = self.body.offsets.offset, self._levels.plausible
+        return MuscleReadings.median([plausible(each, offset) for each in self._received])
 
-    def _problem(self, read: Array, states: Array, now: float) -> tuple[str, str] | None:
+    def _problem(
+        self, read: MuscleReadings, corrected: MuscleReadings, now: float
+    ) -> tuple[str, str] | None:
         """Return why a message is rejected: a value with an impossible level, or a jump; or None.
 
         Args:
-            read: The readings, (Q, M).
-            states: The same readings with the length offset removed from the lengths, (Q, M).
+            read: The readings.
+            corrected: The same readings with the length offset removed from the lengths.
             now: Time of reception by a steady clock [s].
         """
         known, used = self.body.offsets.known, self.body.used
-        problem = self._levels.problem(states, used, known)
+        problem = self._levels.problem(corrected, used, known)
         if problem is not None:
             self._follow(read, now, self._delay)
             return problem
-        problem = self.jumps.step(read[Row.LENGTH], read[Row.TENSION], used, now, self._delay)
+        problem = self.jumps.step(read.length, read.tension, used, now, self._delay)
         # While the length offsets are unknown, lengths are unreliable in any case, so that a jump
         # is no reason to reject the message.
         return problem if known else None
 
-    def _follow(self, read: Array, now: float, delay: float) -> None:
+    def _follow(self, read: MuscleReadings, now: float, delay: float) -> None:
         """Note the plausible lengths of a message that is rejected because of other values.
 
         Args:
-            read: The readings, (Q, M).
+            read: The readings.
             now: Time of reception by a steady clock [s].
             delay: How late the message is (`Arrival.delay`) [s].
         """
-        length, offsets = read[Row.LENGTH], self.body.offsets
+        length, offsets = read.length, self.body.offsets
         if offsets.known:
-            is_possible = np.isfinite(self._levels.plausible_pull(read, offsets.offset)[Row.LENGTH])
+            is_possible = np.isfinite(self._levels.plausible(read, offsets.offset).length)
             length = np.where(is_possible, length, np.nan)
         self.jumps.follow(length, self.body.used, now, delay)

@@ -11,7 +11,7 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS, slack_tension
-from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Row, possible_readings
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings, first, possible_readings
 
 
 class LevelCheck:
@@ -19,49 +19,48 @@ class LevelCheck:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        #: lowest and highest possible value of each quantity, (Q, M)
+        #: lowest and highest possible readings
         self._low, self._high = possible_readings(robot)
         self._slack = slack_tension(robot.description.tension.bias)
 
-    def plausible_pull(self, states: Array, offset: Array) -> Array:
-        """Return the plausible lengths [m] and tensions [N] of a message, together (2, M).
+    def plausible(self, readings: MuscleReadings, offset: Array) -> MuscleReadings:
+        """Return the plausible values of a message; implausible ones become −∞.
 
-        The length offsets `offset` [m], (M,), are subtracted. Implausible values become −∞.
-
-        A length may exceed its range by `slack_length_margin`, because the module may have lost its
-        length offset.
+        The length offsets `offset` [m], (M,), are subtracted. A length may exceed its range by
+        `slack_length_margin`, because the module may have lost its length offset.
         """
-        pull = states[:2].copy()
-        pull[0] -= offset
-        margin = np.array([[LIMITS.slack_length_margin], [0.0]])
-        legal = (pull >= self._low[:2] - margin) & (pull <= self._high[:2] + margin)
-        plausible: Array = np.where(legal, pull, -np.inf)
-        return plausible
+        margin = LIMITS.slack_length_margin
+        low = self._low.replace(length=self._low.length - margin)
+        high = self._high.replace(length=self._high.length + margin)
+        values = readings.replace(length=readings.length - offset).rows
+        is_possible = (values >= low.rows) & (values <= high.rows)
+        return MuscleReadings.of_rows(np.where(is_possible, values, -np.inf))
 
-    def problem(self, states: Array, used: Bools, lengths_known: bool) -> tuple[str, str] | None:
+    def problem(
+        self, readings: MuscleReadings, used: Bools, lengths_known: bool
+    ) -> tuple[str, str] | None:
         """Return reason and detail of the first implausible value, for users; None without one.
 
         Args:
-            states: Readings, (Q, M), with the length offset removed; NaN is ignored.
+            readings: Readings with the length offset removed; NaN is ignored.
             used: Which muscles to check, (M,).
             lengths_known: Whether to check l, which requires known length offsets.
         """
-        beyond = (states < self._low) | (states > self._high)
-        if not np.count_nonzero(beyond):
+        values, low, high = readings.rows, self._low, self._high
+        if not np.count_nonzero((values < low.rows) | (values > high.rows)):
             return None
-        low = self._low.copy()
         # A slack tendon, such as that of a ruptured muscle, can be wound in beyond any posture.
-        low[Row.LENGTH] -= np.where(
-            states[Row.TENSION] < self._slack, LIMITS.slack_length_margin, 0.0
-        )
-        beyond = ((states < low) | (states > self._high)) & used
-        beyond[Row.LENGTH] &= lengths_known
+        margin = np.where(readings.tension < self._slack, LIMITS.slack_length_margin, 0.0)
+        low = low.replace(length=low.length - margin)
+        if not lengths_known:
+            low, high = low.replace(length=-np.inf), high.replace(length=np.inf)
+        beyond = ((values < low.rows) | (values > high.rows)) & used
         if not np.count_nonzero(beyond):
             return None
-        row, muscle = np.argwhere(beyond)[0]
-        quantity = QUANTITIES[row]
-        place = row, muscle
-        value, least, most = distinct(states[place], low[place], self._high[place])
+        quantity, muscle = first(beyond)
+        value, least, most = distinct(
+            *(quantity.of(each)[muscle] for each in (readings, low, high))
+        )
         stated = f'{self._robot.muscles[muscle]} {value} {quantity.unit}'
         return quantity.reason, f'{stated}, legal: {least} to {most} {quantity.unit}'
 

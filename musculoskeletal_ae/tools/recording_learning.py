@@ -46,7 +46,7 @@ from musculoskeletal_ae.process_signals import STOP, Reaction
 from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
-from musculoskeletal_ae.signals.muscle_readings import muscle_reading, possible_readings
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings, possible_readings
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.tables.columns import UNITS, Column
 from musculoskeletal_ae.tables.csv_file import looks_like_a_sequence, read_csv
@@ -232,13 +232,13 @@ def _check_range(robot: Robot, source: TableSource) -> None:
     """Check whether most values of a joint or muscle are possible; otherwise raise a TableError."""
     rows = source.table.rows
     margin = LIMITS.joint_outside * (robot.upper - robot.lower)
-    (low_length, low_tension, *_), (high_length, high_tension, *_) = possible_readings(robot)
-    for what, names, values, low, high in (
+    low, high = possible_readings(robot)
+    for what, names, values, lowest, highest in (
         ('positions', robot.joints, rows.theta, robot.lower - margin, robot.upper + margin),
-        ('lengths', robot.muscles, rows.length, low_length, high_length),
-        ('tensions', robot.muscles, rows.tension, low_tension, high_tension),
+        ('lengths', robot.muscles, rows.length, low.length, high.length),
+        ('tensions', robot.muscles, rows.tension, low.tension, high.tension),
     ):
-        share = np.mean((values < low) | (values > high), axis=0)
+        share = np.mean((values < lowest) | (values > highest), axis=0)
         worst = int(share.argmax())
         if share[worst] <= MOST_IMPOSSIBLE:
             continue
@@ -246,7 +246,7 @@ def _check_range(robot: Robot, source: TableSource) -> None:
             what, (robot.units[worst].radian, robot.units[worst].position)
         )
         reached = ' to '.join(f'{scale * f(values[:, worst]):.3g}' for f in (np.nanmin, np.nanmax))
-        legal = f'{scale * low[worst]:.3g} to {scale * high[worst]:.3g} {unit}'
+        legal = f'{scale * lowest[worst]:.3g} to {scale * highest[worst]:.3g} {unit}'
         raise TableError(
             f'{source.name}: the {what} of {names[worst]} are {reached} {unit}; possible: {legal}. '
             'State their unit with --units, choose other columns with --columns, or correct the '
@@ -476,9 +476,7 @@ def anomaly_in(
         isolated = isolated_in(recording.isolated[row], mae.isolated)
         if isolated != estimator.body.isolated:
             estimator.isolate(isolated)
-        reading = muscle_reading(
-            robot, length=recording.length[row], tension=recording.tension[row]
-        )
+        reading = MuscleReadings(length=recording.length[row], tension=recording.tension[row])
         with suppress(RejectionError):
             estimator.take(reading, at, at)
         progress()

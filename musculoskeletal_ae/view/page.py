@@ -16,6 +16,7 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import whole
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.view import body
 from musculoskeletal_ae.view.body import MARKS, DrawnState
 from musculoskeletal_ae.view.controls import Controls, with_buttons
@@ -134,7 +135,7 @@ class Page:
         self,
         lines: list[str],
         alarm: str,
-        states: Array,
+        muscles: MuscleReadings,
         now: float,
         values: Sequence[float],
         is_urgent: bool = True,
@@ -144,7 +145,7 @@ class Page:
         Args:
             lines: Lines of status text.
             alarm: Text of the alarm box; '': no box.
-            states: Tensions T [N] and temperatures [°C], (2, M), for the bars; NaN where unknown.
+            muscles: Readings of the muscle modules, for the bars.
             now: Time of `values` [s].
             values: Values of the curves: estimation error [rad], the measures A and d that detect
                 an anomaly, and the threshold of d; NaN where unknown.
@@ -153,13 +154,14 @@ class Page:
         self._history.add(now, values)
         status, bars = (
             str(HTML.status(alarm, lines, is_urgent)) + self._arms,
-            str(HTML.bars(self._muscles(*states))),
+            str(HTML.bars(self._muscles(muscles))),
         )
         for readings in list(self._readings.values()):
             readings.show(status, bars, self._history)
 
-    def _muscles(self, tension: Array, temperature: Array) -> list[dict[str, Any]]:
-        """Return the template variables of each muscle's bar, at T [N] and temperature [°C]."""
+    def _muscles(self, readings: MuscleReadings) -> list[dict[str, Any]]:
+        """Return the template variables of each muscle's bar."""
+        tension, temperature = readings.tension, readings.temperature
         columns = {
             'rgb': map(
                 tuple, body.colours(self._robot, np.nan_to_num(tension), self.scene.kinds).tolist()

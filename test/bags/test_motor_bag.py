@@ -82,8 +82,9 @@ def test_motors_are_read_as_muscles_and_the_joints_beside_them_as_joints(
 ):
     arm = recording(tmp_path / 'bag', topic)
     streams = read_streams(Bag.open(tmp_path / 'bag'), robot(stated))
-    assert_allclose(streams.muscles.values[:, :2], np.stack([arm.length, arm.tension], axis=1))
-    assert np.isnan(streams.muscles.values[:, 2]).all()
+    assert_allclose(streams.muscles.length, arm.length)
+    assert_allclose(streams.muscles.tension, arm.tension)
+    assert np.isnan(streams.muscles.temperature).all()
     assert_allclose(streams.length_commands.values, arm.length)
     assert not streams.rejected
     if topic.endswith('joint_states'):
@@ -93,7 +94,7 @@ def test_motors_are_read_as_muscles_and_the_joints_beside_them_as_joints(
 def test_a_robot_without_joint_sensors_is_read_and_what_was_not_used_is_counted(robot, tmp_path):
     recording(tmp_path / 'bag', joints=(), stamps=[1, 1, 0, *range(2, COUNT - 1)])
     streams = read_streams(Bag.open(tmp_path / 'bag'), robot())
-    assert len(streams.muscles.time) == COUNT - 2 and not len(streams.joints.time)
+    assert len(streams.muscle_times) == COUNT - 2 and not len(streams.joints.time)
     assert streams.rejected == {
         '/joint_states as muscle_states: repeated stamp': 1,
         '/joint_states as muscle_states: no stamp': 1,

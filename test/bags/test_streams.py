@@ -35,9 +35,9 @@ def test_streams_are_what_was_recorded(arm, robot, tmp_path):
     arm.add('/muscle_length_command', ARRAY, 0.5, array(arm.length[0]))
     result = streams(arm, robot, tmp_path)
     assert_array_equal(result.joints.values, arm.theta)
-    assert_array_equal(result.muscles.values[:, 0], arm.length)
-    assert_array_equal(result.muscles.values[:, 1], arm.tension)
-    assert_allclose(result.muscles.time, arm.time, atol=1e-9)
+    assert_array_equal(result.muscles.length, arm.length)
+    assert_array_equal(result.muscles.tension, arm.tension)
+    assert_allclose(result.muscle_times, arm.time, atol=1e-9)
     assert_allclose(result.length_commands.time, [0.5], atol=1e-9)
     assert_array_equal(result.length_commands.values, [arm.length[0]])
     assert result.tension_commands.values.shape == (0, robot.muscle_count)
@@ -70,7 +70,7 @@ def test_pairs_are_no_further_apart_than_half_a_period(late, paired, robot, tmp_
 def test_without_joint_sensors_there_are_no_pairs(arm, robot, tmp_path):
     arm.content = [sample for sample in arm.content if sample.type != JOINTS]
     result = streams(arm, robot, tmp_path)
-    assert len(result.muscles.time) == 200
+    assert len(result.muscle_times) == 200
     assert result.pairs().theta.shape == (0, robot.joint_count)
 
 
@@ -88,7 +88,7 @@ def test_invalid_messages_are_left_out_and_counted_by_reason(arm, robot, tmp_pat
         '/muscle_states: wrong length': 1,
         '/joint_states: missing joint': 1,
     }
-    assert len(result.muscles.time) == 200
+    assert len(result.muscle_times) == 200
     assert_array_equal(result.joints.values[1], arm.theta[0])
 
 
@@ -113,9 +113,9 @@ def test_lengths_count_from_their_zeros_and_not_while_these_are_sought(arm, robo
         arm.add(topic, ARRAY, at - 0.001, content)
     result = streams(arm, robot, tmp_path)
     assert result.rejected == {'/muscle_states: length offsets unknown': 50}
-    assert_allclose(result.muscles.time, [*arm.time[:50], *arm.time[100:]], atol=1e-9)
-    assert_array_equal(result.muscles.values[:50, 0], arm.length[:50])
-    assert_allclose(result.muscles.values[50:, 0], arm.length[100:] - offset)
+    assert_allclose(result.muscle_times, [*arm.time[:50], *arm.time[100:]], atol=1e-9)
+    assert_array_equal(result.muscles.length[:50], arm.length[:50])
+    assert_allclose(result.muscles.length[50:], arm.length[100:] - offset)
 
 
 @pytest.mark.parametrize('form', FORMS)
@@ -125,7 +125,7 @@ def test_zeros_that_were_known_before_count_from_the_beginning(arm, robot, tmp_p
     arm.add(topic, ARRAY, 0.501, content)
     result = streams(arm, robot, tmp_path)
     assert not result.rejected
-    assert_allclose(result.muscles.values[:, 0], arm.length - offset)
+    assert_allclose(result.muscles.length, arm.length - offset)
 
 
 @pytest.mark.parametrize('is_earlier', [False, True])

@@ -15,7 +15,6 @@ from control_bench import ROBOT
 from exact_mae import ExactMae
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, rule
-from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.command import LENGTH, TENSION
@@ -69,8 +68,7 @@ class Arm(RuleBasedStateMachine):
         for read in self.arm.faults.deliver(self.arm.sense(), self.now):
             if 'muscles' not in self.blind:
                 with suppress(MessageError):
-                    states = np.array([read.length, read.tension, read.temperature])
-                    self.core.take(reading(states), self.now)
+                    self.core.take(read.muscles, self.now)
             if 'estimate' not in self.blind:
                 self.core.estimated(self.arm.theta, self.now)
 

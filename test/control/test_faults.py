@@ -7,7 +7,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import FIRST_ESTIMATE, Controller
@@ -16,8 +15,8 @@ from musculoskeletal_ae.emulator.faults import KINDS
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.message_reading import read_muscle_states
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.muscle_readings import read_muscle_states
 
 ROBOT = Robot.load('arm26')
 MUSCLE = ROBOT.muscles[3]
@@ -62,10 +61,10 @@ class Loop:
                 self.pulls.append(self.arm.tension)
 
     def read(self, reading):
-        data = np.concatenate(reading[1:])
+        data = reading.muscles.rows.ravel()
         message = SimpleNamespace(data=data, layout=SimpleNamespace(dim=[], data_offset=0))
         with suppress(MessageError):
-            states = read_muscle_states(message, ROBOT.muscle_count)
+            states = read_muscle_states(message, ROBOT)
             if self.has_joint_sensors:
                 self.estimator.joints(reading.theta, self.now)
             # Controller and estimator each check the message. One may reject it, the other not.
@@ -74,10 +73,10 @@ class Loop:
                     take(states)
 
     def control(self, states):
-        self.controller.take(reading(states), self.now)
+        self.controller.take(states, self.now)
 
     def estimate(self, states):
-        estimate = self.estimator.take(reading(states), self.now, self.now)
+        estimate = self.estimator.take(states, self.now, self.now)
         self.controller.use_body(self.estimator.body)
         if estimate is not None:
             self.controller.estimated(estimate.state.theta, self.now)

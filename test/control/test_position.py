@@ -102,7 +102,7 @@ def test_a_motor_current_that_reads_too_little_does_not_lead_to_too_much_tension
     length, tension, highest = np.zeros(COUNT), np.full(COUNT, BIAS), 0.0
     for n in range(400):
         read = 0.75 * tension - 0.05 * LIMIT
-        now = stream.take(reading([length, read, np.full(COUNT, 30.0)], robot), n * DT)
+        now = stream.take(reading([length, read, np.full(COUNT, 30.0)]), n * DT)
         goal = limiter.limit(Command(LENGTH, np.full(COUNT, -0.1)), now, LIMIT, DT).value
         tension, length = pull_in_this_posture(length, tension, goal), goal
         highest = max(highest, (tension / LIMIT).max())

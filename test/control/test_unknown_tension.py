@@ -49,17 +49,15 @@ def loop():
 
 def test_the_emulator_measures_no_tension_and_the_stream_assumes_one():
     arm = make_arm(ROBOT, 0)
-    read = arm.sense()
+    read = arm.sense().muscles
     assert np.isnan(read.tension).all()
     # Without a tension source, the stream ignores whatever tension a message contains.
     for tension in (read.tension, np.zeros(COUNT), np.full(COUNT, 77.0)):
-        sample = MuscleStream(ROBOT, window=3).take(
-            reading([read.length, tension, read.temperature]), 0.0
-        )
+        sample = MuscleStream(ROBOT, window=3).take(read.replace(tension=tension), 0.0)
         np.testing.assert_array_equal(sample.motor_tension, ROBOT.actuation.assumed_tension)
         np.testing.assert_array_equal(sample.bone_tension, ROBOT.actuation.assumed_tension)
     with pytest.raises(RejectionError):  # lengths are still checked
-        MuscleStream(ROBOT).take(reading([read.length + 5.0, read.tension, read.temperature]), 0.0)
+        MuscleStream(ROBOT).take(read.replace(length=read.length + 5.0), 0.0)
 
 
 def test_muscle_stiffness_control_without_a_tension_is_refused(tmp_path):

@@ -7,12 +7,13 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from readings import reading
 
 from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.driver.positioning import Positioning
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.driver.winding import Winding
-from musculoskeletal_ae.emulator.faults import Faults, Readings
+from musculoskeletal_ae.emulator.faults import ArmReadings, Faults
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
@@ -23,23 +24,24 @@ PERIOD = 0.01  # time between two published messages [s]
 class RecordedArm:
     """Stands in for an emulated arm: replays its recorded readings, whatever is commanded."""
 
-    def __init__(self, robot: Robot, readings: Sequence[Readings]) -> None:
+    def __init__(self, robot: Robot, readings: Sequence[ArmReadings]) -> None:
         self.faults = Faults(robot, np.random.default_rng(0))
         self._readings, self._next = readings, -1
 
     def step(self, _: float) -> None:
         self._next += 1
 
-    def sense(self) -> Readings:
+    def sense(self) -> ArmReadings:
         return self._readings[self._next]
 
     def set_wrench(self, _: np.ndarray) -> None:
         """Do nothing: the recorded arm was moved, or it was not."""
 
 
-def muscle_rows(read: Any) -> np.ndarray:
+def muscle_rows(read: ArmReadings) -> np.ndarray:
     """Return the rows l [m], T [N] and temperature [°C] of a reading of an emulated arm, (3, M)."""
-    return np.stack([read.length, read.tension, read.temperature])
+    muscles = read.muscles
+    return np.stack([muscles.length, muscles.tension, muscles.temperature])
 
 
 class Driver:
@@ -134,7 +136,9 @@ class Driver:
             for theta, rows in self.step():
                 tension = max(self.pulled.get(winding.trying, 0.0), self.arm.tension.max())
                 self.pulled[winding.trying] = tension
-                if (target := winding.step(rows, self.now, self.angles(theta))) is not None:
+                if (
+                    target := winding.step(reading(rows), self.now, self.angles(theta))
+                ) is not None:
                     self.command(target)
         return winding.verdict
 
@@ -145,7 +149,7 @@ def hand(k: int) -> np.ndarray:
     return wrench
 
 
-def record(robot: Robot, seconds: float, moved: bool) -> list[Readings]:
+def record(robot: Robot, seconds: float, moved: bool) -> list[ArmReadings]:
     """Return the readings of an arm that receives no commands; a hand may move it."""
     arm, readings = EmulatedArm(robot), []
     for k in range(round(seconds / PERIOD)):

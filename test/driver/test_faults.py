@@ -14,6 +14,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
+from readings import reading
 
 from driver.scripted import Driver, RecordedArm, array, joint_state, muscle_rows, record
 from musculoskeletal_ae import message_reading
@@ -27,7 +28,7 @@ from musculoskeletal_ae.robot.description import TensionRange, with_modules
 from musculoskeletal_ae.robot.motors import Motors, MotorTopics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
-from musculoskeletal_ae.signals import motor_interface
+from musculoskeletal_ae.signals import motor_interface, muscle_readings
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
 
 ROBOT = Robot.load('arm26')
@@ -408,9 +409,11 @@ def test_advice_on_a_rejected_message_is_that_of_its_topic():
 
 def test_every_reason_to_reject_a_message_of_a_driver_has_its_own_advice():
     readers = {
-        ('muscle_states', message_reading): ('read_muscle_states', '_values'),
+        ('muscle_states', message_reading): ('read_rows',),
+        ('muscle_states', muscle_readings): ('read_muscle_states',),
         ('joint_states', message_reading): ('read_posture', 'joint_names'),
-        ('motors', message_reading): ('read_muscle_states', 'joint_names'),
+        ('motors', message_reading): ('joint_names',),
+        ('motors', muscle_readings): ('read_muscle_states',),
         ('motors', motor_interface): ('reading', '_find'),
     }
     for (topic, module), functions in readers.items():
@@ -804,14 +807,14 @@ def test_a_test_that_moved_a_joint_too_little_names_the_tension_to_repeat_it_wit
         still, driver = np.zeros(robot.joint_count), settled()
         while not winding.done:
             for _, rows in driver.step():
-                if (target := winding.step(rows, driver.now, still)) is not None:
+                if (target := winding.step(reading(rows), driver.now, still)) is not None:
                     driver.command(target)
         assert advice in str(verdict)
 
 
 def inverted_law(driver, order):
     """Let the driver confuse lengths: their sign is wrong, and the order of muscles is `order`."""
-    home, back = driver.arm.sense().length, np.argsort(order)
+    home, back = driver.arm.sense().muscles.length, np.argsort(order)
     # The lengths are mirrored about the initial ones, so that listening finds no fault.
     driver.publish = lambda rows: np.stack([2.0 * home - rows[0], *rows[1:]])[:, order]
     follow = law()
@@ -857,7 +860,7 @@ JUMPING = {
 def test_a_driver_that_pulls_from_the_first_command_on_is_released_and_bounded_by_max(name):
     driver = Driver(with_tension(55.0, 60.0))
     driver.listen(2.0)
-    driver.take = partial(JUMPING[name], driver.arm.sense().length)
+    driver.take = partial(JUMPING[name], driver.arm.sense().muscles.length)
     verdict = driver.wind((BICEPS,))
     assert 'released for safety' in str(verdict)
     assert driver.pulled.keys() <= {'hold', 'order'}
@@ -866,7 +869,7 @@ def test_a_driver_that_pulls_from_the_first_command_on_is_released_and_bounded_b
 
 def test_a_length_that_rises_as_the_muscle_is_wound_in_has_the_wrong_sign():
     driver = settled()
-    home = driver.arm.sense().length
+    home = driver.arm.sense().muscles.length
 
     # A length mirrored about the initial length is correct at rest; winding in reveals its sign.
     def mirrored(rows):

@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from driver.scripted import Driver, array, joint_state
+from driver.scripted import Driver, array, joint_state, muscle_rows
 from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.driver.motion import ABOVE_BIAS
 from musculoskeletal_ae.emulator.reality import make_arm
@@ -135,7 +135,7 @@ def test_exchanged_readings_never_pass_the_check_of_order_while_a_hand_moves_the
         order[list(exchanged)] = exchanged[::-1]
         for now, reading in readings:
             listening.joints(joint_state(dict(zip(ARM26.joints, reading.theta))))
-            listening.muscles(array(np.stack(reading[1:])[:, order]), now)
+            listening.muscles(array(muscle_rows(reading)[:, order]), now)
         verdict = listening.verdict(30.0)
         return {m for m in range(ARM26.muscle_count) if verdict.has_passed('order', m)}
 

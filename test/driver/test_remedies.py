@@ -788,7 +788,7 @@ def test_a_fault_that_listening_finds_is_gone_after_the_change(name):
 def test_the_first_step_against_a_wrong_zero_at_rest_finds_a_wrong_sign():
     """A sign that looks like a wrong zero at rest is seen while a hand moves the arm."""
     at_rest = HEARD['zero at rest']
-    middle = recording(False)[0].length[BICEPS]
+    middle = recording(False)[0].muscles.length[BICEPS]
     # The sensor counts in the wrong direction from a zero that is wrong as well.
     turned = publishing(of_muscle(BICEPS, LENGTH, lambda length: 2.0 * middle - length + 0.08))
     (fault,) = listen(at_rest._replace(spoil=turned)).faults

@@ -129,15 +129,15 @@ def test_a_ruptured_muscle_has_no_tension_and_winds_in_at_the_speed_limit(robot,
     arm.set_ruptured([robot.muscles[1]])
     before = arm._muscle.length[1]
     drive(arm, command, 0.1)
-    assert arm.sense().tension[1] == 0.0
+    assert arm.sense().muscles.tension[1] == 0.0
     assert before - arm._muscle.length[1] == pytest.approx(0.1 * SPEED_LIMIT, abs=1e-3)
     drive(arm, command, 3.0)
-    limit = arm.sense().length[1]
+    limit = arm.sense().muscles.length[1]
     drive(arm, command, 0.5)
-    assert arm.sense().length[1] == pytest.approx(limit, abs=1e-3)
+    assert arm.sense().muscles.length[1] == pytest.approx(limit, abs=1e-3)
     arm.set_ruptured([])
     drive(arm, command, 3.0)
-    assert arm.sense().tension[1] > 0.5 * robot.tension.bias[1]
+    assert arm.sense().muscles.tension[1] > 0.5 * robot.tension.bias[1]
 
 
 def test_a_weak_muscle_takes_up_slack(tmp_path, reality):
@@ -146,11 +146,11 @@ def test_a_weak_muscle_takes_up_slack(tmp_path, reality):
     arm = make_arm(robot, 2, reality)
     command = to_mid_range(robot, 5.0)
     drive(arm, command, 2.0)
-    before = arm.sense().length[1]
+    before = arm.sense().muscles.length[1]
     arm._muscle.length[1] += 0.02
     drive(arm, command, 1.5)
-    assert arm.sense().tension[1] > 0.0
-    assert arm.sense().length[1] - before < 0.01
+    assert arm.sense().muscles.tension[1] > 0.0
+    assert arm.sense().muscles.length[1] - before < 0.01
 
 
 def test_a_length_offset_shifts_the_controlled_posture(robot, nominal):
@@ -188,7 +188,7 @@ def test_the_same_seed_gives_the_same_motion(robot, reality):
     for _ in range(2):
         arm = make_arm(robot, 7, reality)
         drive(arm, command, 1.0)
-        lives.append(np.concatenate(arm.sense()))
+        lives.append(np.concatenate([arm.sense().theta, *arm.sense().muscles.rows]))
     np.testing.assert_array_equal(lives[0], lives[1])
 
 
@@ -200,7 +200,7 @@ def test_reset_brings_the_arm_back_to_rest(robot, reality):
     arm.step(0.5)
     arm.reset()
     np.testing.assert_array_equal(arm.theta, start)
-    assert arm.sense().tension.min() > 0.5 * robot.tension.bias[0]
+    assert arm.sense().muscles.tension.min() > 0.5 * robot.tension.bias[0]
 
 
 def test_the_marker_is_seen_where_the_hand_is(robot, reality):

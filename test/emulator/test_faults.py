@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 
 from emulator.commands import to_mid_range
-from musculoskeletal_ae.emulator.faults import KINDS, Faults, Readings, read_fault
+from musculoskeletal_ae.emulator.faults import KINDS, SENSED, ArmReadings, Faults, read_fault
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.emulator.sensors import Sensors, read_sensors
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
 MUSCLE = 2
 
@@ -21,14 +22,15 @@ def arm(robot):
 
 def numbered(robot, i):
     """Return sensor readings of a robot in which every value of a muscle is `i`."""
-    return Readings(np.zeros(robot.joint_count), *np.full((3, robot.muscle_count), float(i)))
+    muscles = MuscleReadings(length=np.full(robot.muscle_count, float(i)))
+    return ArmReadings(np.zeros(robot.joint_count), muscles)
 
 
 def delivered(robot, line, count=400, period=0.0078125):
     faults = Faults(robot, np.random.default_rng(0))
     faults.set([line])
     arrived = [faults.deliver(numbered(robot, i), i * period) for i in range(count)]
-    return [[int(one.length[0]) for one in readings] for readings in arrived]
+    return [[int(one.muscles.length[0]) for one in readings] for readings in arrived]
 
 
 def test_messages_are_dropped_delayed_duplicated_and_reordered(robot):
@@ -51,7 +53,9 @@ def test_ending_a_delay_discards_the_delayed_messages(robot):
     faults = Faults(robot, np.random.default_rng(0))
     for i, lines in enumerate(['delay:0.25'] * 50 + [''] * 50):
         faults.set([lines] if lines else [])
-        last = [int(one.length[0]) for one in faults.deliver(numbered(robot, i), i * 0.0078125)]
+        last = [
+            int(one.muscles.length[0]) for one in faults.deliver(numbered(robot, i), i * 0.0078125)
+        ]
         assert last == ([i] if not lines else [i - 32] if i >= 32 else [])
     faults.set(['reorder:1'])
     assert faults.deliver(numbered(robot, 100), 1.0) == []
@@ -63,36 +67,42 @@ def test_a_frozen_sensor_stays_frozen_when_another_fault_is_added(arm, robot):
     frozen, other = robot.muscles[MUSCLE], robot.muscles[MUSCLE + 1]
     lines = [f'freeze:tension:{frozen}']
     arm.faults.set(lines)
-    before = arm.sense().tension[MUSCLE]
-    after = hold(arm, robot, [*lines, f'bias:tension:{other}']).tension
+    before = arm.sense().muscles.tension[MUSCLE]
+    after = hold(arm, robot, [*lines, f'bias:tension:{other}']).muscles.tension
     assert after[MUSCLE] == before and after[MUSCLE + 1] > before + 50.0
 
 
 def sensed(arm, line, count=300):
+    """Return the readings of N messages with a fault, (N, M) of each quantity."""
     arm.faults.set([line])
-    return [np.stack(arm.sense()[1:]) for _ in range(count)]
+    return MuscleReadings.stack(arm.sense().muscles for _ in range(count))
 
 
 def test_sensors_are_offset_frozen_dead_or_spiky(arm, robot):
-    healthy = np.mean(sensed(arm, 'drop:0'), axis=0)
+    healthy = sensed(arm, 'drop:0')
     others = np.arange(robot.muscle_count) != MUSCLE
     name = robot.muscles[MUSCLE]
-    for line, row, size in (
-        ('bias', 0, 0.05),
-        ('bias:tension', 1, 100.0),
-        ('bias:length', 0, -0.1),
+    for line, quantity, size in (
+        ('bias', 'length', 0.05),
+        ('bias:tension', 'tension', 100.0),
+        ('bias:length', 'length', -0.1),
     ):
         text = f'{line}:{name}' + (f':{size}' if size < 0.0 else '')
-        off = np.mean(sensed(arm, text), axis=0) - healthy
-        assert off[row, MUSCLE] == pytest.approx(size, rel=0.05)
-        assert np.abs(off[:, others]).max() < 0.5
-    dead = sensed(arm, f'dead_sensor:tension:{name}', 3)[-1]
-    assert dead[1, MUSCLE] == 0.0 and dead[1, others].min() > 5.0 and dead[0, MUSCLE] != 0.0
-    assert not np.any(sensed(arm, 'dead_sensor', 1))
-    frozen = np.array(sensed(arm, f'freeze:{name}', 50))
-    assert np.ptp(frozen[:, :, MUSCLE], axis=0).max() == 0.0
-    assert np.ptp(frozen[:, 1, :], axis=0)[others].min() > 0.0
-    spikes = np.array(sensed(arm, 'spike:temperature:80', 300))[:, 2]
+        off = {
+            each: np.mean(getattr(sensed(arm, text), each) - getattr(healthy, each), axis=0)
+            for each in SENSED
+        }
+        assert off[quantity][MUSCLE] == pytest.approx(size, rel=0.05)
+        assert max(np.abs(each[others]).max() for each in off.values()) < 0.5
+    dead = sensed(arm, f'dead_sensor:tension:{name}', 3).at(-1)
+    assert dead.tension[MUSCLE] == 0.0 and dead.tension[others].min() > 5.0
+    assert dead.length[MUSCLE] != 0.0
+    dead = sensed(arm, 'dead_sensor', 1)
+    assert not any(getattr(dead, each).any() for each in SENSED)
+    frozen = sensed(arm, f'freeze:{name}', 50)
+    assert max(np.ptp(getattr(frozen, each)[:, MUSCLE]) for each in SENSED) == 0.0
+    assert np.ptp(frozen.tension, axis=0)[others].min() > 0.0
+    spikes = sensed(arm, 'spike:temperature:80', 300).temperature
     assert 1 <= np.sum(spikes > 90.0) < 60
     assert np.all(np.sum(spikes > 90.0, axis=1) <= 1)
 
@@ -115,20 +125,20 @@ def hold(arm, robot, lines, seconds=1.5, tension=80.0):
 
 
 def test_a_jammed_motor_stands_until_it_is_repaired(arm, robot):
-    before = arm.sense().length
-    after = hold(arm, robot, [f'stuck_motor:{robot.muscles[MUSCLE]}']).length
+    before = arm.sense().muscles.length
+    after = hold(arm, robot, [f'stuck_motor:{robot.muscles[MUSCLE]}']).muscles.length
     assert after[MUSCLE] == pytest.approx(before[MUSCLE], abs=1e-3)
     assert np.abs(after - before).max() > 0.01
-    assert abs(hold(arm, robot, []).length[MUSCLE] - before[MUSCLE]) > 0.005
+    assert abs(hold(arm, robot, []).muscles.length[MUSCLE] - before[MUSCLE]) > 0.005
 
 
 def test_a_slack_tendon_is_wound_in(robot):
     healthy, slack = (EmulatedArm(robot, 1) for _ in range(2))
-    before = hold(healthy, robot, []).length
+    before = hold(healthy, robot, []).muscles.length
     slack.faults.set([f'slack:{robot.muscles[MUSCLE]}'])
     slack.step(0.01)
     assert slack.tension[MUSCLE] < 5.0
-    after = hold(slack, robot, [f'slack:{robot.muscles[MUSCLE]}'], 4.0).length
+    after = hold(slack, robot, [f'slack:{robot.muscles[MUSCLE]}'], 4.0).muscles.length
     assert after[MUSCLE] - before[MUSCLE] < -0.02
 
 
@@ -163,10 +173,10 @@ def test_a_ruptured_tendon_stays_ruptured_until_the_fault_ends(arm, robot):
 
 
 def test_an_offset_of_either_sign_shifts_the_length_of_one_muscle(arm, robot):
-    before = arm.sense().length
+    before = arm.sense().muscles.length
     arm.set_faults([f'offset:{robot.muscles[MUSCLE]}:-0.02'])
     expected = -0.02 * (np.arange(robot.muscle_count) == MUSCLE)
-    np.testing.assert_allclose(arm.sense().length - before, expected, atol=2e-3)
+    np.testing.assert_allclose(arm.sense().muscles.length - before, expected, atol=2e-3)
     for wrong in ('offset:2', 'offset:-2', 'offset:nan'):
         with pytest.raises(MusculoskeletalError, match='sizes from -1 to 1 m'):
             arm.set_faults([wrong])
@@ -205,26 +215,30 @@ def test_a_line_that_describes_no_sensor_is_refused(robot, lines, legal):
 def test_a_slow_winch_keeps_its_speed(robot):
     arm, name = EmulatedArm(robot, 1), robot.muscles[MUSCLE]
     lines = [f'slack:{name}', f'winch_speed:{name}:0.009']
-    wound = hold(arm, robot, lines, 0.5).length - hold(arm, robot, lines, 2.5).length
+    wound = (
+        hold(arm, robot, lines, 0.5).muscles.length - hold(arm, robot, lines, 2.5).muscles.length
+    )
     assert wound[MUSCLE] == pytest.approx(0.0225, abs=0.002)
 
 
 def test_unzeroed_winches_have_length_offsets(arm):
-    before = arm.sense().length
+    before = arm.sense().muscles.length
     arm.faults.set(['unzeroed:0.1'])
-    off = arm.sense().length - before
+    off = arm.sense().muscles.length - before
     assert (np.abs(off) > 0.038).all() and (np.abs(off) < 0.102).all() and np.ptp(off) > 0.05
 
 
 def test_an_overheated_module_is_hot_until_a_reset(arm, robot):
     name = robot.muscles[MUSCLE]
-    hot = hold(arm, robot, [f'overheat:{name}:95'], 0.1).temperature
+    hot = hold(arm, robot, [f'overheat:{name}:95'], 0.1).muscles.temperature
     assert hot[MUSCLE] > 90.0 and np.delete(hot, MUSCLE).max() < 40.0
     arm.faults.set([])
     arm.step(0.1)
-    assert arm.sense().temperature[MUSCLE] > 90.0  # the motor cools only slowly after the repair
+    assert (
+        arm.sense().muscles.temperature[MUSCLE] > 90.0
+    )  # the motor cools only slowly after the repair
     arm.reset()
-    assert arm.sense().temperature.max() < 40.0
+    assert arm.sense().muscles.temperature.max() < 40.0
 
 
 @pytest.mark.parametrize(
@@ -270,5 +284,5 @@ def test_a_saturated_tension_sensor_reads_no_more_than_its_size(arm, robot):
     arm.command_length(to_mid_range(robot, 80.0))
     arm.step(1.0)
     assert arm.tension[MUSCLE] > 30.0
-    read = arm.sense().tension
+    read = arm.sense().muscles.tension
     assert read[MUSCLE] == 20.0 and np.delete(read, MUSCLE).max() > 30.0

@@ -61,7 +61,11 @@ def drive(arm, seconds=0.3, tension=80.0):
         arm.command_length(command)
         arm.step(0.02)
         read = arm.sense()
-        rows.append(np.concatenate([arm.theta, arm.tension, *read[:3]]))
+        rows.append(
+            np.concatenate(
+                [arm.theta, arm.tension, read.theta, read.muscles.length, read.muscles.tension]
+            )
+        )
     return np.array(rows)
 
 

@@ -105,7 +105,7 @@ def test_modules_that_follow_lengths_take_the_command_that_the_refusal_names(rob
     with pytest.raises(MusculoskeletalError) as refused:
         arm.command_tension(robot.tension.bias)
     named = re.search('publish muscle_(length)_command', str(refused.value))[1]
-    getattr(arm, f'command_{named}')(arm.sense().length)
+    getattr(arm, f'command_{named}')(arm.sense().muscles.length)
 
 
 def test_as_many_length_offsets_are_accepted_as_the_refusal_says(robot):

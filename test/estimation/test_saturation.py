@@ -8,6 +8,7 @@ import pytest
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.detectors.saturated_sensor import SaturatedSensor
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
 DT, SATURATED = 0.01, 2
 
@@ -20,7 +21,7 @@ def watched(robot, sense, seconds=40.0):
         tension = 110.0 + 70.0 * np.clip(1.5 * np.sin(n * DT + phase), -1.0, 1.0)
         reading = sense(tension, rng, n)
         sample = SimpleNamespace(
-            newest=np.array([reading, reading, reading]),
+            newest=MuscleReadings(tension=reading),
             length=np.zeros(len(reading)),
             usable=np.ones(len(reading), dtype=bool),
         )
@@ -58,7 +59,9 @@ def test_a_constant_reading_while_the_module_winds_in_is_found_at_once(robot):
         if n >= 2000:
             reading[SATURATED] = 120.0
             length = length - 2e-4 * (np.arange(robot.muscle_count) == SATURATED)
-        sample = SimpleNamespace(newest=np.array(3 * [reading]), length=length, usable=usable)
+        sample = SimpleNamespace(
+            newest=MuscleReadings(tension=reading), length=length, usable=usable
+        )
         finding = detector.step(SimpleNamespace(sample=sample, dt=DT))
         assert finding is None or n >= 2050
     assert 'winds in' in finding.evidence

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
@@ -103,7 +102,7 @@ def test_an_emulated_slow_winch_takes_up_slack_without_an_anomaly(
     """This also holds before the detector is calibrated, and before the first command."""
     arm, name = EmulatedArm(robot, 1), robot.muscles[MUSCLE]
     arm.step(3.0)
-    estimator, hold = Estimator(robot), arm.sense().length
+    estimator, hold = Estimator(robot), arm.sense().muscles.length
     estimator.use(replace(calibrated, anomaly=None))
     arm.faults.set([f'slack:{name}:0.05', f'winch_speed:{name}:{speed}'])
     slack = 0
@@ -111,10 +110,9 @@ def test_an_emulated_slow_winch_takes_up_slack_without_an_anomaly(
         if commanded:
             arm.command_length(hold)
             estimator.commanded(n * DT, length=hold)
-        read = arm.sense()
+        read = arm.sense().muscles
         slack += read.tension[MUSCLE] < 1.0
-        states = np.array([read.length, read.tension, read.temperature])
-        estimator.take(reading(states), n * DT, n * DT)
+        estimator.take(read, n * DT, n * DT)
         assert not estimator.cause
         arm.step(DT)
     assert slack * DT > 0.5

@@ -218,7 +218,7 @@ def test_an_arm_that_stands_still_is_refused_before_the_training(
 
 def test_an_arm_that_never_rests_is_learned_from_slow_moments(arm26, initial):
     arm, rng = EmulatedArm(arm26, seed=1), np.random.default_rng(0)
-    rows, start = [], arm.sense().length
+    rows, start = [], arm.sense().muscles.length
     for theta in arm26.random_postures(25, rng):
         tension = rng.uniform(40.0, 120.0, arm26.muscle_count)
         goal = arm26.muscle_lengths(theta[None], tension[None])[0]
@@ -226,7 +226,9 @@ def test_an_arm_that_never_rests_is_learned_from_slow_moments(arm26, initial):
             arm.command_length(start + (goal - start) * share)
             arm.step(0.01)
             now = arm.sense()
-            rows.append((0.01 * len(rows), now.theta.copy(), now.length, now.tension))
+            rows.append(
+                (0.01 * len(rows), now.theta.copy(), now.muscles.length, now.muscles.tension)
+            )
         start = goal
     time, theta, length, tension = map(np.array, zip(*rows))
     recording = Pairs(time, theta, length, tension, np.full(tension.shape, -1))

@@ -3,7 +3,6 @@
 
 import numpy as np
 import pytest
-from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import Controller
@@ -43,9 +42,8 @@ class Loop:
     def run(self, seconds):
         for _ in range(round(seconds / DT)):
             self.now += DT
-            read = self.arm.sense()
-            length = read.length + self.offset
-            self.core.take(reading([length, read.tension, read.temperature]), self.now)
+            read = self.arm.sense().muscles
+            self.core.take(read.replace(length=read.length + self.offset), self.now)
             if self.has_estimates:
                 self.core.estimated(self.arm.theta, self.now)
             command = self.core.step(self.now)

@@ -14,7 +14,6 @@ import pytest
 from control_bench import DT, OTHER, REST, ROBOT, Bench, values
 from exact_mae import ExactMae, rest_readings
 from nominal_body import nominal_arm
-from readings import reading
 
 from musculoskeletal_ae.control import status
 from musculoskeletal_ae.control.command import LENGTH
@@ -252,8 +251,8 @@ def driven(arm, intervals=(10,), push=0.0, **chosen):
     arm.reset(REST)
     now, off = 0.0, []
     while not off or core.activities.follower.progress.is_moving:
-        theta, *read = arm.sense()
-        core.take(reading([*read]), now)
+        theta, read = arm.sense()
+        core.take(read, now)
         core.estimated(theta, now)
         if core.activities.follower.progress.trajectory is None:
             core.trajectory(points(REST, 0.3))

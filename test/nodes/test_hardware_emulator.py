@@ -12,10 +12,10 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.message_reading import read_muscle_states
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.ros.messages import LATCHED, array_message
+from musculoskeletal_ae.signals.muscle_readings import read_muscle_states
 
 
 @pytest.fixture
@@ -31,8 +31,8 @@ def arm(graph):
     return graph
 
 
-def rows(graph, robot):
-    return read_muscle_states(graph.next('muscle_states'), robot.muscle_count)
+def reading(graph, robot):
+    return read_muscle_states(graph.next('muscle_states'), robot)
 
 
 def drive(graph, command, condition, what):
@@ -52,9 +52,9 @@ def test_the_emulator_publishes_the_topics_of_a_robot(arm, arm26):
         ('quantity', 3, 18),
         ('muscle', 6, 6),
     ]
-    _, tension, temperature = rows(arm, arm26)
-    assert np.all(tension > 0.5 * arm26.tension.bias)
-    assert np.all(np.abs(temperature - 25.0) < 5.0)
+    read = reading(arm, arm26)
+    assert np.all(read.tension > 0.5 * arm26.tension.bias)
+    assert np.all(np.abs(read.temperature - 25.0) < 5.0)
     joints = arm.next('joint_states')
     assert tuple(joints.name) == arm26.joints
     described = arm.received['robot_description']
@@ -76,8 +76,8 @@ def test_length_commands_move_the_arm_and_their_absence_makes_it_safe(arm, arm26
         lambda: np.abs(np.array(arm.received['joint_states'][-1].position) - theta).max() < 0.4,
         'the posture',
     )
-    arm.wait(lambda: rows(arm, arm26)[1].max() > 50.0, 'tension')
-    arm.wait(lambda: rows(arm, arm26)[1].max() < 35.0, 'the safe state after the timeout')
+    arm.wait(lambda: reading(arm, arm26).tension.max() > 50.0, 'tension')
+    arm.wait(lambda: reading(arm, arm26).tension.max() < 35.0, 'the safe state after the timeout')
 
 
 def test_a_muscle_is_ruptured_and_repaired_at_run_time(arm, arm26):
@@ -86,19 +86,19 @@ def test_a_muscle_is_ruptured_and_repaired_at_run_time(arm, arm26):
     assert not success
     assert name in reason  # the reason lists the legal names
     assert arm.set_parameter('hardware_emulator', 'faults', [f'rupture:{name}'])[0]
-    before = rows(arm, arm26)
-    assert before[1, 3] == 0.0
+    before = reading(arm, arm26)
+    assert before.tension[3] == 0.0
     assert Step.REPAIR_EMULATED_FAULT in arm.emulator.report().steps
-    arm.wait(lambda: rows(arm, arm26)[0, 3] < before[0, 3] - 0.01, 'winding in')
+    arm.wait(lambda: reading(arm, arm26).length[3] < before.length[3] - 0.01, 'winding in')
     assert arm.set_parameter('hardware_emulator', 'faults', [''])[0]
-    arm.wait(lambda: rows(arm, arm26)[1, 3] > 15.0, 'tension')
+    arm.wait(lambda: reading(arm, arm26).tension[3] > 15.0, 'tension')
     assert Step.REPAIR_EMULATED_FAULT not in arm.emulator.report().steps
 
 
 def test_payload_offset_and_wrench_act(arm, arm26):
-    start = rows(arm, arm26)[0]
+    start = reading(arm, arm26).length
     assert arm.set_parameter('hardware_emulator', 'faults', ['offset:0.01'])[0]
-    np.testing.assert_allclose(rows(arm, arm26)[0], start + 0.01, atol=3e-3)
+    np.testing.assert_allclose(reading(arm, arm26).length, start + 0.01, atol=3e-3)
     for wrong in ('offset:2.0', 'offset:nan'):
         assert not arm.set_parameter('hardware_emulator', 'faults', [wrong])[0]
     assert arm.set_parameter('hardware_emulator', 'payload', 2.0)[0]
@@ -132,18 +132,18 @@ def test_a_marker_pose_is_published_on_request(graph, arm26):
 
 def test_bad_commands_are_rejected_and_do_not_move_the_arm(arm, arm26):
     publisher = arm.publisher(Float64MultiArray, 'muscle_length_command')
-    before = rows(arm, arm26)[0]
+    before = reading(arm, arm26).length
     for data in ([float('nan')] * 6, [-0.05] * 5, [], [0.0] * 1_300_000):
         publisher.publish(Float64MultiArray(data=data))
     arm.next('muscle_states', 30)
-    np.testing.assert_allclose(rows(arm, arm26)[0], before, atol=2e-3)
+    np.testing.assert_allclose(reading(arm, arm26).length, before, atol=2e-3)
     assert sum(arm.emulator.rejected.values()) == 4
 
 
 def test_a_reset_brings_the_arm_back(arm, arm26):
-    command = rows(arm, arm26)[0] - 0.02
+    command = reading(arm, arm26).length - 0.02
     start = np.array(arm.next('joint_states').position)
-    drive(arm, command, lambda: rows(arm, arm26)[1].max() > 60.0, 'tension')
+    drive(arm, command, lambda: reading(arm, arm26).tension.max() > 60.0, 'tension')
     assert arm.call(Trigger, 'hardware_emulator/reset').success
     np.testing.assert_allclose(np.array(arm.next('joint_states').position), start, atol=0.05)
 
@@ -157,7 +157,7 @@ def test_an_impossible_wrench_is_rejected_and_a_reset_repairs_a_broken_simulatio
     arm.emulator.arm.set_wrench(np.full(6, 1e9))
     arm.wait(lambda: arm.emulator.report().level == 'error', 'the report')
     assert arm.call(Trigger, 'hardware_emulator/reset').success
-    assert np.isfinite(rows(arm, arm26)).all()
+    assert np.isfinite(reading(arm, arm26).rows).all()
     arm.next('joint_states', 20)
     assert arm.emulator.report().level != 'error'
 
@@ -169,14 +169,14 @@ def test_faults_are_switched_at_run_time(arm, arm26):
     assert arm.set_parameter(
         'hardware_emulator', 'faults', [f'overheat:{name}', f'dead_sensor:tension:{name}']
     )[0]
-    arm.wait(lambda: rows(arm, arm26)[1:, 1].tolist()[0] == 0.0, 'the dead sensor')
-    assert rows(arm, arm26)[2, 1] > 80.0
+    arm.wait(lambda: reading(arm, arm26).tension[1] == 0.0, 'the dead sensor')
+    assert reading(arm, arm26).temperature[1] > 80.0
     assert arm.set_parameter('hardware_emulator', 'faults', ['drop:1'])[0]
     before = len(arm.received['muscle_states'])
     arm.spin(0.5)
     assert len(arm.received['muscle_states']) - before < 10
     assert arm.set_parameter('hardware_emulator', 'faults', [''])[0]
-    assert rows(arm, arm26)[1, 1] > 10.0
+    assert reading(arm, arm26).tension[1] > 10.0
 
 
 def test_without_joint_sensors_there_are_no_joint_states(graph):
@@ -191,8 +191,8 @@ def test_the_foreign_emulator_has_the_same_topics(graph, arm26):
     graph.listen(JointState, 'joint_states')
     graph.listen(MarkerArray, 'hardware_emulator/markers')
     graph.emulator = graph.host(HardwareEmulatorNode, robot='arm26', reality='foreign')
-    start = rows(graph, arm26)[0]
-    drive(graph, start - 0.02, lambda: rows(graph, arm26)[1].max() > 60.0, 'tension')
+    start = reading(graph, arm26).length
+    drive(graph, start - 0.02, lambda: reading(graph, arm26).tension.max() > 60.0, 'tension')
     assert tuple(graph.next('joint_states').name) == arm26.joints
     assert graph.next('hardware_emulator/markers').markers
     for wrong in (['rupture:front'], [f'rupture:{arm26.muscles[0]}', 'rupture:front']):

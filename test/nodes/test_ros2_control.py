@@ -132,15 +132,14 @@ def test_the_emulator_plays_the_same_robot(graph, host, arm26):
     position = joint_values(graph)
     assert {*MOTORS, *arm26.joints} == position.keys()
     reading = emulator.motors.reading(graph.next(STATES))
-    rows = np.reshape(reading.data, (3, -1))
-    np.testing.assert_allclose(rows[1], arm26.tension.bias, atol=25.0)
+    np.testing.assert_allclose(reading.tension, arm26.tension.bias, atol=25.0)
     commands = graph.publisher(Float64MultiArray, COMMANDS)
 
     def pulls():
-        wound = emulator.motors.command(rows[0] - 50.0 / arm26.stiffness)
+        wound = emulator.motors.command(reading.length - 50.0 / arm26.stiffness)
         commands.publish(Float64MultiArray(data=wound.tolist()))
-        tension = np.reshape(emulator.motors.reading(graph.next(STATES)).data, (3, -1))[1]
-        return (tension > rows[1] + 5.0).all()
+        tension = emulator.motors.reading(graph.next(STATES)).tension
+        return (tension > reading.tension + 5.0).all()
 
     graph.wait(pulls, 'motors that pull')
 

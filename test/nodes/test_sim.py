@@ -15,13 +15,13 @@ from visualization_msgs.msg import MarkerArray
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
-from musculoskeletal_ae.message_reading import read_muscle_states
 from musculoskeletal_ae.motion.methods import first_command
 from musculoskeletal_ae.nodes.controller import ControllerNode
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.sim import SimNode
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros.messages import LATCHED, array_message
+from musculoskeletal_ae.signals.muscle_readings import read_muscle_states
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 
@@ -67,9 +67,9 @@ def test_the_simulator_rests_at_the_tension_bias_before_a_command(arm, arm26, co
         ('quantity', 3, 18),
         ('muscle', 6, 6),
     ]
-    _, tension, temperature = read_muscle_states(message, 6)
-    np.testing.assert_array_equal(tension, arm26.tension.bias)
-    np.testing.assert_array_equal(temperature, 25.0)
+    read = read_muscle_states(message, arm26)
+    np.testing.assert_array_equal(read.tension, arm26.tension.bias)
+    np.testing.assert_array_equal(read.temperature, 25.0)
     assert tuple(arm.next('sim/joint_states').name) == arm26.joints
     np.testing.assert_allclose(posture(arm), core.state.theta[0], atol=1e-3)
     markers = arm.listen(MarkerArray, 'sim/markers')
@@ -148,7 +148,7 @@ def test_an_unreachable_command_is_reported_and_bad_commands_change_nothing(arm,
     assert sum(arm.simulator.rejected.values()) == 4
     commands.publish(array_message(np.full(6, -1.0), 'muscle'))
     arm.wait(lambda: 'at the limit: ' in arm.simulator.report().message, 'the report')
-    _, tension, _ = read_muscle_states(arm.next('sim/muscle_states'), 6)
+    tension = read_muscle_states(arm.next('sim/muscle_states'), arm26).tension
     assert tension.max() <= arm26.tension.max[0]
     theta = posture(arm)
     assert np.all((theta >= arm26.lower) & (theta <= arm26.upper))

@@ -101,7 +101,7 @@ def test_a_muscle_at_a_coupled_joint_crosses_its_master(tmp_path):
 def test_the_emulated_joint_follows_its_master(robot):
     arm = nominal_arm(robot)
     before = arm.theta
-    arm.command_length(arm.sense().length - 0.01)
+    arm.command_length(arm.sense().muscles.length - 0.01)
     arm.step(0.4)
     assert np.abs(arm.theta - before).max() > 0.01
     # A muscle is attached to the link that the coupled joint moves, so its via points show whether

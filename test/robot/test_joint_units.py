@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 from robots import write_robot
 
-from musculoskeletal_ae.emulator.faults import Faults, Readings
+from musculoskeletal_ae.emulator.faults import ArmReadings, Faults
 from musculoskeletal_ae.estimation.lengths.length_calibration import stated_theta
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.joint_sensors import ORDER, JointFault, corrected
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
 WRIST = 3  # index of the prismatic joint in θ; its limits are 0 and 0.05 m
 POLYNOMIAL = [0.1, 20.0, -3.0]  # of the position of `finger`, for the position of `wrist` [m]
@@ -81,7 +82,7 @@ def test_faults_of_the_sensor_of_a_prismatic_joint_are_in_metres(robot):
     nothing = np.zeros(robot.muscle_count)
     faults = Faults(robot, np.random.default_rng(0))
     faults.set(['bias:theta:wrist:0.006', 'bias:theta:bend:0.2'])
-    read = faults.apply(Readings(np.zeros(4), nothing, nothing, nothing)).theta
+    read = faults.apply(ArmReadings(np.zeros(4), MuscleReadings(length=nothing))).theta
     np.testing.assert_allclose(read, [0.2, 0.0, 0.0, 0.1])
 
 

@@ -67,17 +67,17 @@ def test_keys_that_do_not_go_together_are_refused(tmp_path, keys, fragments):
 def test_an_emulated_module_goes_to_its_position_at_its_speed_and_holds_it(tmp_path, reality):
     robot = Robot.load(write_robot(tmp_path, actuation='position', speed=0.05))
     arm = make_arm(robot, 0, reality)
-    start = arm.sense().length
+    start = arm.sense().muscles.length
     arm.step(1.0)  # before the first command, the module must hold its length
-    assert np.abs(arm.sense().length - start).max() < 1e-3
+    assert np.abs(arm.sense().muscles.length - start).max() < 1e-3
     goal = start + np.linspace(0.005, 0.015, robot.muscle_count)
     arm.command_length(goal)
     arm.step(0.1)
-    assert np.abs(arm.sense().length - start).max() < 0.05 * 0.1 + 1e-3
+    assert np.abs(arm.sense().muscles.length - start).max() < 0.05 * 0.1 + 1e-3
     arm.step(0.4)
-    np.testing.assert_allclose(arm.sense().length, goal, atol=1.5e-3)
+    np.testing.assert_allclose(arm.sense().muscles.length, goal, atol=1.5e-3)
     arm.step(2.0)  # without further commands, the module must hold its position
-    np.testing.assert_allclose(arm.sense().length, goal, atol=1.5e-3)
+    np.testing.assert_allclose(arm.sense().muscles.length, goal, atol=1.5e-3)
     with pytest.raises(MusculoskeletalError, match='follow lengths only'):
         arm.command_tension(goal)
 

@@ -15,10 +15,10 @@ from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
 from musculoskeletal_ae.experiments.recording import ClosedLoop
-from musculoskeletal_ae.message_reading import read_muscle_states
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import Transmission
+from musculoskeletal_ae.signals.muscle_readings import read_muscle_states
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 
 DRIVE = {'torque_constant': 0.05, 'gear': 20.0, 'spool_radius': 0.01}
@@ -44,9 +44,9 @@ def test_torque_constant_gear_and_radius_convert_a_current_to_a_tension(tmp_path
     scale = PER_AMPERE * np.where(np.arange(count) == 1, 2.0, 1.0)
     np.testing.assert_allclose(robot.tension_source.newton_per_ampere, scale)
     rows = np.stack([np.zeros(count), np.full(count, 0.5), np.full(count, 30.0)])
-    states = read_muscle_states(array(rows), count, source=robot.tension_source)
-    np.testing.assert_allclose(states[1], 0.5 * scale)
-    np.testing.assert_allclose(robot.tension_source.to_message(states[1]), 0.5)
+    tension = read_muscle_states(array(rows), robot).tension
+    np.testing.assert_allclose(tension, 0.5 * scale)
+    np.testing.assert_allclose(robot.tension_source.to_message(tension), 0.5)
     assert any('100–200 N per A' in line for line in robot.description.joint_notes)
 
 
@@ -77,7 +77,7 @@ def test_scale_offset_and_drive_friction_are_removed_by_the_direction_of_motion(
         for n in range(100):
             states = np.stack([np.zeros(COUNT), read, np.full(COUNT, 30.0)])
             states[0] -= way * 1e-4 * n
-            sample = stream.take(reading(states, ROBOT), (n + 100.0 * (way < 0.0)) * PERIOD)
+            sample = stream.take(reading(states), (n + 100.0 * (way < 0.0)) * PERIOD)
         np.testing.assert_allclose(sample.tension_read, read)
         np.testing.assert_allclose(sample.motor_tension, pull, rtol=1e-2)
         np.testing.assert_allclose(sample.bone_tension, pull * np.exp(-0.1 * way), rtol=1e-2)
@@ -88,23 +88,23 @@ def test_a_drive_that_pays_out_against_its_friction_does_not_make_a_tendon_push(
     stream = MuscleStream(ROBOT)
     states = np.stack([np.zeros(COUNT), np.full(COUNT, -15.0), np.full(COUNT, 30.0)])
     # −15 N is legal for a motor current: the drive brakes while it pays out.
-    sample = stream.take(reading(states, ROBOT), 0.0)
+    sample = stream.take(reading(states), 0.0)
     assert (sample.motor_tension == 0.0).all() and (sample.bone_tension == 0.0).all()
     assert (sample.tension_read == -15.0).all()
     with pytest.raises(RejectionError, match='tension beyond the maximum'):
-        stream.take(reading(states * np.array([[1.0], [200.0], [1.0]]), ROBOT), PERIOD)
+        stream.take(reading(states * np.array([[1.0], [200.0], [1.0]])), PERIOD)
 
 
 @pytest.mark.parametrize('reality', ['kin', 'foreign'])
 def test_an_emulated_drive_reads_more_current_while_it_winds_in(reality):
     arm, read = make_arm(ROBOT, 0, reality), {}
-    start = arm.sense().length
+    start = arm.sense().muscles.length
     for way in (1.0, -1.0):
         for n in range(100):
             arm.command_length(start - way * 1e-4 * n)
             arm.step(PERIOD)
-            read[way] = arm.sense().tension - arm.tension
-        start = arm.sense().length
+            read[way] = arm.sense().muscles.tension - arm.tension
+        start = arm.sense().muscles.length
     # Winding in adds the drive friction and paying out subtracts it. The difference is therefore
     # twice the friction, which is 0.1 T_limit on average; the current also has an error of scale.
     share = (read[1.0] - read[-1.0]) / ROBOT.tension.limit
@@ -128,8 +128,10 @@ def test_the_driver_check_accepts_currents_and_names_wrong_units():
         for n in range(100):
             arm.step(PERIOD)
             read = arm.sense()
-            current = factor * ROBOT.tension_source.to_message(read.tension)
-            listening.muscles(array([read.length, current, read.temperature]), n * PERIOD)
+            current = factor * ROBOT.tension_source.to_message(read.muscles.tension)
+            listening.muscles(
+                array([read.muscles.length, current, read.muscles.temperature]), n * PERIOD
+            )
         verdicts[unit] = listening.verdict(1.0)
     assert not verdicts['A'].faults
     assert 'current' in str(verdicts['mA']) and 'publish A' in str(verdicts['mA'])

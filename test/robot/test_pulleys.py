@@ -56,7 +56,7 @@ def test_the_drawn_tendon_runs_along_the_pulley(robot):
 
 def test_the_emulator_with_the_same_mechanics_has_pulleys_and_mujoco_has_none(robot):
     arm = make_arm(robot, 0, 'kin')
-    assert np.isfinite(arm.sense().length).all()
+    assert np.isfinite(arm.sense().muscles.length).all()
     with pytest.raises(MusculoskeletalError, match='MuJoCo has no swivelling pulleys'):
         make_arm(robot, 0, 'foreign')
 

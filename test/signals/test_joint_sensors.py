@@ -7,6 +7,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 from driver.scripted import Driver
+from readings import reading
 
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.driver.winding import Winding
@@ -58,7 +59,7 @@ def motion(name):
             length.append(rows[0])
             tension.append(rows[1])
             tested.append(winding.trying)
-            if (target := winding.step(rows, driver.now)) is not None:
+            if (target := winding.step(reading(rows), driver.now)) is not None:
                 driver.command(target)
     segments = np.unique(tested, return_inverse=True)[1]
     return np.array(theta), np.array(length), np.array(tension), segments

@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.message_reading import read_muscle_states
 from musculoskeletal_ae.robot.motors import Motors, MotorTopics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
@@ -64,15 +63,15 @@ def refused(message, interface=None):
 
 def test_positions_and_efforts_become_lengths_and_tensions_by_name_and_temperature_is_unknown():
     for names in (('m1', 'elbow', 'm0', 'gripper', 'm2'), ('m0', 'm1', 'm2')):
-        rows = states(joint_state(names))
-        np.testing.assert_allclose(rows[:2], [LENGTH, TENSION])
-        assert np.isnan(rows[2]).all()
+        read = states(joint_state(names))
+        np.testing.assert_allclose([read.length, read.tension], [LENGTH, TENSION])
+        assert np.isnan(read.temperature).all()
 
 
 def test_an_effort_that_does_not_exist_is_an_unknown_tension_not_zero():
-    assert np.isnan(states(joint_state(effort=[]))[1]).all()
-    rows = states(joint_state(effort=[math.nan, math.nan, 0.5, math.nan, 0.3]))
-    np.testing.assert_array_equal(np.isnan(rows[1]), [False, True, False])
+    assert np.isnan(states(joint_state(effort=[])).tension).all()
+    read = states(joint_state(effort=[math.nan, math.nan, 0.5, math.nan, 0.3]))
+    np.testing.assert_array_equal(np.isnan(read.tension), [False, True, False])
 
 
 @pytest.mark.parametrize(
@@ -107,7 +106,7 @@ def test_a_repeated_message_is_rejected_by_its_stamp_until_the_clock_is_set_back
 def test_the_names_may_change_from_message_to_message():
     interface = MotorInterface(CONNECTED)
     for stamp, names in enumerate((MOTORS, MOTORS[::-1], ('hand', *MOTORS)), 1):
-        np.testing.assert_allclose(interface.reading(joint_state(names, stamp))[0], LENGTH)
+        np.testing.assert_allclose(interface.reading(joint_state(names, stamp)).length, LENGTH)
     assert refused(joint_state(('hand',), 4), interface) == 'missing motor'
 
 
@@ -120,7 +119,7 @@ def test_a_position_that_is_not_a_number_is_rejected_by_the_one_stream_of_all_me
     reading = interface.reading(joint_state(robot.muscles, position=position, effort=effort))
     with pytest.raises(RejectionError, match='not finite: length of brachialis') as rejection:
         MuscleStream(robot).take(reading, 0.0)
-    assert rejection.value.states is not None
+    assert rejection.value.readings is not None
     position[2] = 0.0
     reading = interface.reading(joint_state(robot.muscles, 2, position=position, effort=effort))
     sample = MuscleStream(robot).take(reading, 0.0)
@@ -151,7 +150,7 @@ anything = st.lists(st.floats(width=64), max_size=5)
 def test_whatever_arrives_is_a_reading_or_a_message_error(names, position, velocity, effort):
     arrays = {'position': position, 'velocity': velocity, 'effort': effort}
     with suppress(MessageError):
-        assert states(joint_state(names, **arrays)).shape == (3, 3)
+        assert states(joint_state(names, **arrays)).length.shape == (3,)
 
 
 def test_a_command_is_in_the_order_of_the_controller():
@@ -181,7 +180,5 @@ def test_an_emulated_arm_reads_what_is_commanded_and_publishes_what_is_read(
     interface.take_command(taken.append)(SimpleNamespace(data=data, layout=layout))
     np.testing.assert_allclose(taken[0], length, atol=1e-12)
     names, position, effort = interface.joint_values(np.array(length), np.array(TENSION))
-    rows = read_muscle_states(
-        interface.reading(joint_state(names, position=position, effort=effort)), 3
-    )
-    np.testing.assert_allclose(rows[:2], [length, TENSION], atol=1e-12)
+    read = interface.reading(joint_state(names, position=position, effort=effort))
+    np.testing.assert_allclose([read.length, read.tension], [length, TENSION], atol=1e-12)

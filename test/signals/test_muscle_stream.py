@@ -10,14 +10,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from readings import reading
 
-from musculoskeletal_ae import message_reading
 from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals import muscle_readings, plausibility
+from musculoskeletal_ae.signals import muscle_readings
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets, Trust
 from musculoskeletal_ae.signals.friction import Transmission
 from musculoskeletal_ae.signals.limits import LIMITS, longest_lengths
-from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, Presence, Quantity
+from musculoskeletal_ae.signals.muscle_readings import (
+    QUANTITIES,
+    MuscleReadings,
+    Presence,
+    Quantity,
+)
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 
 ROBOT = Robot.load('arm26')
@@ -58,20 +62,20 @@ def test_a_sound_message_becomes_a_sample_with_the_length_offset_removed():
 
 
 @pytest.mark.parametrize('isolated', [(), (1,)])
-def test_an_optional_quantity_is_one_entry_of_the_layout(monkeypatch, isolated):
-    voltage = Quantity(
-        'voltage', 'V', 'impossible voltage', lambda _: (5.0, 60.0), Presence.OPTIONAL
-    )
-    for module in (muscle_readings, message_reading, plausibility):
-        monkeypatch.setattr(module, 'QUANTITIES', (*QUANTITIES, voltage))
+def test_an_optional_quantity_is_one_entry_of_the_table(monkeypatch, isolated):
+    voltage = Quantity('V', 'impossible voltage', lambda _: (5.0, 60.0), Presence.OPTIONAL)
+    monkeypatch.setattr(MuscleReadings, 'voltage', voltage, raising=False)
+    voltage.__set_name__(MuscleReadings, 'voltage')
+    monkeypatch.setattr(muscle_readings, 'QUANTITIES', (*QUANTITIES, voltage))
     stream = MuscleStream(ROBOT, HEALTHY.with_isolated(isolated))
     volts = np.full(M, 24.0)
-    sample = stream.take(message([*resting(), volts]), 0.0)
-    np.testing.assert_array_equal(sample.newest[-1], volts)
-    for lacking in (resting(), np.array([*resting(), np.full(M, np.nan)])):
-        assert np.isnan(stream.take(message(lacking), 0.1).newest[-1]).all()
+    read = reading(resting()).replace(voltage=volts)
+    sample = stream.take(message(read.rows), 0.0)
+    np.testing.assert_array_equal(sample.newest.voltage, volts)
+    for lacking in (resting(), reading(resting()).rows):
+        assert np.isnan(stream.take(message(lacking), 0.1).newest.voltage).all()
     with pytest.raises(RejectionError, match=r'impossible voltage: .* 90 V, legal: 5 to 60 V'):
-        stream.take(message([*resting(), 90.0 + 0.0 * volts]), 0.2)
+        stream.take(message(read.replace(voltage=90.0).rows), 0.2)
     with pytest.raises(RejectionError, match='wrong length'):
         stream.take(message(resting()[:2]), 0.3)
 
@@ -159,9 +163,9 @@ def test_a_rejected_message_contains_the_tensions_that_last():
         try:
             stream.take(reading(states), n * PERIOD)
         except RejectionError as rejection:
-            pull = rejection.pull
-    assert pull[1, 1] == 300.0 and pull[0, 1] == 0.1
-    assert pull[1, 2] == 0.0
+            plausible = rejection.plausible
+    assert plausible.tension[1] == 300.0 and plausible.length[1] == 0.1
+    assert plausible.tension[2] == 0.0
 
 
 def jump_together(stream, size=0.05, pause=0.0):
@@ -324,7 +328,7 @@ def test_the_median_of_three_hides_a_glitch_that_the_newest_values_show():
     for n, spike in enumerate((0.0, 0.0, 60.0, 0.0)):
         sample = stream.take(reading(resting(tension=(0, tension + spike))), n * PERIOD)
         assert sample.motor_tension[0] == pytest.approx(tension)
-        assert sample.newest[1, 0] == pytest.approx(tension + spike)
+        assert sample.newest.tension[0] == pytest.approx(tension + spike)
 
 
 def test_tendon_friction_is_removed_by_the_direction_of_sliding():

@@ -35,6 +35,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.view import controls
 from musculoskeletal_ae.view.controls import REST_TIME
 from musculoskeletal_ae.view.entries import SETTLE_TIME
@@ -80,17 +81,18 @@ def view(graph):
 @chromium
 def test_readings_and_controls_leave_room_for_the_arm(arm26, tmp_path):
     SCREENSHOTS.mkdir(parents=True, exist_ok=True)
-    port, states, times = free_port(), np.array([[30.0] * 6, [25.0] * 6]), itertools.count()
+    port, times = free_port(), itertools.count()
+    muscles = MuscleReadings(tension=np.full(6, 30.0), temperature=np.full(6, 25.0))
     page = Page(arm26, '127.0.0.1', port, False, lambda *_: None)
     page.offer(['controller'])
     sizes = (1280, 800), (800, 600)
     browser = Browser(tmp_path / 'profile', f'http://127.0.0.1:{port}', sizes[0])
 
     def is_complete() -> bool:
-        page.draw({'estimated': np.array([0.0, -1.0])}, states[0], np.array([2, *[0] * 5]))
+        page.draw({'estimated': np.array([0.0, -1.0])}, muscles.tension, np.array([2, *[0] * 5]))
         page.offer(['controller'], explores=True)
         values = (0.1, np.nan, np.nan, np.nan)
-        page.tell(['error 0.1'], 'STOPPED: why', states, next(times), values)
+        page.tell(['error 0.1'], 'STOPPED: why', muscles, next(times), values)
         texts = 'STOPPED: why', 'End exploring', 'Restore isolated muscles', '30 N', 'A: '
         return all(text in browser.text for text in texts)
 

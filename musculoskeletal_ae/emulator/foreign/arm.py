@@ -18,7 +18,7 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.design.route_jumps import MOST_DRAWS, newly_jumping
-from musculoskeletal_ae.emulator.faults import Readings
+from musculoskeletal_ae.emulator.faults import ArmReadings
 from musculoskeletal_ae.emulator.foreign import deviation, mujoco_model, tendons
 from musculoskeletal_ae.emulator.foreign.effects import NONE, Draw, Effects
 from musculoskeletal_ae.emulator.modules import STEP, Arm
@@ -26,6 +26,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.importing.adapted_mjcf import HAND
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
 #: update the bends of the tendons, and how far route points yield, only after this many steps
 GUIDES_EVERY = 5
@@ -185,44 +186,45 @@ class LateSensors:
 
     def __init__(self, robot: Robot, draw: Draw) -> None:
         joints = robot.joint_count
-        self._joint_count, self._span = joints, robot.upper - robot.lower
+        self._span = robot.upper - robot.lower
         self._zero = draw.normal('joint_zero', joints)
         self._bend = draw.about('joint_bend', joints, signed=True)
         self._backlash = draw.about('backlash', joints)
         self._delays = draw.about('delay', 2)  # delay of joint sensors, and of muscle modules [s]
-        self._history = np.zeros((HISTORY, joints + 3 * robot.muscle_count))
+        #: true θ [rad], (HISTORY, D), and readings of the modules, after each of the last steps
+        self._theta = np.zeros((HISTORY, robot.joint_count))
+        self._muscles = MuscleReadings(length=np.zeros((HISTORY, robot.muscle_count)))
         self._steps = 0
 
     def stand(self, theta: Array) -> None:
         """Start from rest at θ [rad], (D,), each joint sensor in the middle of its backlash."""
         self._play = theta + self._zero
 
-    def start(self, now: Array) -> None:
-        """Start with the present values of all sensed quantities as history, (D + 3 M,)."""
-        self._history[:] = now
+    def start(self, theta: Array, muscles: MuscleReadings) -> None:
+        """Start with the present θ [rad], (D,), and readings of the modules as history."""
+        self._theta[:], self._muscles.rows[:] = theta, muscles.rows
 
-    def append(self, now: Array) -> None:
-        """Append the values of all sensed quantities, (D + 3 M,), one step after the last ones."""
+    def append(self, theta: Array, muscles: MuscleReadings) -> None:
+        """Append θ [rad], (D,), and the readings of the modules, one step after the last ones."""
         self._steps += 1
-        self._history[self._steps % HISTORY] = now
+        place = self._steps % HISTORY
+        self._theta[place], self._muscles.rows[place] = theta, muscles.rows
 
-    def read(self, jitter: float) -> tuple[Array, Array, Array, Array]:
-        """Read the sensed quantities as they were before the delays of their messages.
+    def read(self, jitter: float) -> ArmReadings:
+        """Read the sensors as they were before the delays of their messages.
+
+        The joint angles have the errors of the joint sensors.
 
         Args:
             jitter: Time that is added to the delays [s]; may be negative.
-
-        Returns:
-            Joint angles [rad], (D,), with the errors of the joint sensors; lengths [m], tensions
-            [N] and temperatures [°C], each (M,).
         """
         late = np.maximum(self._delays + jitter, 0.0) / STEP
-        joints, muscles = (self._history[(self._steps - round(steps)) % HISTORY] for steps in late)
+        of_joints, of_muscles = ((self._steps - round(steps)) % HISTORY for steps in late)
         half, span = 0.5 * self._backlash, self._span
-        theta = joints[: self._joint_count] + self._zero
+        theta = self._theta[of_joints] + self._zero
         theta = theta + self._bend * span * np.sin(2.0 * np.pi * theta / span)
         self._play = np.clip(self._play, theta - half, theta + half)
-        return self._play, *muscles[self._joint_count :].reshape(3, -1)
+        return ArmReadings(self._play, self._muscles.at(of_muscles))
 
 
 class Ageing:
@@ -385,8 +387,8 @@ class ForeignArm(Arm):
         self._memory.rest[:] = 1.0
         for m in range(self.robot.muscle_count):
             tendons.read(self.tendons, self._muscle, self._memory, self._command, m)
-        self._sensors.start(self._sensed_quantities())
-        self._last_readings: Readings | None = None
+        self._sensors.start(self.theta, self._module_readings())
+        self._last_readings: MuscleReadings | None = None
 
     def _attach(self, which: Bools) -> None:
         super()._attach(which)
@@ -445,29 +447,28 @@ class ForeignArm(Arm):
             at = data.xpos[self._hand]
             mujoco.mj_applyFT(model, data, force, torque, at, self._hand, data.qfrc_applied)
         mujoco.mj_step2(model, data)
-        self._sensors.append(self._sensed_quantities())
+        self._sensors.append(self.theta, self._module_readings())
 
-    def _sensed_quantities(self) -> Array:
-        """Return all quantities that the sensors measure at this moment in one array, (D + 3 M,).
-
-        These are the true joint angles [rad], the lengths [m] and tensions [N] that the modules
-        read, and the temperatures of their housings [°C].
-        """
+    def _module_readings(self) -> MuscleReadings:
+        """Return what the sensors of the modules measure at this moment."""
         memory, muscle = self._memory, self._muscle
-        return np.concatenate([self.theta, memory.reading, memory.cell, muscle.housing])
+        return MuscleReadings(
+            length=memory.reading, tension=memory.cell, temperature=muscle.housing
+        )
 
-    def _raw_readings(self) -> tuple[Array, Array, Array, Array]:
+    def _raw_readings(self) -> ArmReadings:
         return self._sensors.read(self.effects.jitter * self._rng.uniform(-0.5, 0.5))
 
-    def sense(self) -> Readings:
+    def sense(self) -> ArmReadings:
         """Read all sensors once, with delay, noise, errors, resolution and faults."""
         now = super().sense()
-        last = self._last_readings or now
-        lost = self._rng.uniform(size=len(now.length)) < self.effects.dropouts
-        length = np.where(lost, last.length, now.length)
-        tension = np.where(lost, last.tension, now.tension)
-        self._last_readings = now._replace(length=length, tension=tension)
-        return self._last_readings
+        read, last = now.muscles, self._last_readings or now.muscles
+        lost = self._rng.uniform(size=self.robot.muscle_count) < self.effects.dropouts
+        self._last_readings = read.replace(
+            length=np.where(lost, last.length, read.length),
+            tension=np.where(lost, last.tension, read.tension),
+        )
+        return now._replace(muscles=self._last_readings)
 
     @property
     def hand(self) -> pin.SE3:

@@ -24,6 +24,7 @@ from numba import njit
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator import modules
+from musculoskeletal_ae.emulator.faults import ArmReadings
 from musculoskeletal_ae.emulator.kin import wrapping
 from musculoskeletal_ae.emulator.kin.individual import Individual
 from musculoskeletal_ae.emulator.kin.wrapping import Placed
@@ -32,6 +33,7 @@ from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.kinematics import joint_space_inertia
 from musculoskeletal_ae.robot.passive_torque import add_passive
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
 #: let tendon friction build up to its full size over this sliding distance [m]
 SLIDING_DISTANCE = 0.0005
@@ -299,11 +301,12 @@ class EmulatedArm(modules.Arm):
         after = kin.tree.angles(theta + STEP * (self.velocity + STEP * acceleration))
         return ((after - joint.q) / STEP - joint.velocity) / STEP
 
-    def _raw_readings(self) -> tuple[Array, Array, Array, Array]:
+    def _raw_readings(self) -> ArmReadings:
         muscle, true = self._muscle, self.individual
         tension = true.tension_gain * muscle.tension + true.tension_bias
         length = muscle.length + self._command.length_error + self._command.zero
-        return self.theta, length, tension, muscle.housing
+        muscles = MuscleReadings(length=length, tension=tension, temperature=muscle.housing)
+        return ArmReadings(self.theta, muscles)
 
     def route_points(self) -> Array:
         """Return the true route points in the root link's frame [m], shape (P, 3)."""

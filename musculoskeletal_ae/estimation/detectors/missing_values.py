@@ -9,10 +9,11 @@ import math
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
 SILENT = 0.15  # report a muscle once it alone has reported NaN for this long [s]
 
@@ -27,13 +28,13 @@ class MissingValues(Detector):
         #: message [s]
         self._since = self._last = -math.inf
 
-    def read(self, states: Array, usable: Bools, now: float) -> Finding | None:
+    def read(self, readings: MuscleReadings, usable: Bools, now: float) -> Finding | None:
         """Report the only muscle with NaN in a message, if it has reported NaN for 0.15 s.
 
         The result is None if there is nothing to report. `Detector.read` describes the arguments.
         """
-        known = self._robot.tension_source.measured(states[:2])
-        is_missing = ~np.isfinite(known).all(axis=0) & usable
+        has_no_tension = ~np.isfinite(readings.tension) & self._robot.tension_source.is_known
+        is_missing = (~np.isfinite(readings.length) | has_no_tension) & usable
         muscle = int(is_missing.argmax()) if np.count_nonzero(is_missing) == 1 else None
         if muscle != self._muscle or now - self._last > SILENT:
             self._since = now

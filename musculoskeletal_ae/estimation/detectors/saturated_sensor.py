@@ -81,7 +81,7 @@ class SaturatedSensor(Detector):
         It must have been clipped twice at the same value, or while its module winds in.
         """
         sample, dt, value = observation.sample, observation.dt, self._value
-        reading = sample.newest[1]
+        reading = sample.newest.tension
         is_same = reading == self._before
         same_count = np.count_nonzero(is_same)
         if 2 * same_count > len(is_same):  # a repeated message

@@ -32,7 +32,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import anomaly, residuals
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import slack_tension
-from musculoskeletal_ae.signals.muscle_readings import Row
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement, decide, single_faults
 
 SPACING = 0.25  # store at most one message in this time [s]
@@ -99,14 +99,14 @@ class ExchangeCheck:
         """Use another network; its isolated muscles are ignored."""
         self._mae = mae
 
-    def read(self, states: Array, now: float) -> None:
+    def read(self, readings: MuscleReadings, now: float) -> None:
         """Read the raw lengths of a message, accepted or not, to notice a pause of the driver.
 
         Args:
-            states: The raw readings, (Q, M).
+            readings: The raw readings.
             now: Time of the message on a steady clock [s].
         """
-        length = states[Row.LENGTH]
+        length = readings.length
         if not np.isfinite(length).all():
             return
         if self._newest is not None and now - self._newest[0] > SILENT:
