@@ -482,8 +482,8 @@ class Mae:
         """
         rows = self._length_root @ self.muscle_jacobian(theta, tension)
         prior = np.diag(1.0 / self.usual_posture[1] ** 2)
-        covariance: Array = np.linalg.inv(rows.swapaxes(-1, -2) @ rows + prior)
-        return covariance
+        information = rows.swapaxes(-1, -2) @ rows + prior
+        return np.asarray(np.linalg.inv(information), dtype=np.float64)
 
     @cached_property
     def usual_posture(self) -> tuple[Array, Array]:
