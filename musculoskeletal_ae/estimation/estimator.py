@@ -31,6 +31,7 @@ from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
 from musculoskeletal_ae.estimation.estimate import Estimate, estimate
 from musculoskeletal_ae.estimation.finding import Finding, Observation
+from musculoskeletal_ae.estimation.further_loss import needed_muscles
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
 from musculoskeletal_ae.estimation.joint_sensor_check import JointSensorCheck
@@ -94,6 +95,8 @@ class Estimator:
         stream: Converts messages into samples.
         mae: The network in use, without the isolated muscles; None before the first.
         complete_mae: The same network with all muscles.
+        needed_muscles: While a muscle is isolated, which further muscles the estimate needs, as a
+            text for users; otherwise ''.
         health: Checks each message with all detectors.
         suspects: The latched fault that a detector found, and the verification of its muscle.
         calibration: The running length calibration, or None.
@@ -129,6 +132,7 @@ class Estimator:
         self.stream = MuscleStream(robot, self.body)
         self.mae: Mae | None = None
         self.complete_mae: Mae | None = None
+        self.needed_muscles = ''
         self.health = HealthMonitor(robot, preset)
         self.suspects = SuspectHandling(robot)
         self.calibration: LengthCalibration | None = None
@@ -210,6 +214,7 @@ class Estimator:
         self.mounting.use(reduced)
         self.stream.use_transmission(reduced.transmission)
         self.complete_mae, self.mae = mae, reduced
+        self.needed_muscles = needed_muscles(self.robot, reduced)
         if self.calibration is not None:
             posture = self.calibration.posture
             self.calibration = LengthCalibration(self.robot, reduced, posture)
