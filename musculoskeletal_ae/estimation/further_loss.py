@@ -32,12 +32,12 @@ def needed_muscles(robot: Robot, mae: Mae) -> str:
     if not mae.isolated:
         return ''
     theta = robot.random_postures(POSTURES, np.random.default_rng(0))
-    tension = np.tile(robot.tension.bias, (POSTURES, 1))
+    jacobian = mae.muscle_jacobian(theta, np.tile(robot.tension.bias, (POSTURES, 1)))
     needed = list[str]()
     for muscle, name in enumerate(robot.muscles):
         if muscle in mae.isolated:
             continue
-        covariance = mae.without((*mae.isolated, muscle)).posture_covariance(theta, tension)
+        covariance = mae.without((*mae.isolated, muscle)).posture_covariance(jacobian)
         variance = np.diagonal(covariance, axis1=-2, axis2=-1)
         share = (variance > UNDETERMINED**2).mean(axis=0)
         joints = np.flatnonzero(share > NOTABLE_SHARE)

@@ -468,19 +468,19 @@ class Mae:
 
         return minimise_each(residuals, start, 1.0 / std**2, ROUNDS)
 
-    def posture_covariance(self, theta: Array, tension: Array) -> Array:
+    def posture_covariance(self, jacobian: Array) -> Array:
         """Return the covariance of a posture that `fit_posture` fits to the muscles in use.
 
             P = (Gᵀ Σ⁻¹ G + diag(1/s²))⁻¹
 
         Args:
-            theta: Joint angles [rad], (..., D).
-            tension: Bone-side tensions [N], (..., M).
+            jacobian: Muscle Jacobian G in this posture [m/rad], (..., M, D). It does not depend on
+                which muscles are isolated.
 
         Returns:
             P [rad²], (..., D, D).
         """
-        rows = self._length_root @ self.muscle_jacobian(theta, tension)
+        rows = self._length_root @ jacobian
         prior = np.diag(1.0 / self.usual_posture[1] ** 2)
         information = rows.swapaxes(-1, -2) @ rows + prior
         return np.asarray(np.linalg.inv(information), dtype=np.float64)
