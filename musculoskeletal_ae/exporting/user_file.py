@@ -2,9 +2,10 @@
 """Writes learned attachment points into the user's own MJCF file.
 
 Only the positions of sites change. Names, actuators, meshes, comments and the layout of the text
-stay, because the text is edited in place and not written anew. Included files are copied into the
-same folder if a site in them moves; otherwise the copy includes the original. Folders of meshes and
-textures become absolute paths, because the copy lies elsewhere.
+stay, because the text is edited in place and not written anew. Included files are copied with it,
+to the same places relative to the file, or beside it if they lie outside its folder. Meshes and
+textures are not copied: MuJoCo finds them by absolute paths of their folders, or of single files
+that lie beside an included file.
 """
 
 import re
@@ -22,6 +23,8 @@ SITE = re.compile(r'<site\b[^>]*>')
 INCLUDE = re.compile(r'<include\b[^>]*?\bfile\s*=\s*["\']([^"\']*)["\'][^>]*>')
 COMPILER = re.compile(r'<compiler\b[^>]*>')
 ATTRIBUTE = r'\b{name}\s*=\s*(["\'])(.*?)\1'
+ASSET = re.compile(r'<(mesh|hfield|skin|texture)\b[^>]*>')
+ASSET_FILE = re.compile(r'\bfile\w*\s*=\s*(["\'])(.*?)\1')
 FOLDERS = 'meshdir', 'texturedir', 'assetdir'
 SAME = 1e-6  # regard a site as unchanged if it has moved by no more than this [m]
 
@@ -42,7 +45,6 @@ class UserFile:
             problem = f'MuJoCo cannot load it: {" ".join(str(error).split())}'
             raise MusculoskeletalError(f'{file}: {problem}') from error
         self.texts: dict[Path, str] = {}
-        self._changed: set[Path] = set()
         self._read(self.file)
         self.sites = self._movable_sites()
 
@@ -105,53 +107,27 @@ class UserFile:
                 if not count:
                     new = re.sub(r'^<site\b', f'<site pos="{position}"', tag)
                 self.texts[file] = text[: match.start()] + new + text[match.end() :]
-                self._changed.add(file)
                 return
         raise KeyError(name)
 
     def write(self, folder: Path) -> Path:
-        """Write the changed file into a folder; return its path.
+        """Write the file and all files that it includes into a folder; return its path there.
 
         Raises:
             MusculoskeletalError: If MuJoCo does not load the result.
         """
-        # A file that includes a changed file must change too, because it names the copy.
-        before = -1
-        while before != len(self._changed):
-            before = len(self._changed)
-            for file, text in self.texts.items():
-                included = [match[1] for match in INCLUDE.finditer(_without_comments(text))]
-                if any(self._included(file, name) in self._changed for name in included):
-                    self._changed.add(file)
-        self._changed.add(self.file)
-        names = dict[Path, str]()
-        for file in self.texts:
-            name = file.name
-            while name in names.values():
-                name = f'included_{name}'
-            names[file] = name
-        is_folder_stated = False
-        for file in self._changed:
-            text, stated = self._placed_elsewhere(file, names)
-            is_folder_stated |= stated
-            self.texts[file] = text
-        is_folder_stated |= any(
-            any(_attribute(match[0], key) for key in FOLDERS)
-            for file, text in self.texts.items()
-            if file not in self._changed
-            for match in COMPILER.finditer(_without_comments(text))
-        )
+        copies, folders = self._copies(), self._asset_folders()
+        texts = {file: self._placed_elsewhere(file, copies, folders) for file in self.texts}
         model = self.model
-        has_assets = any((model.nmesh, model.ntex, model.nhfield, model.nskin))
-        if has_assets and not is_folder_stated:
-            folders = ' '.join(f'{key}="{self.file.parent}"' for key in FOLDERS[:2])
+        if not folders and any((model.nmesh, model.ntex, model.nhfield, model.nskin)):
+            stated = ' '.join(f'{key}="{self.file.parent}"' for key in FOLDERS[:2])
             head = re.compile(r'(<mujoco\b[^>]*>)')
-            self.texts[self.file] = head.sub(
-                rf'\1\n  <compiler {folders}/>', self.texts[self.file], count=1
-            )
-        for file in self._changed:
-            (folder / names[file]).write_text(self.texts[file], encoding='utf-8')
-        result = folder / names[self.file]
+            texts[self.file] = head.sub(rf'\1\n  <compiler {stated}/>', texts[self.file], count=1)
+        for file, text in texts.items():
+            copy = folder / copies[file]
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_text(text, encoding='utf-8')
+        result = folder / copies[self.file]
         try:
             mujoco.MjModel.from_xml_path(str(result))
         except (ValueError, mujoco.FatalError) as error:
@@ -159,25 +135,54 @@ class UserFile:
             raise MusculoskeletalError(f'{self.file}: {problem}') from error
         return result
 
-    def _placed_elsewhere(self, file: Path, names: dict[Path, str]) -> tuple[str, bool]:
-        """Return a file's text for another folder, and whether it states the folder of meshes."""
-        text, is_stated = self.texts[file], False
-        edits = list[tuple[int, int, str]]()
-        plain = _without_comments(text)
+    def _copies(self) -> dict[Path, str]:
+        """Return the path of each file's copy, relative to the folder of the copies."""
+        home = self.file.parent.resolve()
+        copies = {self.file: self.file.name}
+        for file in self.texts:
+            is_inside = file.is_relative_to(home)
+            name = file.relative_to(home).as_posix() if is_inside else file.name
+            while file != self.file and name in copies.values():
+                name = f'included_{name}'
+            copies.setdefault(file, name)
+        return copies
+
+    def _asset_folders(self) -> dict[str, Path]:
+        """Return the folders of assets that the files state, by the name of the attribute."""
+        folders = dict[str, Path]()
+        for text in self.texts.values():
+            for match in COMPILER.finditer(_without_comments(text)):
+                for key in FOLDERS:
+                    if stated := _attribute(match[0], key):
+                        folders[key] = (self.file.parent / stated).resolve()
+        return folders
+
+    def _placed_elsewhere(
+        self, file: Path, copies: dict[Path, str], folders: dict[str, Path]
+    ) -> str:
+        """Return a file's text for its copy, with other paths of included files and of assets."""
+        text = self.texts[file]
+        plain, edits = _without_comments(text), list[tuple[int, int, str]]()
         for match in INCLUDE.finditer(plain):
-            other = self._included(file, match[1])
-            name = names[other] if other in self._changed else str(other)
-            edits.append((match.start(1), match.end(1), name))
+            edits.append((*match.span(1), copies[self._included(file, match[1])]))
         for match in COMPILER.finditer(plain):
             for key in FOLDERS:
                 if inside := re.search(ATTRIBUTE.format(name=key), match[0]):
-                    is_stated = True
+                    start, end = (match.start() + at for at in inside.span(2))
                     absolute = (self.file.parent / inside[2]).resolve()
-                    start = match.start() + inside.start(2)
-                    edits.append((start, start + len(inside[2]), str(absolute)))
+                    edits.append((start, end, str(absolute)))
+        # MuJoCo looks for an asset in the folder of assets, and then beside the including file.
+        for match in ASSET.finditer(plain):
+            key = 'texturedir' if match[1] == 'texture' else 'meshdir'
+            place = folders.get(key) or folders.get('assetdir') or self.file.parent
+            for inside in ASSET_FILE.finditer(match[0]):
+                beside = (file.parent / inside[2]).resolve()
+                if beside.is_file() and not (place / inside[2]).is_file():
+                    start, end = (match.start() + at for at in inside.span(2))
+                    edits.append((start, end, str(beside)))
         for start, end, new in sorted(edits, reverse=True):
             text = text[:start] + new + text[end:]
-        return text, is_stated
+        return text
 
 
 def _without_comments(text: str) -> str:

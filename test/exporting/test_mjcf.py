@@ -16,6 +16,7 @@ from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.exporting import learned_routes
 from musculoskeletal_ae.exporting.mjcf import export, export_into
+from musculoskeletal_ae.exporting.user_file import UserFile
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
@@ -102,14 +103,45 @@ def test_learned_points_are_written_into_the_users_file_and_all_else_stays(learn
     assert 'muscles that keep their points: none' in printed
     written = (folder / 'into' / 'mine.xml').read_text()
     assert '<!-- mine -->' in written
-    expected = mine.read_text().replace('"tendons.xml"', f'"{folder}/tendons.xml"')
-    assert without_sites(written) == without_sites(expected)
+    assert without_sites(written) == without_sites(mine.read_text())
+    assert (folder / 'into' / 'tendons.xml').read_text() == (folder / 'tendons.xml').read_text()
     again = import_robot(folder / 'into' / 'mine.xml', folder / 'again_into').robot
     theta = robot.random_postures(200, np.random.default_rng(5))
     true = individual.muscle_jacobian(theta)
     before = differences(robot.routes.muscle_jacobian(theta), true)
     after = differences(again.routes.muscle_jacobian(theta), true)
     assert np.median(after) < 0.2 * np.median(before)
+
+
+CUBE = 'v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n'
+MESHES = """<mujoco>
+  <include file="shared.xml"/><include file="bones/assets.xml"/>
+  <include file="../outside/site.xml"/>
+  <worldbody><body><geom type="mesh" mesh="tip"/><geom type="mesh" mesh="own"/></body></worldbody>
+</mujoco>"""
+
+
+def test_meshes_are_found_wherever_an_included_file_places_them(tmp_path):
+    files = {
+        'home/mine.xml': MESHES,
+        'home/shared.xml': '<mujoco><compiler meshdir="meshes"/></mujoco>',
+        'home/bones/assets.xml': '<mujoco><asset><mesh name="tip" file="tip.obj"/>'
+        '<mesh name="own" file="own.obj"/></asset></mujoco>',
+        'outside/site.xml': '<mujoco><worldbody><site name="s" pos="1 2 3"/></worldbody></mujoco>',
+        'home/meshes/tip.obj': CUBE,
+        'home/bones/own.obj': CUBE,
+    }
+    for name, text in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    user = UserFile(tmp_path / 'home' / 'mine.xml')
+    user.move('s', np.array([3.0, 2.0, 1.0]))
+    (tmp_path / 'copy').mkdir()
+    model = mujoco.MjModel.from_xml_path(str(user.write(tmp_path / 'copy')))
+    assert model.nmesh == 2
+    np.testing.assert_allclose(model.site('s').pos, [3.0, 2.0, 1.0])
+    written = (tmp_path / 'copy' / 'mine.xml').read_text()
+    assert written == MESHES.replace('../outside/site.xml', 'site.xml')
 
 
 def test_another_file_is_refused(learned):
