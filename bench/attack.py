@@ -246,7 +246,9 @@ def evaluate(attack: 'Attack') -> list[Row]:
         for begin, end, mode in stops:
             if (length := wound_in(at, value, begin + JITTER, end)) > STILL:
                 wound.append(f'{1e3 * length:.1f} mm in {mode}, from {begin:.2f} s')
-    true = [load for load in attack.loads if without(np.array([load[0]]), attack.lying)[0]]
+    # The driver obeys other nodes as well, so their tensions are not the controller's.
+    excluded = [*attack.lying, *attack.foreign]
+    true = [load for load in attack.loads if without(np.array([load[0]]), excluded)[0]]
     highest, when = max(((float(load.max()), at) for at, load in true), default=(0.0, 0.0))
     tense = [
         f'{robot.muscles[m]} for {seconds:.1f} s, highest tension {highest:.0f} N at {when:.2f} s'
@@ -304,7 +306,7 @@ def main(argv: list[str]) -> int:
     """Run the attacks, and print the table."""
     from bench.attack_kinds import KINDS, all_attacks
 
-    parser = Parser('attack', 'Attacks the running system and counts what breaks.')
+    parser = Parser('attack', 'Attacks the running system and counts the promises that it breaks.')
     parser.add_quick('attack for about half a minute only')
     parser.add_argument(
         '--messages',

@@ -94,7 +94,7 @@ def calibration(
 
 def table(rows: Sequence[Row]) -> str:
     """Return the rows and their means as plain text."""
-    head = 'seed  lengths off [mm]  oracle [rad]  least squares  default  paper'
+    head = 'seed  length error [mm]; errors [rad]: oracle  least squares  default  paper'
     lines = [head, *(_line(f'{row.seed:4d}', row[1:]) for row in rows)]
     lines.append(_line('mean', np.mean([row[1:] for row in rows], axis=0)))
     return '\n'.join(lines)

@@ -349,7 +349,7 @@ def _options(argv: list[str]) -> argparse.Namespace:
     parser.add_argument('names', nargs='*', metavar='NAME', help=', '.join(PLATFORMS))
     parser.add_argument(
         '--node', type=Path, metavar='CHECKPOINT',
-        help='check only the core and one node with this checkpoint of arm26, without torch',
+        help='check only the core and one node, without torch, with this checkpoint of arm26',
     )  # fmt: skip
     parser.add_folder('working folder (default: a temporary one)')
     parser.add_argument(

@@ -254,7 +254,7 @@ def clone_of(repository: Repository, clones: Path, fetch: bool) -> Path | None:
 
 def main(argv: list[str]) -> int:
     """Learn and test all cases of repositories that have clones, and write the tables."""
-    parser = Parser('recordings', "Learns public recordings of other people's robots.")
+    parser = Parser('recordings', "Learns from public recordings of other people's robots.")
     parser.add_argument('--clones', type=Path, required=True, help='directory with the clones')
     parser.add_argument('--fetch', action='store_true', help='clone missing data from GitHub')
     text = 'use only repositories whose name contains this text'

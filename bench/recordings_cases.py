@@ -123,7 +123,7 @@ def drawn(recording: Recording, count: int, draw: int) -> Case | None:
     if test is None:
         test = pool.at(order[count:])
     if isinstance(body, SoftLink) and body.name == 'continuum_stand':
-        # The publication does not state where the tendons run.
+        # The publication does not state where the tendons run, so their routes are fitted.
         body, at_zero = fitted(body, training)
         training, test = (replace(run, length=run.length - at_zero) for run in (training, test))
     test = test.at(slice(None, None, max(1, len(test.length) // MOST_ROWS)))

@@ -144,7 +144,7 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
 
 
 def measure(robot: Robot, folder: Path, seed: int) -> dict[str, dict[str, Any]]:
-    """Return the results of one individual, with and without joint sensors."""
+    """Measure how well one individual is zeroed, with and without joint sensors."""
     learned = learned_arm(robot, seed, folder, MINUTES)
     held_out = record(EmulatedArm(robot, seed), learned.driver, HELD_OUT_STREAM, HELD_OUT)
     return {how: zeroed(robot, learned.mae, seed, how, held_out) for how in GOALS}

@@ -433,9 +433,9 @@ class ConditionKind(Enum):
         'length_offsets_not_saved',
         'estimator',
         'warn',
-        'the file that keeps length offsets and isolated muscles for the next estimator cannot be '
-        'written',
-        'length offsets and isolated muscles are not on disk',
+        'the file from which a restarted estimator reads length offsets and isolated muscles '
+        'cannot be written',
+        'length offsets and the list of isolated muscles are not saved',
         (Step.FREE_DISK,),
     )
 

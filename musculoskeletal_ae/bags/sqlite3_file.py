@@ -192,7 +192,7 @@ def salvage(path: Path, target: Path) -> int:
 
 
 def _next_readable(connection: sqlite3.Connection, place: int) -> int | None:
-    """Return an id from `place` on whose row can be read; None if there is none."""
+    """Return the first id, at or after `place`, whose row can be read; None if none can."""
     if _is_readable(connection, place):
         return place
     step = 1

@@ -124,7 +124,7 @@ class CalibratedBody:
 
     @cached_property
     def attachment_spread(self) -> Array:
-        """Standard deviation σ of each muscle's route points, per coordinate [m], (M,)."""
+        """Expected σ of the errors δ of each muscle's route points [m], (M,)."""
         return attachment_spread(self.robot)
 
     @property

@@ -213,7 +213,7 @@ class MuscleFit:
         return Equations.of_common(curvature + np.diag(self._precision))
 
     def right_sides(self, point: MusclePoint) -> RightSides:
-        """Return the right sides of the normal equations of a Gauss–Newton step from a point."""
+        """Return the right-hand sides of the normal equations of a Gauss–Newton step."""
         by_samples = point.jacobian.T @ (self._weight * point.residual)[:, 0]
         by_prior = self._precision * (self._mean - point.parameters)
         return RightSides.of_common(by_samples + by_prior)

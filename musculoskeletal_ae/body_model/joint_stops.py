@@ -43,7 +43,9 @@ NOT_REACHED = 0.5  # assume that the arm never reaches a given stop with this pr
 SHARES = 0.03, 0.1, 0.3  # consider that this share π of all rests is at a stop that is reached
 #: consider that the readings at a stop scatter with these standard deviations σ [rad]
 WIDTHS = 0.001, 0.002, 0.004
-WIDTH_RATIO = 2.0  # beyond a limit, widen the cluster by this factor, because stops are compliant
+#: beyond a limit, let a cluster of readings at a stop be wider by this factor, because stops are
+#: compliant
+WIDTH_RATIO = 2.0
 #: beyond a limit, expect this density of other readings, relative to that within the range
 DENSITY_RATIO = 0.01
 # A joint is at its stop if it is near a limit and the muscles push it there.

@@ -40,9 +40,11 @@ class Prior:
     drive_friction_mean: float = DRIVE_FRICTION_MEAN
 
     def spread(self, layout: Layout, attachment: float) -> Array:
-        """Return the prior spread s of every parameter of a muscle.
+        """Return the prior spread s of every parameter of a muscle, (P,).
 
-        `attachment` is the σ of its route points according to `attachment_spread` [m].
+        Args:
+            layout: Layout of the parameters.
+            attachment: σ of the errors of its route points, from `attachment_spread` [m].
         """
         spread = np.empty(layout.size)
         spread[layout.attachment] = min(self.attachment, attachment)

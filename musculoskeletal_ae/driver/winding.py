@@ -390,7 +390,7 @@ class Winding(MotionTest):
 
     def _mean(self) -> _Reading:
         readings = self._readings()
-        # The demand is averaged, because it is a nonlinear function of the noisy l.
+        # Average the demand and not l, because the demand is a nonlinear function of the noisy l.
         demand = self._demanded(readings.length)
         clipped = np.minimum(demand, self._robot.tension.max).mean(axis=0)
         mean = MuscleReadings.of_rows(readings.rows.mean(axis=0))

@@ -33,7 +33,6 @@ from musculoskeletal_ae.robot.robot import Robot
 
 STEP = 0.001  # duration of a simulation step [s]
 
-# modes of a module
 #: modes of a module: safe state, following a target length, following a target tension
 SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 

@@ -352,7 +352,7 @@ class JointSensorCheck:
     def _begin_of_doubt(self, joint: int) -> float:
         """Return the time since which the readings of a joint may be wrong [s].
 
-        It is the time of the last message before which a window of messages agreed.
+        Until this time, the readings agreed with the lengths, averaged over a window.
         """
         count = WINDOWS[0][0]
         deviation = np.array([deviation[joint] for deviation, _ in self._compared])

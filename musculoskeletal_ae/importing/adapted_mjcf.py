@@ -158,10 +158,10 @@ class AdaptedModel:
             self._joints[j].set('axis', _text(pose.rotation.T @ data.xaxis[j]))
 
     def _place_routes(self) -> None:
-        """Write the exact places of sites and wrapped objects.
+        """Place sites and wrapped objects exactly.
 
-        MuJoCo rounds them to six digits. Such an error could move a site on the rim of an object
-        into the object.
+        MuJoCo writes positions with six digits. Such an error could move a site from the surface
+        of an object into the object.
         """
         model, world = self._model, self._section('worldbody')
         sites = {site.get('name'): site for site in world.iter('site')}

@@ -35,7 +35,7 @@ TENSION_DISTANCE = 10.0  # keep a sample if a tension differs from every stored 
 
 
 class Sample(NamedTuple):
-    """One sample: the means of the measurements over a rest of the arm."""
+    """One sample: the means of the measurements over a time in which the arm rested."""
 
     theta: Array  # θ [rad], (D,); NaN where it was not measured
     tension: Array  # T [N], (M,)

@@ -35,10 +35,10 @@ from musculoskeletal_ae.signals.body_state import BodyState
 
 
 class Candidates:
-    """Passes candidates to the validation, and publishes its decisions.
+    """Passes candidate networks to the validation, and publishes its decisions.
 
     Attributes:
-        queue: Queue in which the candidates from the topic wait; it validates them in small steps.
+        queue: Candidate networks that were received and are validated in small steps.
     """
 
     def __init__(self, node: Shell, networks: CheckpointValidator) -> None:

@@ -65,7 +65,7 @@ NO_TENSION = (
 )
 BY_CURRENT = (
     'tensions are computed from motor currents; scale, offset and drive friction are learned, and '
-    'until then, their errors are also errors of the tension limits'
+    'the tension limits are wrong by as much as these constants until then'
 )
 
 
@@ -413,7 +413,9 @@ def _read_joint_elasticity(
     def index(place: str, name: str) -> int:
         if name in joints:
             return joints.index(name)
-        followed = ' (it follows another joint: state the spring there)' * (name in couplings)
+        followed = ' (it follows another joint; state the spring of that one)' * (
+            name in couplings
+        )
         legal = ', '.join(joints)
         raise fail(f'{place}: unknown joint {name!r}{followed}; legal: {legal}')
 

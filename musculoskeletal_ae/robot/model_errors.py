@@ -48,7 +48,7 @@ def typical_arms(robot: Robot) -> Array:
 
 
 def attachment_spread(robot: Robot) -> Array:
-    """Return the standard deviation of each muscle's route points, per coordinate [m], (M,)."""
+    """Return σ of the error of each muscle's route points, for each coordinate [m], (M,)."""
     return np.minimum(ATTACHMENT, ARM_SHARE * typical_arms(robot))
 
 

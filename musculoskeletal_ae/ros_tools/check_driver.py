@@ -58,7 +58,7 @@ def _instruction(robot: Robot, options: Namespace, has_joint_sensors: bool) -> s
     An arm without joint sensors has to be held still.
     """
     if options.move:
-        return 'do not touch the arm; it moves by itself afterwards, if no fault is found'
+        return 'do not touch the arm; if this check finds no fault, the arm then moves by itself'
     if options.posture:
         return 'hold the arm still in the posture that --posture states'
     by_hand = 'move the arm by hand through its whole range'

@@ -60,7 +60,8 @@ class Limits(NamedTuple):
     # Between two messages, a length changes by at most `step + speed · dt`. dt is the time between
     # the messages, limited to `longest_step`. A length that has jumped is accepted after it has
     # stayed at the new level for `settled`.
-    step: float = 0.02  # constant part of the largest change of a length [m]
+    #: reject a length that changes by more than this plus a part that grows with time [m]
+    step: float = 0.02
     speed: float = 1.0  # largest plausible speed of a muscle length [m/s]
     longest_step: float = 0.05  # upper limit of dt in this formula [s]
     settled: float = 1.0  # time after which a new level of a length is accepted [s]

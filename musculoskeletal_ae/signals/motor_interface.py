@@ -67,7 +67,7 @@ class MotorInterface:
         self._zero, self._effort_zero = motors.zero, motors.effort_zero
         self._tension_per_effort = motors.tension_per_effort
         self._names: list[str] = []  # names of the joints in the last message
-        #: places of the motors among these names, (M,)
+        #: index of each motor in these names, (M,)
         self._places: Ints = np.zeros(len(motors.joints), dtype=int)
 
     def reset(self) -> None:

@@ -283,7 +283,8 @@ def _obstacle(
         turn, origin = poses.rotation[:, carrier], poses.translation[:, carrier]
         away = [poses.rotation[:, c] @ at + poses.translation[:, c] - origin for c, at in ends]
         local = [np.einsum('nji,nj->ni', turn, each) - middle for each in away]
-        along = cylinder * ((local[1] - local[0]) @ axis)  # on a cylinder: a helix
+        # On a cylinder, the tendon is a helix; on a sphere, it does not move along the axis.
+        along = cylinder * ((local[1] - local[0]) @ axis)
         local = [each - cylinder * np.outer(each @ axis, axis) for each in local]
         apart = [np.linalg.norm(each, axis=1) for each in local]
         radius = np.linspace(0.0, min(0.8 * min(map(np.min, apart)), THICKEST), 30)[:, None]

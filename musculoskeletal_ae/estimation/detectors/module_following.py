@@ -47,7 +47,7 @@ SMOOTHING = 0.1
 #: reduce the evidence while the winch turns at more than this share of its largest speed, if that
 #: is known: it can hardly correct faster
 FULL_SPEED = 0.5
-#: expect a healthy module to correct a difference of T_limit at least this fast [m/s]
+#: expect a healthy module to wind at least this fast [m/s] while |T − T_ref| is T_limit
 CORRECTING = 0.2
 #: tolerate a difference T − T_ref of this share of T_limit, plus this share of T_ref for errors of
 #: the sensor's gain and of the module's stiffness

@@ -281,7 +281,7 @@ class CheckpointValidator:
         while len(self._used) > 1 and now - self._used[1][0] >= PROOF:
             del self._used[0]
         if len(self._used) > MOST_USED:
-            del self._used[1]  # the oldest network stays, because it is most likely to be proven
+            del self._used[1]  # the oldest network has proven itself longest, so it stays
 
     def anomaly(self, detected: bool, now: float) -> Mae | None:
         """Record whether an anomaly is present, and return to a proven network when one begins.
