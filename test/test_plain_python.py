@@ -139,7 +139,8 @@ def test_bringup_and_the_recordings_are_installed_with_the_package(described, mo
     monkeypatch.chdir(ROOT)
     files = dict(described.data_files)
     assert files['lib/musculoskeletal_ae'] == ['bringup.sh']
-    assert files['share/musculoskeletal_ae/.ci'] == ['.ci/environment.sh', '.ci/compile.py']
+    sourced = re.findall(r'\. "\$repository/(\.ci/\S+)"', Path('bringup.sh').read_text('utf-8'))
+    assert sourced and {*sourced, '.ci/compile.py'} == {*files['share/musculoskeletal_ae/.ci']}
     installed = {name for names in files.values() for name in names}
     recordings = {file.as_posix() for file in Path('bags').glob('*/*')}
     assert recordings and recordings <= installed

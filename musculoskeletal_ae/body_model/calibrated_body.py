@@ -21,7 +21,6 @@ their corrections.
 from __future__ import annotations
 
 from copy import copy
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +30,6 @@ from musculoskeletal_ae.body_model import springs
 from musculoskeletal_ae.body_model.remainder import Remainder
 from musculoskeletal_ae.robot.description import RoutePoint
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
-from musculoskeletal_ae.robot.model_errors import attachment_spread
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.signals.friction import LARGEST_GAIN, Transmission
@@ -121,11 +119,6 @@ class CalibratedBody:
         body = copy(self)
         body.parameters = parameters
         return body
-
-    @cached_property
-    def attachment_spread(self) -> Array:
-        """Expected σ of the errors δ of each muscle's route points [m], (M,)."""
-        return attachment_spread(self.robot)
 
     @property
     def elasticity(self) -> JointElasticity:

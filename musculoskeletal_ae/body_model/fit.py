@@ -114,7 +114,7 @@ def fit_body(
 def _prior(body: CalibratedBody, observed: Observations, m: int) -> MusclePrior:
     """Return the prior of a muscle around the geometric model."""
     layout = body.layouts[m]
-    spread = PRIOR.spread(layout, body.attachment_spread[m])
+    spread = PRIOR.spread(layout)
     # The prior of the offset describes the tendon before it crept, so widen it by the creep since.
     spread[layout.offset] = np.hypot(PRIOR.offset, PRIOR.creep * observed.age.max(initial=0.0))
     return MusclePrior(PRIOR.mean(layout), spread)
@@ -135,8 +135,7 @@ def _reopened(
     poses = body.poses(observed.theta)
     problem = MuscleFit(body, poses, observed, before, prior, LEAST_NOISE, m)
     body.parameters[m] = problem.run()
-    spread = REOPENED.spread(body.layouts[m], body.attachment_spread[m])
-    return MusclePrior(body.parameters[m], spread)
+    return MusclePrior(body.parameters[m], REOPENED.spread(body.layouts[m]))
 
 
 class MusclePoint(NamedTuple):
@@ -248,7 +247,7 @@ def fit_to_network(
     observed = Observations(theta, read, lengths, np.zeros(shape), everything)
     poses, priors = body.poses(theta), list[MusclePrior]()
     for m, layout in enumerate(body.layouts):
-        mean, spread = PRIOR.mean(layout), PRIOR.spread(layout, body.attachment_spread[m])
+        mean, spread = PRIOR.mean(layout), PRIOR.spread(layout)
         # The network's lengths contain no information about friction and drive, because its input
         # is T_end. Their prior means are therefore the values that were learned with the network.
         spread[layout.drive] = FIXED

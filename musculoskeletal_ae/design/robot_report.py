@@ -88,7 +88,7 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
     need = (
         f'the muscles must hold the arm in {share} of postures; it must be stiff enough in {share}'
         if result.required
-        else f'an equilibrium must be found in {share} of the trials; {share} of them must be stable'
+        else f'an equilibrium must be found in {share} of trials; {share} of them must be stable'
     )
     required = required_stiffness(robot, result.required)
     desired = DESIRED_SHARE * robot.tension.limit

@@ -5,11 +5,10 @@ A real tendon is attached some millimetres beside the route points of the model,
 straight between them. At θ = 0, attachments cause no error, because lengths are relative to that
 posture. The variance of the error of a length in the posture θ is
 
-    s² = SHAPE_FACTOR² (SMOOTH² + σ² Σ over the route points of ‖∂f/∂p(θ) − ∂f/∂p(0)‖²)
+    s² = SHAPE_FACTOR² (SMOOTH² + ATTACHMENT² Σ over the route points of ‖∂f/∂p(θ) − ∂f/∂p(0)‖²)
 
-where f is the length of the route, p a route point in the frame of its joint, and σ the result of
-`attachment_spread`. The names in capitals are constants of this file. Errors of different muscles
-are independent.
+where f is the length of the route and p a route point in the frame of its joint. The names in
+capitals are constants of this file. Errors of different muscles are independent.
 """
 
 import numpy as np
@@ -17,13 +16,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
 
-#: assume at most this standard deviation of each coordinate of each route point [m]
-ATTACHMENT = 0.007
-#: assume at most this standard deviation of a route point, relative to the typical moment arm of
-#: its muscle: the moment arms of a finger, which are a few millimetres, are as well known relative
-#: to their size as those of an arm
-ARM_SHARE = 0.3
-POSTURES = 200  # average moment arms over this many postures
+ATTACHMENT = 0.007  # assume this standard deviation of each coordinate of each route point [m]
 ELASTIC = 0.2  # assume this standard deviation of an elongation, relative to the elongation
 #: assume this standard deviation of a length, because tendons do not run straight between route
 #: points [m]
@@ -38,20 +31,6 @@ SHAPE_FACTOR = 1.7
 LARGEST = 0.045
 
 
-def typical_arms(robot: Robot) -> Array:
-    """Return the root mean square moment arm of each muscle over the workspace [m], (M,)."""
-    theta = robot.random_postures(POSTURES, np.random.default_rng(0))
-    arms = robot.routes.muscle_jacobian(theta)
-    crossed = np.maximum(robot.routes.crossed.sum(axis=1), 1)
-    result: Array = np.sqrt((arms**2).sum(axis=2).mean(axis=0) / crossed)
-    return result
-
-
-def attachment_spread(robot: Robot) -> Array:
-    """Return σ of the error of each muscle's route points, for each coordinate [m], (M,)."""
-    return np.minimum(ATTACHMENT, ARM_SHARE * typical_arms(robot))
-
-
 def length_variances(robot: Robot, theta: Array) -> Array:
     """Return the variance of each muscle's length error in the geometric model [m²], (N, M).
 
@@ -60,10 +39,10 @@ def length_variances(robot: Robot, theta: Array) -> Array:
     routes, tree = robot.routes, robot.kinematics.tree
     slopes = routes.moved(tree.joint_poses(theta), routes.point)[1]
     at_zero = routes.moved(tree.joint_poses(np.zeros_like(theta[:1])), routes.point)[1]
-    by_point, spread = np.square(slopes - at_zero).sum(axis=-1), attachment_spread(robot)
+    by_point = np.square(slopes - at_zero).sum(axis=-1) * ATTACHMENT**2
     variance = np.full((len(theta), robot.muscle_count), SMOOTH**2)
     for m in range(robot.muscle_count):
         own = routes.muscle == m
         points = np.union1d(routes.first[own], routes.second[own])
-        variance[:, m] += spread[m] ** 2 * by_point[:, points].sum(axis=1)
+        variance[:, m] += by_point[:, points].sum(axis=1)
     return SHAPE_FACTOR**2 * variance

@@ -57,8 +57,7 @@ def drawn_body(robot, wrapping: int, seed: int, scale: float) -> CalibratedBody:
     body.remainder = Wrapping(robot, scale, wrapping)
     for m, layout in enumerate(body.layouts):
         draw = np.insert(rng.standard_normal(layout.size - 1), layout.creep, 0.0)
-        spread = PRIOR.spread(layout, body.attachment_spread[m])
-        body.parameters[m] = PRIOR.mean(layout) + scale * spread * draw
+        body.parameters[m] = PRIOR.mean(layout) + scale * PRIOR.spread(layout) * draw
     return body
 
 

@@ -25,7 +25,6 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.emulator.foreign.effects import NONE, Draw, Effects
-from musculoskeletal_ae.robot.model_errors import typical_arms
 from musculoskeletal_ae.robot.robot import Robot
 
 #: standard deviation σ of the displacement of a point, relative to the typical moment arm
@@ -38,6 +37,7 @@ MASS = 0.1  # standard deviation σ of the logarithm of a body's mass, relative 
 #: draw offsets of tension sensors with this σ, relative to T_bias: modules that keep a low tension
 #: have sensors that can measure it
 ZERO = 0.1
+POSTURES = 200  # average moment arms over this many postures
 
 
 def effects(robot: Robot) -> Effects:
@@ -51,6 +51,15 @@ def effects(robot: Robot) -> Effects:
         tension_zero=ZERO * float(np.median(robot.tension.bias)),
         joint_zero=np.radians(1.0),
     )
+
+
+def typical_arms(robot: Robot) -> Array:
+    """Return the root mean square moment arm of each muscle over the workspace [m], (M,)."""
+    theta = robot.random_postures(POSTURES, np.random.default_rng(0))
+    arms = robot.routes.muscle_jacobian(theta)
+    crossed = np.maximum(robot.routes.crossed.sum(axis=1), 1)
+    result: Array = np.sqrt((arms**2).sum(axis=2).mean(axis=0) / crossed)
+    return result
 
 
 def slack(robot: Robot, draw: Draw) -> Array:
