@@ -661,7 +661,7 @@ def _bad_ends(of: Iterable[dict[str, Any]]) -> str:
         if each['well']:
             continue
         error = f'{each["error before"]:.3f} → {each["error after"]:.3f}'
-        how = each['ended'] or ('' if each['mended by advice'] else 'the advice did not find it')
+        how = each['ended'] or ('' if each['mended by advice'] else 'advice did not mend it')
         steps = ', '.join(dict.fromkeys(each['steps'])) or 'none'
         rows.append(
             f'| {each["mishap"]} ({each["detail"]}) | {each["reality"]} {each["seed"]} | {error} '

@@ -343,8 +343,7 @@ class ConditionKind(Enum):
         'estimator',
         'warn',
         'for more than 2 s, readings of a joint sensor were beyond the joint limits, or jumped '
-        'further than a joint can move; until none has been so for 1 s, no reading of the sensor '
-        'is used',
+        'further than a joint can move; the sensor is used again after 1 s without such a reading',
         'joint sensors are not used, because their readings are impossible',
         (Step.CHECK_JOINT_DRIVER,),
     )
@@ -378,8 +377,8 @@ class ConditionKind(Enum):
         'sensor_saturated',
         'estimator',
         'error',
-        'a tension sensor cannot read more than a value below tension.limit, so that the arm may '
-        'pull more than it reads',
+        'a tension sensor cannot read values up to tension.limit, so the muscle may pull harder than '
+        'the sensor reads',
         'a tension sensor saturates below tension.limit',
         (Step.REPAIR_SENSOR, Step.RESET_ESTIMATOR),
         reaction=FindingReaction.ISOLATE_AT_ONCE,
@@ -389,7 +388,7 @@ class ConditionKind(Enum):
         'estimator',
         'error',
         'the constants of the thermal model of a hot module have changed',
-        'a hot module heats or cools otherwise than before',
+        'a hot module heats up or cools down at another rate than before',
         REPAIR,
         reaction=FindingReaction.ISOLATE,
     )
@@ -593,7 +592,7 @@ class ConditionKind(Enum):
         'controller',
         'warn',
         'the arm does not move, because its length offsets are unknown',
-        'the arm stands: while the length offsets are unknown, it can only explore gently',
+        'the length offsets are unknown: until they are known, the arm can only explore gently',
         (Step.EXPLORE_GENTLY,),
     )
     NOT_EXPLORING = Declaration(

@@ -132,7 +132,7 @@ def parse_yaml(text: str) -> Any:
 class _Collection:
     """An open list or mapping of a YAML text that is being checked."""
 
-    anchor: str  # name of the collection's anchor, '' if it has none
+    anchor: str  # YAML anchor of the mapping or list, '' if it has none
     first: int  # number of entries that precede the collection
     is_mapping: bool
     keys: set[str] = field(default_factory=set)

@@ -68,7 +68,7 @@ class ProgressBar:
         self._last = 0.0  # time at which the last part was done [s]
         # sums of durations [s] and parts since the first part, in which old ones count less
         self._recent_time = self._recent_parts = 0.0
-        self._shown = time.perf_counter()  # time of the last line of text or note [s]
+        self._shown = time.perf_counter()  # time at which the last text was printed [s]
 
     def __enter__(self) -> 'ProgressBar':
         return self

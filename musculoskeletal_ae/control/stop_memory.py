@@ -88,8 +88,8 @@ class StopMemory:
         If writing fails, `problem` states the reason, and a later call tries again.
 
         Args:
-            stop: The latched stop. If it is None, no stop is latched, and the file names the cause
-                `restarted`.
+            stop: The latched stop, or None. Without one, the file has the cause `restarted`, with
+                which the controller stops if it restarts after a crash.
         """
         self._is_latched = stop is not None
         cause = ConditionKind.RESTARTED if stop is None else stop.kind

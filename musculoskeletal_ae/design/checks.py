@@ -59,7 +59,8 @@ SLACK_MARGIN = 1e-3
 #: treat a muscle as acting on a joint if its moment arm exceeds this [m]: 300 N then produce about
 #: 1 N·m
 COUNTED_ARM = 0.003
-#: also treat it as acting if its moment arm exceeds this share of the longest one at the joint
+#: treat a muscle as acting on a joint also if its moment arm exceeds this share of the longest
+#: moment arm at the joint
 COUNTED_ARM_SHARE = 0.1
 LEAST_COUNTED_ARM = 1e-4  # but ignore every moment arm below this [m]
 #: warn about a joint all of whose moment arms are shorter than this [m]: in emulated individuals,

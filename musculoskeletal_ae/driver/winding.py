@@ -216,8 +216,9 @@ class Winding(MotionTest):
     def _release(self, error: RunAwayError) -> Wait:
         """Release all muscles by paying them out, because the arm may be falling.
 
-        Every target moves away from the newest l, because l may change in the wrong direction. If
-        a tension still rises, the sign of the commands is wrong, so that no more are sent.
+        Each target follows from the newest l and not from the last target, because l may change in
+        the wrong direction. If a tension still rises, the sign of the commands is wrong, and no
+        more commands are sent.
         """
         # A length that rises as the muscle is wound in has the wrong sign, not the wrong place.
         self._suspects = [] if error.fault == 'rising' else self._misplaced()

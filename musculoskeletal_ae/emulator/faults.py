@@ -4,9 +4,8 @@
 A line `KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]` describes a fault, such as 'drop:0.3',
 'stuck_motor:biceps', 'bias:tension:40', 'drift:theta:elbow:0.01' or 'dead_sensor:elbow'. If the
 line names no muscle or joint, the fault affects all muscles. 'exchange:JOINT:JOINT' exchanges two
-joint sensors, by default those of the first and the last joint. The turn of the base (`mount_x`,
-`mount_y`) is no fault of the arm, but of its mounting: `robot.urdf` states another direction of
-gravity.
+joint sensors, by default those of the first and the last joint. `mount_x` and `mount_y` turn the
+base. The arm itself is then sound, but gravity acts in another direction than `robot.urdf` states.
 """
 
 from collections.abc import Iterable
@@ -21,7 +20,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, MuscleReadings
 
 SPEED_LIMIT = 0.25  # fastest speed of a muscle module's motor [m/s]; chosen by hand
-TURN = 6.2832  # reject a larger turn of the base [rad]: a full turn leaves the base upright
+TURN = 6.2832  # reject a turn of the base by more than this [rad], one revolution
 SPIKE_SHARE = 0.05  # give one muscle a spike in this share of the readings
 BURST_TIME, BURST_PAUSE = 0.3, 3.0  # let bursts and the pauses before them last this on average [s]
 

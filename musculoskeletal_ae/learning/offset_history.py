@@ -45,8 +45,8 @@ class OffsetHistory:
     def __init__(self, samples: SampleStore, offset: Array) -> None:
         """Start with the present offsets [m], (M,).
 
-        If samples have been held back since before a restart of the learner, the offsets under
-        which they were taken are used instead of `offset`.
+        If the learner was restarted while it held back samples, start with the offsets under which
+        those samples were taken instead.
         """
         self._samples = samples
         self._offset = samples.held_offset if samples.held else offset

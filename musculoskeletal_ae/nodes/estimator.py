@@ -138,7 +138,7 @@ class EstimatorNode(Shell):
         if self.posture:
             doing = 'hold the arm still in zero_posture'
         else:
-            doing = 'call controller/explore, unless the arm explores already'
+            doing = 'call controller/explore, unless the arm is already exploring'
         return f'calibrating length offsets: {doing}; /diagnostics shows the progress'
 
     def _isolate_more(self, request: Trigger.Request) -> str:

@@ -41,5 +41,5 @@ class AnomalyNorm(ResidualDistance):
         return math.sqrt(tension @ tension) + math.sqrt(length @ length)
 
     def limit(self, theta: Array, tension: Array) -> float:  # noqa: ARG002
-        """Return the threshold of A, the same for every state; ∞ if there is none."""
+        """Return the threshold of the anomaly score A for every state; ∞ if there is none."""
         return self.threshold

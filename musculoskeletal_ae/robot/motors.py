@@ -37,7 +37,7 @@ Radius = Annotated[float, Meta(ge=1e-4, le=10.0)]
 class MotorTopics(NamedTuple):
     """Topics of a ros2_control robot. The defaults stand for a robot that has none of them."""
 
-    states: str = ''  # JointState messages that contain the motors
+    states: str = ''  # topic of the JointState messages that contain the motors
     commands: str = ''  # positions that the motors should reach; '' to command no motor
 
 

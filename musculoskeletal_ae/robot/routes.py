@@ -93,7 +93,7 @@ class Routes:
         #: start point, end point and muscle of each segment, (S,)
         self.first = np.flatnonzero((owner[:-1] == owner[1:]) & ~begins[1:])
         self.second, self.muscle = self.first + 1, owner[self.first]
-        #: 1/divisor of each segment, (S,)
+        #: factor with which the length of each segment counts in that of its muscle, (S,)
         self.weight: Array = 1.0 / divisor[self.first]
         self._sum: Array = self.weight * (np.arange(len(routes))[:, None] == self.muscle)
         #: segments that may wrap, and the objects around which they wrap

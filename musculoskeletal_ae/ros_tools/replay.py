@@ -438,8 +438,8 @@ def _check_combination(parser: Parser, options: Namespace) -> None:
     """Check that options fit together and have an effect; otherwise, exit with an error."""
     if options.rate != 1 and not options.clock:
         parser.error(
-            '--rate other than 1 needs --clock, and nodes with use_sim_time, because nodes with '
-            'clocks of their own would compute wrong speeds; add --clock'
+            '--rate other than 1 needs --clock, because nodes with clocks of their own would '
+            'compute wrong speeds; add --clock, and start the nodes with use_sim_time'
         )
     if options.wait_for and not options.clock:
         parser.error(

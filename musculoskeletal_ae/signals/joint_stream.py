@@ -73,7 +73,7 @@ class ImpossibleSeries(NamedTuple):
     total: int
 
     def is_present(self, now: float) -> bool:
-        """Return whether the series has not ended yet."""
+        """Return whether readings still arrive at the time `now` [s]."""
         return now - self.until <= ENDED
 
     def is_lasting(self, now: float) -> bool:

@@ -57,7 +57,8 @@ COLOURS = {
 def colours(robot: Robot, tension: Array, kinds: Ints) -> Array:
     """Return the colours of muscles as red, green and blue, uint8 (M, 3).
 
-    They depend on T [N] (M,), except if the `DrawnState` in `kinds` (M,) has a colour of its own.
+    A muscle is coloured by its `tension` [N] (M,), unless its `DrawnState` in `kinds` (M,) has a
+    colour of its own.
     """
     rgb = LOOSE + drawing.tension_share(robot, tension)[:, None] * (TIGHT - LOOSE)
     for kind, colour in COLOURS.items():

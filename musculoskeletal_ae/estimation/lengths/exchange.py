@@ -62,7 +62,7 @@ DISCONTINUOUS = 0.02
 #: this divides their change over the pause by this factor, and if they had changed more than all
 #: other lengths by this factor.
 CONTINUOUS = 3.0
-#: look for exchanged muscles only after a finding of one of these kinds, to which an exchange leads
+#: look for exchanged muscles only after one of these findings: an exchange causes no others
 EXPLAINED = frozenset(
     {
         ConditionKind.LENGTHS_JUMPED,
@@ -214,7 +214,7 @@ class ExchangeCheck:
         used = ~np.isin(np.arange(self._robot.muscle_count), mae.isolated)
         slack = sample.motor_tension < slack_tension(self._robot.description.tension.bias)
         if len(self._messages) < ENOUGH or (slack & used).any():
-            return None  # no exchange explains a tendon without tension
+            return None  # an exchange makes no tendon slack
         offset = _offset(observation)
         messages = *self._messages, (sample.bone_tension, sample.length_read)
         tension, length = (np.array(part) for part in zip(*messages))
