@@ -377,8 +377,8 @@ class ConditionKind(Enum):
         'sensor_saturated',
         'estimator',
         'error',
-        'a tension sensor cannot read values up to tension.limit, so the muscle may pull harder than '
-        'the sensor reads',
+        'a tension sensor cannot read values up to tension.limit, so the muscle may pull harder '
+        'than the sensor reads',
         'a tension sensor saturates below tension.limit',
         (Step.REPAIR_SENSOR, Step.RESET_ESTIMATOR),
         reaction=FindingReaction.ISOLATE_AT_ONCE,
