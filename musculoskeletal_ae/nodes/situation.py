@@ -300,7 +300,7 @@ class Situation:
         needed, samples = values.get('samples to begin with', '1'), self.count('samples')
         if not samples.isdecimal() or int(samples) >= int(needed):
             return ''
-        why = 'nothing has been learned yet, so the error of the estimate may rise'
+        why = 'nothing has been learned yet, so the error may rise'
         return why if needed == '1' else f'{why}; learning begins with {needed} samples'
 
     def unexplored(self) -> str:

@@ -413,7 +413,7 @@ def _read_joint_elasticity(
     def index(place: str, name: str) -> int:
         if name in joints:
             return joints.index(name)
-        followed = ' (it follows another joint; state the spring of that one)' * (name in couplings)
+        followed = ' (it follows another joint: state the spring there)' * (name in couplings)
         legal = ', '.join(joints)
         raise fail(f'{place}: unknown joint {name!r}{followed}; legal: {legal}')
 
