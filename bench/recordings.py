@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import json
 import subprocess
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -50,9 +49,7 @@ from bench.recordings_learn import (
 from bench.recordings_read import Files, Recording, Repository, SoftLink, repositories
 from bench.regression import BASELINES
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser, whole
-from musculoskeletal_ae.robot.robot import Robot
 
 GEOMETRY, STATICS, PACKAGE = 'geometry', 'statics', 'this package'
 LENGTHS, EFFORTS = 'lengths', 'lengths and efforts'
@@ -75,25 +72,9 @@ class Result(NamedTuple):
         return self.recording, self.case, self.draw, self.inputs
 
 
-class First:
-    """First networks by the robot that they belong to: equal robots have equal networks."""
-
-    def __init__(self) -> None:
-        """Begin without networks."""
-        self._known = dict[tuple[Any, bool], tuple[Robot, Mae]]()
-
-    def of(self, case: Case, with_effort: bool) -> tuple[Robot, Mae]:
-        """Return the robot of a case, and a network of its geometric model."""
-        key = case.body, with_effort
-        if key not in self._known:
-            with tempfile.TemporaryDirectory() as folder:
-                self._known[key] = described(case.body, Path(folder) / 'robot', with_effort)
-        return self._known[key]
-
-
-def models(case: Case, with_effort: bool, first: First) -> Iterator[tuple[str, Model]]:
+def models(case: Case, with_effort: bool) -> Iterator[tuple[str, Model]]:
     """Yield every model of a case with its name."""
-    robot, mae = first.of(case, with_effort)
+    robot, mae = described(case.body, with_effort)
     is_link = isinstance(case.body, SoftLink)
     yield GEOMETRY, network(mae, tensions(robot, case.training, with_effort, not is_link))
     for name, fit in BASELINES.items():
@@ -103,11 +84,11 @@ def models(case: Case, with_effort: bool, first: First) -> Iterator[tuple[str, M
     yield PACKAGE, package(case, robot, mae, with_effort)
 
 
-def measured(case: Case, with_effort: bool, first: First) -> list[Result]:
+def measured(case: Case, with_effort: bool) -> list[Result]:
     """Return the errors of all models in a case."""
     inputs = EFFORTS if with_effort else LENGTHS
     results = []
-    for name, model in models(case, with_effort, first):
+    for name, model in models(case, with_effort):
         off = round(error(model, case.test), 5)
         results.append(
             Result(
@@ -279,7 +260,7 @@ def main(argv: list[str]) -> int:
             )
             print(f'{repository.name}: left out, because {reason}')
             continue
-        is_any, recording, first = True, repository.read(Files(clone)), First()
+        is_any, recording = True, repository.read(Files(clone))
         document.also[repository.name] = observations(recording)
         counts = [count for count in args.counts if count]
         for case in cases(recording, counts, args.draws):
@@ -289,7 +270,7 @@ def main(argv: list[str]) -> int:
                     continue
                 if document.has(case, inputs) and not args.again:
                     continue
-                results = measured(case, with_effort, first)
+                results = measured(case, with_effort)
                 document.add(results)
                 errors = ', '.join(f'{each.model} {each.error_rad:.4f}' for each in results)
                 where = f'{case.body.name}: {case.name}, draw {case.draw}, {inputs}'

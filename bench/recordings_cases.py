@@ -77,16 +77,10 @@ def _arm(recording: Recording) -> Iterator[Case]:
     yield Case('rests at 0 g, 500 g → 200 g, 300 g', body, rests, joined(others))
 
 
-def _none(_: Recording) -> Iterator[Case]:
-    yield from ()
-
-
-#: cases with payloads or files that were not learned
+#: cases with payloads or files that were not learned, of the recordings that have any
 TRANSFERS: dict[str, Callable[[Recording], Iterator[Case]]] = {
     'soft_neck': _neck,
     'soft_arm': _arm,
-    'continuum_stand': _none,
-    'cable_platform': _none,
 }
 
 
@@ -135,7 +129,8 @@ def cases(recording: Recording, counts: list[int], draws: int) -> Iterator[Case]
 
     All draws of a small count come before those of a larger one.
     """
-    yield from TRANSFERS[recording.link.name](recording)
+    if transfers := TRANSFERS.get(recording.link.name):
+        yield from transfers(recording)
     for count in counts:
         for draw in range(draws):
             if (case := drawn(recording, count, draw)) is not None:

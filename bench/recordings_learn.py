@@ -7,7 +7,9 @@ robot.
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -72,12 +74,15 @@ def tensions(
     return scaled
 
 
-def described(body: Body, directory: Path, with_effort: bool) -> tuple[Robot, Mae]:
-    """Write and load the robot of a body; return it with a network of its geometric model.
+@cache
+def described(body: Body, with_effort: bool) -> tuple[Robot, Mae]:
+    """Return the robot of a body, and a network of its geometric model.
 
     With efforts, the robot measures tensions; without, tensions are unknown.
     """
-    robot = Robot.load(body.write(directory, 'sensor' if with_effort else 'none'))
+    with tempfile.TemporaryDirectory() as folder:
+        source = 'sensor' if with_effort else 'none'
+        robot = Robot.load(body.write(Path(folder) / 'robot', source))
     return robot, initial_mae(robot, steps=INITIAL_STEPS, seed=0).mae
 
 

@@ -90,6 +90,9 @@ class Body(Protocol):
     def write(self, directory: Path, tension_source: str = 'none') -> Path:
         """Write the robot directory, with `tension_source` in muscles.yaml; return its path."""
 
+    def __hash__(self) -> int:
+        """Return a hash that equal bodies share."""
+
 
 @dataclass(frozen=True)
 class SoftLink:

@@ -327,7 +327,7 @@ class Learner:
         self.keeper.use(mae)
 
     def note_accepted(self, mae: Mae) -> None:
-        """Note that the estimator uses this network; it is saved (`CheckpointKeeper`)."""
+        """Note that the estimator uses this network, and save it."""
         # The detector of this network may have been calibrated before a muscle was changed.
         self.keeper.note_accepted(mae if self.scheduler.statistics_hold else uncalibrated(mae))
 

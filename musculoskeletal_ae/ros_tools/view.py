@@ -287,10 +287,11 @@ class View(Node):
         trouble = self.page.with_buttons(situation.trouble())
         if len(isolated := self._isolated()):
             lines.append(f'isolated: {self.robot.names(isolated)}')
-        shown = muscles or MuscleReadings(length=np.full(self.robot.muscle_count, np.nan))
+        if muscles is None:
+            muscles = MuscleReadings(length=np.full(self.robot.muscle_count, np.nan))
         values = error, anomaly, distance, situation.number('estimator', 'd limit')
         now, is_urgent = time.monotonic(), situation.level() == 'error'
-        self.page.tell([*filter(None, lines)], trouble, shown, now, values, is_urgent)
+        self.page.tell([*filter(None, lines)], trouble, muscles, now, values, is_urgent)
         self._show_reset_outcome()
         self.page.follow(self.payload, self._newest('played', math.inf))
 

@@ -179,8 +179,8 @@ def possible_readings(robot: Robot) -> tuple[MuscleReadings, MuscleReadings]:
     high = low.copy()
     for quantity in QUANTITIES:
         lowest, highest = quantity.possible(robot)
-        quantity.__set__(low, lowest)
-        quantity.__set__(high, highest)
+        setattr(low, quantity.name, lowest)
+        setattr(high, quantity.name, highest)
     return low, high
 
 
