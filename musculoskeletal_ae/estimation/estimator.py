@@ -626,7 +626,7 @@ class Estimator:
         verification, mae = self.suspects.verification, self.mae
         assert verification is not None
         assert mae is not None
-        muscle, command = verification.muscle, self._commands.length(sample, now)
+        muscle, command = verification.muscle, self._commands.newest_length(now)
         pull = np.clip(sample.bone_tension, 0.0, self.robot.tension.limit)
         tension = self.robot.tension_source.known(sample.motor_tension)
         verdict = verification.step(

@@ -8,7 +8,6 @@ that command of this time from which it differs least. On an idle computer, d is
 newest command.
 """
 
-import math
 from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
@@ -51,6 +50,10 @@ class ModuleCommands:
             self._commands.popleft()
         self._commands.append(_Command(now, length, tension))
 
+    def newest_length(self, now: float) -> Array | None:
+        """Return the newest target lengths [m], (M,), or None without an up-to-date command."""
+        return self._commands[-1].length if self._is_up_to_date(now) else None
+
     def length(self, sample: MuscleSample, now: float) -> Array | None:
         """Return the target lengths that the modules obeyed when they sent the readings [m], (M,).
 
@@ -81,6 +84,9 @@ class ModuleCommands:
 
         return self._nearest(sample.motor_tension, sample.delay, now, demanded)
 
+    def _is_up_to_date(self, now: float) -> bool:
+        return bool(self._commands) and now - self._commands[-1].time <= COMMAND_AGE
+
     def _nearest(
         self,
         reading: Array,
@@ -92,8 +98,7 @@ class ModuleCommands:
 
         Between two commands, everything between their values may have been wanted.
         """
-        newest = self._commands[-1].time if self._commands else -math.inf
-        if now - newest > COMMAND_AGE or 2.0 * delay > STORED:
+        if not self._is_up_to_date(now) or 2.0 * delay > STORED:
             return None
         values = []
         for command in reversed(self._commands):
@@ -101,7 +106,7 @@ class ModuleCommands:
             if value is None:
                 break
             values.append(value)
-            if command.time < now - 2.0 * delay:  # no earlier one was in force
+            if command.time <= now - 2.0 * delay:  # no earlier one was in force
                 break
         if len(values) < 2:
             return values[0] if values else None
