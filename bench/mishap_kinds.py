@@ -32,7 +32,7 @@ Rng = np.random.Generator
 SELF = frozenset({
     'tension_above_limit', 'implausible_estimate',
     'anomaly_detected', 'not_exploring', 'calibrating', 'learning_waits', 'gentle_only',
-    'length_offsets_unknown', 'trajectory_slowed', 'nothing_to_learn',
+    'length_offsets_unknown', 'trajectory_slowed', 'nothing_to_learn', 'muscle_needed',
 })  # fmt: skip
 #: statements that a muscle is faulty, without saying which part of it
 FAULTY = frozenset({'residual_distance', 'muscle_isolated'})

@@ -4,6 +4,7 @@
     python -m bench mujoco_models CLONES --out DIR [--only NAME,…] [--minutes 1] [--whole]
     python -m bench mujoco_models CLONES --out DIR --prospects
     python -m bench mujoco_models CLONES --out DIR --page doc/results/mujoco.md
+    python -m bench mujoco_models CLONES --out DIR --only arm26 --experiments --whole --minutes 10
 
 CLONES has a clone (a working tree) of each repository of MODELS in OWNER/NAME; models of MyoSuite
 load only from a folder of their repository's name. A model whose clone is missing is left out.
@@ -25,6 +26,9 @@ export into a copy of the file. The export is imported again. The numbers of a m
   exported model.
 
 If a model is refused, the reason is stored with the CPU time after which it was known.
+
+With --experiments, each individual of --seeds makes the experiments of `mujoco_experiments.py`
+instead, which takes 10 min or longer for each individual.
 """
 
 import json
@@ -39,6 +43,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bench.mujoco_experiments import EXPERIMENTS_HEAD, arm_errors, experiment_rows
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.design.prospects import Prospects, prospects
 from musculoskeletal_ae.emulator.reality import make_arm
@@ -47,7 +52,7 @@ from musculoskeletal_ae.exporting.mjcf import export_into
 from musculoskeletal_ae.figures import save_figure
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae.initial_training import initial_mae
-from musculoskeletal_ae.options import Parser, names
+from musculoskeletal_ae.options import Parser, names, seeds
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.robot.robot import Robot
@@ -79,6 +84,7 @@ ADROIT = 'gymnasium_robotics/envs/assets/adroit_hand/adroit_pen.xml'
 INDEX = 'mcp2_flexion', 'mcp2_abduction', 'pm2_flexion', 'md2_flexion'
 MIDDLE = 'mcp3_flexion', 'mcp3_abduction', 'pm3_flexion', 'md3_flexion'
 THUMB = 'cmc_abduction', 'cmc_flexion', 'mp_flexion', 'ip_flexion'
+ARM = 'elv_angle', 'shoulder_elv', 'shoulder_rot', 'elbow_flexion', 'pro_sup'
 LEG = 'hip_flexion_r', 'knee_angle_r', 'ankle_angle_r'
 MODELS = (
     Model('arm26', MUJOCO, 'model/tendon_arm/arm26.xml'),
@@ -91,6 +97,7 @@ MODELS = (
     Model('thumb', MYO, 'hand/myohand.xml', THUMB),
     Model('wrist', MYO, 'hand/myohand.xml', ('pro_sup', 'deviation', 'flexion')),
     Model('whole hand', MYO, 'hand/myohand.xml'),
+    Model('shoulder and elbow of the arm', MYO, 'arm/myoarm.xml', ARM),
     Model('elbow of the arm', MYO, 'arm/myoarm.xml', ('elbow_flexion', 'pro_sup')),
     Model('one leg', MYO, 'leg/myolegs.xml', LEG),
     Model('both legs', MYO, 'leg/myolegs.xml'),
@@ -104,10 +111,6 @@ MODELS = (
     Model('Helix', SOFT, 'mujoco_models/helix/helix_control.xml'),
     Model('Adroit hand', GYMNASIUM, ADROIT),
 )
-
-
-class RefusedError(MusculoskeletalError):
-    """Training a model is pointless."""
 
 
 class EnoughError(Exception):
@@ -126,7 +129,7 @@ def measured(model: Model, file: Path, folder: Path, args: Namespace) -> dict[st
         result.update(joints=robot.joint_count, muscles=robot.muscle_count, known=seconds())
         result.update(held=held_text(found))
         if found.is_pointless:
-            raise RefusedError(' '.join(found.lines()[:-1]))
+            raise MusculoskeletalError(' '.join(found.lines()[:-1]))
         if args.prospects:
             raise EnoughError
 
@@ -171,9 +174,8 @@ def differences(robot: Robot, body: Any, theta: Array) -> tuple[float, float]:
     square of the moment arms, over postures θ (N, D).
     """
     length = robot.routes.absolute_lengths(theta) - body.absolute_lengths(theta)
-    arms = robot.routes.muscle_jacobian(theta) - body.muscle_jacobian(theta)
-    root = np.sqrt((arms**2).sum(axis=2).mean(axis=0))
-    return float(np.median(length.std(axis=0))), float(np.median(root))
+    arms = arm_errors(robot.routes.muscle_jacobian, body.muscle_jacobian, theta)
+    return float(np.median(length.std(axis=0))), float(np.median(arms))
 
 
 def result_of(model: Model, args: Namespace) -> dict[str, Any] | None:
@@ -344,6 +346,21 @@ def draw(results: Sequence[tuple[Model, dict[str, Any]]], args: Namespace, file:
     save_figure(figure, file)
 
 
+def print_experiments(models: Sequence[Model], args: Namespace) -> None:
+    """Print a table with a row for each individual of each model, as soon as it is known."""
+    print(table(EXPERIMENTS_HEAD, []), flush=True)
+    for model in models:
+        file, folder = args.clones / model.repository / model.file, args.out / folder_name(model)
+        if not file.is_file():
+            continue
+        try:
+            rows = experiment_rows(model.name, file, model.joints, folder / 'experiments', args)
+            for row in rows:
+                print(f'| {" | ".join(row)} |', flush=True)
+        except MusculoskeletalError as error:
+            print(f'| {model.name} | {error} |', flush=True)
+
+
 def main(argv: list[str]) -> None:
     """Measure all models and print the tables, or write the page."""
     parser = Parser('mujoco_models', (__doc__ or '').partition('\n')[0])
@@ -357,11 +374,19 @@ def main(argv: list[str]) -> None:
     parser.add_argument('--whole', action='store_true', help=text)
     text = 'write the page and its picture from the results in --out, run none'
     parser.add_argument('--page', type=Path, metavar='FILE', help=text)
+    text = 'make the experiments on each individual, instead of the page'
+    parser.add_argument('--experiments', action='store_true', help=text)
+    text = 'seeds of the individuals with --experiments'
+    parser.add_argument('--seeds', type=seeds, default=(0, 1, 2), help=text)
     args = parser.parse_args(argv)
+    chosen = [
+        model for model in MODELS if not args.only or any(name in model.name for name in args.only)
+    ]
+    if args.experiments:
+        print_experiments(chosen, args)
+        return
     results = list[tuple[Model, dict[str, Any]]]()
-    for model in MODELS:
-        if args.only and not any(name in model.name for name in args.only):
-            continue
+    for model in chosen:
         result = result_of(model, args)
         if result is None and not args.page:
             result = run(model, args)

@@ -75,8 +75,7 @@ class Result(NamedTuple):
 def models(case: Case, with_effort: bool) -> Iterator[tuple[str, Model]]:
     """Yield every model of a case with its name."""
     robot, mae = described(case.body, with_effort)
-    is_link = isinstance(case.body, SoftLink)
-    yield GEOMETRY, network(mae, tensions(robot, case.training, with_effort, not is_link))
+    yield GEOMETRY, network(mae, tensions(case.body, robot, case.training, with_effort))
     for name, fit in BASELINES.items():
         yield name, regression(fit, case.training, with_effort)
     if case.rests and not with_effort:

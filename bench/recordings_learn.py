@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from bench.recordings_cases import Case
-from bench.recordings_read import Body, Run, SoftLink
+from bench.recordings_read import Body, Run
 from bench.regression import Predict
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.learner import Learner
@@ -52,9 +52,7 @@ def regression(fit: Callable[[Array, Array], Predict], training: Run, with_effor
     return lambda run: predict(inputs(run))
 
 
-def tensions(
-    robot: Robot, training: Run, with_effort: bool, measures_tension: bool = False
-) -> Callable[[Run], Array]:
+def tensions(body: Body, robot: Robot, training: Run, with_effort: bool) -> Callable[[Run], Array]:
     """Return a function that computes the tensions of a run [N], (N, M).
 
     Efforts may be measured tensions. Otherwise, a tension is T_bias plus a multiple of the effort
@@ -63,7 +61,7 @@ def tensions(
     """
     if not with_effort:
         return lambda run: np.tile(robot.actuation.assumed_tension, (len(run.length), 1))
-    if measures_tension:
+    if body.measures_tension:
         return lambda run: np.clip(run.effort, 0.0, robot.tension.max)
     strong = np.quantile(np.abs(training.effort), 0.95)
 
@@ -99,7 +97,7 @@ def package(case: Case, robot: Robot, mae: Mae, with_effort: bool, seed: int = 0
         with_effort: Whether efforts are used.
         seed: Random seed of the training.
     """
-    tension = tensions(robot, case.training, with_effort, not isinstance(case.body, SoftLink))
+    tension = tensions(case.body, robot, case.training, with_effort)
     learner = Learner(robot, mae, seed=seed)
     rows = case.training
     known = tension(rows) if with_effort else None

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.io import loadmat
@@ -37,6 +37,8 @@ SPAN = 5  # average this many rows (0.5 s) in a rest sample
 @dataclass(frozen=True)
 class Platform:
     """The platform as a robot of six joints; its muscle modules regulate positions."""
+
+    measures_tension: ClassVar[bool] = True
 
     name: str = 'cable_platform'
 

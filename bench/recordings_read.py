@@ -14,7 +14,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import yaml
@@ -87,6 +87,10 @@ class Body(Protocol):
     def name(self) -> str:
         """Name of the recorded robot, which its URDF states."""
 
+    @property
+    def measures_tension(self) -> bool:
+        """Whether the recorded efforts are tensions [N]."""
+
     def write(self, directory: Path, tension_source: str = 'none') -> Path:
         """Write the robot directory, with `tension_source` in muscles.yaml; return its path."""
 
@@ -97,6 +101,8 @@ class Body(Protocol):
 @dataclass(frozen=True)
 class SoftLink:
     """A soft link with tendons parallel to it, as a robot of two joints."""
+
+    measures_tension: ClassVar[bool] = False
 
     name: str
     azimuths: tuple[float, ...]  # azimuth of each tendon [rad]

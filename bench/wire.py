@@ -351,12 +351,17 @@ def main(argv: list[str]) -> None:
     parser.add_argument(
         '--seconds', type=number(1.0, 3600.0), default=20.0, help='time of each measurement [s]'
     )
+    text = 'emulate an individual of the MuJoCo model in the directory of each robot'
+    parser.add_argument('--mujoco', action='store_true', help=text)
     parser.add_argument('--repeat', type=whole(1, 100), default=1, help='number of repetitions')
     args = parser.parse_args(argv)
     print(
         'latency [ms]: median, 99th percentile, maximum; late and missed messages [%]; CPU [% of '
         'a core]'
     )
+    kinds = [*KINDS] * args.repeat
     for robot in args.robots:
-        for rate, kind, wire in systems(robot, args.rates, [*KINDS] * args.repeat, args.seconds):
+        model = f'reality:={robot}/model.xml', 'deviates:=true'
+        emulator = model if args.mujoco else ()
+        for rate, kind, wire in systems(robot, args.rates, kinds, args.seconds, emulator):
             print(f'{Path(robot).name:<20}{rate:4.0f} Hz  {kind:<24}{wire}', flush=True)

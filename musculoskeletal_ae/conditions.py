@@ -411,6 +411,15 @@ class ConditionKind(Enum):
         'a muscle is isolated and not used',
         (Step.REPAIR_MUSCLE, Step.RESTORE_MUSCLES),
     )
+    MUSCLE_NEEDED = Declaration(
+        'muscle_needed',
+        'estimator',
+        'warn',
+        'a muscle is isolated, and joint angles would be undetermined if one of the named muscles '
+        'were lost as well',
+        'joint angles would be undetermined without another of these muscles',
+        (Step.RESTORE_MUSCLES,),
+    )
     LENGTH_OFFSETS_UNKNOWN = Declaration(
         'length_offsets_unknown',
         'estimator, controller',

@@ -68,6 +68,7 @@ PLACES = {
                               'signals/test_heat.py: test_a_changed_module'],
     Kind.MODULE_CHANGED: ['signals/test_heat.py: test_a_changed_module'],
     Kind.MUSCLE_ISOLATED: ['nodes/test_isolation.py: test_a_ruptured_muscle_is_verified_isolated'],
+    Kind.MUSCLE_NEEDED: ['nodes/test_isolation.py: test_a_ruptured_muscle_is_verified_isolated'],
     Kind.LENGTH_OFFSETS_UNKNOWN: ['nodes/test_zeroing.py: test_length_offsets_are_found_and_reach'],
     Kind.LENGTH_CALIBRATION_STUCK: [
         # calibrating again is a new calibration of the corrected readings

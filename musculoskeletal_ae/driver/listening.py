@@ -207,7 +207,7 @@ class Listening:
         if self._motors.is_ros2_control:
             verdict.notes.append(MOTOR_NOTE)
         self._judge_repetition(verdict, read)
-        usual = MuscleReadings.of_rows(np.median(read.rows, axis=0)) if len(read) else None
+        usual = MuscleReadings.of_rows(np.median(read.rows, axis=0)) if self._read else None
         if usual is not None and self._judge_values(verdict, usual):
             self._judge_rest(verdict, usual)
             known = np.flatnonzero(np.isfinite(theta).all(axis=1))
@@ -257,7 +257,7 @@ class Listening:
         return at
 
     def _judge_repetition(self, verdict: Verdict, read: MuscleReadings) -> None:
-        if len(read) > 10:
+        if len(self._read) > 10:
             # A driver may publish more often than it reads the modules. Temperatures are not
             # compared, because they may stay the same.
             values = read.length

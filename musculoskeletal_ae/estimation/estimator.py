@@ -95,8 +95,8 @@ class Estimator:
         stream: Converts messages into samples.
         mae: The network in use, without the isolated muscles; None before the first.
         complete_mae: The same network with all muscles.
-        needed_muscles: While a muscle is isolated, which further muscles the estimate needs, as a
-            text for users; otherwise ''.
+        needed_muscles: While a muscle is isolated, the names of the further muscles that the
+            estimate needs, each with the reason.
         health: Checks each message with all detectors.
         suspects: The latched fault that a detector found, and the verification of its muscle.
         calibration: The running length calibration, or None.
@@ -132,7 +132,7 @@ class Estimator:
         self.stream = MuscleStream(robot, self.body)
         self.mae: Mae | None = None
         self.complete_mae: Mae | None = None
-        self.needed_muscles = ''
+        self.needed_muscles = dict[str, str]()
         self.health = HealthMonitor(robot, preset)
         self.suspects = SuspectHandling(robot)
         self.calibration: LengthCalibration | None = None

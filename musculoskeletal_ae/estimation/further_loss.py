@@ -18,22 +18,22 @@ POSTURES = 50  # compute the covariance in this many random postures
 NOTABLE_SHARE = 0.05
 
 
-def needed_muscles(robot: Robot, mae: Mae) -> str:
-    """Return which further muscles the estimate needs, as a text for users.
+def needed_muscles(robot: Robot, mae: Mae) -> dict[str, str]:
+    """Return which further muscles the estimate needs while a muscle is isolated.
 
     Args:
         robot: The robot.
         mae: The network in use, without the isolated muscles.
 
     Returns:
-        The muscles, with the joints that would be undetermined without each of them; '' if no
-        muscle is isolated, or if the estimate needs none of the other muscles.
+        For the name of each such muscle, a text that names the joints that would be undetermined
+        without it; empty if no muscle is isolated.
     """
     if not mae.isolated:
-        return ''
+        return {}
     theta = robot.random_postures(POSTURES, np.random.default_rng(0))
     jacobian = mae.muscle_jacobian(theta, np.tile(robot.tension.bias, (POSTURES, 1)))
-    needed = list[str]()
+    needed = dict[str, str]()
     for muscle, name in enumerate(robot.muscles):
         if muscle in mae.isolated:
             continue
@@ -43,7 +43,5 @@ def needed_muscles(robot: Robot, mae: Mae) -> str:
         joints = np.flatnonzero(share > NOTABLE_SHARE)
         if joints.size:
             shares = (f'{robot.joints[j]} in {share[j]:.0%} of the postures' for j in joints)
-            needed.append(f'{name} ({", ".join(shares)})')
-    if not needed:
-        return ''
-    return f'joint angles would be undetermined without another of these: {", ".join(needed)}'
+            needed[name] = ', '.join(shares)
+    return needed

@@ -84,8 +84,7 @@ def _changed_modules(core: Estimator) -> Iterator[Condition]:
 def _isolated(core: Estimator) -> Iterator[Condition]:
     """Yield a condition for each isolated muscle, except one that is only being verified.
 
-    It also names the muscles without which the estimate would be undetermined, before one of them
-    is isolated as well.
+    Another condition names the muscles that must not be lost as well.
     """
     verification = core.suspects.verification
     for muscle in core.body.isolated:
@@ -93,11 +92,12 @@ def _isolated(core: Estimator) -> Iterator[Condition]:
             continue
         name, fault = core.robot.muscles[muscle], core.suspects.faults.get(muscle)
         detail = name if fault is None else f'{name} ({fault})'
-        if core.needed_muscles:
-            detail += f'; {core.needed_muscles}'
         # Advise no repair of a muscle that a user has isolated, because it need not be faulty.
         steps = None if fault is not None else (Step.RESTORE_MUSCLES,)
         yield ConditionKind.MUSCLE_ISOLATED.condition(detail, [name], steps=steps)
+    if needed := core.needed_muscles:
+        detail = ', '.join(f'{name} ({joints})' for name, joints in needed.items())
+        yield ConditionKind.MUSCLE_NEEDED.condition(detail, needed)
 
 
 def _unknown_offsets(core: Estimator) -> Iterator[Condition]:

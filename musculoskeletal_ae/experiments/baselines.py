@@ -16,14 +16,14 @@ from scipy.spatial import cKDTree
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.experiments.least_squares import nominal
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, Recording, mean_error
-from musculoskeletal_ae.experiments.study import RestSamples
+from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
 
 STREAM_STRIDE = 10
 
 
 def baseline_errors(
-    robot: Robot, rests: RestSamples, stream: Recording, held_out: Recording
+    robot: Robot, rests: State, stream: Recording, held_out: Recording
 ) -> dict[str, dict[str, float]]:
     """Return each estimator's error [rad] on the held-out motion, before and after learning.
 
@@ -32,7 +32,7 @@ def baseline_errors(
     two errors are equal.
     """
     part = stream.part(np.s_[::STREAM_STRIDE])
-    moving = RestSamples(part.theta_sensor, part.tension, part.length)
+    moving = State(part.theta_sensor, part.tension, part.length)
     error = nominal(robot, tension_noise=0.0).error(held_out)
     errors = {'geometric model, least squares': {'before_rad': error, 'after_rad': error}}
     for kind in (PolynomialFilter, TableSearch):

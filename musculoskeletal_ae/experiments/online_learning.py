@@ -45,7 +45,6 @@ from musculoskeletal_ae.experiments.study import (
     Experiment,
     Measured,
     Plot,
-    RestSamples,
     Rows,
     Study,
 )
@@ -211,11 +210,11 @@ def measure(study: Study, seed: int) -> Measured:
     return Measured(numbers, traces)
 
 
-def _rests(learner: Learner) -> RestSamples:
+def _rests(learner: Learner) -> State:
     if not len(learner.samples):
-        return RestSamples(*np.empty((3, 0, 0)))
+        return State(*np.empty((3, 0, 0)))
     stored = learner.samples.observations()
-    return RestSamples(stored.theta, stored.tension, stored.length)
+    return State(stored.theta, stored.tension, stored.length)
 
 
 def _numbers(curve: Curve, learner: Learner, initial: Mae, held_out: Recording) -> dict[str, float]:

@@ -23,6 +23,7 @@ from musculoskeletal_ae.experiments import kept
 from musculoskeletal_ae.experiments.recording import Recording
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -30,14 +31,6 @@ HELD_OUT = 300.0  # duration of the held-out motion [s]
 #: in a shortened run, shorten a motion to this share of the whole one, and to at most this time [s]
 QUICK_SHARE, QUICK_LIMIT = 0.25, 10.0
 DIGITS = 6  # round results to this many significant digits; further digits are noise
-
-
-class RestSamples(NamedTuple):
-    """The N rest samples that a learner stored."""
-
-    theta: Array  # joint angles θ [rad], (N, D)
-    tension: Array  # muscle tensions T [N], (N, M)
-    length: Array  # muscle lengths l [m], (N, M)
 
 
 @dataclass(frozen=True)
@@ -106,7 +99,7 @@ class Study:
         """Load the networks 'before' and 'after' learning from the individual of a seed."""
         return {'before': self.network(None, preset), 'after': self.network(seed, preset)}
 
-    def save(self, seed: int, **arrays: Recording | RestSamples) -> None:
+    def save(self, seed: int, **arrays: Recording | State) -> None:
         """Save an individual's streams `exploring` and `held_out`, or the learner's `rests`."""
         for name, values in arrays.items():
             kept.write(self._stream_file(seed, name), values)
@@ -115,9 +108,9 @@ class Study:
         """Load a saved stream of an individual: `exploring` or `held_out`."""
         return Recording(**self._load(seed, name, Recording._fields))
 
-    def rests(self, seed: int) -> RestSamples:
+    def rests(self, seed: int) -> State:
         """Load the rest samples that the learner of an individual stored."""
-        return RestSamples(**self._load(seed, 'rests', RestSamples._fields))
+        return State(**self._load(seed, 'rests', State._fields))
 
     def _stream_file(self, seed: int, name: str) -> Path:
         return self.folder / f'{name}_{seed}.npz'

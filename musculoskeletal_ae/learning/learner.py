@@ -106,6 +106,7 @@ class Learner:
             )
         self.robot = robot
         self.enabled = True
+        self._steps = steps
         self._polled_at = math.inf  # time of the last poll [s]
         self.trainer = trainer(robot, preset, seed)
         samples, healthy = SampleStore(), Reservoir(robot.muscle_count, seed)
@@ -114,7 +115,7 @@ class Learner:
         )
         least = self.trainer.preset.least_samples
         self.scheduler = UpdateScheduler(
-            least if joint_source == SENSOR else max(least, LEAST_BLIND), steps
+            least if joint_source == SENSOR else max(least, LEAST_BLIND)
         )
         self.keeper = CheckpointKeeper(robot, samples, directory)
         saved = self.keeper.load()
@@ -293,11 +294,12 @@ class Learner:
 
     # -- samples → checkpoints ------------------------------------------------------------------
 
-    def poll(self, now: float) -> bytes | None:
+    def poll(self, now: float, steps: int | None = None) -> bytes | None:
         """Start the next update if it is due, and use the network of an update that has finished.
 
         Args:
             now: The present time on the clock of the messages [s].
+            steps: Training steps of an update that begins now; None for those of the learner.
 
         Returns:
             A checkpoint if one is due for publication, else None.
@@ -307,8 +309,8 @@ class Learner:
         self._polled_at = now
         is_learning = self.enabled and not self.collector.is_anomaly
         if is_learning and self.trainer.ready and self.scheduler.is_due(now, len(self.samples)):
-            healthy = self.collector.healthy
-            self.trainer.submit(self.scheduler.begin(now, self.samples, healthy, self.isolated))
+            data = self.samples, self.collector.healthy, self.isolated
+            self.trainer.submit(self.scheduler.begin(now, *data, steps or self._steps))
         update = self.trainer.poll()
         if update is not None:
             self._finish(update, is_learning)

@@ -90,7 +90,6 @@ def complete(learner: Learner, progress: Callable[[float], None] | None = None) 
         Whether the updates have converged, and the errors on synthetic samples.
     """
     convergence = Convergence()
-    online_steps, learner.scheduler.steps = learner.scheduler.steps, STEPS
     learner.use_body(learner.body.with_anomaly(Anomaly.NONE))
     now = 0.0  # the caller's clock was that of the recording; a new one begins here
 
@@ -99,13 +98,12 @@ def complete(learner: Learner, progress: Callable[[float], None] | None = None) 
         before = learner.updates
         now += LEAST_INTERVAL
         learner.scheduler.note_news()
-        learner.poll(now)
+        learner.poll(now, STEPS)
         return None if learner.updates == before else learner.last_update
 
     for _ in convergence.updates(make_update, lambda: learner.trainer.body):
         if progress is not None:
             progress(1.0)
-    learner.scheduler.steps = online_steps
     return convergence
 
 

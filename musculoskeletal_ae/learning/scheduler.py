@@ -25,19 +25,18 @@ class UpdateScheduler:
 
     Attributes:
         least_samples: Number of samples required for an update.
-        steps: Number of training steps of each update.
         updates: Number of finished updates.
         last_update: The last finished update; None before the first.
         statistics_hold: Whether the detector's statistics are valid for the present arm. After a
             muscle has changed, they are invalid until the detector has been calibrated again.
     """
 
-    def __init__(self, least_samples: int, steps: int) -> None:
-        """Schedule updates of `steps` training steps each, which need `least_samples` samples."""
+    def __init__(self, least_samples: int) -> None:
+        """Schedule updates, which need `least_samples` samples."""
         self.updates = 0
         self.last_update: Update | None = None
         self.statistics_hold = True
-        self.least_samples, self.steps = least_samples, steps
+        self.least_samples = least_samples
         self._has_news = True
         self._began_at = -math.inf  # start of the last update [s]
         self._has_changed = False  # whether a muscle has changed since the start of the last update
@@ -66,14 +65,18 @@ class UpdateScheduler:
         return self._has_news and enough and not is_recent(self._began_at, now)
 
     def begin(
-        self, now: float, samples: SampleStore, healthy: Reservoir, isolated: tuple[int, ...]
+        self,
+        now: float,
+        samples: SampleStore,
+        healthy: Reservoir,
+        isolated: tuple[int, ...],
+        steps: int,
     ) -> Job:
-        """Begin an update at `now` [s]; return its job."""
+        """Begin an update of `steps` training steps at `now` [s]; return its job."""
         self._has_news = self.updates + 1 < self._updates_to_repeat
         self._began_at, self._has_changed = now, False
-        return Job(
-            samples.observations(), healthy.healthy(), self.statistics_hold, self.steps, isolated
-        )
+        observed, statistics_hold = samples.observations(), self.statistics_hold
+        return Job(observed, healthy.healthy(), statistics_hold, steps, isolated)
 
     def finish(self, update: Update) -> Mae:
         """Record that an update has finished, and return its network.

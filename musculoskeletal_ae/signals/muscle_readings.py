@@ -139,10 +139,6 @@ class MuscleReadings:
             return next(iter(readings))
         return cls.of_rows(median_of_rows(np.array([each.rows for each in readings])))
 
-    def __len__(self) -> int:
-        """Return the number of messages, of readings that `stack` has returned."""
-        return len(self.rows)
-
     def at(self, messages: Any) -> MuscleReadings:
         """Return the readings of some messages, which an index, a mask or a slice selects."""
         return MuscleReadings.of_rows(self.rows[messages])

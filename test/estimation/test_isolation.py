@@ -150,11 +150,14 @@ def test_a_ruptured_muscle_is_isolated_at_once_and_stays_isolated(loop, robot, h
 def test_the_report_names_the_muscles_without_which_the_posture_would_be_undetermined(loop, robot):
     loop.core.isolate([0])
     (alone,) = loop.core.report(loop.now).conditions
+    assert alone.identifier == 'muscle_isolated'
     loop.core.isolate(range(robot.muscle_count - 2))
-    for condition in loop.core.report(loop.now).conditions:
-        detail = condition.text.partition('undetermined without another of these: ')[2]
-        for muscle in robot.muscles[-2:]:  # one length cannot determine two joints
-            assert f'{muscle} (' in detail and detail not in alone.text
+    *isolated, needed = loop.core.report(loop.now).conditions
+    assert {each.identifier for each in isolated} == {'muscle_isolated'}
+    assert needed.identifier == 'muscle_needed'
+    assert needed.subjects == robot.muscles[-2:]  # one length cannot determine two joints
+    for muscle in robot.muscles[-2:]:
+        assert f'{muscle} (' in needed.text
 
 
 def test_a_healthy_suspect_is_restored_but_a_third_anomaly_is_latched(loop, healthy, wound):

@@ -1,20 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains networks on published MuJoCo models, and prints the results for each individual.
-
-    python -m bench mujoco NAME=FILE[:joints=A,B][:without=C,D][:end=E] … --out DIR [--minutes 10]
-    python -m bench mujoco NAME=FILE … --out DIR --nodes [--seconds 30]
-
-You have to fetch the models yourself; this repository does not contain them:
-
-    arm26           google-deepmind/mujoco, model/tendon_arm/arm26.xml (Apache-2.0)
-    elbow           MyoHub/myo_sim, elbow/myoelbow_2dof6muscles.xml (Apache-2.0)
-    shoulder        MyoHub/myo_sim, arm/myoarm.xml with five joints (Apache-2.0)
-    aero_hand       google-deepmind/mujoco_playground, aero_hand/xmls/right_hand.xml, a hand of
-                    TetherIA (Apache-2.0), with its meshes of mujoco_menagerie
-    finger          MyoHub/myo_sim, finger/motorfinger_v0.xml and finger/myofinger_v0.xml
-    hand            MyoHub/myo_sim, hand/myohand.xml, whole, or a finger, the thumb, the wrist of it
-    leg             MyoHub/myo_sim, leg/myolegs.xml, whole, or hip, knee and ankle of one leg
-    arm             MyoHub/myo_sim, arm/myoarm.xml
+"""The experiments on an imported MuJoCo model, for the bench `mujoco_models --experiments`.
 
 Each seed is an emulated individual that deviates from the file (`emulator/foreign/deviation.py`).
 The columns of a row are
@@ -37,28 +22,19 @@ The columns of a row are
   the individual; then the size of these moment arms,
 - the speed of the emulated arm on one core, as a multiple of real time, and
 - the duration of the initial training on one core [s].
-
-If the bench is interrupted, the same command continues it: finished rows are read from --out.
-
-With --nodes, the bench measures the running system instead, for the first individual of --seeds:
-emulator, estimator, sim, controller and learner exchange messages at 100 Hz while the arm explores.
-The columns are the CPU time of each node [% of a core], and the share of messages of the emulator
-that arrived: below 100 %, the emulator is slower than real time, or the machine is busy.
 """
 
 import shutil
 import time
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from bench.wire import KINDS, systems
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.design.prospects import prospects
@@ -82,25 +58,20 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.motion import reach, slowness
 from musculoskeletal_ae.motion.explored_postures import holdable_postures
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
-from musculoskeletal_ae.options import Parser, number, seeds
 from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot
 
-ALL_NODES = 'with learner'  # kind of `bench wire` that runs all nodes
-HEAD = (
+EXPERIMENTS_HEAD = (
     'model', 'seed', 'joints', 'muscles', 'held', 'first network [s]', 'before [rad]', '`paper`',
     'after', 'detected', 'named', 'trajectory [rad]', 'held [rad]', 'export, network [mm]',
     'export, body', 'file, body', 'of', 'real time', 'training [s]',
 )  # fmt: skip
-NODES_HEAD = 'model', 'joints', 'muscles', *KINDS[ALL_NODES], 'sum', 'arrived'
 MOTIONS, DURATION, TRIES = 4, 2.0, 400
 MOMENTS = 25  # evaluate the torque of a motion at this many instants
 LEAST_TORQUE = 1e-6  # treat the muscles as too weak for a motion if more torque is missing [N·m]
 HOLDING = 5.0  # let the arm hold each posture for this time [s]
 ARM_POSTURES = 300
-RATE = 100.0  # rate of muscle_states with --nodes [Hz]
 TRAINED = 'trained'  # name of the part of a run that contains the first networks
-LISTS = 'joints', 'muscles', 'without'
 MuscleJacobian = Callable[[Array], Array]
 
 
@@ -110,17 +81,6 @@ class Individuals(Study):
     def arm(self, seed: int, friction: bool = True) -> Arm:
         """Return the individual of a seed at rest, with or without tendon friction."""
         return make_arm(self.robot, seed, self.reality, friction, deviates=True)
-
-
-def parse(text: str) -> tuple[str, Path, dict[str, Any]]:
-    """Return the name and file of a model, and the arguments that select a part of it."""
-    name, _, rest = text.partition('=')
-    file, *options = rest.split(':')
-    chain: dict[str, Any] = {}
-    for option in options:
-        key, _, value = option.partition('=')
-        chain[key] = value.split(',') if key in LISTS else value
-    return name, Path(file), chain
 
 
 def speed(arm: Arm) -> float:
@@ -212,7 +172,7 @@ def learned_error(preset: str, held_out: Recording, study: Study, seed: int) -> 
 
 
 def table_row(
-    study: Study, name: str, seed: int, training: float, file: Path, chain: dict[str, Any]
+    study: Study, name: str, seed: int, training: float, file: Path, joints: Sequence[str]
 ) -> list[str]:
     """Return the cells of one individual.
 
@@ -222,7 +182,7 @@ def table_row(
         seed: Seed of the individual.
         training: CPU time of the initial training [s].
         file: The MJCF file that was imported.
-        chain: Arguments that select the imported part of the file.
+        joints: Joints that are imported; all if empty.
     """
     robot = study.robot
     held_out = record(study.arm(seed), study.network(None), 0xB0 + seed, study.held_out_time)
@@ -237,21 +197,24 @@ def table_row(
     for unfinished in (out, again):
         shutil.rmtree(unfinished, ignore_errors=True)
     export_into(robot, study.network(seed), file, out)
-    exported = import_robot(out / file.name, again, **chain).robot
+    exported = import_robot(out / file.name, again, joints=joints).robot
     theta = robot.random_postures(ARM_POSTURES, np.random.default_rng(0x309))
     differences = route_errors(exported, study.network(seed), theta)
     arm_size = np.sqrt((robot.routes.muscle_jacobian(theta) ** 2).sum(axis=2).mean(axis=0))
     bodies = exported.routes, robot.routes
-    from_individual = [arm_errors(study.arm(seed), body.muscle_jacobian) for body in bodies]
+    individual = study.arm(seed).individual.muscle_jacobian
+    from_individual = [arm_errors(individual, body.muscle_jacobian, theta) for body in bodies]
     parts = differences.arms, *from_individual, arm_size
     cells += [f'{1e3 * np.median(part):.2f}' for part in parts]
     return [*cells, f'{speed(study.arm(seed)):.1f}', f'{training:.0f}']
 
 
-def arm_errors(arm: Arm, muscle_jacobian: MuscleJacobian) -> Array:
-    """Return each muscle's moment arm error, as a root mean square over postures [m], (M,)."""
-    theta = arm.robot.random_postures(ARM_POSTURES, np.random.default_rng(0x308))
-    error = muscle_jacobian(theta) - arm.individual.muscle_jacobian(theta)
+def arm_errors(one: MuscleJacobian, other: MuscleJacobian, theta: Array) -> Array:
+    """Return each muscle's difference of moment arms over postures θ (N, D) [m], (M,).
+
+    It is the root mean square over the postures of the norm over the joints.
+    """
+    error = one(theta) - other(theta)
     result: Array = np.sqrt((error**2).sum(axis=2).mean(axis=0))
     return result
 
@@ -285,29 +248,18 @@ def attempt(error: Callable[[Study, int], float], study: Study, seed: int) -> st
         return str(problem)[:80]
 
 
-def nodes_row(name: str, file: Path, chain: dict[str, Any], args: Namespace) -> list[str]:
-    """Import a model, run all nodes, and return the cells with the CPU time of each node.
-
-    `chain` are options of `import_robot` that select a part of the model in `file`.
-    """
-    robot: Robot = import_robot(file, args.out / name / 'robot', **chain).robot
-    directory = str(robot.description.directory)
-    emulator = f'reality:={directory}/model.xml', 'deviates:=true', f'seed:={args.seeds[0]}'
-    ((_, _, wire),) = systems(directory, [RATE], [ALL_NODES], args.seconds, emulator)
-    cells = [name, str(robot.joint_count), str(robot.muscle_count)]
-    cells += [f'{wire.cpu[node]:.0f}' for node in KINDS[ALL_NODES]]
-    return [*cells, f'{sum(wire.cpu.values()):.0f}', f'{100.0 - wire.missed:.0f} %']
-
-
-def model_rows(
-    name: str, file: Path, chain: dict[str, Any], args: Namespace
+def experiment_rows(
+    name: str, file: Path, joints: Sequence[str], folder: Path, args: Namespace
 ) -> Iterator[list[str]]:
-    """Import a model, train, and yield the row of each individual.
+    """Import a model, train, and yield the row of each individual of `args.seeds`.
 
-    `chain` are options of `import_robot` that select a part of the model in `file`. Networks and
-    rows of an interrupted run with the same --out are read from its files.
+    Args:
+        name: Name of the model.
+        file: The MJCF file.
+        joints: Joints that are imported; all if empty.
+        folder: Folder of the results. Networks and rows of an interrupted run are read from it.
+        args: Seeds, minutes of the exploration, and whether to train the whole time.
     """
-    folder = args.out / name
     directory = folder / 'robot'
     folder.mkdir(parents=True, exist_ok=True)
     begun = time.perf_counter()
@@ -332,43 +284,13 @@ def model_rows(
         robot = Robot.load(directory)
     else:
         shutil.rmtree(directory, ignore_errors=True)
-        robot = import_robot(file, directory, check, **chain).robot
+        robot = import_robot(file, directory, check, joints=joints).robot
     study = Individuals(
-        robot, 'default', args.seeds, args.minutes, quick=args.quick, folder=folder,
+        robot, 'default', args.seeds, args.minutes, quick=not args.whole, folder=folder,
         reality=str(directory / 'model.xml'),
     )  # fmt: skip
     trained = study.remember(TRAINED, measure_training)
     for seed in args.seeds:
-        row = partial(table_row, study, name, seed, trained['training'], file, chain)
+        row = partial(table_row, study, name, seed, trained['training'], file, joints)
         cells = study.remember(f'row_{seed}', row)
         yield [*cells[:4], f'{100 * trained["share"]:.0f} %', f'{trained["first"]:.0f}', *cells[4:]]
-
-
-def main(argv: list[str]) -> None:
-    """Learn the models that the command line names, and print a row for each individual."""
-    parser = Parser('mujoco', 'Learns MuJoCo models that you have fetched.')
-    text = (
-        'name and MJCF file of a model, and the part of it to import: joints=…, muscles=…, '
-        'without=… (muscles to leave out), end=… (end effector), base=… (root link); for '
-        'example arm=myoarm.xml:joints=elbow_flexion,pro_sup'
-    )
-    parser.add_argument('models', nargs='+', type=parse, metavar='NAME=FILE…', help=text)
-    parser.add_out('DIR', 'a directory; the same one continues an interrupted run')
-    parser.add_argument('--seeds', type=seeds, default=(0, 1, 2), help='seeds of the individuals')
-    parser.add_minutes('duration of the exploration', 10.0)
-    parser.add_quick('short initial training and held-out motion, to try things out')
-    text = 'measure the CPU time of each node, and do not measure the learning'
-    parser.add_argument('--nodes', action='store_true', help=text)
-    text = 'duration of the measurement with --nodes [s]'
-    parser.add_argument('--seconds', type=number(1.0, 3600.0), default=30.0, metavar='S', help=text)
-    args = parser.parse_args(argv)
-
-    head = NODES_HEAD if args.nodes else HEAD
-    print(f'| {" | ".join(head)} |\n{"|---" * len(head)}|', flush=True)
-    for name, file, chain in args.models:
-        try:
-            model = name, file, chain, args
-            for cells in [nodes_row(*model)] if args.nodes else model_rows(*model):
-                print(f'| {" | ".join(cells)} |', flush=True)
-        except MusculoskeletalError as error:
-            print(f'| {name} | {error} |', flush=True)
