@@ -32,6 +32,7 @@ from musculoskeletal_ae.report import (
     overload_note,
     with_load,
 )
+from musculoskeletal_ae.ros.diagnostics import LAST_REJECTED
 from musculoskeletal_ae.ros.messages import RELIABLE, SENSOR
 
 #: hide problems for this time after the start and after the first estimate, because most of them
@@ -157,7 +158,7 @@ class BringupStatusNode(Shell):
 
     def _why_no_estimate(self) -> str:
         """Return the last rejected message of the estimator; without one, all problems."""
-        rejected = self.situation.values('estimator').get('last rejected', '')
+        rejected = self.situation.values('estimator').get(LAST_REJECTED, '')
         return f'rejected {rejected}' if rejected else self.situation.trouble()
 
     def _learned(self) -> str:
