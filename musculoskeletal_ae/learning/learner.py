@@ -182,9 +182,7 @@ class Learner:
             return
         if self.collector.has_jumped:  # since the last calibration of the lengths
             return
-        for _ in self.collector.collect(paired):
-            self.offset_history.accepted(time)
-            self.joint_history.accepted(time)
+        for _ in self.collector.collect(paired, time):
             self._note_new_samples()
 
     def _use_known_offsets(self) -> None:
