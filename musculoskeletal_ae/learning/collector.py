@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.learning.anomaly_margin import AnomalyMargin
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.rest import REST_TIME, RestDetector
 from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
 from musculoskeletal_ae.learning.slow_moments import SlowMoments
+from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.joint_stream import JointStream

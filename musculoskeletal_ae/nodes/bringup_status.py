@@ -17,9 +17,9 @@ from rclpy.executors import ExternalShutdownException
 from std_msgs.msg import Float64
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.arrival import SILENCE
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import printable
+from musculoskeletal_ae.messages.arrival import SILENCE
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.situation import Situation, figures, nodes_in_graph
 from musculoskeletal_ae.options import CLOSED

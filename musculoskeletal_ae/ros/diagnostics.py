@@ -9,7 +9,7 @@ from rclpy.qos import QoSProfile
 
 from musculoskeletal_ae.conditions import CONDITIONS, ordered, to_json
 from musculoskeletal_ae.exceptions import printable
-from musculoskeletal_ae.reception import Reception
+from musculoskeletal_ae.messages.reception import Reception
 from musculoskeletal_ae.remedy import sentence
 from musculoskeletal_ae.report import Report
 

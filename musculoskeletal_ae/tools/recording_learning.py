@@ -13,8 +13,8 @@ from scipy.spatial import KDTree
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.bags.check import recorded_wiring
-from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.recorded_joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator

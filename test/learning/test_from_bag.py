@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae import progress_bar
-from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.message_types import TYPESTORE
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.recorded_joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.conditions import ConditionKind
