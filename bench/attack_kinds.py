@@ -90,7 +90,8 @@ class Scene:
         if silent:
             late = max(silent) - begin
             self.attack.found(
-                'no OK while something is wrong', f'{self.what}: OK after {late:.1f} s'
+                'no OK while something is wrong',
+                f'{self.what}: the status line was still OK after {late:.1f} s',
             )
 
     def bring(self, moment: str) -> bool:

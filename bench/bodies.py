@@ -265,7 +265,11 @@ def main(argv: list[str]) -> None:
     text = 'number of updates; by default, as many as the network needs to converge'
     parser.add_argument('--updates', type=whole(1, 100), help=text)
     parser.add_argument('--seed', type=whole(0, 10**6), default=0, help='seed of the training')
-    parser.add_argument('--body', action='store_true', help='fit the body without a network')
+    parser.add_argument(
+        '--body',
+        action='store_true',
+        help='fit only the body model, and estimate θ by least squares',
+    )
     parser.add_argument('--baselines', action='store_true', help='also fit the regressions')
     args = parser.parse_args(argv)
     torch.set_num_threads(1)

@@ -117,7 +117,7 @@ def listening(count: int) -> Listener:
 
 
 def heard(listener: Listener, count: int) -> int:
-    """Return how many arms have sent commands."""
+    """Return for how many of the `count` arms a length command has been received."""
     commands = (topic(arm, 'muscle_length_command') for arm in range(1, count + 1))
     return sum(bool(listener.stamps[name]) for name in commands)
 

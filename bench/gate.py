@@ -50,7 +50,7 @@ MINUTE = 60.0  # add or remove the payload at this interval [s]
 MESSAGES = {
     'change of l in 10 ms [m]': SIGNAL_LIMITS.step + SIGNAL_LIMITS.speed * SAMPLE_TIME,
     'T relative to tension.max': SIGNAL_LIMITS.highest_tension,
-    'θ_est beyond its limits, relative to the range': SIGNAL_LIMITS.estimate_outside,
+    'θ_est beyond the joint limits, in joint ranges': SIGNAL_LIMITS.estimate_outside,
 }
 
 
@@ -80,7 +80,13 @@ class Spread:
         self.refused, self.count = list[str](), 0
 
     def take(self, gate: CheckpointValidator, mae: Mae, name: str) -> None:
-        """Measure a network, and record it under `name` as refused if the validation rejects it."""
+        """Include a network in the largest measures, and note if and why it is refused.
+
+        Args:
+            gate: The validation.
+            mae: The network.
+            name: Name of the network in the list of refusals.
+        """
         self.count += 1
         values = {key: error.max() for key, error in filter(None, gate.postures.errors(mae))}
         errors = gate.message_errors(mae)

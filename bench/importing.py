@@ -115,7 +115,7 @@ def compared(file: Path, robot: Robot, comparison: Comparison | None) -> Compari
 
 
 def row(file: Path, out: Path) -> list[str]:
-    """Import one file, and return the cells of its row."""
+    """Import one file, and return the row of the table that describes the result."""
     name = f'{file.parent.name}/{file.name}'
     try:
         robot, notes, comparison = import_robot(file, out)

@@ -133,9 +133,9 @@ class Packet(NamedTuple):
     theta: Array | None  # joint angles [rad], (D,), with NaN for missing ones; None: no message
 
 
-#: function of the time [s] and a packet that returns the packets that are sent instead
+#: maps the time [s] and a packet to the packets that are sent instead
 ReadingFault = Callable[[float, Packet], list[Packet]]
-#: function of the time [s] and a length command [m] (M,) that returns the command that arrives
+#: maps the time [s] and a length command [m] (M,) to the command that arrives; None if none does
 CommandFault = Callable[[float, Array], Array | None]
 
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs one node on the present interpreter: the estimator must publish what the core computes.
+"""Checks that the node `estimator` publishes the network's estimate on the present interpreter.
 
-`python -m bench.platform_node CHECKPOINT`, from the root of the repository. It needs neither torch
-nor the built package: `python -m bench platforms` and the tests run it with other interpreters.
+Run `python -m bench.platform_node CHECKPOINT` from the root of the repository. The check needs
+neither torch nor the built package; `python -m bench platforms` and the tests run it with other
+interpreters.
 """
 
 import signal

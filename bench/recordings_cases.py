@@ -33,7 +33,8 @@ class Case(NamedTuple):
     training: Run
     test: Run
     draw: int = 0
-    #: `training` by run, to which `Statics` is fitted; empty if it is not fitted to this case
+    #: the postures of `training`, separately for each run, for the fit of `Statics`; empty if there
+    #: is no such fit
     rests: tuple[Run, ...] = ()
 
 

@@ -114,7 +114,9 @@ def failures_of(worst: float, filled: float, most: float, times: list[float]) ->
 
 def main(argv: list[str]) -> int:
     """Run the endurance test; return the exit status."""
-    parser = Parser('soak', 'Learns for a day, and checks error, memory and update time.')
+    parser = Parser(
+        'soak', 'Learns for an emulated day, and checks error, memory and time of an update.'
+    )
     parser.add_robot()
     parser.add_argument('--hours', type=float, default=24.0, help='robot time [h]')
     parser.add_quick('two hours, to try things out')

@@ -253,7 +253,10 @@ def command_line() -> str:
 CAPABILITIES = (
     (
         'joint-angle error after learning without joint sensors',
-        '{none_rad:.3f} rad ({before_rad:.3f} before)',
+        (
+            '{none_rad:.3f} rad ({before_rad:.3f} before; '
+            'later versions have [more](#fewer-joint-sensors))'
+        ),
         'sensors',
     ),
     (

@@ -38,8 +38,11 @@ each exerts T_bias. Modules that follow positions are paid out until their measu
 T_bias, or by `release` of muscles.yaml where no tension is known.
 - `release at once` does not wait for `hold_time`.
 
-Every cause lasts until `controller/reset`, except that some end earlier. If several \
-begin together, the first one in this table is reported. Each remedy ends with `controller/reset`.
+A cause ends with `controller/reset`, or earlier where the column *ends earlier* says so: by \
+default, only a short interruption of readings or estimates does; with `on_anomaly: isolate`, also \
+causes that the verification of a muscle explains. `anomaly_detected` stands for any of the \
+[findings](diagnostics.md#conditions) of the estimator. If several causes begin together, the \
+first one in this table is reported. Each remedy ends with `controller/reset`.
 
 {table}
 

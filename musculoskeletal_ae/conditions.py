@@ -654,8 +654,9 @@ class ConditionKind(Enum):
         'away_from_target',
         'controller',
         'warn',
-        'for 5 s after the end of a motion, a joint has rested more than 0.5 rad away from its '
-        'target, or 0.25 rad further away than it already was, according to the estimate',
+        'while the arm rests after a motion, a joint has been more than 0.5 rad away from its '
+        'target for 5 s, or 0.25 rad further away than before in this rest, according to the '
+        'estimate',
         'the arm is not at its target',
         (Step.CHECK_LOAD,),
     )

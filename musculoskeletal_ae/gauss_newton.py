@@ -148,15 +148,16 @@ class Equations(NamedTuple):
 class RightSides(NamedTuple):
     """The right sides of the normal equations."""
 
-    samples: Array  # part a of the unknowns of single samples, (N, D)
-    common: Array  # part c of the shared unknowns, (P,)
+    samples: Array  # part a, which belongs to the unknowns of single samples, (N, D)
+    common: Array  # part c, which belongs to the shared unknowns, (P,)
 
     @classmethod
     def of_common(cls, common: Array) -> RightSides:
         """Return the right sides of a fit whose samples have no unknowns of their own.
 
         Args:
-            common: The part c of the unknowns that all samples share.
+            common: Part c of the right side, which belongs to the unknowns that all samples
+                share, (P,).
         """
         return cls(np.zeros((0, 0)), common)
 

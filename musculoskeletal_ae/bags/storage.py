@@ -40,7 +40,7 @@ CONVERT_ROS1 = (
 )
 #: problem and remedy of a recording of which nothing can be read
 EMPTY = 'contains no complete message', 'record again, or use another recording'
-#: remedy for a recording that is legal elsewhere, but cannot be read here
+#: remedy for a recording that is valid for ROS 2, but that this package does not read
 CONVERT = 'convert it with `rosbags-convert` (of the Python package rosbags) or `ros2 bag convert`'
 
 _TOPIC_NAME = re.compile(r'(/[A-Za-z_]\w*)+', re.ASCII)

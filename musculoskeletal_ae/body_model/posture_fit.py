@@ -174,7 +174,8 @@ class GroupFit:
         for _ in range(SCALINGS):
             inverse = solve_triangular(root, np.eye(len(root)))[parameters]
             undetermined = float(scaled @ np.square(inverse).sum(axis=1))
-            # Add one parameter at its expected deviation, so that the ratio is 1 without samples.
+            # Count a fictitious parameter that deviates as expected, so that the ratio is 1 without
+            # samples.
             ratio = (chi_square + 1.0) / (max(0.0, len(parameters) - undetermined) + 1.0)
             scaled = prior.precision / max(self._least_ratio, ratio)
             common = equations.common.copy()

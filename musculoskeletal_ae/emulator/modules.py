@@ -40,8 +40,9 @@ SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 #: let a module in the safe state change its tension towards T_bias at this rate [N/s]
 RELEASE_RATE = 100.0
 MOTOR_GAIN = 0.004  # speed at which a module winds in for each newton of missing tension [m/s/N]
-#: Wind in a slack tendon at this speed [m/s], which falls to 0 at half of T_bias. Weak muscles need
-#: it: MOTOR_GAIN alone would wind in at 2 mm/s with a T_bias of 0.5 N.
+#: Wind in a tendon without tension at this speed [m/s], and more slowly as the tension rises, down
+#: to 0 at half of T_bias. MOTOR_GAIN alone would be too slow for weak muscles: 2 mm/s with a T_bias
+#: of 0.5 N.
 TAKE_UP_SPEED = 0.03
 #: time constant with which a position-controlled module follows its target length [s]
 POSITION_LAG = 0.02

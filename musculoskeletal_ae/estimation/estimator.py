@@ -483,8 +483,8 @@ class Estimator:
         dt, sent_apart = min(self._unchecked, LONGEST_STEP), self._unchecked_sent
         self._unchecked = self._unchecked_sent = 0.0
         known = self.body.offsets.known
-        demand = self._commands.demand(self.robot, sample.length, now)
-        command = self._commands.length(now)
+        demand = self._commands.demand(self.robot, sample, now)
+        command = self._commands.length(sample, now)
         observation = Observation(sample, estimated, demand, dt, known, self.measured, command)
         detected = self._handle(self.health.step(observation), now)
         self.load = None
@@ -592,7 +592,7 @@ class Estimator:
         limit = LARGEST_LEARNED if self.health.residual.is_calibrated else LARGEST_YOUNG
         if not body.offsets.known:
             limit = math.inf
-        demand = self._commands.demand(self.robot, sample.length, self.stepped_at)
+        demand = self._commands.demand(self.robot, sample, self.stepped_at)
         jumping, theta = self.stream.jumping, self.measured
         return RepairCheck(self.robot, mae, sample, body.isolated, theta, demand, jumping, limit)
 
@@ -626,7 +626,7 @@ class Estimator:
         verification, mae = self.suspects.verification, self.mae
         assert verification is not None
         assert mae is not None
-        muscle, command = verification.muscle, self._commands.length(now)
+        muscle, command = verification.muscle, self._commands.newest_length(now)
         pull = np.clip(sample.bone_tension, 0.0, self.robot.tension.limit)
         tension = self.robot.tension_source.known(sample.motor_tension)
         verdict = verification.step(

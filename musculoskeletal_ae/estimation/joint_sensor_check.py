@@ -82,7 +82,7 @@ GROSS = 0.8
 
 
 class _CountedMessage(NamedTuple):
-    """The readings of one message by which the joint sensors are judged."""
+    """A message that counts when joint sensors are judged: its readings, and θ − θ̂."""
 
     time: float  # time of the message on the steady clock [s]
     theta: Array  # readings of the joint sensors [rad], (D,); NaN where unknown or in doubt

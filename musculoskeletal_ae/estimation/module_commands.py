@@ -1,49 +1,114 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stores the newest command to the muscle modules, until it is out of date."""
+"""Stores the newest commands to the muscle modules, to compare readings with them.
 
-import math
+On a busy computer, readings and commands are late, and a module still obeys an earlier command when
+it sends a reading. Which one is not known: if no message is later than the delay d of the reading,
+it is one of those that the estimator received in the last 2 d. A reading is therefore compared with
+that command of this time from which it differs least. On an idle computer, d is 0, and this is the
+newest command.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 #: Ignore a command that is older than this [s]: modules without commands for this time enter their
 #: safe state (doc/howto/your_driver.md). The age is measured on the steady clock, because the
 #: modules do not wait for pauses of this process.
 COMMAND_AGE = 0.5
+#: store commands for this time [s]; what a module obeyed when it sent a reading is unknown if the
+#: reading is later than half of this time
+STORED = 1.0
+
+
+class _Command(NamedTuple):
+    """A command to the muscle modules: target lengths or target tensions."""
+
+    time: float  # when the estimator received it [s]
+    length: Array | None  # l_target [m], (M,)
+    tension: Array | None  # T_target [N], (M,)
 
 
 class ModuleCommands:
-    """Stores the newest command to the muscle modules: target lengths or target tensions.
+    """Stores the newest commands to the muscle modules.
 
-    A command older than 0.5 s (COMMAND_AGE) is ignored.
+    If the newest command is older than 0.5 s (COMMAND_AGE), there is none.
     """
 
     def __init__(self) -> None:
-        self._length: Array | None = None  # l_target [m], (M,)
-        self._tension: Array | None = None  # T_target [N], (M,)
-        self._time = -math.inf  # time of the newest command [s]
+        self._commands: deque[_Command] = deque()
 
     def note(self, now: float, length: Array | None = None, tension: Array | None = None) -> None:
         """Note target lengths [m] (M,) or target tensions [N] (M,) that were sent at `now` [s]."""
-        self._length, self._tension, self._time = length, tension, now
+        while self._commands and self._commands[0].time < now - STORED:
+            self._commands.popleft()
+        self._commands.append(_Command(now, length, tension))
 
-    def length(self, now: float) -> Array | None:
-        """Return the target lengths [m], (M,), or None without an up-to-date length command."""
-        return self._length if now - self._time <= COMMAND_AGE else None
+    def newest_length(self, now: float) -> Array | None:
+        """Return the newest target lengths [m], (M,), or None without an up-to-date command."""
+        return self._commands[-1].length if self._is_up_to_date(now) else None
 
-    def demand(self, robot: Robot, length: Array, now: float) -> Array | None:
-        """Return the tensions that the newest command demands of the modules [N], (M,).
+    def length(self, sample: MuscleSample, now: float) -> Array | None:
+        """Return the target lengths that the modules obeyed when they sent the readings [m], (M,).
+
+        The result is None if these are not known, or if modules were to follow tensions.
+
+        Args:
+            sample: The readings.
+            now: The present time on the same clock as in `note` [s].
+        """
+        return self._nearest(sample.length, sample.delay, now, lambda command: command.length)
+
+    def demand(self, robot: Robot, sample: MuscleSample, now: float) -> Array | None:
+        """Return the tensions that were demanded of the modules at their readings [N], (M,).
 
         The tensions that a length command demands depend on the measured lengths. The result is
-        None if the command is out of date, or if the modules follow positions.
+        None if the demand is not known, or if the modules follow positions.
 
         Args:
             robot: The robot.
-            length: Measured lengths [m], (M,).
+            sample: The readings.
             now: The present time on the same clock as in `note` [s].
         """
-        if now - self._time > COMMAND_AGE:
+
+        def demanded(command: _Command) -> Array | None:
+            if command.length is not None:
+                return robot.actuation.demanded(sample.length, command.length)
+            return command.tension if robot.actuation.follows_tensions else None
+
+        return self._nearest(sample.motor_tension, sample.delay, now, demanded)
+
+    def _is_up_to_date(self, now: float) -> bool:
+        return bool(self._commands) and now - self._commands[-1].time <= COMMAND_AGE
+
+    def _nearest(
+        self,
+        reading: Array,
+        delay: float,
+        now: float,
+        wanted: Callable[[_Command], Array | None],
+    ) -> Array | None:
+        """Return what the modules were to reach, as near to the reading as it may have been, (M,).
+
+        Between two commands, everything between their values may have been wanted.
+        """
+        if not self._is_up_to_date(now) or 2.0 * delay > STORED:
             return None
-        if self._length is None:
-            return self._tension if robot.actuation.follows_tensions else None
-        return robot.actuation.demanded(length, self._length)
+        values = []
+        for command in reversed(self._commands):
+            value = wanted(command)
+            if value is None:
+                break
+            values.append(value)
+            if command.time <= now - 2.0 * delay:  # no earlier one was in force
+                break
+        if len(values) < 2:
+            return values[0] if values else None
+        nearest: Array = np.clip(reading, np.min(values, axis=0), np.max(values, axis=0))
+        return np.where(np.isfinite(nearest), nearest, values[0])

@@ -140,7 +140,7 @@ def _read_result(file: Path) -> dict[str, Any]:
 
 
 def combine(study: Study, rows: Rows) -> dict[str, Any]:
-    """Return the content of one experiment's result.json, without plots and failures."""
+    """Combine the rows of all individuals for result.json: mean, settings, and each individual."""
     numbers = {str(seed): row.numbers for seed, row in rows.items()}
     about: dict[str, Any] = {'robot': study.robot.description.directory.name}
     about |= {key: getattr(study, key) for key in ('preset', 'reality', 'minutes', 'quick')}

@@ -33,7 +33,7 @@ KINDS = REVOLUTE + PRISMATIC
 POSTURES = 1000  # number of random postures in which lengths are compared with those of the source
 #: number of random postures in which moment arms are compared with those of the source
 ARM_POSTURES = 200
-#: number of postures in which the joints are searched that change the length of a passive tendon
+#: search in this many postures for the joints that change the length of a passive tendon
 PROBES = 20
 MOVED = 1e-8  # count a joint as moving a tendon if it changes the length by at least this [m]
 WRONG_LENGTH = 5e-5  # report a passive tendon whose polynomial is wrong by at least this [m]
@@ -167,7 +167,9 @@ class Source:
         if np.isfinite([low, high]).all() and low < high and high - low < 100.0:
             return float(low), float(high)
         end = UNLIMITED[slides]
-        range_text = f'{low:.4g} to {high:.4g}' if low != high and abs(low) < np.inf else 'none'
+        range_text = 'no range'
+        if low != high and abs(low) < np.inf:
+            range_text = f'the unusable range {low:.4g} to {high:.4g}'
         remedy = self.limits_file or 'the source'
         chosen = f'joint {joint}: limits ±{end:.4g}, because the source has {range_text}'
         self.note('chosen', f'{chosen}; give it a range in {remedy}')

@@ -32,7 +32,7 @@ POLYNOMIALS = (
 LARGE = 256
 #: raise eigenvalues to at least this multiple of the largest; float32 does not resolve smaller ones
 LEAST_EIGENVALUE = 1e-7
-#: train the weight matrices by Muon with a step size that is this multiple of the biases' (Adam)
+#: train the weight matrices by Muon with this multiple of the step size of Adam for the biases
 MATRIX_RATIO = 12.5
 
 

@@ -6,13 +6,13 @@ desired posture (`Shift`), which acts in two ways (`tension_plan.TensionPlan`):
 
     l = ①(θ + δ, T),   −Gᵀ T = τ + k u,   k = SUPPORT σ/CORRECTION
 
-The lengths are those of the posture shifted by δ. A muscle at T_bias cannot answer by pulling less.
-If few muscles pull with more than T_bias, other lengths therefore exert almost no torque in some
-directions, and friction holds the arm there, wherever it is. For this reason, the planned tensions
-support the shift u by a torque. At the bound of a shift, the torque is SUPPORT times σ, the
-residual torque of the healthy moving arm (`estimation/healthy_torque.py`). σ contains the friction
-and the errors of the learned body that the arm has shown. A network that does not know σ supports
-no shift.
+δ shifts the posture whose lengths are commanded. A muscle at T_bias cannot pull less when its
+commanded length grows. If few muscles pull with more than T_bias, δ therefore hardly changes the
+joint torque in some directions, and friction can hold the arm in any posture along them. For this
+reason, the planned tensions produce a torque k u in the direction of the shift u, in addition to τ,
+the torque of the plan. At the bound of a shift, k u is SUPPORT times σ, the residual torque of the
+healthy moving arm (`estimation/healthy_torque.py`). σ contains the friction and the errors of the
+learned body that the arm has shown. A network that does not know σ supports no shift.
 """
 
 from __future__ import annotations

@@ -110,9 +110,10 @@ class Frames:
 
 
 class ArmNode(Shell):
-    """Base class of nodes that replace a real arm: they obey its commands and publish its state.
+    """Base class of nodes that replace a real arm: they obey commands and publish the arm's state.
 
-    Like real muscle modules, such a node obeys commands even while several nodes publish them.
+    All other nodes ignore a topic that several nodes publish. These nodes obey such commands, as
+    real muscle modules would.
     """
 
     accepted_from_all = COMMANDS

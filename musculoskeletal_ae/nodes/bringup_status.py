@@ -180,7 +180,7 @@ class BringupStatusNode(Shell):
 
     def _print_waiting(self, now: float) -> None:
         """Print that there is no estimate yet, and why; again if the reason has changed."""
-        # Most problems end by themselves while the nodes start.
+        # State problems only after SETTLING, because most end by themselves while the nodes start.
         is_settled = now - self.begun >= SETTLING
         reason = self._why_no_estimate() if is_settled else self._why_replay_waits()
         line = ': '.join(filter(None, ['waiting for the first estimate', reason]))

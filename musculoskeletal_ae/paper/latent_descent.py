@@ -73,7 +73,7 @@ class Loss:
 
 
 def descend(mae: Mae, z: Array, terms: Sequence[Term], search: StepSearch) -> Array:
-    """Minimise the loss of `terms` from an initial z (D+M,), and return the final z (D+M,)."""
+    """Return the latent vector z (D+M,) that minimises the loss of `terms`, starting from `z`."""
     loss = Loss(terms)
     steps = search.largest_step * np.arange(search.candidates)[:, None] / search.candidates
     for _ in range(search.epochs):

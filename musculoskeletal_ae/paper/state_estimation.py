@@ -4,9 +4,9 @@
     (θ_est, T_est, l_est) = f_decode(f_encode,2(T, l))
     A = ‖T_est − T‖₂ + ‖l_est − l‖₂                                                          (4)
 
-Both presets share the estimate (`estimation/estimate.py`). The paper does not state the
-following, which we chose: A is in scaled units, its threshold comes from the checkpoint, and a
-finding needs five consecutive messages.
+Both presets share the estimate (`estimation/estimate.py`). The paper leaves three
+things open, which we chose: the anomaly score A is in scaled units, its threshold comes from the
+checkpoint, and a muscle is reported when A exceeds the threshold in five consecutive messages.
 """
 
 import math

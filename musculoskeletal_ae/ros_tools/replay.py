@@ -381,7 +381,8 @@ def parse(arguments: list[str]) -> Namespace:
     """Parse the command line of `replay`, and return its options."""
     parser = Parser(
         'replay',
-        'Plays a recorded bag onto the topics, with the recorded spacing. ' + ROS_HELP,
+        'Publishes the messages of a recorded bag on their topics, at the recorded intervals. '
+        + ROS_HELP,
         'While it plays, the services replay/pause, replay/resume and replay/step '
         '(std_srvs/Trigger) pause it, resume it, and play the messages of the next recorded time. '
         'Set its parameter `position` [s] to seek.',

@@ -128,7 +128,11 @@ class PresumedRupture:
         return True
 
     def refuted(self, tension: Array, used: Bools, now: float) -> tuple[int, ...]:
-        """Return muscles that pull again, for which no rupture is presumed any more."""
+        """Presume no rupture of muscles that have pulled again for `LIMITS.settled`.
+
+        Returns:
+            Indices of these muscles.
+        """
         if not self._presumed.any():
             return ()
         is_taut = self._presumed & used & (tension >= self._slack)

@@ -87,7 +87,10 @@ class History:
 
 
 def scale_top(largest: float) -> float:
-    """Return the smallest 1, 2 or 5 times a power of ten that is at least `largest`."""
+    """Return the smallest of the numbers …, 0.5, 1, 2, 5, 10, … that is at least `largest`.
+
+    The result is 1 if `largest` is not positive or not finite.
+    """
     if not 0.0 < largest < math.inf:
         return 1.0
     power = 10.0 ** math.floor(math.log10(largest))

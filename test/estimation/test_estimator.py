@@ -177,6 +177,27 @@ def test_messages_before_a_pause_are_no_evidence_of_a_muscle_without_tension(
     assert any(estimate.detected for estimate in stepped.step(slack, round(DEAD_TIME / DT)))
 
 
+@pytest.mark.parametrize(('late', 'found'), [(0.4, False), (0.0, True)])
+def test_readings_that_arrive_late_are_compared_with_the_commands_of_their_time(
+    robot, mae, healthy, late, found
+):
+    """The modules follow their commands at once; only the message says how late it is."""
+    core, theta, delay = Estimator(robot), 0.5 * (robot.lower + robot.upper), 0.4
+    core.use(mae)
+
+    def demand(time):
+        return np.full(6, 110.0 + 70.0 * np.sin(4.0 * time))
+
+    for n in range(300):
+        now = 100.0 + n * DT
+        core.commanded(now, tension=demand(now))
+        tension = demand(now - delay)
+        length = robot.muscle_lengths(theta, tension)
+        states_then = states(healthy._replace(tension=tension, length=length))
+        core.take(reading(states_then), now, now, late)
+    assert (core.suspects.finding is not None) == found
+
+
 def message_of(values):
     layout = SimpleNamespace(dim=[], data_offset=0)
     return SimpleNamespace(data=values.ravel(), layout=layout)

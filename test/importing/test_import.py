@@ -457,7 +457,7 @@ def test_missing_limits_are_named_with_the_remedy(cardsflow, tmp_path):
     put(tmp_path, 'model.urdf', text)
     notes = import_robot(cardsflow, tmp_path / 'out').notes
     expected = (
-        'chosen: joint shoulder: limits ±3.142, because the source has none; give it a range in'
+        'chosen: joint shoulder: limits ±3.142, because the source has no range; give it a range in'
     )
     assert f'{expected} joint_limits.yaml' in notes
 

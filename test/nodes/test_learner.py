@@ -31,7 +31,7 @@ from musculoskeletal_ae.ros.messages import LATCHED, array_message
 from musculoskeletal_ae.ros.running import NICENESS
 from musculoskeletal_ae.signals.body_state import Anomaly, BodyState
 
-REST, MOVE = 0.8, 0.1  # duration of a rest, and of the motion between two rests [s]
+REST, MOVE = 0.8, 0.3  # duration of a rest, and of the motion between two rests [s]
 DT = 0.02
 
 

@@ -51,7 +51,7 @@ class WrappedRoutes(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """Poses of joints, route points and tendons in the root link's frame; `place` fills them in."""
+    """Where `place` has put joints, route points and tendons, in the root link's frame."""
 
     rotation: Array  # orientation of each joint, (J, 3, 3)
     translation: Array  # position of each joint [m], (J, 3)

@@ -234,9 +234,9 @@ class LengthDisagreement(Detector):
         change, largest = self._change(self.gap)
         muscle = int(np.abs(change).argmax())
         if self._is_ruptured(muscle, observation.sample, change, largest):
-            short = f'{-1e3 * change[muscle]:.0f} mm shorter than at the measured posture'
+            short = f'{-1e3 * change[muscle]:.0f} mm shorter than expected in the measured posture'
             return Finding(
-                muscle, ConditionKind.SLACK_TENDON, f'it has no tension although it is {short}'
+                muscle, ConditionKind.SLACK_TENDON, f'it has no tension, although it is {short}'
             )
         tension = observation.sample.bone_tension
         jacobian = self._mae.muscle_jacobian(observation.measured, tension)

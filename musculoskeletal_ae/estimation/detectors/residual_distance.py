@@ -215,7 +215,7 @@ class ResidualDistance(Detector):
         if self._beyond < IN_A_ROW:
             return ''
         reached, most = distinct(value, limit)
-        exceeded = f'{self.symbol} = {reached} exceeded {most}{where}'
+        exceeded = f'{self.symbol} = {reached} exceeded its threshold {most}{where}'
         return f'{exceeded} in {IN_A_ROW} consecutive messages'
 
     def _suspects(self, bone_tension: Array, length: Array, candidates: Bools) -> list[int]:
