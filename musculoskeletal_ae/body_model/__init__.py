@@ -2,5 +2,5 @@
 """The calibrated body: a geometric model whose parameters are fitted to samples.
 
 `calibrated_body` is the model; begin there. `priors` states what is expected of its parameters,
-`fit` and `posture_fit` find them, and `body_fit` repeats the fit in each update.
+`fit` and `postures` find them, and `body_fit` repeats the fit in each update.
 """

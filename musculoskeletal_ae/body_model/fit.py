@@ -2,9 +2,9 @@
 """Fits the calibrated body to samples.
 
 The fit is a robust maximum a posteriori estimate (`gauss_newton`) of the parameters together with
-the samples' postures (`posture_fit`). It starts from the last fit. The prior spreads s have
-physical causes: attachments are placed by hand with limited accuracy, and elastic elements of one
-kind differ. With known postures, each muscle is fitted separately:
+the samples' postures (`postures`). It starts from the last fit. The prior spreads s have physical
+causes: attachments are placed by hand with limited accuracy, and elastic elements of one kind
+differ. With known postures, each muscle is fitted separately:
 
     min_w  Σ_n ω_n (l_n − l(θ_n, T_n; w))² / σ² + Σ_k ((w_k − w̄_k) / s_k)²
 
@@ -21,7 +21,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody, Poses
-from musculoskeletal_ae.body_model.posture_fit import FIRST_NOISE, fit_jointly
+from musculoskeletal_ae.body_model.postures import FIRST_NOISE, fit_jointly
 from musculoskeletal_ae.body_model.priors import PRIOR, REOPENED, MusclePrior
 from musculoskeletal_ae.body_model.remainder import learned_remainder
 from musculoskeletal_ae.gauss_newton import (
@@ -52,7 +52,7 @@ class FittedBody(NamedTuple):
     #: robust weights ω of the lengths, (N, M); 0 where a sample does not describe a muscle
     weight: Array
     theta: Array  # fitted postures of the samples [rad], (N, D)
-    #: for each group, its muscles and R; (RᵀR)⁻¹ is the covariance of w, z and e (`posture_fit`)
+    #: for each group, its muscles and R; (RᵀR)⁻¹ is the covariance of w, z and e (`postures`)
     root: list[tuple[Ints, Array]]
 
 

@@ -7,10 +7,10 @@
     gravity   u_ni − R_iᵀ(θ_n) ĝ
 
 Here w are the parameters of the body, θ_n the postures of the samples and z the joint-sensor
-offsets (`posture_fit`). g(θ) are the torques that hold the weight, G is the muscle Jacobian, and
-T_end are the bone-side tensions. K and b describe the joints' springs (`springs`). y_nj are
-measured angles and u_ni measured directions of gravity in the frame of joint i. R_i is the rotation
-of this frame, and ĝ is the direction of gravity in the frame of the root link.
+offsets (`postures`). g(θ) are the torques that hold the weight, G is the muscle Jacobian, and T_end
+are the bone-side tensions. K and b describe the joints' springs (`springs`). y_nj are measured
+angles and u_ni measured directions of gravity in the frame of joint i. R_i is the rotation of this
+frame, and ĝ is the direction of gravity in the frame of the root link.
 """
 
 from __future__ import annotations
