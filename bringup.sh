@@ -226,7 +226,7 @@ if [ $hardware = false ] && [ $network = false ]; then
 fi
 # shellcheck source=.ci/udp.sh
 . "$repository/.ci/udp.sh"
-[ ${#parameters[@]} = 0 ] || "$python" -m musculoskeletal_ae.nodes.parameters "${parameters[@]}" || exit
+[ ${#parameters[@]} = 0 ] || "$python" -m musculoskeletal_ae.nodes.declared_parameters "${parameters[@]}" || exit
 if [ -n "$bag" ]; then
   say "reading $bag"
   "$python" -m musculoskeletal_ae.tools.recorded_robot "$bag" "$robot" "${from[@]}" || exit 2

@@ -46,7 +46,7 @@ from bench.processes import end_processes, memory
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.faults import KINDS, read_fault
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.nodes.parameters import PARAMETERS
+from musculoskeletal_ae.nodes.declared_parameters import PARAMETERS
 from musculoskeletal_ae.nodes.situation import Situation
 from musculoskeletal_ae.process_signals import STOP
 from musculoskeletal_ae.robot.robot import Robot

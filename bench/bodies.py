@@ -41,13 +41,13 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.online_learning import teach
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, HELD_OUT_STREAM, record
 from musculoskeletal_ae.gauss_newton import minimise_each
+from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.calibration import Healthy
-from musculoskeletal_ae.learning.convergence import STEPS, Convergence
+from musculoskeletal_ae.learning.convergence import STEPS, until_converged
 from musculoskeletal_ae.learning.job import Job, Update
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import CAPACITY, Observations
 from musculoskeletal_ae.learning.trainer import Trainer
-from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.robot.robot import Robot
@@ -172,9 +172,10 @@ def package(case: Case, updates: int | None, seed: int) -> str:
         times.append(time.process_time() - begin)
         return made
 
-    until_converged = Convergence().updates(make_update, lambda: updater.body)
-    wanted = until_converged if updates is None else (make_update() for _ in range(updates))
-    *_, update = wanted
+    if updates is None:
+        *_, (update, _) = until_converged(make_update, lambda: updater.body)
+    else:
+        *_, update = (make_update() for _ in range(updates))
     mae, test, body = update.mae, case.test, updater.body
     end = test.end_tension(mae.transmission)
     error = mae.estimate(end, test.length).theta - test.theta

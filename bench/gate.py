@@ -22,9 +22,9 @@ from network_attacks import ATTACKS
 
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
-from musculoskeletal_ae.estimation.network_validation.detector import LEAST_RUPTURED
+from musculoskeletal_ae.estimation.network_validation.detector_check import LEAST_RUPTURED
 from musculoskeletal_ae.estimation.network_validation.message_errors import FLOOR, WORSE
-from musculoskeletal_ae.estimation.network_validation.postures import LIMITS
+from musculoskeletal_ae.estimation.network_validation.posture_check import LIMITS
 from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.exceptions import GateError
 from musculoskeletal_ae.experiments.recording import (

@@ -29,7 +29,6 @@ import numpy as np
 
 from bench.learned_arm import STEPS, Seldom
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.emulator.modules import Arm
@@ -40,6 +39,7 @@ from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.state import StateStore
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 

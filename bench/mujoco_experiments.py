@@ -51,8 +51,8 @@ from musculoskeletal_ae.experiments.recording import (
     record,
 )
 from musculoskeletal_ae.experiments.study import Study
+from musculoskeletal_ae.exporting.exported_mjcf import export_into
 from musculoskeletal_ae.exporting.learned_routes import errors as route_errors
-from musculoskeletal_ae.exporting.mjcf import export_into
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.motion import reach, slowness

@@ -48,7 +48,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.design.prospects import Prospects, prospects
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.exporting.mjcf import export_into
+from musculoskeletal_ae.exporting.exported_mjcf import export_into
 from musculoskeletal_ae.figures import save_figure
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae.initial_training import initial_mae

@@ -41,11 +41,11 @@ from musculoskeletal_ae.experiments.recording import (
     estimation_error,
     record,
 )
+from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.samples import CAPACITY, Observations
 from musculoskeletal_ae.learning.scheduler import STEPS
-from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import one_thread, random_states
 from musculoskeletal_ae.motion.methods import proposed

@@ -30,7 +30,7 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.modules import STEP
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.exporting.mjcf import export
+from musculoskeletal_ae.exporting.exported_mjcf import export
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae, read_groups

@@ -69,7 +69,7 @@ MODULES = {
         'from_json',
     ],
     'report.py': ['Report'],
-    'arrival.py': ['Arrival'],
+    'messages/arrival.py': ['Arrival'],
     'awake_clock.py': ['AwakeClock'],
     'estimation/estimator.py': ['Estimator', 'Output'],
     'estimation/finding.py': ['Finding', 'Observation', 'Detector'],
@@ -81,10 +81,10 @@ MODULES = {
     'control/controller.py': ['Controller'],
     'control/supervisor.py': ['Supervisor', 'Activity', 'StopState'],
     'control/watchdog.py': ['Watchdog'],
-    'control/status.py': ['report', 'conditions', 'slowed'],
+    'control/controller_status.py': ['report', 'conditions', 'slowed'],
     'control/settings.py': ['Settings'],
     'motion/trajectory.py': ['Trajectory', 'Setpoint'],
-    'message_reading.py': ['TrajectoryPoints'],
+    'messages/message_reading.py': ['TrajectoryPoints'],
     'motion/follower.py': ['Follower'],
     'motion/progress.py': ['Progress'],
     'learning/learner.py': ['Learner'],
@@ -191,7 +191,7 @@ def api() -> str:
 
 def parameters() -> str:
     """Return the page of all parameters of all nodes."""
-    from musculoskeletal_ae.nodes.parameters import PARAMETERS
+    from musculoskeletal_ae.nodes.declared_parameters import PARAMETERS
 
     lines = ['# Parameters', '', *PARAMETERS_INTRODUCTION.splitlines(), '']
     for node, table in PARAMETERS.items():

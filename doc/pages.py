@@ -10,7 +10,7 @@ from musculoskeletal_ae.conditions import (
     Revokes,
     stop_causes,
 )
-from musculoskeletal_ae.control import status, supervisor
+from musculoskeletal_ae.control import controller_status, supervisor
 from musculoskeletal_ae.remedy import Step
 
 STOPS = """\
@@ -87,7 +87,7 @@ def stops() -> str:
         table=_table(('cause', 'condition', 'action', 'ends earlier', 'remedy'), causes),
         consequences='\n'.join(
             f'- from `{first.identifier}`: {_listed(kind.identifier for kind in others)}'
-            for first, others in status.CONSEQUENCES.items()
+            for first, others in controller_status.CONSEQUENCES.items()
         ),
         steps=_table(
             ('place', 'identifier', 'step'),

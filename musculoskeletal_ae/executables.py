@@ -64,7 +64,7 @@ def _node_help(name: str) -> str:
 
     The nodes are not imported, because that would take too long.
     """
-    from musculoskeletal_ae.nodes.parameters import COMBINED, help_text
+    from musculoskeletal_ae.nodes.declared_parameters import COMBINED, help_text
 
     parts = []
     for node in COMBINED.get(name, (name,)):

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read files that a user names, and write files atomically.
+"""Read files that a user names, write files atomically, and lock directories.
 
 A file of a user is read only if it is a regular file up to a size limit. The argument
 `refuse(file, problem)` of the functions that read them returns the exception to raise.
 """
 
 import csv
+import fcntl
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, BinaryIO, TextIO, TypeVar
 
 import msgspec
 import yaml
@@ -201,6 +202,26 @@ def new_directory(directory: Path, refuse: Refuse) -> Iterator[None]:
         if not is_there:
             directory.rmdir()
         raise
+
+
+def locked(file: Path) -> TextIO:
+    """Open a file, which is created if it does not exist, and lock it for this process.
+
+    The lock ends when the returned file is closed.
+
+    Raises:
+        BlockingIOError: If another process has locked the file.
+        OSError: If the file cannot be opened.
+    """
+    lock = file.open('w', encoding='utf-8')
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        lock.close()
+        if isinstance(error, BlockingIOError):
+            raise BlockingIOError(f'another process uses {file.parent}') from error
+        raise
+    return lock
 
 
 def write_whole(file: Path, data: bytes, previous: Path | None = None) -> None:

@@ -9,9 +9,9 @@ Settings that a user may choose are a frozen dataclass whose fields are paramete
             0.5, 'time for which a stop holds the last command', 's', 0.0, 60.0
         )
 
-`nodes/parameters.py` assembles the parameters of each node from such classes. `Parameter.checked`
-is the only function that validates a value. The constructor of settings calls it, and so do the
-nodes.
+`nodes/declared_parameters.py` assembles the parameters of each node from such classes.
+`Parameter.checked` is the only function that validates a value. The constructor of settings calls
+it, and so do the nodes.
 """
 
 import sys

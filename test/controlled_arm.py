@@ -8,9 +8,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from musculoskeletal_ae.arrival import LONGEST_STEP
 from musculoskeletal_ae.awake_clock import PAUSE
-from musculoskeletal_ae.message_reading import read_array
+from musculoskeletal_ae.messages.arrival import LONGEST_STEP
+from musculoskeletal_ae.messages.message_reading import read_array
 from musculoskeletal_ae.nodes.controller import ControllerNode
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode

@@ -17,11 +17,10 @@ from estimation.test_body_memory import FOUND, MUSCLES
 
 from bench.attack_kinds import KINDS as ATTACKS
 from bench.mishap_kinds import NAMES as MISHAPS
+from musculoskeletal_ae import remembered_text
 from musculoskeletal_ae.conditions import ConditionKind as Kind
-from musculoskeletal_ae.control import stop_memory
 from musculoskeletal_ae.control.stop_memory import StopMemory
 from musculoskeletal_ae.emulator.reality import make_arm
-from musculoskeletal_ae.estimation import body_memory
 from musculoskeletal_ae.estimation.body_memory import BodyMemory
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.robot.robot import Robot
@@ -160,7 +159,7 @@ def test_every_step_is_advised_by_a_kind_or_where_a_node_states_its_own():
 
 
 def test_offsets_are_saved_once_the_directory_can_be_written(tmp_path, monkeypatch):
-    monkeypatch.setattr(body_memory, 'RETRY_INTERVAL', 0.0)
+    monkeypatch.setattr(remembered_text, 'RETRY_INTERVAL', 0.0)
     directory = tmp_path / 'state'
     directory.write_text('')  # a file in place of the directory
     memory = BodyMemory(directory, MUSCLES)
@@ -173,13 +172,14 @@ def test_offsets_are_saved_once_the_directory_can_be_written(tmp_path, monkeypat
 
 
 def test_a_stop_is_saved_once_the_directory_can_be_written(tmp_path, monkeypatch):
-    monkeypatch.setattr(stop_memory, 'RETRY_INTERVAL', 0.0)
+    monkeypatch.setattr(remembered_text, 'RETRY_INTERVAL', 0.0)
     arm = tmp_path / 'arm'
     memory = StopMemory(arm)
     arm.rename(tmp_path / 'moved')
+    arm.write_text('')  # a file in place of the directory
     memory.note(Kind.OPERATOR.condition())
     assert 'a restarted controller will not know it' in memory.problem
-    (tmp_path / 'moved').rename(arm)
+    arm.unlink()
     memory.note(Kind.OPERATOR.condition())
     assert memory.problem == ''
     memory.close()

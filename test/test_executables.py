@@ -13,7 +13,7 @@ from graph import executable
 from musculoskeletal_ae import executables
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments import NAMES
-from musculoskeletal_ae.nodes.parameters import COMBINED, PARAMETERS, check_names
+from musculoskeletal_ae.nodes.declared_parameters import COMBINED, PARAMETERS, check_names
 
 ROOT = Path(__file__).resolve().parent.parent
 NODES = [*PARAMETERS, *COMBINED]

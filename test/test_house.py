@@ -83,7 +83,13 @@ def test_outside_its_folder_the_paper_is_only_cited() -> None:
     # Folders that implement the paper or compare with it, files whose options name its preset, and
     # the file that names the folders whose code determines an initial network.
     chosen = 'paper', 'presets', 'experiments'
-    offered = 'parameters.py', 'train.py', 'experiment.py', 'network_cache.py'
+    offered = (
+        'parameters.py',
+        'declared_parameters.py',
+        'train.py',
+        'experiment.py',
+        'network_cache.py',
+    )
     for file in sources(PACKAGE):
         if file.parent.name in chosen or file.name in offered:
             continue

@@ -16,7 +16,7 @@ from musculoskeletal_ae.estimation.lengths.length_calibration import stated_thet
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.training import check_device
 from musculoskeletal_ae.mujoco_version import check_mujoco
-from musculoskeletal_ae.nodes.parameters import MOVED, PARAMETERS, check_names
+from musculoskeletal_ae.nodes.declared_parameters import MOVED, PARAMETERS, check_names
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.recorded_joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.storage import LONGEST_PAUSE
 from musculoskeletal_ae.bags.streams import Pairs, Streams, read_streams
 from musculoskeletal_ae.bags.timed_messages import find_pauses

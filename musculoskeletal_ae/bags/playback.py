@@ -19,13 +19,13 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.arrival import SILENCE
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LONGEST_PAUSE, BagMessage
 from musculoskeletal_ae.bags.timed_messages import TimedMessages
 from musculoskeletal_ae.bags.topics import latched_topics
 from musculoskeletal_ae.exceptions import BagError, MessageError
-from musculoskeletal_ae.message_reading import MOST_ENTRIES, target_values
+from musculoskeletal_ae.messages.arrival import SILENCE
+from musculoskeletal_ae.messages.message_reading import MOST_ENTRIES, target_values
 
 LONGEST_LAG = 1.0  # after a longer interruption, resume playback instead of catching up [s]
 #: when a pause of the recording is skipped, continue at this recorded time before the next message

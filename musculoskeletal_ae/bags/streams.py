@@ -13,19 +13,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LATEST
 from musculoskeletal_ae.bags.timed_messages import TimedMessages
 from musculoskeletal_ae.bags.topics import EARLIER, interface_topics
 from musculoskeletal_ae.exceptions import BagError
-from musculoskeletal_ae.message_reading import (
+from musculoskeletal_ae.messages.arrival import Arrival
+from musculoskeletal_ae.messages.message_reading import (
     joints_not_finite,
     read_array,
     read_names,
     read_posture,
 )
-from musculoskeletal_ae.reception import Reception
+from musculoskeletal_ae.messages.reception import Reception
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
 from musculoskeletal_ae.signals.joint_series import JointSeries, judge_series

@@ -4,5 +4,6 @@
 `controller` connects the parts; begin there. `watchdog` detects stop causes, which `conditions.py`
 declares, and `supervisor` decides what follows. `activities` is the interface of everything that
 the arm can do; `motion/` implements it. `stop_commands` computes the commands while the arm is
-stopped. Every command finally passes the `limiter`. `status` reports to users and programs.
+stopped. Every command finally passes the `limiter`. `controller_status` reports to users and
+programs.
 """

@@ -30,7 +30,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.awake_clock import PAUSE, AwakeClock
 from musculoskeletal_ae.conditions import ORDER, Action, Condition, ConditionKind
-from musculoskeletal_ae.control import status
+from musculoskeletal_ae.control import controller_status
 from musculoskeletal_ae.control.activities import ActivityControl, Inputs
 from musculoskeletal_ae.control.command import LENGTH, TENSION, Command, Pull
 from musculoskeletal_ae.control.holding import HoldingCheck
@@ -42,7 +42,7 @@ from musculoskeletal_ae.control.supervisor import Activity, Supervisor
 from musculoskeletal_ae.control.watchdog import Watchdog
 from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.message_reading import TrajectoryPoints
+from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion.calibrating import Calibrating, gentle_limit
 from musculoskeletal_ae.motion.exploration import Exploration, Exploring
 from musculoskeletal_ae.motion.follower import Follower
@@ -491,11 +491,11 @@ class Controller:
 
     def conditions(self, now: float) -> tuple[Condition, ...]:
         """Return everything that users should know: causes of the stop, and warnings."""
-        return status.conditions(self, now)
+        return controller_status.conditions(self, now)
 
     def report(self, now: float) -> Report:
         """Return the status for /diagnostics."""
-        return status.report(self, now)
+        return controller_status.report(self, now)
 
     def stop_conditions(self, now: float) -> list[Condition]:
         """Return the stop causes that are present, in the order of `ConditionKind`."""

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.arrival import INTERRUPTION
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.messages.arrival import INTERRUPTION
 from musculoskeletal_ae.parameters import PRESET, CheckedSettings, settable
 from musculoskeletal_ae.robot.joint_units import SLIDE, JointUnits
 

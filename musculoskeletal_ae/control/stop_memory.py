@@ -11,20 +11,15 @@ killed or has crashed. A controller that finds controller.stop when it starts is
 beginning, and moves the arm only after `controller/reset`.
 """
 
-import fcntl
-import time
-from contextlib import suppress
 from pathlib import Path
 from typing import TextIO
 
 from musculoskeletal_ae.conditions import Condition, ConditionKind, stop_causes
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.files import read_text
+from musculoskeletal_ae.files import locked
+from musculoskeletal_ae.remembered_text import RememberedText
 
 FILE, LOCK = 'controller.stop', 'controller.lock'
-#: ignore the content of a larger file, which then counts as the stop cause `restarted` [bytes]
-LARGEST = 10_000
-RETRY_INTERVAL = 2.0  # wait this long after a failed attempt to write [s]
 BEFORE = 'before this controller was started'
 
 
@@ -33,7 +28,6 @@ class StopMemory:
 
     Attributes:
         found: The stop that the previous controller has left behind, or None.
-        problem: Why the present stop cannot be kept, or ''.
     """
 
     def __init__(self, directory: Path | None) -> None:
@@ -47,11 +41,9 @@ class StopMemory:
             MusculoskeletalError: If the directory cannot be used, or another controller uses it.
         """
         self.found: Condition | None = None
-        self.problem = ''
         self._written: ConditionKind | None = None  # the stop cause that the file contains
         self._is_latched = False  # whether the file has to outlive this controller
-        self._next_attempt = 0.0
-        self._file: Path | None = None
+        self._file: RememberedText | None = None
         self._lock: TextIO | None = None
         if directory is None:
             return
@@ -59,9 +51,9 @@ class StopMemory:
         try:
             file = directory.expanduser() / FILE
             file.parent.mkdir(parents=True, exist_ok=True)
-            self._lock = file.with_name(LOCK).open('w', encoding='utf-8')
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            exists = file.exists()
+            self._lock = locked(file.with_name(LOCK))
+            remembered = RememberedText(file)
+            text = remembered.read()
         except BlockingIOError as error:
             self.close()
             remedy = (
@@ -77,9 +69,9 @@ class StopMemory:
                 'without remembering stops (a latched stop then ends with the controller)'
             )
             raise MusculoskeletalError(f'{name} cannot be used ({error}); {remedy}') from error
-        self._file = file
-        if exists:
-            self._is_latched, self._written = True, _cause_in(file)
+        self._file = remembered
+        if text is not None:
+            self._is_latched, self._written = True, _cause_in(text)
             self.found = self._written.condition(BEFORE)
 
     def note(self, stop: Condition | None) -> None:
@@ -93,40 +85,33 @@ class StopMemory:
         """
         self._is_latched = stop is not None
         cause = ConditionKind.RESTARTED if stop is None else stop.kind
-        if self._file is None or cause is self._written or time.monotonic() < self._next_attempt:
+        if self._file is None or cause is self._written:
             return
-        new = self._file.with_name(f'.{FILE}')
-        try:
-            # Write without fsync, which could delay a command by 0.1 s. If the process is killed,
-            # nothing that was written is lost. A power failure may leave an empty file, which
-            # counts as `restarted`.
-            text = cause.text if stop is None else stop.text
-            new.write_text(f'{cause.identifier}\n{text}\n', encoding='utf-8')
-            new.replace(self._file)
-        except OSError as error:
-            self._next_attempt = time.monotonic() + RETRY_INTERVAL
-            self.problem = (
-                f'the stop cannot be saved, so a restarted controller will not know it: {error}'
-            )
-        else:
-            self._written, self.problem = cause, ''
+        text = cause.text if stop is None else stop.text
+        if self._file.write(f'{cause.identifier}\n{text}\n'):
+            self._written = cause
+
+    @property
+    def problem(self) -> str:
+        """Why the present stop cannot be kept, as a text for users; '' if it is kept."""
+        if self._file is None or not self._file.problem:
+            return ''
+        lost = 'the stop cannot be saved, so a restarted controller will not know it'
+        return f'{lost}: {self._file.problem}'
 
     def close(self) -> None:
         """Delete the file unless a stop is latched, and release the directory."""
         if self._file is not None and not self._is_latched:
-            with suppress(OSError):
-                self._file.unlink(missing_ok=True)
+            self._file.delete()
         if self._lock is not None:
             self._lock.close()
             self._lock = None
         self._file = None
 
 
-def _cause_in(file: Path) -> ConditionKind:
-    """Return the stop cause in a file; `restarted` if the file states none."""
-    with suppress(MusculoskeletalError):
-        text = read_text(file, lambda _, problem: MusculoskeletalError(problem), LARGEST)
-        for cause in stop_causes():
-            if text.partition('\n')[0] == cause.identifier:
-                return cause
+def _cause_in(text: str) -> ConditionKind:
+    """Return the stop cause in the text of a file; `restarted` if the text states none."""
+    for cause in stop_causes():
+        if text.partition('\n')[0] == cause.identifier:
+            return cause
     return ConditionKind.RESTARTED

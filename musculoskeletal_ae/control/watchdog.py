@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.arrival import LONGEST_STEP, Arrival
 from musculoskeletal_ae.awake_clock import PAUSE, AwakeClock
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.messages.arrival import LONGEST_STEP, Arrival
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.heat import Heat, soon

@@ -20,7 +20,7 @@ from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.driver.pace import Pace
 from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.message_reading import (
+from musculoskeletal_ae.messages.message_reading import (
     joints_not_finite,
     read_posture,
 )

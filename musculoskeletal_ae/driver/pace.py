@@ -15,14 +15,14 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.arrival import INTERRUPTION
 from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.driver.verdict import Verdict
+from musculoskeletal_ae.messages.arrival import INTERRUPTION
 from musculoskeletal_ae.report import is_overloaded
 
 RATE_TOLERANCE = 0.2  # accept a rate that deviates from the expected one by this share
 #: Begin the motion test only at this rate or above [Hz], unless the expected rate is lower. A
-#: muscle that runs away is then noticed within 33 ms, and `motion.MEAN` averages 9 readings.
+#: muscle that runs away is then noticed within 33 ms, and `motion_test.MEAN` averages 9 readings.
 LEAST_RATE = 30.0
 #: report a longer gap between messages as a fault of the driver, even if this computer is
 #: overloaded [s]

@@ -15,7 +15,7 @@ from collections.abc import Generator, Sequence
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.driver.motion import (
+from musculoskeletal_ae.driver.motion_test import (
     ABOVE_BIAS,
     HOLD,
     RELEASE,

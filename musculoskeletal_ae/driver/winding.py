@@ -29,7 +29,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.driver.motion import (
+from musculoskeletal_ae.driver.motion_test import (
     ABOVE_BIAS,
     HOLD,
     LATEST,

@@ -14,20 +14,16 @@ other nodes would have to infer from the change that this is wrong.
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.files import read_text
+from musculoskeletal_ae.remembered_text import RememberedText
 from musculoskeletal_ae.signals.body_state import MOST_OFFSET, BodyState, LengthOffsets
 
 FILE = 'estimator.offsets'  # name of the file, in the directory that the user chooses
-LARGEST = 1_000_000  # treat a file larger than this as damaged, and use none of its values [bytes]
-RETRY_INTERVAL = 2.0  # wait this long after a failed attempt to write [s]
 
 
 class BodyMemory:
@@ -37,7 +33,6 @@ class BodyMemory:
         found: The body state that the previous estimator has left behind; None if there was none.
             Its offsets are known only if they were known to be zero, otherwise they are unknown,
             with 0 for muscles that the file does not name.
-        problem: Why the present body state could not be saved, as a text for users; '' if it was.
     """
 
     def __init__(self, directory: Path | None, muscles: Sequence[str]) -> None:
@@ -48,29 +43,32 @@ class BodyMemory:
             muscles: Names of all muscles.
         """
         self._muscles = muscles
-        self._file: Path | None = None
+        self._file: RememberedText | None = None
         self._was_decided = True  # whether the last offsets were known or revoked, not provisional
         self._saved: tuple[LengthOffsets, tuple[int, ...]] | None = None  # what the file contains
         self.found: BodyState | None = None
         self._has_file = False
         self._noted: BodyState | None = None  # the body state of the last call of `note`
-        self._next_attempt = 0.0
-        self.problem = ''
         # A NUL in the path raises a ValueError, and an unknown home directory a RuntimeError.
         with suppress(OSError, ValueError, RuntimeError):
             if directory is not None:
-                self._file = directory.expanduser() / FILE
-                self._has_file = self._file.exists()
-                if self._has_file:
-                    self.found = self._read(self._file)
+                self._file = RememberedText(directory.expanduser() / FILE)
+                if (text := self._file.read()) is not None:
+                    self.found, self._has_file = self._parse(text), True
 
-    def _read(self, file: Path) -> BodyState:
-        """Read the body state from the file; if it is damaged, return unknown offsets of 0."""
+    @property
+    def problem(self) -> str:
+        """Why the present body state could not be saved, as a text for users; '' if it was."""
+        if self._file is None or not self._file.problem:
+            return ''
+        lost = 'length offsets and isolated muscles cannot be saved'
+        return f'{lost}, so a restarted estimator will not know them: {self._file.problem}'
+
+    def _parse(self, text: str) -> BodyState:
+        """Return the body state in the text of the file; unknown offsets of 0 if it is damaged."""
         unknown = LengthOffsets.unknown(len(self._muscles))
-        with suppress(MusculoskeletalError, ValueError, TypeError, KeyError, AttributeError):
-            content = json.loads(
-                read_text(file, lambda _, problem: MusculoskeletalError(problem), LARGEST)
-            )
+        with suppress(ValueError, TypeError, KeyError, AttributeError):
+            content = json.loads(text)
             names, generation = content.get('isolated', []), int(content['generation'])
             isolated = tuple(m for m, name in enumerate(self._muscles) if name in names)
             saved = content['offset']
@@ -90,7 +88,7 @@ class BodyMemory:
         reason, and a later call tries again.
         """
         is_noted = body is self._noted and not self.problem
-        if self._file is None or is_noted or time.monotonic() < self._next_attempt:
+        if self._file is None or is_noted:
             return
         self._noted = body
         offsets = body.offsets
@@ -99,33 +97,22 @@ class BodyMemory:
             offsets, _ = self._saved
         is_healthy = _are_zero(offsets) and not body.isolated
         is_known = self._saved == (offsets, body.isolated)
-        if not (is_known or (is_healthy and not self._has_file)):
-            try:
-                self._save(self._file, offsets, body)
-            except OSError as error:
-                self._next_attempt = time.monotonic() + RETRY_INTERVAL
-                self.problem = (
-                    'length offsets and isolated muscles cannot be saved, so a restarted estimator '
-                    f'will not know them: {error}'
-                )
-                return
+        if is_known or (is_healthy and not self._has_file):
+            self._file.problem = ''  # an attempt to save another body state may have failed
+        elif self._file.write(self._text(offsets, body)):
             self._saved, self._has_file = (offsets, body.isolated), True
-        self._was_decided, self.problem = is_decided, ''
+        else:
+            return
+        self._was_decided = is_decided
 
-    def _save(self, file: Path, offsets: LengthOffsets, body: BodyState) -> None:
+    def _text(self, offsets: LengthOffsets, body: BodyState) -> str:
         by_name = dict(zip(self._muscles, offsets.offset.tolist(), strict=True))
         content = {
             'generation': body.generation,
             'offset': None if _are_zero(offsets) else by_name,
             'isolated': [self._muscles[muscle] for muscle in body.isolated],
         }
-        file.parent.mkdir(parents=True, exist_ok=True)
-        # Write without fsync, which could delay an estimate by 0.1 s. If the process is killed,
-        # nothing that was written is lost. A power failure may leave an empty file; a reader treats
-        # it as damaged.
-        new = file.with_name(f'.{FILE}')
-        new.write_text(json.dumps(content), encoding='utf-8')
-        new.replace(file)
+        return json.dumps(content)
 
 
 def _are_zero(offsets: LengthOffsets) -> bool:

@@ -24,12 +24,12 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.arrival import INTERRUPTION, LONGEST_STEP, SILENCE, SPACING
 from musculoskeletal_ae.conditions import Condition, ConditionKind
-from musculoskeletal_ae.estimation import status
+from musculoskeletal_ae.estimation import estimator_status
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
 from musculoskeletal_ae.estimation.estimate import Estimate, estimate
+from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings
 from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.further_loss import needed_muscles
 from musculoskeletal_ae.estimation.health import HealthMonitor
@@ -42,12 +42,12 @@ from musculoskeletal_ae.estimation.module_commands import ModuleCommands
 from musculoskeletal_ae.estimation.mounting import MountingCheck
 from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.estimation.repair_check import LARGEST_LEARNED, LARGEST_YOUNG, RepairCheck
-from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.estimation.suspect_verification import LONGEST
 from musculoskeletal_ae.estimation.suspects import SuspectHandling
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
+from musculoskeletal_ae.messages.arrival import INTERRUPTION, LONGEST_STEP, SILENCE, SPACING
 from musculoskeletal_ae.remedy import REPAIR, Step, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
@@ -390,14 +390,14 @@ class Estimator:
 
     def report(self, now: float) -> Report:
         """Report the status for /diagnostics; `now` is a time of the steady clock [s]."""
-        return status.report(self, now)
+        return estimator_status.report(self, now)
 
     def conditions(self, now: float) -> tuple[Condition, ...]:
         """Return the conditions of readings, body and network that users should know.
 
         `now` is a time of the steady clock [s].
         """
-        return status.conditions(self, now)
+        return estimator_status.conditions(self, now)
 
     def rejected_because(self, now: float) -> str:
         """Return why all muscle states of the last 0.1 s or longer were rejected; '' otherwise."""

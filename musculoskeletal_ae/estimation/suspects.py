@@ -41,8 +41,8 @@ muscles. While a muscle is being verified, it cannot be restored.
 from collections.abc import Iterable
 
 from musculoskeletal_ae.conditions import FindingReaction
+from musculoskeletal_ae.estimation.estimator_settings import ISOLATE, EstimatorSettings
 from musculoskeletal_ae.estimation.finding import Finding
-from musculoskeletal_ae.estimation.settings import ISOLATE, EstimatorSettings
 from musculoskeletal_ae.estimation.suspect_verification import (
     ModuleLaw,
     Outcome,

@@ -16,7 +16,7 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import ArmReadings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.settings import EstimatorSettings
+from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.exploration import Exploration

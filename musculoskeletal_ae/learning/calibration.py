@@ -15,7 +15,7 @@ not used to compute Σ, so that it is not too low for new messages. Single messa
 others are regarded as sensor glitches and excluded.
 
 If joint sensors read all angles, the network also learns from every second recent message
-(`update`). The other recent messages serve to validate its estimates.
+(`body_updater`). The other recent messages serve to validate its estimates.
 """
 
 from collections.abc import Iterable

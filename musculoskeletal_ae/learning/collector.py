@@ -10,6 +10,7 @@ Values of isolated muscles are replaced by 0 before messages are paired. A sampl
 that were isolated when it was taken.
 """
 
+import math
 from collections import Counter
 from dataclasses import replace
 from typing import Any
@@ -17,12 +18,12 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.learning.anomaly_margin import AnomalyMargin
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.rest import REST_TIME, RestDetector
 from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
 from musculoskeletal_ae.learning.slow_moments import SlowMoments
+from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.joint_stream import JointStream
@@ -177,11 +178,15 @@ class SampleCollector:
             )
         return self._pairing.muscles(time, sample)
 
-    def collect(self, paired: Paired[MuscleSample]) -> list[Sample]:
+    def collect(self, paired: Paired[MuscleSample], now: float = math.nan) -> list[Sample]:
         """Use a message and its θ to detect rests; return the samples that were stored.
 
         A message is used only after `margin` has held it back for some time. Messages during an
         anomaly and shortly after it are ignored.
+
+        Args:
+            paired: The message and its θ.
+            now: The present time, at which new samples are accepted [s], if it is known.
         """
         dt = min(paired.dt, self._longest_pause)
         measured = self._unmeasured if paired.theta is None else paired.theta
@@ -213,7 +218,7 @@ class SampleCollector:
         for waited in self._margin.hold(dt, reading, rest):
             self.healthy.step(waited.reading, waited.dt)
             if waited.rest is not None and self._is_new(waited.rest):
-                self.accept(waited.rest)
+                self.accept(waited.rest, now)
                 new.append(waited.rest)
         return new
 
@@ -224,9 +229,12 @@ class SampleCollector:
         self.rejected['like a stored one'] += 1
         return False
 
-    def accept(self, sample: Sample) -> None:
-        """Accept a sample: store it, as a description of the muscles that are not isolated."""
-        self.samples.add(sample, self.body.used.copy())
+    def accept(self, sample: Sample, now: float = math.nan) -> None:
+        """Accept a sample: store it, as a description of the muscles that are not isolated.
+
+        `now` is the time at which it is accepted [s], if it is known.
+        """
+        self.samples.add(sample, self.body.used.copy(), time=now)
 
     # -- changes of state -----------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ On a running arm, each rest causes an update instead (`scheduler`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -47,48 +47,41 @@ def model_error(update: Update, body: CalibratedBody) -> float:
     return float(np.exp(np.log(error).mean()))
 
 
-class Convergence:
-    """Makes updates of a network until they have converged.
+def until_converged(
+    make_update: Callable[[], Update | None], body: Callable[[], CalibratedBody | None]
+) -> Iterator[tuple[Update, float]]:
+    """Make updates until the network represents the body; yield each with its `model_error` [rad].
 
-    Attributes:
-        errors: `model_error` after each update [rad]; NaN if the preset fits no body.
+    The error is NaN if the preset fits no body.
+
+    Args:
+        make_update: Makes one update from all samples; None if there are too few.
+        body: Returns the body of the last update; None if the preset fits no body.
     """
+    errors = list[float]()
+    while not is_reached(errors):
+        update = make_update()
+        if update is None:
+            return
+        fitted = body()
+        errors.append(np.nan if fitted is None else model_error(update, fitted))
+        yield update, errors[-1]
+        if update.unchanged:
+            return
 
-    def __init__(self) -> None:
-        self.errors = list[float]()
 
-    def updates(
-        self, make_update: Callable[[], Update | None], body: Callable[[], CalibratedBody | None]
-    ) -> Iterator[Update]:
-        """Make and yield updates until the network represents the body.
+def is_reached(errors: Sequence[float]) -> bool:
+    """Return whether no more updates are needed, from the error after each update [rad].
 
-        Args:
-            make_update: Makes one update from all samples; None if there are too few.
-            body: Returns the body of the last update; None if the preset fits no body.
-        """
-        while not self.is_reached:
-            update = make_update()
-            if update is None:
-                return
-            fitted = body()
-            self.errors.append(np.nan if fitted is None else model_error(update, fitted))
-            yield update
-            if update.unchanged:
-                return
+    Without a learned body, LEAST_UPDATES are made.
+    """
+    count = len(errors)
+    return count >= MOST_UPDATES or (count >= LEAST_UPDATES and not is_falling(errors))
 
-    @property
-    def is_reached(self) -> bool:
-        """Whether no more updates are needed.
 
-        Without a learned body, LEAST_UPDATES are made.
-        """
-        count = len(self.errors)
-        return count >= MOST_UPDATES or (count >= LEAST_UPDATES and not self.is_falling)
-
-    @property
-    def is_falling(self) -> bool:
-        """Whether the error has fallen by LEAST_DECREASE during the last PATIENCE updates."""
-        if len(self.errors) <= PATIENCE:
-            return False
-        before, recent = self.errors[-PATIENCE - 1], self.errors[-PATIENCE:]
-        return min(recent) < (1.0 - LEAST_DECREASE) * before
+def is_falling(errors: Sequence[float]) -> bool:
+    """Return whether the error has fallen by LEAST_DECREASE during the last PATIENCE updates."""
+    if len(errors) <= PATIENCE:
+        return False
+    before, recent = errors[-PATIENCE - 1], errors[-PATIENCE:]
+    return min(recent) < (1.0 - LEAST_DECREASE) * before

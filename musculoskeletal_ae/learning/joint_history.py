@@ -9,13 +9,8 @@ keep tensions, lengths and the other angles. What happens next depends on the es
     confirmed by user    the doubt was wrong, so the samples get their angles back
 """
 
-from collections import deque
-
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.joint_trust import JointTrust, SensorTrust
-
-#: remember the times of this many newest samples, to find those taken after a doubt began
-MOST_RECENT = 400
 
 
 class JointHistory:
@@ -29,26 +24,19 @@ class JointHistory:
         """Start with sensors that are all trusted."""
         self._samples = samples
         self._trust = JointTrust.full(joint_count)
-        #: times [s] and numbers of recent samples
-        self._recent: deque[tuple[float, int]] = deque(maxlen=MOST_RECENT)
         #: angles that were removed [rad], by number of the sample, for each unused joint
         self._removed: dict[int, dict[int, float]] = {}
         self.given_up = 0
-
-    def accepted(self, now: float) -> None:
-        """Record that the newest accepted sample of the store was taken at `now` [s]."""
-        self._recent.append((now, self._samples.accepted))
 
     def use(self, trust: JointTrust) -> tuple[int, ...]:
         """Use another trust: remove or put back angles; return the newly unused joints."""
         before, self._trust = self._trust, trust
         new = tuple(j for j in trust.unused if before.is_used[j])
         for j in new:
-            numbers = {number for at, number in self._recent if at >= trust.since[j]}
-            self._removed[j] = self._samples.remove_angles(j, numbers)
+            self._removed[j] = self._samples.remove_angles(j, trust.since[j])
             self.given_up += len(self._removed[j])
         for j in [j for j in self._removed if trust.is_used[j]]:
             removed = self._removed.pop(j)
             if trust.trust[j] is SensorTrust.CONFIRMED and before.trust[j] is SensorTrust.DOUBTED:
-                self.given_up -= self._samples.put_back_angles(j, removed)
+                self.given_up -= self._samples.set_angles(j, removed)
         return new

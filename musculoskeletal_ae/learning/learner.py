@@ -27,21 +27,21 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.body_model.joint_stops import LARGEST_OFFSET
 from musculoskeletal_ae.conditions import Condition
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.calibration import Reservoir, uncalibrated
+from musculoskeletal_ae.learning.checkpoint_keeper import CheckpointKeeper
 from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR, SampleCollector
 from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.learning.joint_history import JointHistory
-from musculoskeletal_ae.learning.keeper import CheckpointKeeper
+from musculoskeletal_ae.learning.learner_status import learner_conditions, learner_report
 from musculoskeletal_ae.learning.offset_history import HELD_TIME, OffsetHistory
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.scheduler import LEAST_BLIND, STEPS, UpdateScheduler
-from musculoskeletal_ae.learning.status import learner_conditions, learner_report
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
@@ -182,9 +182,7 @@ class Learner:
             return
         if self.collector.has_jumped:  # since the last calibration of the lengths
             return
-        for _ in self.collector.collect(paired):
-            self.offset_history.accepted(time)
-            self.joint_history.accepted(time)
+        for _ in self.collector.collect(paired, time):
             self._note_new_samples()
 
     def _use_known_offsets(self) -> None:

@@ -16,8 +16,6 @@ offsets are corrected.
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
@@ -52,16 +50,9 @@ class OffsetHistory:
         self._offset = samples.held_offset if samples.held else offset
         #: number of the first sample that was taken under the present offsets
         self._first = samples.accepted + 1
-        self._recent: deque[tuple[float, int]] = deque()  # times [s] and numbers of recent samples
         self._is_revoked = bool(samples.held)
         self._is_continuous = True  # whether no jump or gap has occurred since `_first`
         self.dropped = self.corrected = 0
-
-    def accepted(self, now: float) -> None:
-        """Record that the newest sample of the store was taken at `now` [s]."""
-        self._recent.append((now, self._samples.accepted))
-        while self._recent and not 0.0 <= now - self._recent[0][0] <= HELD_TIME:
-            self._recent.popleft()
 
     def interrupt(self) -> None:
         """Record a jump or gap, after which the muscle modules may have lost their position."""
@@ -70,8 +61,7 @@ class OffsetHistory:
     def revoke(self, now: float) -> None:
         """Hold back recent samples, because a finding at `now` [s] has revoked the offsets."""
         if not self._is_revoked:
-            recent = {number for at, number in self._recent if 0.0 <= now - at <= HELD_TIME}
-            self._samples.hold(recent, self._offset)
+            self._samples.hold(now - HELD_TIME, now, self._offset)
         self._is_revoked = True
 
     def use(self, offset: Array) -> None:
@@ -92,6 +82,5 @@ class OffsetHistory:
             else:
                 self._first = self._samples.accepted + 1
         if size > CALIBRATION_SPREAD or self._is_revoked:
-            self._recent.clear()
             self._is_continuous = True
         self._offset, self._is_revoked = offset, False

@@ -21,7 +21,7 @@ from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.collector import SampleCollector
-from musculoskeletal_ae.learning.convergence import STEPS, Convergence
+from musculoskeletal_ae.learning.convergence import STEPS, until_converged
 from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
@@ -77,7 +77,7 @@ def collect(learner: Learner, table: Table, progress: Callable[[float], None] | 
     return ''
 
 
-def complete(learner: Learner, progress: Callable[[float], None] | None = None) -> Convergence:
+def complete(learner: Learner, progress: Callable[[float], None] | None = None) -> list[float]:
     """Make updates until the network represents the body that was fitted to all samples.
 
     Nothing happens if there are too few samples.
@@ -87,9 +87,8 @@ def complete(learner: Learner, progress: Callable[[float], None] | None = None) 
         progress: Called with 1 after each update.
 
     Returns:
-        Whether the updates have converged, and the errors on synthetic samples.
+        The error on synthetic samples after each update (`until_converged`) [rad].
     """
-    convergence = Convergence()
     learner.use_body(learner.body.with_anomaly(Anomaly.NONE))
     now = 0.0  # the caller's clock was that of the recording; a new one begins here
 
@@ -101,10 +100,12 @@ def complete(learner: Learner, progress: Callable[[float], None] | None = None) 
         learner.poll(now, STEPS)
         return None if learner.updates == before else learner.last_update
 
-    for _ in convergence.updates(make_update, lambda: learner.trainer.body):
+    errors = list[float]()
+    for _, error in until_converged(make_update, lambda: learner.trainer.body):
+        errors.append(error)
         if progress is not None:
             progress(1.0)
-    return convergence
+    return errors
 
 
 def unchanged(learner: Learner) -> str:

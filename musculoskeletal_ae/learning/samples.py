@@ -11,9 +11,10 @@ tensions so far, and the newest sample always stays.
 
 from __future__ import annotations
 
-from bisect import bisect
-from collections.abc import Mapping, Sequence, Set
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -55,6 +56,8 @@ class StoredSample(NamedTuple):
     sample: Sample
     known: Bools  # whether the sample describes each muscle, (M,)
     number: int  # position among all samples ever accepted, from 1
+    #: when it was accepted [s]; NaN if that is unknown, as after a restart
+    time: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -117,19 +120,29 @@ class Observations:
 
 
 class SampleStore:
-    """Keeps up to `capacity` samples in the order in which they were accepted."""
+    """Keeps up to `capacity` samples in the order in which they were accepted.
+
+    Attributes:
+        stored: The samples from which the learner learns, the oldest first.
+        accepted: Number of samples ever accepted.
+        held: Samples that are held back because their length offsets are in doubt.
+        held_offset: These length offsets [m], (M,).
+    """
 
     def __init__(self, capacity: int = CAPACITY) -> None:
         """Create an empty store for at most `capacity` samples."""
-        self.capacity = capacity
-        self.accepted = 0  # number of samples ever accepted
-        #: samples that are held back because their length offsets are in doubt, and these offsets
+        self.capacity, self.accepted = capacity, 0
+        self.stored: list[StoredSample] = []
         self.held: list[StoredSample] = []
         self.held_offset: Array = NOTHING
-        self.clear()
 
     def __len__(self) -> int:
-        return len(self.samples)
+        return len(self.stored)
+
+    @property
+    def samples(self) -> list[Sample]:
+        """The samples from which the learner learns, the oldest first."""
+        return [each.sample for each in self.stored]
 
     def is_new(self, sample: Sample) -> bool:
         """Return whether a sample is new: an angle or tension differs from every stored sample.
@@ -139,54 +152,51 @@ class SampleStore:
         points = self._scaled([*self.samples, sample])
         return bool((np.nanmax(np.abs(points[:-1] - points[-1]), axis=1) > 1.0).all())
 
-    def add(self, sample: Sample, known: Bools | None = None, number: int | None = None) -> None:
+    def add(
+        self,
+        sample: Sample,
+        known: Bools | None = None,
+        number: int | None = None,
+        time: float = math.nan,
+    ) -> None:
         """Add a sample as the newest one.
 
         Args:
             sample: The sample.
             known: Whether the sample describes each muscle, (M,); by default, it describes all.
             number: Number of a sample that is restored from disk; by default the next number.
+            time: Time at which it is accepted [s].
         """
         self.accepted = number or self.accepted + 1
-        self.samples.append(sample)
-        self.known.append(np.ones(len(sample.tension), dtype=bool) if known is None else known)
-        self.numbers.append(self.accepted)
-        if len(self.samples) > self.capacity:
-            worst = self._dispensable()
-            del self.samples[worst], self.known[worst], self.numbers[worst]
+        described = np.ones(len(sample.tension), dtype=bool) if known is None else known
+        self.stored.append(StoredSample(sample, described, self.accepted, time))
+        if len(self.stored) > self.capacity:
+            del self.stored[self._dispensable()]
 
     def all(self) -> list[Sample]:
         """Return all samples, including the held ones."""
-        return [*self.samples, *(each.sample for each in self.held)]
+        return [each.sample for each in (*self.stored, *self.held)]
 
     def forget(self, muscle: int, newest: int = 0) -> None:
         """Forget what all but the last `newest` samples say about a muscle."""
-        for known in self.known[: len(self.known) - newest]:
-            known[muscle] = False
-        for held in self.held:
-            held.known[muscle] = False
+        for each in (*self.stored[: len(self.stored) - newest], *self.held):
+            each.known[muscle] = False
 
-    def hold(self, numbers: Set[int], offset: Array) -> None:
-        """Hold back the samples with these numbers until it is known whether they are correct.
+    def hold(self, since: float, now: float, offset: Array) -> None:
+        """Hold back the samples of some time until it is known whether they are correct.
 
         Args:
-            numbers: Numbers of the samples.
+            since: Beginning of this time [s].
+            now: End of this time [s].
             offset: Length offsets under which they were taken [m], (M,).
         """
-        stored = [*map(StoredSample, self.samples, self.known, self.numbers)]
-        for place in reversed(range(len(stored))):
-            if stored[place].number in numbers:
-                del self.samples[place], self.known[place], self.numbers[place]
-        self.held += [each for each in stored if each.number in numbers]
+        self.held += [each for each in self.stored if since <= each.time <= now]
+        self.stored = [each for each in self.stored if not since <= each.time <= now]
         self.held_offset = offset
 
     def put_back_held(self) -> None:
         """Put back the held samples at their original positions."""
-        for each in self.held:
-            place = bisect(self.numbers, each.number)
-            self.samples.insert(place, each.sample)
-            self.known.insert(place, each.known)
-            self.numbers.insert(place, each.number)
+        self.stored = sorted([*self.stored, *self.held], key=attrgetter('number'))
         self.held = []
 
     def drop_held(self) -> int:
@@ -194,30 +204,31 @@ class SampleStore:
         count, self.held = len(self.held), []
         return count
 
-    def remove_angles(self, joint: int, numbers: Set[int]) -> dict[int, float]:
-        """Remove θ of a joint from the samples with these numbers.
+    def remove_angles(self, joint: int, since: float) -> dict[int, float]:
+        """Remove θ of a joint from the samples accepted at `since` [s] or later.
 
         Returns:
             The removed angles [rad] by number of the sample.
         """
-        removed = dict[int, float]()
-        for place, number in enumerate(self.numbers):
-            if number in numbers and np.isfinite(angle := self.samples[place].theta[joint]):
-                removed[number] = float(angle)
-                self._set_angle(place, joint, np.nan)
+        recent = {
+            each.number: float(each.sample.theta[joint])
+            for each in self.stored
+            if each.time >= since
+        }
+        removed = {number: angle for number, angle in recent.items() if np.isfinite(angle)}
+        self.set_angles(joint, dict.fromkeys(removed, np.nan))
         return removed
 
-    def put_back_angles(self, joint: int, angles: Mapping[int, float]) -> int:
-        """Put removed angles [rad] of a joint back, by number; return how many were put back."""
-        places = [place for place, number in enumerate(self.numbers) if number in angles]
-        for place in places:
-            self._set_angle(place, joint, angles[self.numbers[place]])
-        return len(places)
-
-    def _set_angle(self, place: int, joint: int, angle: float) -> None:
-        theta = self.samples[place].theta.copy()
-        theta[joint] = angle
-        self.samples[place] = self.samples[place]._replace(theta=theta)
+    def set_angles(self, joint: int, angles: Mapping[int, float]) -> int:
+        """Set θ of a joint [rad] in some samples, by number; return how many there are."""
+        count = 0
+        for place, each in enumerate(self.stored):
+            if each.number in angles:
+                theta = each.sample.theta.copy()
+                theta[joint] = angles[each.number]
+                self.stored[place] = each._replace(sample=each.sample._replace(theta=theta))
+                count += 1
+        return count
 
     def lengthen(self, by: Array, first: int) -> int:
         """Add `by` [m] (M,) to the lengths of all samples with number `first` or above.
@@ -227,27 +238,26 @@ class SampleStore:
         Returns:
             The number of changed samples.
         """
-        places = [i for i, number in enumerate(self.numbers) if number >= first]
-        for i in places:
-            sample = self.samples[i]
-            used = ~np.isin(np.arange(len(by)), sample.isolated)
-            self.samples[i] = sample._replace(length=sample.length + by * used)
-        return len(places)
+        count = 0
+        for place, each in enumerate(self.stored):
+            if each.number >= first:
+                used = ~np.isin(np.arange(len(by)), each.sample.isolated)
+                longer = each.sample._replace(length=each.sample.length + by * used)
+                self.stored[place] = each._replace(sample=longer)
+                count += 1
+        return count
 
     def clear(self) -> None:
         """Clear all samples."""
-        self.samples: list[Sample] = []  # the oldest first
-        self.known: list[Bools] = []  # whether each sample describes each muscle, (M,)
-        self.numbers: list[int] = []  # position of each among all samples ever accepted, from 1
-        self.held = []
-        self.accepted = 0
+        self.stored, self.held, self.accepted = [], [], 0
 
     def observations(self) -> Observations:
         """Return all samples as arrays, except those that are held back."""
         columns = [*zip(*self.samples, strict=True)]
         theta, tension, length, direction = map(np.array, columns[:4])
         spread, gravity = _filled(columns[4], 0.0), _filled(columns[5], np.nan)
-        known, age = np.array(self.known), self.numbers[-1] - np.array(self.numbers, float)
+        known = np.array([each.known for each in self.stored])
+        age = self.stored[-1].number - np.array([each.number for each in self.stored], float)
         # Do not estimate creep without joint angles, because a drift of the estimated postures
         # would look like creep.
         read = np.isfinite(theta).all(axis=1).mean()
@@ -275,7 +285,7 @@ class SampleStore:
         distance = square[:, None] + square - 2.0 * points @ points.T
         distance[np.diag_indices_from(distance)] = np.inf
         # Prefer to drop samples that no longer describe all muscles.
-        lost = 1.0 - np.array(self.known).mean(axis=1)
+        lost = 1.0 - np.array([each.known for each in self.stored]).mean(axis=1)
         distance /= 1.0 + lost[:, None] + lost
         return int(min(np.unravel_index(np.argmin(distance), distance.shape)))
 

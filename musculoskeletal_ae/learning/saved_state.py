@@ -59,12 +59,11 @@ class SavedState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def collect(robot: Robot, samples: SampleStore, network: bytes | None) -> SavedState:
     """Collect what is saved: the samples of a store, and a network as a checkpoint's content."""
-    stored = map(StoredSample, samples.samples, samples.known, samples.numbers)
     return SavedState(
         robot.joints,
         robot.muscles,
         robot.tension_source.kind,
-        tuple(map(_saved, stored)),
+        tuple(map(_saved, samples.stored)),
         tuple(map(_saved, samples.held)),
         tuple(samples.held_offset.tolist()) if samples.held else (),
         samples.accepted,

@@ -12,14 +12,13 @@ Each save replaces the whole file atomically, and a checksum detects damage. To 
 copy its file to `learner.state` while no learner is running.
 """
 
-import fcntl
 import os
 import time
 from pathlib import Path
 from typing import TextIO
 
 from musculoskeletal_ae.exceptions import StateError
-from musculoskeletal_ae.files import read_bytes, write_whole
+from musculoskeletal_ae.files import locked, read_bytes, write_whole
 from musculoskeletal_ae.learning import saved_state
 from musculoskeletal_ae.learning.samples import Sample, SampleStore
 from musculoskeletal_ae.learning.saved_state import SavedState
@@ -80,15 +79,7 @@ class StateStore:
 
     def _open(self) -> None:
         self.directory.mkdir(parents=True, exist_ok=True)
-        lock = (self.directory / LOCK).open('w')
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            lock.close()
-            if isinstance(error, BlockingIOError):
-                raise BlockingIOError('another learner uses the directory') from error
-            raise
-        self._lock = lock
+        self._lock = locked(self.directory / LOCK)
         # Remove the temporary files of a learner that was killed while it saved.
         for pattern in ('.*.state.*', f'.{NETWORK}.*'):
             for unfinished in self.directory.glob(pattern):

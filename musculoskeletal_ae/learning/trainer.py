@@ -2,7 +2,7 @@
 """Runs updates, either in the calling process or in a separate training process.
 
 Experiments and learning from recordings use the calling process, and the node uses a separate one.
-The caller submits a job and polls for its update. The module `update` computes the update. It
+The caller submits a job and polls for its update. The module `body_updater` computes the update. It
 imports torch and is therefore imported only in processes that train.
 """
 

@@ -19,7 +19,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.message_reading import TrajectoryPoints
+from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion.reach import lacking, nearest_held
 from musculoskeletal_ae.motion.trajectory import STOPPING, Setpoint, Trajectory
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics

@@ -20,7 +20,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.message_reading import TrajectoryPoints
+from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion import reach
 from musculoskeletal_ae.motion.hand import Hand
 from musculoskeletal_ae.motion.slowness import exertion_slowness, slowness

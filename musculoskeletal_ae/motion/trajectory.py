@@ -24,7 +24,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.message_reading import TrajectoryPoints
+from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 

@@ -17,9 +17,9 @@ from rclpy.executors import ExternalShutdownException
 from std_msgs.msg import Float64
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.arrival import SILENCE
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import printable
+from musculoskeletal_ae.messages.arrival import SILENCE
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.situation import Situation, figures, nodes_in_graph
 from musculoskeletal_ae.options import CLOSED
@@ -32,6 +32,7 @@ from musculoskeletal_ae.report import (
     overload_note,
     with_load,
 )
+from musculoskeletal_ae.ros.diagnostics import LAST_REJECTED
 from musculoskeletal_ae.ros.messages import RELIABLE, SENSOR
 
 #: hide problems for this time after the start and after the first estimate, because most of them
@@ -157,7 +158,7 @@ class BringupStatusNode(Shell):
 
     def _why_no_estimate(self) -> str:
         """Return the last rejected message of the estimator; without one, all problems."""
-        rejected = self.situation.values('estimator').get('last rejected', '')
+        rejected = self.situation.values('estimator').get(LAST_REJECTED, '')
         return f'rejected {rejected}' if rejected else self.situation.trouble()
 
     def _learned(self) -> str:

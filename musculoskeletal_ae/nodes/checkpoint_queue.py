@@ -10,7 +10,7 @@ from rclpy.node import Node
 from std_msgs.msg import UInt8MultiArray
 
 from musculoskeletal_ae.exceptions import CheckpointError, GateError, MusculoskeletalError
-from musculoskeletal_ae.reception import Reception
+from musculoskeletal_ae.messages.reception import Reception
 
 CANDIDATES = 'mae_checkpoint'  # topic of the networks that the learner proposes
 ACCEPTED = 'accepted_checkpoint'  # topic of the networks that the estimator has accepted

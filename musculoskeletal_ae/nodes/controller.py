@@ -21,10 +21,9 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from musculoskeletal_ae.arrival import STREAM_GAP, is_later, nanoseconds
 from musculoskeletal_ae.bags.topics import topics_with
 from musculoskeletal_ae.conditions import Condition, ConditionKind
-from musculoskeletal_ae.control import status
+from musculoskeletal_ae.control import controller_status
 from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.method_choice import check_settings
@@ -32,7 +31,8 @@ from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.control.stop_memory import BEFORE, StopMemory
 from musculoskeletal_ae.estimation.suspect_verification import LONGEST
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
-from musculoskeletal_ae.message_reading import (
+from musculoskeletal_ae.messages.arrival import STREAM_GAP, is_later, nanoseconds
+from musculoskeletal_ae.messages.message_reading import (
     read_pose,
     read_posture,
     read_target,
@@ -234,7 +234,7 @@ class ControllerNode(Shell):
             self.get_logger().info(f'accepted {topic}: {content}')
 
     def _warn_if_slowed(self) -> None:
-        if slowed := status.slowed(self.core.activities.follower):
+        if slowed := controller_status.slowed(self.core.activities.follower):
             self.get_logger().warning(f'trajectory {slowed}', throttle_duration_sec=1.0)
 
     def _state(self) -> JointTrajectory:

@@ -26,14 +26,14 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation.body_memory import BodyMemory
 from musculoskeletal_ae.estimation.estimator import Estimator, Output
+from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings
 from musculoskeletal_ae.estimation.lengths.length_calibration import stated_theta
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
-from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.estimation.suspect_verification import VerificationVerdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.message_reading import read_pose
-from musculoskeletal_ae.nodes.arm import Frames, Markers
+from musculoskeletal_ae.messages.message_reading import read_pose
+from musculoskeletal_ae.nodes.arm_node import Frames, Markers
 from musculoskeletal_ae.nodes.candidates import Candidates
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.robot.drawing import Line, draw_arm

@@ -22,7 +22,7 @@ from std_srvs.srv import Trigger
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.emulator.sensors import read_sensors
-from musculoskeletal_ae.nodes.arm import ArmNode, Markers
+from musculoskeletal_ae.nodes.arm_node import ArmNode, Markers
 from musculoskeletal_ae.parameters import naming_parameter
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm

@@ -17,14 +17,14 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from musculoskeletal_ae.arrival import SPACING
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.trainer import TrainerProcess
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.message_reading import read_imu
+from musculoskeletal_ae.messages.arrival import SPACING
+from musculoskeletal_ae.messages.message_reading import read_imu
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, REJECTED
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.parameters import naming_parameter

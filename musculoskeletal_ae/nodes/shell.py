@@ -41,14 +41,14 @@ from musculoskeletal_ae.exceptions import (
 )
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.message_reading import (
+from musculoskeletal_ae.messages.message_reading import (
     joints_not_finite,
     read_array,
     read_posture,
 )
+from musculoskeletal_ae.messages.reception import SHOWN, Reception
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, CheckpointQueue
-from musculoskeletal_ae.nodes.parameters import check_names
-from musculoskeletal_ae.reception import SHOWN, Reception
+from musculoskeletal_ae.nodes.declared_parameters import check_names
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot

@@ -19,8 +19,8 @@ from sensor_msgs.msg import JointState
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.message_reading import read_target
-from musculoskeletal_ae.nodes.arm import ArmNode, Markers
+from musculoskeletal_ae.messages.message_reading import read_target
+from musculoskeletal_ae.nodes.arm_node import ArmNode, Markers
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm

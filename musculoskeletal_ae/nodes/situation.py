@@ -22,7 +22,7 @@ from musculoskeletal_ae.conditions import CONDITIONS, KINDS, LEVELS, Condition, 
 from musculoskeletal_ae.control.supervisor import Activity, StopState
 from musculoskeletal_ae.remedy import Step, sentence
 from musculoskeletal_ae.report import with_load
-from musculoskeletal_ae.ros.diagnostics import IDENTITY, NODE_SILENCE
+from musculoskeletal_ae.ros.diagnostics import IDENTITY, NODE_SILENCE, values_of
 
 #: forget other nodes than NEEDED without a report for this time [s]; it exceeds NODE_SILENCE,
 #: because nodes of other packages may report less often
@@ -134,7 +134,7 @@ class Situation:
         """Store the report of the node `name` of this namespace."""
         if name == SUMMARY:
             return
-        values = _values_of(status)
+        values = values_of(status)
         present = conditions.from_json(values.get(CONDITIONS, '[]'))
         level = LEVELS[min(ord(status.level), len(LEVELS) - 1)]
         if level != 'ok' and not present:  # a node of another package, such as a driver
@@ -335,7 +335,7 @@ class Arms:
         """Store the reports of all arms that a message of /diagnostics contains."""
         for status in message.status:
             namespace, name = _node_of(status)
-            is_of_arm = name in NEEDED and IDENTITY in _values_of(status)
+            is_of_arm = name in NEEDED and IDENTITY in values_of(status)
             if is_of_arm or namespace in self._situations:
                 self.situation(namespace).reported(name, status)
 
@@ -363,10 +363,6 @@ def _node_of(status: DiagnosticStatus) -> tuple[str, str]:
     full_name, _, _ = status.name.partition(':')
     namespace, _, name = full_name.rpartition('/')
     return namespace, name
-
-
-def _values_of(status: DiagnosticStatus) -> dict[str, str]:
-    return {value.key: value.value for value in status.values}
 
 
 def _with_padded_numbers(namespace: str) -> str:

@@ -54,7 +54,7 @@ class DefaultPreset:
 
     def make_updater(self, robot: Robot, mae: Mae, seed: int) -> Updater:
         """Return an updater that fits the calibrated body model."""
-        from musculoskeletal_ae.learning.update import BodyUpdater
+        from musculoskeletal_ae.learning.body_updater import BodyUpdater
 
         return BodyUpdater(robot, mae, seed)
 

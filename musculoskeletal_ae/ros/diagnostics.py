@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishes a node's state on /diagnostics, with message rates and rejected messages."""
+"""Publishes a node's state on /diagnostics, with message rates and rejected messages; reads it."""
 
 import secrets
 
@@ -9,14 +9,30 @@ from rclpy.qos import QoSProfile
 
 from musculoskeletal_ae.conditions import CONDITIONS, ordered, to_json
 from musculoskeletal_ae.exceptions import printable
-from musculoskeletal_ae.reception import Reception
+from musculoskeletal_ae.messages.reception import Reception
 from musculoskeletal_ae.remedy import sentence
 from musculoskeletal_ae.report import Report
 
 MANY_REPORTS = QoSProfile(depth=50)  # QoS of /diagnostics, on which all nodes of the graph report
 IDENTITY = 'identity'  # value that is in the reports of this package's nodes only
+LAST_REJECTED = 'last rejected'  # value that names the topic and the fault of that message
+REJECTED = 'rejected '  # value `rejected TOPIC: REASON`: the number of messages rejected so far
 PERIOD = 1.0  # publish a report of each node at this interval [s]
 NODE_SILENCE = 2.0  # treat a node as ended or hanging if it has not reported for this time [s]
+
+
+def values_of(status: DiagnosticStatus) -> dict[str, str]:
+    """Return the values of a report by name."""
+    return {value.key: value.value for value in status.values}
+
+
+def rejected_counts(values: dict[str, str]) -> dict[str, int]:
+    """Return how many messages a node has rejected, by TOPIC: REASON, from a report's values."""
+    return {
+        key.removeprefix(REJECTED): int(value)
+        for key, value in values.items()
+        if key.startswith(REJECTED) and value.isdecimal()
+    }
 
 
 class Diagnostics:
@@ -43,9 +59,9 @@ class Diagnostics:
         values |= {**report.values, IDENTITY: self.identity}
         values |= {f'{topic} rate': f'{rate:.1f} Hz' for topic, rate in rates.items()}
         values['rejected'] = str(sum(rejected.values()))
-        values |= {f'rejected {reason}': str(n) for reason, n in rejected.items()}
+        values |= {f'{REJECTED}{reason}': str(n) for reason, n in rejected.items()}
         if self._reception.last_rejected:
-            values['last rejected'] = self._reception.last_rejected
+            values[LAST_REJECTED] = self._reception.last_rejected
         values |= {f'ignored {part}': str(n) for part, n in self._reception.ignored.items()}
         present = ordered(report.conditions)
         if steps := report.steps:

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator
 
 from rclpy.node import Node
 
-from musculoskeletal_ae.arrival import SILENCE
 from musculoskeletal_ae.conditions import Condition, ConditionKind, Level
-from musculoskeletal_ae.reception import Reception
+from musculoskeletal_ae.messages.arrival import SILENCE
+from musculoskeletal_ae.messages.reception import Reception
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import with_load
 

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.parameters import PARAMETERS
+from musculoskeletal_ae.nodes.declared_parameters import PARAMETERS
 from musculoskeletal_ae.parameters import Parameter, naming_parameter
 
 

@@ -20,7 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
-from musculoskeletal_ae.nodes.parameters import COMBINED, check_names
+from musculoskeletal_ae.nodes.declared_parameters import COMBINED, check_names
 from musculoskeletal_ae.nodes.shell import STEADY
 from musculoskeletal_ae.process_signals import STOP, Reaction
 from musculoskeletal_ae.ros.executor import RCLError, make_executor

@@ -28,9 +28,9 @@ from typing import NamedTuple
 
 from rclpy.node import Node
 
-from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.ros.diagnostics import NODE_SILENCE
 
 _ESTIMATOR, _CONTROLLER, _DRIVER = 'the estimator', 'the controller', 'the driver'

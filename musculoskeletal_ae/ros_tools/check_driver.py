@@ -20,9 +20,9 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from musculoskeletal_ae.arrival import SILENCE, Arrival
 from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.messages.arrival import SILENCE, Arrival
 from musculoskeletal_ae.options import Parser, names, number, numbers, positive
 from musculoskeletal_ae.process_signals import import_heavy
 from musculoskeletal_ae.ros.messages import RELIABLE, SENSOR, array_message, motor_command

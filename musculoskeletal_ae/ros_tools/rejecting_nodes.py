@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterable
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-REJECTED = 'rejected '  # first word of the keys `rejected TOPIC: REASON` in reports
-LAST_REJECTED = 'last rejected'
+from musculoskeletal_ae.ros.diagnostics import LAST_REJECTED, rejected_counts, values_of
 
 
 class Rejections:
@@ -34,13 +33,9 @@ class Rejections:
         """Compare the reports in a message of /diagnostics with earlier reports."""
         for status in message.status:
             node, _, _ = status.name.partition(':')
-            values = {value.key: value.value for value in status.values}
+            values = values_of(status)
             namespace = node.rpartition('/')[0]
-            counts = {
-                key.removeprefix(REJECTED): int(value)
-                for key, value in values.items()
-                if key.startswith(REJECTED) and value.isdecimal()
-            }
+            counts = rejected_counts(values)
             before = self._counts.get(node)
             self._counts[node] = counts
             for rejected, count in counts.items():

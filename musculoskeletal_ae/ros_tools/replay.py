@@ -35,10 +35,10 @@ from musculoskeletal_ae.bags.timed_messages import TimedMessages
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, DIAGNOSTICS, latched_topics, select
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
+from musculoskeletal_ae.messages.reception import Reception
 from musculoskeletal_ae.options import Parser, names, not_negative, number, positive
 from musculoskeletal_ae.process_signals import STOP, Reaction
 from musculoskeletal_ae.progress_bar import is_bar_visible
-from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import (
     END_OF_RECORDING,
     NOT_WAITED_FOR,

@@ -17,7 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
-from musculoskeletal_ae.nodes.parameters import OF_RCLPY
+from musculoskeletal_ae.nodes.declared_parameters import OF_RCLPY
 from musculoskeletal_ae.options import exit_status
 from musculoskeletal_ae.process_signals import STOP, Reaction
 from musculoskeletal_ae.ros.executor import RCLError, make_executor

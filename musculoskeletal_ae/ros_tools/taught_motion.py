@@ -16,7 +16,7 @@ from musculoskeletal_ae.bags.playback import LEAD_TIME, TAUGHT_TOPIC, taught_mot
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import select
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
-from musculoskeletal_ae.ros.diagnostics import PERIOD
+from musculoskeletal_ae.ros.diagnostics import LAST_REJECTED, PERIOD, rejected_counts, values_of
 from musculoskeletal_ae.ros.messages import RELIABLE
 from musculoskeletal_ae.ros_tools.ros_tool import Spinner, start_ros
 
@@ -77,7 +77,7 @@ class _Answers:
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name.removesuffix(': state') in self.listeners:
-                self.reports.append({value.key: value.value for value in status.values})
+                self.reports.append(values_of(status))
 
     def begin(self) -> None:
         """Discard the reports so far; from now on, only refusals that follow are counted."""
@@ -86,9 +86,8 @@ class _Answers:
 
     @property
     def _refused(self) -> int:
-        counted = f'rejected {TRAJECTORY}: '
-        last = self.reports[-1] if self.reports else {}
-        return sum(int(n) for key, n in last.items() if key.startswith(counted) and n.isdecimal())
+        counts = rejected_counts(self.reports[-1]) if self.reports else {}
+        return sum(count for why, count in counts.items() if why.startswith(f'{TRAJECTORY}: '))
 
     @property
     def is_taken(self) -> bool:
@@ -101,7 +100,7 @@ class _Answers:
         """Why a node has refused a message since `begin`; '' if none has reported a refusal."""
         if not self.reports or self._refused <= self._refused_before:
             return ''
-        last = self.reports[-1].get('last rejected', '')
+        last = self.reports[-1].get(LAST_REJECTED, '')
         return last if last.startswith(TRAJECTORY) else '/diagnostics shows the reason'
 
 

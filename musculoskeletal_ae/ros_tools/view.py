@@ -34,18 +34,18 @@ from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.arrival import SILENCE, Arrival
 from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
-from musculoskeletal_ae.message_reading import (
+from musculoskeletal_ae.messages.arrival import SILENCE, Arrival
+from musculoskeletal_ae.messages.message_reading import (
     read_array,
     read_posture,
 )
+from musculoskeletal_ae.messages.reception import Reception
 from musculoskeletal_ae.nodes.situation import PAGE, Arms, figures, nodes_in_graph
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.process_signals import STOP, Reaction, import_heavy
-from musculoskeletal_ae.reception import Reception
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.inverse_kinematics import POSITION_ONLY, inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.arrival import longer_pause
+from musculoskeletal_ae.messages.arrival import longer_pause
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.limits import LENGTH_JUMPED, LIMITS, slack_tension

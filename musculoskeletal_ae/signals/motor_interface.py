@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.arrival import is_later, nanoseconds
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.message_reading import joint_names, read_array
+from musculoskeletal_ae.messages.arrival import is_later, nanoseconds
+from musculoskeletal_ae.messages.message_reading import joint_names, read_array
 from musculoskeletal_ae.robot.motors import ARRAY, JOINT_STATE, NO_MOTORS, Motors
 from musculoskeletal_ae.robot.tension_source import TENSION_SENSOR, TensionSource
 from musculoskeletal_ae.signals.muscle_readings import MuscleReadings

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints, median_of_rows
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.message_reading import read_rows
+from musculoskeletal_ae.messages.message_reading import read_rows
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension_source import TensionSource
 from musculoskeletal_ae.signals.limits import LIMITS, longest_lengths, reading_range

@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
-from musculoskeletal_ae.arrival import longer_pause
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.messages.arrival import longer_pause
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.friction import FrictionDirection, Transmission

@@ -29,7 +29,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(args: Namespace) -> int:
     checkpoint = import_heavy('musculoskeletal_ae.mae.checkpoint')
-    exporting = import_heavy('musculoskeletal_ae.exporting.mjcf')
+    exporting = import_heavy('musculoskeletal_ae.exporting.exported_mjcf')
     robot = import_heavy('musculoskeletal_ae.robot.robot').Robot.load(args.robot)
     mae = checkpoint.load(args.checkpoint, robot)
     if args.into is not None:

@@ -26,7 +26,7 @@ from musculoskeletal_ae.experiments.recording import (
     estimation_error,
     record,
 )
-from musculoskeletal_ae.exporting.mjcf import export_into
+from musculoskeletal_ae.exporting.exported_mjcf import export_into
 from musculoskeletal_ae.importing import convert
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint

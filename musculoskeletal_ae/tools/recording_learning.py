@@ -13,8 +13,8 @@ from scipy.spatial import KDTree
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.bags.check import recorded_wiring
-from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.recorded_joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
@@ -24,7 +24,7 @@ from musculoskeletal_ae.exceptions import (
     GateError,
     MusculoskeletalError,
 )
-from musculoskeletal_ae.learning.convergence import MOST_UPDATES
+from musculoskeletal_ae.learning.convergence import MOST_UPDATES, is_falling
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.recordings import (
     LEAST_RESTS,
@@ -362,8 +362,8 @@ def _complete_and_show(learner: Learner) -> str:
     title = 'training the network on the learned body'
     with ProgressBar(title, MOST_UPDATES, lambda: _learned(learner), ends_early=True) as bar:
         bar.announce(f' until its error stops falling, in at most {MOST_UPDATES} updates')
-        convergence = complete(learner, bar.add)
-    if len(convergence.errors) < MOST_UPDATES or not convergence.is_falling:
+        errors = complete(learner, bar.add)
+    if len(errors) < MOST_UPDATES or not is_falling(errors):
         return ''
     return (
         f'after {MOST_UPDATES} updates, the error of the network on the learned body still falls; '

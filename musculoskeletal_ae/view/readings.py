@@ -11,7 +11,7 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.arrival import SILENCE
+from musculoskeletal_ae.messages.arrival import SILENCE
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.view import body
 

@@ -21,7 +21,7 @@ from trajectory_msgs.msg import JointTrajectory
 from bags import bag_samples as samples
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.exceptions import BagError
-from musculoskeletal_ae.message_reading import read_array
+from musculoskeletal_ae.messages.message_reading import read_array
 from musculoskeletal_ae.nodes.controller import ControllerNode
 from musculoskeletal_ae.nodes.learner import LearnerNode
 from musculoskeletal_ae.ros.messages import SENSOR

@@ -8,8 +8,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from bags import bag_samples as samples
 from bags.arm_bag import ARRAY, JOINTS, STRING, Arm, array, joints, string
 from musculoskeletal_ae.bags.check import check_bag, motion_text, recorded_wiring
-from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.recorded_joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.streams import Pairs, read_streams
 from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.robot.description import with_modules

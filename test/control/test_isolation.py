@@ -18,7 +18,7 @@ from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.control.stop_commands import LARGEST_RISE, PAYING_OUT
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
-from musculoskeletal_ae.message_reading import TrajectoryPoints
+from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion import reach
 from musculoskeletal_ae.motion.assumed_friction import FRICTION
 from musculoskeletal_ae.motion.planner import Planner

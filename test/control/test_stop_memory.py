@@ -89,6 +89,7 @@ def test_a_stop_that_cannot_be_written_is_reported(tmp_path):
     arm = tmp_path / 'arm'
     memory = StopMemory(arm)
     shutil.rmtree(arm)
+    arm.write_text('')  # a file in place of the directory
     memory.note(STOP)
     assert 'a restarted controller will not know it' in memory.problem
 

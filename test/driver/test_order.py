@@ -8,7 +8,7 @@ import pytest
 
 from driver.scripted import Driver, array, joint_state, muscle_rows
 from musculoskeletal_ae.driver.listening import Listening
-from musculoskeletal_ae.driver.motion import ABOVE_BIAS
+from musculoskeletal_ae.driver.motion_test import ABOVE_BIAS
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot

@@ -15,7 +15,7 @@ from musculoskeletal_ae.emulator.foreign.effects import NONE
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm, tension_from_elongation
 from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.emulator.reality import make_arm
-from musculoskeletal_ae.message_reading import MOST_WRENCH
+from musculoskeletal_ae.messages.message_reading import MOST_WRENCH
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 

@@ -16,7 +16,7 @@ from robots import DRUM_ENDS, behind_a_drum
 
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
 from musculoskeletal_ae.estimation.network_validation.message_errors import FLOOR
-from musculoskeletal_ae.estimation.network_validation.postures import LIMITS
+from musculoskeletal_ae.estimation.network_validation.posture_check import LIMITS
 from musculoskeletal_ae.estimation.network_validation.validator import (
     DETECTION_DELAY,
     MOST_USED,

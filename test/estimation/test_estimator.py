@@ -9,14 +9,14 @@ import pinocchio as pin
 import pytest
 from readings import reading
 
-from musculoskeletal_ae.arrival import INTERRUPTION
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.detectors.missing_values import SILENT
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME
 from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings
 from musculoskeletal_ae.estimation.module_commands import COMMAND_AGE
-from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
+from musculoskeletal_ae.messages.arrival import INTERRUPTION
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 

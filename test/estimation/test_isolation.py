@@ -8,7 +8,7 @@ import pytest
 from readings import reading
 
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.settings import EstimatorSettings
+from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings
 from musculoskeletal_ae.estimation.suspect_verification import (
     LONGEST,
     PATIENCE,

@@ -11,8 +11,8 @@ from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
-from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.remedy import REPAIR, Step, sentence
 from musculoskeletal_ae.signals.body_state import Anomaly

@@ -4,8 +4,8 @@
 import pytest
 
 from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings
 from musculoskeletal_ae.estimation.finding import Finding
-from musculoskeletal_ae.estimation.settings import EstimatorSettings
 from musculoskeletal_ae.estimation.suspect_verification import Outcome, VerificationVerdict
 from musculoskeletal_ae.estimation.suspects import ACQUITTALS, WITHIN, SuspectHandling
 

@@ -15,7 +15,7 @@ from musculoskeletal_ae.body_model.fit import fit_to_network
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.exporting import learned_routes
-from musculoskeletal_ae.exporting.mjcf import export, export_into
+from musculoskeletal_ae.exporting.exported_mjcf import export, export_into
 from musculoskeletal_ae.exporting.user_file import UserFile
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae import checkpoint

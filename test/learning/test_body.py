@@ -71,7 +71,9 @@ def test_bad_samples_do_not_poison_the_fit(arm26, stage):
     clean = CalibratedBody(arm26)
     fit_body(clean, store.observations())
     for n in range(0, 60, 10):
-        store.samples[n] = store.samples[n]._replace(length=store.samples[n].length + 0.05)
+        each = store.stored[n]
+        bad = each.sample._replace(length=each.sample.length + 0.05)
+        store.stored[n] = each._replace(sample=bad)
     poisoned = CalibratedBody(arm26)
     fit = fit_body(poisoned, store.observations())
     states = stage.states(300)

@@ -8,7 +8,7 @@ from musculoskeletal_ae.learning import recordings
 from musculoskeletal_ae.learning.convergence import (
     LEAST_UPDATES,
     MOST_UPDATES,
-    Convergence,
+    is_reached,
     model_error,
 )
 from musculoskeletal_ae.learning.learner import Learner
@@ -18,10 +18,10 @@ from musculoskeletal_ae.tables.table import Table
 
 def updates(errors):
     """Return the number of updates until the errors, of which the last one repeats, converge."""
-    convergence = Convergence()
-    while not convergence.is_reached:
-        convergence.errors.append(errors[min(len(convergence.errors), len(errors) - 1)])
-    return len(convergence.errors)
+    seen = list[float]()
+    while not is_reached(seen):
+        seen.append(errors[min(len(seen), len(errors) - 1)])
+    return len(seen)
 
 
 def test_updates_go_on_while_the_error_falls():

@@ -19,8 +19,7 @@ def taught(stage):
     samples = SampleStore()
     history = JointHistory(samples, 2)
     for now in range(1, 11):
-        samples.add(stage.sample())
-        history.accepted(float(now))
+        samples.add(stage.sample(), time=float(now))
     return samples, history
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae import progress_bar
-from musculoskeletal_ae.bags.joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.message_types import TYPESTORE
 from musculoskeletal_ae.bags.reader import Bag
+from musculoskeletal_ae.bags.recorded_joint_sensors import wrong_joint_sensors
 from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.conditions import ConditionKind
@@ -119,8 +119,8 @@ def test_isolated_muscles_of_a_recording_are_neither_learned_nor_used(arm26, ini
     learner = Learner(arm26, initial, steps=1)
     learn(learner, part(recording, 0.0, 4.0))
     assert learner.isolated == (2,)
-    (known,) = learner.samples.known
-    assert np.flatnonzero(~known).tolist() == [2]
+    (stored,) = learner.samples.stored
+    assert np.flatnonzero(~stored.known).tolist() == [2]
     learn(learner, part(recording, 4.0, 5.0))
     assert learner.isolated == ()
     learner.use_body(learner.body.with_isolated((1,)))

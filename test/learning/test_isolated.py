@@ -42,7 +42,7 @@ def test_isolated_muscles_are_left_out_of_samples_and_of_the_next_update(
         learner.accept(stage.sample())
     learner.use_body(learner.body.with_isolated((LOST,)))
     learner.accept(stage.sample()._replace(isolated=learner.isolated))
-    assert [known[LOST] for known in learner.samples.known] == [True] * 3 + [False]
+    assert [each.known[LOST] for each in learner.samples.stored] == [True] * 3 + [False]
     assert learner.trainer.jobs == []
     learner.poll(0.0)
     assert learner.trainer.jobs[-1].isolated == (LOST,)

@@ -241,7 +241,7 @@ def test_a_muscle_relearned_during_an_update_leaves_no_calibrated_detector(learn
     learner.trainer.released = True
     learner.poll(0.5)
     assert not calibrated(learner)
-    assert not any(known[2] for known in learner.samples.known)
+    assert not any(each.known[2] for each in learner.samples.stored)
     learner.poll(1.5)  # returns an update that began after the change, so its statistics are valid
     assert not learner.trainer.jobs[-1].statistics_hold
     assert calibrated(learner)
@@ -251,7 +251,7 @@ def test_a_changed_muscle_is_relearned_from_the_samples_since_its_change(learner
     accept(learner, stage, 6)
     learner.trainer.calibrated, learner.trainer.changed = True, ((1, 4),)
     learner.poll(0.0)
-    assert [bool(known[1]) for known in learner.samples.known] == [False] * 2 + [True] * 4
+    assert [bool(each.known[1]) for each in learner.samples.stored] == [False] * 2 + [True] * 4
     assert not calibrated(learner)
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from learning.conftest import job
 from learning.test_learner import IdleTrainer
+from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.update import BodyUpdater
 
 
 class OneUpdate(IdleTrainer):

@@ -126,8 +126,8 @@ def test_they_are_dropped_if_other_zeros_are_found(learner, arm):
     arm.rest(POSTURE)
     assert learner.report().values['samples dropped with wrong length offsets'] == str(held)
     assert learner.samples.accepted >= numbers
-    for number in learner.samples.numbers:
-        assert number == 1 or number > numbers
+    for each in learner.samples.stored:
+        assert each.number == 1 or each.number > numbers
 
 
 @pytest.mark.parametrize(('is_interrupted', 'corrected'), [(False, 6), (True, 2)])

@@ -9,7 +9,7 @@ from control_bench import DT, OTHER, REST, ROBOT, Bench
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.message_reading import TrajectoryPoints
+from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion.goal import (
     BEYOND_GOAL,
     BEYOND_PATH,

@@ -15,14 +15,14 @@ from control_bench import DT, OTHER, REST, ROBOT, Bench, values
 from exact_mae import ExactMae, rest_readings
 from nominal_body import nominal_arm
 
-from musculoskeletal_ae.control import status
+from musculoskeletal_ae.control import controller_status
 from musculoskeletal_ae.control.command import LENGTH
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.residuals import TouchStatistics
-from musculoskeletal_ae.message_reading import TrajectoryPoints
+from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion import hand as hand_motion
 from musculoskeletal_ae.motion.feedback import CORRECTION, SUPPORT
 from musculoskeletal_ae.motion.hand import HAND_SPEED, Hand
@@ -558,7 +558,7 @@ def test_the_duration_of_points_that_hardly_differ_in_time_is_stated(bench, apar
         TrajectoryPoints(np.arange(2), np.array([1.0, 1.0 + apart]), goals, None, None)
     )
     follower = bench.follower
-    text = status.slowed(follower)
+    text = controller_status.slowed(follower)
     assert f'takes {follower.progress.latest.duration:.3g} s' in text, text
 
 

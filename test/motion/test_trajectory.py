@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from robots import write_robot
 
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.message_reading import TrajectoryPoints
+from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.robot import Robot
 

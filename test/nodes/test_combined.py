@@ -10,8 +10,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.nodes.declared_parameters import check_names
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
-from musculoskeletal_ae.nodes.parameters import check_names
 
 
 def test_both_nodes_of_one_process_move_the_arm_and_end_by_one_signal(graph, trained_file):

@@ -297,21 +297,21 @@ def test_relearning_forgets_the_named_muscles_and_refuses_unknown_ones(host, gra
     assert not nameless.success
     assert 'set that parameter first' in nameless.message
     assert graph.set_parameter('learner', 'relearn_muscles', [arm26.muscles[1]])[0]
-    assert not any(known[1] for known in learner.node.core.samples.known)
+    assert not any(each.known[1] for each in learner.node.core.samples.stored)
     # Setting the parameter forgets the muscle in all samples. The service does so again, for
     # samples that have arrived since then.
     samples = learner.samples
     learner.learn(lambda: learner.samples > samples, 'a sample')
-    assert any(known[1] for known in learner.node.core.samples.known)
+    assert any(each.known[1] for each in learner.node.core.samples.stored)
     assert graph.call(Trigger, 'learner/relearn').success
-    assert not any(known[1] for known in learner.node.core.samples.known)
-    assert all(known[0] for known in learner.node.core.samples.known)
+    assert not any(each.known[1] for each in learner.node.core.samples.stored)
+    assert all(each.known[0] for each in learner.node.core.samples.stored)
     # At a start, the parameter forgets nothing until the service is called.
     learner.end()
     learner = host(state_directory=state, relearn_muscles=[arm26.muscles[2]])
-    assert all(known[2] for known in learner.node.core.samples.known)
+    assert all(each.known[2] for each in learner.node.core.samples.stored)
     assert graph.call(Trigger, 'learner/relearn').success
-    assert not any(known[2] for known in learner.node.core.samples.known)
+    assert not any(each.known[2] for each in learner.node.core.samples.stored)
 
 
 def test_parameters_refused_together_change_nothing(host, arm26, trained_file, state):
@@ -328,7 +328,7 @@ def test_parameters_refused_together_change_nothing(host, arm26, trained_file, s
     assert not refused.successful and '/nowhere' in refused.reason
     assert not together(checkpoint=trained_file, relearn_muscles=['tail']).successful
     assert not together(fresh=True, checkpoint='').successful
-    assert learner.samples >= 2 and all(known.all() for known in core.samples.known)
+    assert learner.samples >= 2 and all(each.known.all() for each in core.samples.stored)
     # Three parameters that are set together restart the learner once, and make only one backup of
     # the earlier state.
     assert together(relearn_muscles=[first], fresh=True, checkpoint=trained_file).successful

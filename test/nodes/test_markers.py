@@ -14,7 +14,7 @@ from std_msgs.msg import Float64MultiArray
 from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.arm import Frames
+from musculoskeletal_ae.nodes.arm_node import Frames
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.nodes.shell import Shell

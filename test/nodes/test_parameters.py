@@ -13,10 +13,10 @@ from robots import write_robot
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.controller import ControllerNode
+from musculoskeletal_ae.nodes.declared_parameters import PARAMETERS, yaml_text
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.nodes.learner import LearnerNode
-from musculoskeletal_ae.nodes.parameters import PARAMETERS, yaml_text
 from musculoskeletal_ae.nodes.sim import SimNode
 from musculoskeletal_ae.parameters import Parameter
 
@@ -25,7 +25,7 @@ NUMBERS = Parameter((0.0,), 'numbers')
 
 
 def test_the_file_of_parameters_is_the_one_that_the_table_makes():
-    remedy = 'run: python -m musculoskeletal_ae.nodes.parameters > config/nodes.yaml'
+    remedy = 'run: python -m musculoskeletal_ae.nodes.declared_parameters > config/nodes.yaml'
     assert FILE.read_text(encoding='utf-8') == yaml_text(), remedy
 
 

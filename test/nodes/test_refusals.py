@@ -9,7 +9,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from musculoskeletal_ae import reception
+from musculoskeletal_ae.messages import reception
 from musculoskeletal_ae.nodes.controller import ControllerNode
 
 

@@ -23,10 +23,10 @@ from musculoskeletal_ae.conditions import CONDITIONS
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.nodes.bringup_status import BringupStatusNode
 from musculoskeletal_ae.nodes.controller import ControllerNode
+from musculoskeletal_ae.nodes.declared_parameters import PARAMETERS
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.nodes.learner import LearnerNode
-from musculoskeletal_ae.nodes.parameters import PARAMETERS
 from musculoskeletal_ae.nodes.sim import SimNode
 
 #: services of each node, besides those of rclpy

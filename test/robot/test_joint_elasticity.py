@@ -23,12 +23,12 @@ from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.estimation.contact import ContactEstimator
 from musculoskeletal_ae.exceptions import CheckpointError, InfeasibleError, RobotDescriptionError
-from musculoskeletal_ae.exporting.mjcf import export
+from musculoskeletal_ae.exporting.exported_mjcf import export
 from musculoskeletal_ae.importing.convert import import_robot
+from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.samples import Observations
-from musculoskeletal_ae.learning.update import BodyUpdater
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.motion.methods import StiffnessModel

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from readings import reading
 
-from musculoskeletal_ae.arrival import Arrival
+from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals import muscle_readings
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets, Trust

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.estimation.network_validation.postures import PostureCheck
+from musculoskeletal_ae.estimation.network_validation.posture_check import PostureCheck
 from musculoskeletal_ae.estimation.network_validation.recent_messages import LEAST, RecentMessages
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot

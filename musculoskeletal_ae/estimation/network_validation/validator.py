@@ -7,11 +7,11 @@
 
 Four checks compare a candidate with the geometric model, the arm and the network in use:
 
-    postures.py        errors on fixed states of the geometric model
+    posture_check.py   errors on fixed states of the geometric model
     message_errors.py  errors on the healthy messages of the last seconds
     agreement.py       differences of joint angles and lengths; the reference is joint
                        sensors, or else the network in use
-    detector.py        a calibrated anomaly detector reports nothing on these messages,
+    detector_check.py  a calibrated anomaly detector reports nothing on these messages,
                        and would detect a rupture
 
 The first network is only subject to the first and the last check, because its error on a body that
@@ -40,9 +40,9 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.design.route_jumps import jump_warning
 from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
-from musculoskeletal_ae.estimation.network_validation import detector, message_errors
+from musculoskeletal_ae.estimation.network_validation import detector_check, message_errors
 from musculoskeletal_ae.estimation.network_validation.agreement import Agreement, AgreementCheck
-from musculoskeletal_ae.estimation.network_validation.postures import PostureCheck
+from musculoskeletal_ae.estimation.network_validation.posture_check import PostureCheck
 from musculoskeletal_ae.estimation.network_validation.recent_messages import RecentMessages
 from musculoskeletal_ae.exceptions import CheckpointError, GateError
 from musculoskeletal_ae.mae.mae import Mae
@@ -326,7 +326,7 @@ class CheckpointValidator:
         the same messages with the tension of one muscle set to 0, as if the muscle were ruptured.
         Nothing is yielded without a calibrated threshold, or if there are too few messages.
         """
-        return detector.measures(mae, self._messages, self.isolated)
+        return detector_check.measures(mae, self._messages, self.isolated)
 
     def with_detector(self, mae: Mae, now: float) -> Mae:
         """Return a network with a calibrated anomaly detector, if one is available.
@@ -341,7 +341,7 @@ class CheckpointValidator:
         assert statistics is not None
         repaired = [m for m, at in self._repaired_at.items() if 0.0 <= now - at < RELEARNING_TIME]
         statistics = statistics.ignoring(repaired)
-        return detector.with_detector_of(statistics, mae, self._messages, self.isolated)
+        return detector_check.with_detector_of(statistics, mae, self._messages, self.isolated)
 
     def _steps(self, mae: Mae, is_chosen: bool) -> Iterator[str | None]:
         """Check a candidate step by step; yield a text for each fault, or None between steps."""
@@ -355,7 +355,7 @@ class CheckpointValidator:
                 for comparison in self.agreement(mae):
                     yield from comparison.faults()
             yield None
-        yield from detector.faults(mae, self._messages, self.isolated)
+        yield from detector_check.faults(mae, self._messages, self.isolated)
 
     @cached_property
     def _likely_cause(self) -> str:

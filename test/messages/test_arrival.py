@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from musculoskeletal_ae.arrival import LONGEST_DELAY, SILENCE, Arrival, is_later
 from musculoskeletal_ae.awake_clock import AwakeClock
+from musculoskeletal_ae.messages.arrival import LONGEST_DELAY, SILENCE, Arrival, is_later
 
 PERIOD = 0.01  # period of the messages [s]
 SECOND = 1_000_000_000

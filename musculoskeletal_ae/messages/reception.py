@@ -7,9 +7,9 @@ from collections import Counter, defaultdict
 from collections.abc import Callable
 from typing import Any
 
-from musculoskeletal_ae.arrival import Arrival
 from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
+from musculoskeletal_ae.messages.arrival import Arrival
 
 LONGEST_TEXT = 500
 SHOWN = 10.0  # report a refusal or an internal error for this time after it happened [s]

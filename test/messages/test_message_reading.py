@@ -15,7 +15,7 @@ from std_msgs.msg import Float64MultiArray, MultiArrayDimension, MultiArrayLayou
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.message_reading import (
+from musculoskeletal_ae.messages.message_reading import (
     joints_not_finite,
     read_array,
     read_imu,

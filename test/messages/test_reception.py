@@ -6,7 +6,7 @@ import time
 import pytest
 
 from musculoskeletal_ae.exceptions import CheckpointError, MessageError
-from musculoskeletal_ae.reception import Reception
+from musculoskeletal_ae.messages.reception import Reception
 
 SECOND = 1_000_000_000
 

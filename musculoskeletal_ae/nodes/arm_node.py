@@ -15,9 +15,9 @@ from std_msgs.msg import ColorRGBA, Float64MultiArray, String
 from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.arrival import LONGEST_STEP
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.message_reading import read_wrench
+from musculoskeletal_ae.messages.arrival import LONGEST_STEP
+from musculoskeletal_ae.messages.message_reading import read_wrench
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.robot.drawing import BONE_COLOUR, Line
 from musculoskeletal_ae.robot.kinematics import body_frames
