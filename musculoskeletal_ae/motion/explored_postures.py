@@ -12,7 +12,12 @@ from musculoskeletal_ae.exceptions import InfeasibleError, RobotDescriptionError
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.equilibrium_states import has_followers
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import holding_tension, least_tension
+from musculoskeletal_ae.robot.tension import (
+    AT_STOP,
+    holding_tension,
+    least_tension,
+    supporting_stops,
+)
 
 TRIES = 1000  # search at most this many random postures for holdable ones
 AT_LIMITS = 0.25  # place this fraction of each joint's random angles at one of its limits
@@ -29,8 +34,6 @@ LARGEST_STEP = 0.2  # turn a joint by at most this in one step of the search [ra
 #: raise small stiffnesses in a step of the search to this share of the largest one, so that the
 #: step stays short
 LEAST_STIFFNESS = 0.05
-AT_STOP = 1e-3  # let a stop support a joint up to this distance from the limit [rad]
-STOP_TORQUE = 100.0  # let a stop support a joint with at most this torque [N·m]
 BALANCED = 1e-3  # count a posture as held if it lacks at most this share of the largest torque
 SMALL = 1e-9  # divide torques by at least this, to avoid a division by zero [N·m]
 PRESSES = 10  # draw this many random T_const, and use the one that presses most strongly
@@ -135,19 +138,15 @@ def settled(robot: Robot, theta: Array) -> tuple[Array, Array] | None:
     Returns:
         The posture and the tensions; None if no such posture is found.
     """
-    limits, eye, theta = robot.tension, np.eye(robot.joint_count), theta.copy()
+    limits, theta = robot.tension, theta.copy()
     for _ in range(SETTLING_STEPS):
         torque = robot.kinematics.holding_torque(theta)
-        is_low, is_high = theta < robot.lower + AT_STOP, theta > robot.upper - AT_STOP
-        # A stop acts as a muscle that pulls the joint away from it.
-        stops = np.vstack([-eye[is_low], eye[is_high]])
-        jacobian = np.vstack([robot.routes.muscle_jacobian(theta), stops])
-        low, high = np.zeros(len(jacobian)), np.full(len(jacobian), STOP_TORQUE)
-        low[: robot.muscle_count], high[: robot.muscle_count] = limits.bias, limits.limit
-        exertion = least_tension(jacobian, torque, low, high)
+        jacobian = robot.routes.muscle_jacobian(theta)
+        stops = supporting_stops(robot, theta)
+        exertion = least_tension(jacobian, torque, limits.bias, limits.limit, stops=stops)
         if np.abs(exertion.missing_torque).max() <= BALANCED * np.abs(torque).max():
-            return theta, exertion.tension[: robot.muscle_count]
-        falling = -jacobian.T @ exertion.tension - torque
+            return theta, exertion.tension
+        falling = -exertion.missing_torque
         gradient = robot.kinematics.holding_gradient(theta)
         values, vectors = np.linalg.eigh(0.5 * (gradient + gradient.T))
         values = np.maximum(np.abs(values), LEAST_STIFFNESS * np.abs(values).max() + SMALL)

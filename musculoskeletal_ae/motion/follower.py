@@ -6,12 +6,15 @@ muscle lengths,
 
     τ = M(θ) θ̈ + h(θ, θ̇)                                       rigid bodies (pinocchio's RNEA)
     δ = k_p e + c,   e = θ − θ_estimated,   dc/dt = k_i e,   |c|, |δ| ≤ CORRECTION       `feedback`
-    T = argmin ‖T‖²   subject to  −Gᵀ T = τ + k δ,  T_low ≤ T ≤ T_limit,   bone-side tension
+    T = argmin ‖T‖²   subject to  −Gᵀ T + f = τ + k δ,  T_low ≤ T ≤ T_limit,   bone-side tension
     l = ①(θ + δ, T)
     l_target = l + l_comp(T e^{μ s}) + λ dl/dt
 
 Tendon friction: the motor-side tension is T e^{μ s}. Here s is the direction in which the tendon
 slides, and μ is learned or a typical value (`motion/assumed_friction.py`).
+
+Joint stops: f is the torque of the stops of those joints whose desired angle is at a limit
+(`robot/tension.py`). Paths of an arm with isolated muscles may lead along a stop (`reach`).
 
 Lag of the muscle modules: a motor under muscle stiffness control (MSC) turns at
 dl/dt = (T − T_MSC)/(K_stiff λ). Therefore the command has to lead by λ dl/dt. A tendon that is

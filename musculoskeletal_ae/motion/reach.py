@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finds out whether a posture is holdable, and finds holdable postures and paths.
 
-All functions use the learned G and the least tensions within the limits. An arm with isolated
-muscles falls where the remaining muscles cannot hold it, until a joint's stop supports it. From
-there, the straight path to a target may lead through postures that are not holdable. `way` returns
-the cheapest path through a roadmap of random postures, with
+All functions use the learned G and the least tensions within the limits. A posture is holdable if
+the muscles hold it together with the stops of joints at their limits (`supporting_stops`). An arm
+with isolated muscles falls where the remaining muscles cannot hold it, until a joint's stop
+supports it. From there, the straight path to a target may lead through postures that are not
+holdable. `way` returns the cheapest path through a roadmap of random postures, with
 
     cost of an edge = ∫ 1 + PRICE m(θ) ds,   m = max_j |τ_missing,j|
 
@@ -29,7 +30,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.assumed_friction import tendon_friction
 from musculoskeletal_ae.motion.trajectory import Setpoint
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import least_tension
+from musculoskeletal_ae.robot.tension import AT_STOP, least_tension, supporting_stops
 
 NOTABLE = 0.05  # treat a posture as not holdable if it lacks more torque than this [N·m]
 HALVINGS = 6  # search for the last holdable posture of a path with this many bisection steps
@@ -44,15 +45,15 @@ SPACING = 0.15  # evaluate postures of an edge that are at most this far apart [
 #: assume full tendon friction for muscles whose length changes by much more than this with the
 #: angle [m/rad]; less friction for other muscles, because their sliding direction is uncertain
 CERTAIN = 0.005
-AT_STOP = 0.05  # treat a joint as resting at a stop that is nearer than this [rad]
-STOP = 100.0  # let a stop support a joint with at most this torque [N·m]
 
 
 def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
     """Return a text on the largest missing torque at θ [rad], (D,), or '' if θ is holdable."""
     limits, torque = robot.tension, robot.kinematics.holding_torque(theta)
     jacobian = mae.muscle_jacobian(theta, limits.bias)
-    lacks = np.abs(least_tension(jacobian, torque, limits.bias, limits.limit).missing_torque)
+    stops = supporting_stops(robot, theta)
+    exertion = least_tension(jacobian, torque, limits.bias, limits.limit, stops=stops)
+    lacks = np.abs(exertion.missing_torque)
     joint = int(lacks.argmax())
     if lacks[joint] <= NOTABLE:
         return ''
@@ -145,7 +146,9 @@ class ReachLimits:
         paid_out = np.maximum(jacobian @ velocity, 0.0)
         ends = self.of(jacobian, at.velocity, robot.actuation.tension_of_lag(lag, paid_out))
         torque = robot.kinematics.inverse_dynamics(at.theta, velocity, acceleration)
-        return float(np.abs(least_tension(jacobian, torque, *ends).missing_torque).max())
+        stops = supporting_stops(robot, at.theta)
+        exertion = least_tension(jacobian, torque, *ends, stops=stops)
+        return float(np.abs(exertion.missing_torque).max())
 
 
 class PathCost:
@@ -174,25 +177,12 @@ class PathCost:
         jacobians = self._mae.muscle_jacobian(postures, tensions)
         torques = []
         for theta, jacobian in zip(postures, jacobians):
-            # Model a stop as a muscle that pulls the joint away from it.
-            stops = self._stops(theta)
-            none = np.zeros(len(stops))
-            low, high = self._limits.of(jacobian, moved)
-            ends = np.concatenate([low, none]), np.concatenate([high, none + STOP])
+            ends, stops = self._limits.of(jacobian, moved), supporting_stops(robot, theta)
             torque = robot.kinematics.holding_torque(theta)
-            exertion = least_tension(np.vstack([jacobian, stops]), torque, *ends)
+            exertion = least_tension(jacobian, torque, *ends, stops=stops)
             torques.append(exertion.missing_torque)
         m = np.abs(torques).max(axis=1)
         return np.where(m > NOTABLE, m, 0.0)
-
-    def _stops(self, theta: Array) -> Array:
-        """Return muscle Jacobians (S, D) that model the S joint stops at which joints rest.
-
-        A stop is modelled as a muscle that pulls the joint away from the stop.
-        """
-        robot, joints = self._robot, np.eye(self._robot.joint_count)
-        is_low, is_high = theta < robot.lower + AT_STOP, theta > robot.upper - AT_STOP
-        return np.vstack([-joints[is_low], joints[is_high]])
 
     def of_edge(self, one: Array, other: Array) -> float:
         """Return the cost of the straight path between two postures θ [rad], (D,) each."""

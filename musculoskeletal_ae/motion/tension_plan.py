@@ -21,7 +21,7 @@ from musculoskeletal_ae.motion.methods import Solution, stiffness_command
 from musculoskeletal_ae.motion.slowness import SHARE
 from musculoskeletal_ae.motion.trajectory import Trajectory
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import least_tension
+from musculoskeletal_ae.robot.tension import least_tension, supporting_stops
 from musculoskeletal_ae.signals.friction import slid
 
 #: plan full tendon friction for tendons that slide much faster than this [m/s], and less for slower
@@ -182,11 +182,13 @@ class TensionPlan:
             near = self._stiffening.step(mae, trajectory, time, self.effort, limit, dt)
         if actuation.knows_tension:
             limits = np.minimum(low, inputs.limit) / loss, inputs.limit / loss
+            stops = supporting_stops(robot, at.theta)
             supporting = torque + self._support * shift.torque
-            tension, missing_torque = least_tension(jacobian, supporting, *limits, near)
+            exertion = least_tension(jacobian, supporting, *limits, near, stops)
+            tension, missing_torque = exertion
             if missing_torque.any():  # report only what is missing without the feedback
-                missing_torque = least_tension(jacobian, torque, *limits, near).missing_torque
-            self.tension = PlannedTension(tension, tension * loss, missing_torque)
+                exertion = least_tension(jacobian, torque, *limits, near, stops)
+            self.tension = PlannedTension(tension, tension * loss, exertion.missing_torque)
         else:
             assumed = actuation.assumed_tension
             self.tension = PlannedTension(assumed, assumed, self.tension.missing_torque)

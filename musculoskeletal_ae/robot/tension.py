@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Muscle tensions that produce a joint torque, by quadratic programming.
+"""Muscle tensions that produce a joint torque, by quadratic programming, and the joint stops.
 
     hard:   min ‖T − T_desired‖²         subject to   −Gᵀ T = τ,   T_low ≤ T ≤ T_high
     soft:   min ‖τ + Gᵀ T‖² + ε ‖T‖²     subject to                T_low ≤ T ≤ T_high
@@ -7,6 +7,14 @@
 (Kawamura 2016). T are the tensions, τ is the joint torque and G = ∂l/∂θ the muscle Jacobian. The
 hard form produces exactly the torque τ. The soft form comes as near to τ as possible, with a small
 weight ε on the tensions.
+
+Where a joint is at a stop (`supporting_stops`), the stop provides a part f of the torque, which the
+programme chooses together with T:
+
+    −Gᵀ T + f = τ,   0 ≤ f_j ≤ STOP_TORQUE at a lower stop,   −STOP_TORQUE ≤ f_j ≤ 0 at an upper one
+
+f_j is 0 for all other joints. As f costs next to nothing compared with tensions, a joint at its
+stop leans on it. The plan of a path and that of the tensions along it use these same stops.
 
 T_desired = 0 gives the least tension that holds τ; the control experiment reports it as the QP
 bound. `check_robot` uses T_desired = 0.3 T_limit, the tension of a well-tensed arm.
@@ -27,6 +35,10 @@ from musculoskeletal_ae.robot.robot import Robot
 LEAST_GAP = 1e-8
 #: ε [(N·m/N)²]; with torques of some N·m and tensions of some hundred N, the second term is small
 SOFT_WEIGHT = 1e-7
+#: let a stop support a joint that is nearer to its limit than this [rad]; a joint with a target
+#: nearer than this may come to rest at the stop instead
+AT_STOP = 0.02
+STOP_TORQUE = 100.0  # let a stop support a joint with at most this torque [N·m]
 
 
 class Exertion(NamedTuple):
@@ -126,6 +138,7 @@ def least_tension(
     low: Array | float,
     high: Array | float,
     desired: Array | float = 0.0,
+    stops: Array | None = None,
 ) -> Exertion:
     """Return tensions that produce a joint torque or, if that is impossible, come nearest to it.
 
@@ -136,15 +149,36 @@ def least_tension(
         high: Highest tensions [N], scalar or (M,).
         desired: Desired tensions [N], scalar or (M,). Of all tensions that produce the torque,
             those nearest to the desired tensions are returned.
+        stops: The joint stops that provide a part of the torque (`supporting_stops`), (S, D); None
+            if the muscles have to provide all of it.
 
     Raises:
         InfeasibleError: If an entry is not finite.
     """
+    count = len(muscle_jacobian)
+    if stops is not None and len(stops):
+        muscle_jacobian = np.concatenate([muscle_jacobian, stops])
+        low, high, desired = (
+            np.concatenate([np.broadcast_to(of_muscles, count), np.full(len(stops), of_stops)])
+            for of_muscles, of_stops in ((low, 0.0), (high, STOP_TORQUE), (desired, 0.0))
+        )
     programme = TensionProgramme(muscle_jacobian, torque, low, high)
     try:
-        return Exertion(programme.nearest(desired), np.zeros(len(torque)))
+        exertion = Exertion(programme.nearest(desired), np.zeros(len(torque)))
     except InfeasibleError:
-        return programme.compromise()
+        exertion = programme.compromise()
+    return exertion._replace(tension=exertion.tension[:count])
+
+
+def supporting_stops(robot: Robot, theta: Array) -> Array:
+    """Return the stops that support joints at θ [rad], (D,), as the rows of a Jacobian (S, D).
+
+    A stop pushes its joint back with any torque, but does not pull it. It is therefore modelled as
+    a muscle that turns its joint away from the limit, and whose tension is the torque.
+    """
+    is_low, is_high = theta < robot.lower + AT_STOP, theta > robot.upper - AT_STOP
+    joints = np.eye(robot.joint_count)
+    return np.concatenate([-joints[is_low], joints[is_high]])
 
 
 @cache

@@ -28,7 +28,7 @@ from musculoskeletal_ae.motion.tension_plan import TURNING
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.actuation import DEPTH
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import TensionProgramme, least_tension
+from musculoskeletal_ae.robot.tension import AT_STOP, TensionProgramme, least_tension
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.simulation.simulation import Simulation
 
@@ -165,6 +165,23 @@ def test_a_target_that_the_others_cannot_hold_is_refused_or_approached():
     bench.isolate([])
     bench.target(NOT_THERE)
     np.testing.assert_array_equal(bench.core.target_state.theta, NOT_THERE)
+
+
+def test_a_posture_that_the_others_hold_with_a_joint_stop_is_approached_and_lacks_no_torque():
+    lifted = [np.where(joint, ROBOT.lower, at) for joint in np.eye(2) for at in POSTURES[:50]]
+    theta = next(
+        theta
+        for theta in lifted
+        if not held(theta) and not lacking(ROBOT_WITHOUT, ExactMae(ROBOT), theta)
+    )
+    bench = Bench(target_duration=0.2)
+    bench.dt = SELDOM
+    bench.isolate([LOST])
+    bench.theta = theta
+    bench.step()
+    bench.target(theta)
+    bench.step(50)
+    assert not bench.follower.missing_torque.any()
 
 
 def test_exploration_is_refused_without_muscles_and_the_report_names_the_remedy():
@@ -313,10 +330,14 @@ def sliding(tmp_path_factory):
 
 def test_a_prismatic_joint_without_muscles_lacks_force_in_newtons(sliding):
     robot, postures, force = sliding
+    wrist, low, high = postures[:, -1], robot.lower[-1] + AT_STOP, robot.upper[-1] - AT_STOP
+    is_supported = (wrist < low) & (force > 0.0) | (wrist > high) & (force < 0.0)
+    missing = np.where(is_supported, 0.0, np.abs(force))
     reported = [lacking(robot, ExactMae(robot), theta) for theta in postures]
     notable = reach.NOTABLE / robot.units[-1].radian
-    assert reported == [f'{f:.2f} N at joint wrist' if f > notable else '' for f in np.abs(force)]
-    assert 0 < np.sum(np.abs(force) > notable) < len(force)
+    assert reported == [f'{f:.2f} N at joint wrist' if f > notable else '' for f in missing]
+    assert 0 < np.sum(missing > notable) < len(force)
+    assert is_supported.any()
 
 
 def test_a_prismatic_joint_without_muscles_is_led_along_its_stop(sliding):

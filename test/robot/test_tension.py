@@ -5,7 +5,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.exceptions import InfeasibleError
-from musculoskeletal_ae.robot.tension import TensionProgramme, least_tension
+from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.robot.tension import (
+    AT_STOP,
+    TensionProgramme,
+    least_tension,
+    supporting_stops,
+)
 
 LOW, HIGH = 30.0, 200.0
 
@@ -69,6 +75,20 @@ def test_the_programme_is_solved_with_muscles_of_equal_bounds(seed, share):
     assert (tension >= LOW - 1e-6).all()
     assert (tension <= high + 1e-6).all()
     np.testing.assert_allclose(missing, torque + jacobian.T @ tension, atol=1e-6)
+
+
+@pytest.mark.parametrize('side', [-1.0, 1.0])
+def test_a_stop_pushes_its_joint_back_and_does_not_pull_it(side):
+    robot = Robot.load('arm26')
+    middle, half = 0.5 * (robot.lower + robot.upper), 0.5 * (robot.upper - robot.lower)
+    near, far = (middle + [side * (half[0] - apart * AT_STOP), 0.0] for apart in (0.9, 1.1))
+    jacobian = np.zeros((robot.muscle_count, 2))  # the muscles exert no torque
+    push, pull = np.array([-side, 0.0]), np.array([side, 0.0])  # torques that the joint needs
+    for theta, torque, missing in [(near, push, 0.0), (near, pull, pull), (far, push, push)]:
+        stops = supporting_stops(robot, theta)
+        exertion = least_tension(jacobian, torque, LOW, HIGH, 60.0, stops)
+        np.testing.assert_allclose(exertion.missing_torque, missing, atol=1e-6)
+        assert exertion.tension.shape == (robot.muscle_count,)
 
 
 @pytest.mark.filterwarnings('error')
