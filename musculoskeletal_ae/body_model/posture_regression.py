@@ -120,15 +120,16 @@ def learned_regressions(
     starts = {each.muscles.tobytes(): each.logarithms for each in body.regressions}
     for group in body.robot.groups:
         joints, muscles = np.array(group.joints, dtype=int), np.array(group.muscles, dtype=int)
-        joints = joints[np.isfinite(observed.theta[:, joints]).mean(axis=0) >= MEASURED_SHARE]
-        is_used = np.isfinite(observed.theta[:, joints]).all(axis=1)
+        is_measured = np.isfinite(observed.theta[:, joints])
+        is_estimated = is_measured.mean(axis=0) >= MEASURED_SHARE
+        joints = joints[is_estimated]
+        is_used = is_measured[:, is_estimated].all(axis=1)
         is_used &= (fit.weight[:, muscles] > 0.0).all(axis=1)
         rows = np.flatnonzero(is_used)
         if len(rows) < LEAST_SAMPLES or not len(joints) or not len(muscles):
             continue
         error, weight = _body_errors(body, observed, fit, rows, group)
-        own = np.searchsorted(group.joints, joints)
-        weighted = weight[:, None] * np.square(error[:, own])
+        weighted = weight[:, None] * np.square(error[:, is_estimated])
         body_variance = weighted.sum(axis=0) / weight.sum()
         start = starts.get(muscles.tobytes())
         used = observed[rows]
@@ -260,20 +261,20 @@ def _body_errors(
     error, weight = fit.residual[np.ix_(rows, muscles)], fit.weight[np.ix_(rows, muscles)]
     spread, correlation = np.tile(fit.noise[muscles], (len(rows), 1)), np.eye(len(muscles))
     if (known := body.remainder.group_of(muscles)) is not None:
-        place = np.searchsorted(known.left_out.rows, rows)
-        error, weight = known.left_out.error[place], known.left_out.weight[place]
-        spread = np.sqrt(known.left_out.variance[place])
         correlation = known.correlation @ known.correlation.T
+        is_known = np.isin(rows, known.left_out.rows)
+        place = np.searchsorted(known.left_out.rows, rows[is_known])
+        error[is_known], weight[is_known] = (
+            part[place] for part in (known.left_out.error, known.left_out.weight)
+        )
+        spread[is_known] = np.sqrt(known.left_out.variance[place])
     direction = np.zeros_like(tension)
-    steps = DIFFERENCE * np.eye(theta.shape[1])[joints]
-    slope = np.stack(
-        [
-            (body.lengths(theta + step, tension, direction)[0]
-             - body.lengths(theta - step, tension, direction)[0])[:, muscles]
-            for step in steps
-        ],
-        axis=2,
-    ) / (2.0 * DIFFERENCE)  # fmt: skip
+
+    def lengths(at: Array) -> Array:
+        return body.lengths(at, tension, direction)[0][:, muscles]
+
+    length, steps = lengths(theta), DIFFERENCE * np.eye(theta.shape[1])[joints]
+    slope = np.stack([lengths(theta + step) - length for step in steps], axis=2) / DIFFERENCE
     inverse = np.linalg.inv(correlation) / (spread[:, :, None] * spread[:, None, :])
     by_length = slope.swapaxes(1, 2) @ inverse
     low, high = body.robot.lower[joints], body.robot.upper[joints]
