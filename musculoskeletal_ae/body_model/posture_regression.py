@@ -51,7 +51,7 @@ SPREAD = np.array([3.0, 3.0, 3.0, 2.0, 1.5, 1.5])
 #: search each of the six logarithms within these limits
 BOUNDS = ((-8.0, 4.0), (-8.0, 2.0), (-8.0, 4.0), (-8.0, 4.0), (-4.0, 4.0), (-4.0, 1.0))
 #: start a search from these logarithms, for a smooth and for a rough rest
-STARTS = USUAL, USUAL + [0.0, 0.0, 0.0, 0.0, -1.2, 0.0]
+STARTS: tuple[Array, ...] = USUAL, USUAL + [0.0, 0.0, 0.0, 0.0, -1.2, 0.0]
 ROUNDS = 40  # end a search that starts from STARTS after this many iterations
 FEW_ROUNDS = 4  # end a search that continues from the last result after this many iterations
 CONSTANT = 0.3  # expect the mean of θ in all postures to differ from that in the samples by this²
@@ -158,17 +158,14 @@ def _learned(
     angle_mean, angle_spread = theta.mean(axis=0), theta.std(axis=0) + JITTER
     scaled, targets = (inputs - mean) / scale, (theta - angle_mean) / angle_spread
     evidence = _Evidence(np.split(scaled, 2, axis=1), targets, weight)
-    is_known = start is not None and len(scaled) >= FEW_SAMPLES
+    starts, rounds = STARTS, ROUNDS
+    if start is not None and len(scaled) >= FEW_SAMPLES:
+        starts, rounds = (start,), FEW_ROUNDS
     found = [
         minimize(
-            evidence,
-            each,
-            jac=True,
-            method='L-BFGS-B',
-            bounds=BOUNDS,
-            options={'maxiter': FEW_ROUNDS if is_known else ROUNDS},
+            evidence, each, jac=True, method='L-BFGS-B', bounds=BOUNDS, options={'maxiter': rounds}
         )
-        for each in ([start] if is_known else STARTS)
+        for each in starts
     ]
     logarithms = min(found, key=lambda result: result.fun).x
     root = cholesky(evidence.covariance(logarithms), lower=True)
@@ -255,12 +252,12 @@ def _body_errors(
     Returns:
         e [rad], (N, D), for the samples in `rows` and the joints of the group, and ω, (N,).
     """
-    joints, muscles = list(group.joints), list(group.muscles)
+    joints, muscles = np.array(group.joints), np.array(group.muscles)
     theta, tension = fit.theta[rows], observed.tension[rows]
     theta = np.where(np.isfinite(observed.theta[rows]), observed.theta[rows], theta)
     error, weight = fit.residual[np.ix_(rows, muscles)], fit.weight[np.ix_(rows, muscles)]
     spread, correlation = np.tile(fit.noise[muscles], (len(rows), 1)), np.eye(len(muscles))
-    if (known := body.remainder.group_of(muscles)) is not None:
+    if (known := body.remainder.group_of(group.muscles)) is not None:
         correlation = known.correlation @ known.correlation.T
         is_known = np.isin(rows, known.left_out.rows)
         place = np.searchsorted(known.left_out.rows, rows[is_known])
@@ -281,5 +278,7 @@ def _body_errors(
     precision = (USUAL_SHARE * (high - low)) ** -2.0
     away = precision * (0.5 * (low + high) - theta[:, joints])
     right = (by_length @ error[:, :, None])[:, :, 0] + away
-    errors = np.linalg.solve(by_length @ slope + np.diag(precision), right[:, :, None])[:, :, 0]
-    return errors, weight.mean(axis=1)
+    curvature = by_length @ slope + np.diag(precision)
+    errors: Array = np.linalg.solve(curvature, right[:, :, None])[:, :, 0]
+    mean_weight: Array = weight.mean(axis=1)
+    return errors, mean_weight
