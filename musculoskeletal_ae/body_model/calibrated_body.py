@@ -27,6 +27,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.body_model import springs
+from musculoskeletal_ae.body_model.posture_regression import PostureRegression
 from musculoskeletal_ae.body_model.remainder import Remainder
 from musculoskeletal_ae.robot.description import RoutePoint
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
@@ -101,6 +102,8 @@ class CalibratedBody:
         self.parameters = parameters or [np.zeros(layout.size) for layout in self.layouts]
         #: what the parameters cannot express; `lengths` includes it, `linearised` does not
         self.remainder = Remainder(robot.muscle_count)
+        #: regressions from lengths to joint angles, which `estimated` combines with the body
+        self.regressions: tuple[PostureRegression, ...] = ()
         #: joint-sensor offsets from which the next fit starts [rad], (D,)
         self.zero = np.zeros(robot.joint_count)
         #: corrections α and β of the joints' springs, from which the next fit starts, (2, D)
@@ -251,6 +254,21 @@ class CalibratedBody:
                 end, _ = self.end(m, tension[:, m], s[:, m])
                 lengths[:, m] = fixed - elastic.elongation(absolute, end)
         return result
+
+    def estimated(self, theta: Array, tension: Array, length: Array) -> Array:
+        """Return the estimate of θ from T and l [rad], (N, D), where the body estimates θ.
+
+        It is the weighted mean of body and regressions (`posture_regression`).
+
+        Args:
+            theta: Estimate of the body [rad], (N, D).
+            tension: Tension readings T or T_read [N], (N, M).
+            length: Measured lengths [m], (N, M).
+        """
+        estimate = theta.copy()
+        for regression in self.regressions:
+            estimate[:, regression.joints] = regression.combined(theta, tension, length)
+        return estimate
 
     def linearised(
         self,

@@ -21,6 +21,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody, Poses
+from musculoskeletal_ae.body_model.posture_regression import learned_regressions
 from musculoskeletal_ae.body_model.postures import FIRST_NOISE, fit_jointly
 from musculoskeletal_ae.body_model.priors import PRIOR, REOPENED, MusclePrior
 from musculoskeletal_ae.body_model.remainder import learned_remainder
@@ -108,6 +109,7 @@ def fit_body(
     # lengths.
     if np.abs(body.remainder.at(measured.theta, observed.tension) - before).max() > LEAST_NOISE:
         fit = fitted()
+    body.regressions = learned_regressions(body, replace(observed, theta=known), fit)
     return fit
 
 

@@ -115,6 +115,15 @@ class Lengths(NamedTuple):
         return Lengths(self.theta[rows], self.tension[rows], deviation, by_body, self.weight[rows])
 
 
+class LeftOut(NamedTuple):
+    """Errors of the lengths of N samples, each predicted from all other samples of a group."""
+
+    rows: Ints  # indices of the samples, ascending, (N,)
+    error: Array  # measured minus predicted lengths [m], (N, M)
+    variance: Array  # variance of these errors [m²], (N, M)
+    weight: Array  # robust weights ω of the samples' lengths, (N, M)
+
+
 @dataclass(frozen=True, eq=False)
 class GroupRemainder:
     """The remainder g of one group of joints and muscles.
@@ -134,6 +143,7 @@ class GroupRemainder:
     #: lower Cholesky factor of k + σ² diag(1/ω) for each row of `crossed` that differs, with the
     #: mean ω of all muscles, (N, N) each
     roots: tuple[Array, ...]
+    left_out: LeftOut
 
     def at(self, theta: Array, tension: Array) -> Array:
         """Return the remainder of the group's muscles [m], (N, M), at θ and T of the whole body."""
@@ -184,6 +194,10 @@ class Remainder:
             result[:, group.muscles] = group.at(theta, tension)
         return result if self.before is None else result + self.before.at(theta, tension)
 
+    def group_of(self, muscles: Sequence[int]) -> GroupRemainder | None:
+        """Return the part of the group with exactly these muscles; None if there is none."""
+        return next((g for g in self.groups if g.muscles.tolist() == list(muscles)), None)
+
     def covariance(self, theta: Array, tension: Array) -> Array:
         """Return the posterior covariance of the remainder [m²] for a known body, (N, M, M)."""
         result = np.zeros((len(theta), self.muscle_count, self.muscle_count))
@@ -229,12 +243,12 @@ def learned_remainder(
             limb, own.limb(joints, muscles), weight[np.ix_(rows, muscles)], priors_of_group
         )
         start = starts.get(joints.tobytes())
-        groups.append(group_remainder(body.robot, joints, muscles, of_group, start))
+        groups.append(group_remainder(body.robot, joints, muscles, rows, of_group, start))
     return Remainder(body.robot.muscle_count, tuple(groups), before)
 
 
 def group_remainder(
-    robot: Robot, joints: Ints, muscles: Ints, lengths: Lengths, start: Array | None
+    robot: Robot, joints: Ints, muscles: Ints, rows: Ints, lengths: Lengths, start: Array | None
 ) -> GroupRemainder:
     """Learn the remainder of one group from samples.
 
@@ -245,6 +259,7 @@ def group_remainder(
         robot: The whole robot.
         joints: Joints of the group.
         muscles: Muscles of the group.
+        rows: Indices of the samples.
         lengths: The samples, with the robust weights of the fit.
         start: Logarithms of the six constants (see UNITS) from which the search starts; None to
             start from STARTS.
@@ -270,9 +285,11 @@ def group_remainder(
         cholesky(_covariance(inputs, inputs, of_joints, logarithms) + mean_noise, lower=True)
         for of_joints, _ in _alike(crossed)
     )
+    left_out_errors = LeftOut(rows, error, variance, lengths.weight)
     return GroupRemainder(
-        joints, muscles, scale, crossed, logarithms, inputs, weights, correlation, roots
-    )
+        joints, muscles, scale, crossed, logarithms, inputs, weights, correlation, roots,
+        left_out_errors,
+    )  # fmt: skip
 
 
 def _likeliest(
@@ -424,7 +441,7 @@ def _parts(inputs: Array, crossed: Bools) -> list[Array]:
     """Return squared distances of inputs by crossed joints, other joints and tensions, (N, N)."""
     joints, of_tensions = inputs[:, : len(crossed)], inputs[:, len(crossed) :]
     parts = joints[:, crossed], joints[:, ~crossed], of_tensions
-    return [_squares(part, part) for part in parts]
+    return [squares(part, part) for part in parts]
 
 
 def _covariance(one: Array, other: Array, crossed: Bools, logarithms: Array) -> Array:
@@ -432,10 +449,10 @@ def _covariance(one: Array, other: Array, crossed: Bools, logarithms: Array) -> 
     _, by_theta, ratio, by_tension, _, _ = _constants(logarithms)
     scale = np.full(one.shape[1], by_tension)
     scale[: len(crossed)] = by_theta * np.where(crossed, 1.0, ratio)
-    return _kernel(_squares(one / scale, other / scale), logarithms)
+    return _kernel(squares(one / scale, other / scale), logarithms)
 
 
-def _squares(one: Array, other: Array) -> Array:
+def squares(one: Array, other: Array) -> Array:
     """Return the squared distances between inputs, (N, K)."""
     squares = np.square(one).sum(axis=1)[:, None] + np.square(other).sum(axis=1)
     squares -= 2.0 * one @ other.T

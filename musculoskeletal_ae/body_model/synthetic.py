@@ -41,7 +41,7 @@ def synthetic_samples(
 ) -> TrainingData:
     """Draw random samples of a body with length noise and residual friction.
 
-        target: (θ_r, T_r, l(θ_r, T_r; s = 0)),   input: (θ_r, T_r, l(θ_r, T_r; u s_r) + ε + e_g)
+        target: (θ_est, T_r, l(θ_r, T_r; s = 0)),   input: (θ_r, T_r, l(θ_r, T_r; u s_r) + ε + e_g)
 
     θ_r are random postures, T_r random tensions at the elastic elements, and s_r random directions
     of sliding. From measured tensions, an estimator can compute T_r except for a share u of the
@@ -53,6 +53,10 @@ def synthetic_samples(
     e_g is drawn from the posterior of the remainder. Far from all real samples, the lengths of the
     body are little known, and might be equal to the known lengths of a different posture. With e_g,
     the network prefers the known posture when it estimates θ.
+
+    θ_est is the mean of θ_r and of the posture regression at the input's T and l, weighted by the
+    variances of body and regression (`posture_regression`). From T and l, the network therefore
+    estimates the weighted mean of both; from θ and T, it computes the lengths of the body.
 
     Args:
         body: The calibrated body.
@@ -75,7 +79,8 @@ def synthetic_samples(
     length, scattered = body.lengths(theta, read, np.zeros(shape), UNKNOWN_FRICTION * direction)
     scattered = scattered + noise * rng.standard_normal(shape)
     scattered = scattered + body.remainder.drawn_error(theta, read, rng)
-    true, entered = State(theta, tension, length), State(theta, tension, scattered)
+    estimate = body.estimated(theta, read, scattered)
+    true, entered = State(estimate, tension, length), State(theta, tension, scattered)
     return TrainingData(entered.scaled(), true.scaled())
 
 
