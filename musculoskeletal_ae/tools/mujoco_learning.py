@@ -5,6 +5,7 @@ The emulated arm is an individual that deviates from the file (`emulator/foreign
 explores in closed loop, as fast as the computer can.
 """
 
+import sys
 import time
 from argparse import Namespace
 from collections.abc import Iterator
@@ -16,7 +17,7 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.design.prospects import prospects
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exceptions import DivergedError, MusculoskeletalError
 from musculoskeletal_ae.experiments.online_learning import explore, teach
 from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,
@@ -48,7 +49,9 @@ class Learned(NamedTuple):
     before: float  # error of the initial network on the held-out motion [rad]
     after: float  # error of the learned network on the held-out motion [rad]
     samples: int  # number of samples that were learned
+    minutes: float  # duration of the exploration [min]
     speed: float  # speed of the exploration, as a multiple of real time
+    problem: str  # what ended the exploration early; empty if nothing did
 
 
 def train(args: Namespace) -> None:
@@ -69,7 +72,9 @@ def train(args: Namespace) -> None:
     learned = learn(robot, initial, robot_folder / 'model.xml', args.seed, args.minutes)
     checkpoint.save(learned.mae, args.out)
     speed, count = f'{learned.speed:.1f} times real time', f'{learned.samples} samples'
-    print(f'{args.minutes:g} min of exploration at {speed}, {count}')
+    if learned.problem:
+        print(f'warning: {learned.problem}; what was learned before is kept', file=sys.stderr)
+    print(f'{learned.minutes:.3g} min of exploration at {speed}, {count}')
     errors = f'{learned.before:.4f} → {learned.after:.4f} {robot.units.distance_unit}'
     print(f'error on {HELD_OUT:g} s of held-out motion: {errors}')
     report = export_into(robot, learned.mae, args.mujoco, model_folder, args.seed)
@@ -82,12 +87,17 @@ def train(args: Namespace) -> None:
 def learn(robot: Robot, initial: Mae, model: Path, seed: int, minutes: float) -> Learned:
     """Let the emulated arm of an imported file explore and learn.
 
+    If the emulated arm diverges, the exploration ends. Nothing is learned from the diverged arm.
+
     Args:
         robot: The imported robot.
         initial: Its initial network.
         model: The `model.xml` that the import wrote.
         seed: Selects the emulated arm, which deviates from the file.
         minutes: Duration of the exploration [min].
+
+    Raises:
+        DivergedError: If the emulated arm diverges during the held-out motion.
     """
 
     def new_arm() -> Arm:
@@ -97,11 +107,15 @@ def learn(robot: Robot, initial: Mae, model: Path, seed: int, minutes: float) ->
     learner = Learner(robot, initial, initial.preset, seed)
     settings = Settings(preset=initial.preset)
     loop = ClosedLoop(new_arm(), initial, settings, EXPLORATION_STREAM + seed)
-    start = time.perf_counter()
-    teach(learner, _shown(loop, learner, 60.0 * minutes))
+    start, problem = time.perf_counter(), ''
+    try:
+        teach(learner, _shown(loop, learner, 60.0 * minutes))
+    except DivergedError as error:
+        minutes, problem = loop.time / 60.0, str(error)
     speed = 60.0 * minutes / (time.perf_counter() - start)
     before, after = (estimation_error(mae, held_out) for mae in (initial, learner.mae))
-    return Learned(learner.mae, before, after, len(learner.samples), speed)
+    samples = len(learner.samples)
+    return Learned(learner.mae, before, after, samples, minutes, speed, problem)
 
 
 def _imported(args: Namespace, folder: Path) -> Robot:
