@@ -260,17 +260,23 @@ def end_tensions(mae: Mae, recording: Recording) -> Array:
     return mae.transmission.end(recording.tension, directions(recording.length))
 
 
-def make_error_function(recording: Recording, stride: int = 1) -> Callable[[Mae], float]:
+def make_error_function(
+    recording: Recording, stride: int = 1, joints: Bools | None = None
+) -> Callable[[Mae], float]:
     """Return a function that computes a network's mean error [rad] on every `stride`-th message.
 
-    The friction directions are computed once, because they are the same for all networks.
+    The friction directions are computed once, because they are the same for all networks. The mask
+    `joints`, (D,), selects the joints that count; by default, all do.
     """
     direction = directions(recording.length)[::stride]
     part = recording.part(np.s_[::stride])
 
     def error(mae: Mae) -> float:
         tension = mae.transmission.end(part.tension, direction)
-        return mean_error(mae.estimate(tension, part.length).theta, part.theta)
+        estimate = mae.estimate(tension, part.length).theta
+        if joints is None:
+            return mean_error(estimate, part.theta)
+        return mean_error(estimate[:, joints], part.theta[:, joints])
 
     return error
 

@@ -12,8 +12,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.design.contacts import movable_joints
 from musculoskeletal_ae.design.prospects import prospects
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
@@ -24,11 +27,12 @@ from musculoskeletal_ae.experiments.recording import (
     HELD_OUT_STREAM,
     SAMPLE_TIME,
     ClosedLoop,
-    estimation_error,
+    make_error_function,
     record,
 )
 from musculoskeletal_ae.exporting.mjcf import export_into
 from musculoskeletal_ae.importing import convert
+from musculoskeletal_ae.importing.source import listed
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -48,6 +52,9 @@ class Learned(NamedTuple):
     mae: Mae  # the learned network
     before: float  # error of the initial network on the held-out motion [rad]
     after: float  # error of the learned network on the held-out motion [rad]
+    #: joints that contacts keep from most of their range (`design/contacts.py`); errors are those
+    #: of the other joints, unless there are none
+    still: tuple[str, ...]
     samples: int  # number of samples that were learned
     minutes: float  # duration of the exploration [min]
     speed: float  # speed of the exploration, as a multiple of real time
@@ -77,6 +84,8 @@ def train(args: Namespace) -> None:
     print(f'{learned.minutes:.3g} min of exploration at {speed}, {count}')
     errors = f'{learned.before:.4f} → {learned.after:.4f} {robot.units.distance_unit}'
     print(f'error on {HELD_OUT:g} s of held-out motion: {errors}')
+    if learned.still:
+        print(f'not movable because of contacts, and not in this error: {listed(learned.still)}')
     report = export_into(robot, learned.mae, args.mujoco, model_folder, args.seed)
     print(next(line for line in report.splitlines() if line.startswith('muscles that keep')))
     print(f'robot: {robot_folder}')
@@ -113,9 +122,11 @@ def learn(robot: Robot, initial: Mae, model: Path, seed: int, minutes: float) ->
     except DivergedError as error:
         minutes, problem = loop.time / 60.0, str(error)
     speed = 60.0 * minutes / (time.perf_counter() - start)
-    before, after = (estimation_error(mae, held_out) for mae in (initial, learner.mae))
-    samples = len(learner.samples)
-    return Learned(learner.mae, before, after, samples, minutes, speed, problem)
+    movable = movable_joints(robot)
+    error_of = make_error_function(held_out, joints=movable if movable.any() else None)
+    before, after, samples = error_of(initial), error_of(learner.mae), len(learner.samples)
+    still = tuple(robot.joints[j] for j in np.flatnonzero(~movable))
+    return Learned(learner.mae, before, after, still, samples, minutes, speed, problem)
 
 
 def _imported(args: Namespace, folder: Path) -> Robot:
