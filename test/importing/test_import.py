@@ -522,6 +522,18 @@ def test_a_chain_is_cut_out_and_what_is_held_is_named(mjcf, tmp_path, capsys):
     assert 'check_robot: no faults' in output
 
 
+def test_a_floating_base_is_held_and_named_unless_it_is_asked_for(mjcf, tmp_path):
+    base = '<body name="base" pos="0 0.1 1" euler="0.2 0 0.1">'
+    slide = '<joint name="root_z" type="slide" axis="0 0 1" range="-1 1" limited="true"/>'
+    mjcf.write_text(mjcf.read_text().replace(base, f'{base}{slide}'))
+    result = import_robot(mjcf, tmp_path / 'held')
+    assert result.robot.joints == ('swing', 'lift', 'elbow')
+    (note,) = [note for note in result.notes if 'root_z' in note]
+    assert re.match(r'held fixed: joint root_z at 0, because .* no muscle moves it', note)
+    joints = 'root_z', 'swing', 'lift', 'elbow'
+    assert import_robot(mjcf, tmp_path / 'kept', joints=joints).robot.joints == joints
+
+
 def test_weight_pulls_in_the_same_direction_on_a_chain_that_was_cut_out(mjcf, tmp_path):
     whole = import_robot(mjcf, tmp_path / 'whole').robot
     part = import_robot(mjcf, tmp_path / 'part', base='upper').robot
