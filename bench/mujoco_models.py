@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lets public MuJoCo models learn, one command for each, and writes the page of the results.
 
-    python -m bench mujoco_models CLONES --out DIR [--only NAME,…] [--minutes 1] [--whole]
+    python -m bench mujoco_models CLONES --out DIR [--only NAME,…] [--seeds 1,2,3] [--whole]
     python -m bench mujoco_models CLONES --out DIR --prospects
     python -m bench mujoco_models CLONES --out DIR --page doc/results/mujoco.md
     python -m bench mujoco_models CLONES --out DIR --only arm26 --experiments --whole --minutes 10
@@ -12,7 +12,8 @@ Finished models are read from DIR, so the same command continues an interrupted 
 
 Each model takes the way of `train --mujoco FILE --seed 1 --quick`, by the same functions: import,
 prospects, initial training, a minute of exploration and learning on an emulated individual, and
-export into a copy of the file. The export is imported again. The numbers of a model are
+export into a copy of the file. The export is imported again. Further individuals (--seeds) learn
+with the same initial network and are not exported. The numbers of a model are
 
 - the share of random postures that the muscles can hold, or near how many of ten random postures
   joint stops or springs support the arm (`design/prospects.py`),
@@ -20,7 +21,8 @@ export into a copy of the file. The export is imported again. The numbers of a m
 - the CPU time from the start of the import to the first network, thus to the first estimate, and
   that of everything [s],
 - the estimation error on 60 s of held-out motion before and after learning [rad, norm over the
-  joints], and the number of rest samples,
+  joints that contacts let move], and the number of rest samples: median and range over the
+  individuals,
 - the difference from the individual in lengths (standard deviation) and moment arms (root mean
   square) [mm, median over the muscles], over POSTURES random postures: of the file, and of the
   exported model.
@@ -58,7 +60,7 @@ from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.mujoco_learning import learn
 
-SEED = 1  # seed of the emulated individual
+SEEDS = 1, 2, 3  # seeds of the emulated individuals; the first one is also exported
 POSTURES = 200  # compare exported models with the individual in this many postures
 QUICK = 10  # divide the number of mini-batches of the initial training by this, without --whole
 SOON = 10.0  # name what cannot work within this time [s]
@@ -138,12 +140,19 @@ def measured(model: Model, file: Path, folder: Path, args: Namespace) -> dict[st
         robot = import_robot(file, robot_folder, check, joints=model.joints).robot
         preset = preset_named('default')
         steps = preset.initial_steps(robot) // (1 if args.whole else QUICK)
-        initial = initial_mae(robot, preset.name, SEED, steps=steps).mae
+        initial = initial_mae(robot, preset.name, args.seeds[0], steps=steps).mae
         result['first'] = seconds()
-        learned = learn(robot, initial, robot_folder / 'model.xml', SEED, args.minutes)
-        result.update(before=learned.before, after=learned.after, samples=learned.samples)
-        export_into(robot, learned.mae, file, folder / 'exported', SEED)
-        result['whole'] = seconds()
+        result['individuals'] = individuals = list[dict[str, Any]]()
+        for seed in args.seeds:
+            learned = learn(robot, initial, robot_folder / 'model.xml', seed, args.minutes)
+            individuals.append({
+                'seed': seed, 'before': learned.before, 'after': learned.after,
+                'samples': learned.samples, 'problem': learned.problem,
+            })  # fmt: skip
+            if seed == args.seeds[0]:
+                result['still'] = learned.still
+                export_into(robot, learned.mae, file, folder / 'exported', seed)
+                result['whole'] = seconds()
         exported = folder / 'exported' / file.name, folder / 'exported_robot'
         again = import_robot(*exported, joints=model.joints).robot
     except EnoughError:
@@ -154,7 +163,8 @@ def measured(model: Model, file: Path, folder: Path, args: Namespace) -> dict[st
         result.update(refused=text, known=result.get('known', seconds()))
         return result
     theta = robot.random_postures(POSTURES, np.random.default_rng(0x308))
-    body = make_arm(robot, SEED, str(robot_folder / 'model.xml'), deviates=True).individual
+    model_file = str(robot_folder / 'model.xml')
+    body = make_arm(robot, args.seeds[0], model_file, deviates=True).individual
     for name, other in (('file', robot), ('exported', again)):
         result[f'{name}_length'], result[f'{name}_arm'] = differences(other, body, theta)
     return result
@@ -199,7 +209,7 @@ def run(model: Model, args: Namespace) -> dict[str, Any] | None:
     folder = args.out / folder_name(model)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    result = measured(model, file, folder, args)
+    result = measured(model, file, folder, args) | {'commit': commit()}
     is_whole = 'refused' in result or 'whole' in result
     name = RESULT if is_whole else PROSPECTS
     (folder / name).write_text(json.dumps(result), encoding='utf-8')
@@ -216,9 +226,19 @@ def cells(model: Model, result: dict[str, Any]) -> list[str]:
         ' → '.join(f'{1e3 * result[f"{kind}_{what}"]:.2f}' for kind in ('file', 'exported'))
         for what in ('length', 'arm')
     )
-    errors = f'{result["before"]:.3f} → {result["after"]:.3f}'
     times = f'{result["first"]:.0f}', f'{result["whole"]:.0f}'
-    return [*head, *times, errors, str(result['samples']), length, arm]
+    found = [values(result, name, '.3f') for name in ('before', 'after')]
+    errors = ' → '.join(found)
+    if still := result['still']:
+        errors += f'; without {", ".join(still)}'
+    return [*head, *times, errors, values(result, 'samples', '.0f'), length, arm]
+
+
+def values(result: dict[str, Any], name: str, form: str) -> str:
+    """Return the median of a value of the individuals, with its range if there are several."""
+    found = [each[name] for each in result['individuals']]
+    spread = f' ({min(found):{form}} to {max(found):{form}})' if len(found) > 1 else ''
+    return f'{float(np.median(found)):{form}}{spread}'
 
 
 HEAD = (
@@ -228,11 +248,11 @@ HEAD = (
 REFUSED_HEAD = 'model', 'known after [s]', 'reason'
 PAGE = """# Public MuJoCo models
 
-`python -m bench mujoco_models CLONES --out DIR --minutes {minutes:g}{whole}` imports public
-models of MuJoCo, lets an emulated individual of each explore and learn for {minutes:g} min, and
-exports what it learned into a copy of the file. It takes the way of
-`train --mujoco FILE --seed {seed}{quick}`, by the same functions ({count} models; page written at
-{commit}).
+`python -m bench mujoco_models CLONES --out DIR --minutes {minutes:g} --seeds {seeds}{whole}`
+imports public models of MuJoCo, lets emulated individuals of each explore and learn for
+{minutes:g} min, and exports what the first one learned into a copy of the file. It takes the way of
+`train --mujoco FILE --seed {seed}{quick}`, by the same functions ({count} models;
+measured {commit}).
 
 {missing}![The models, drawn by this project](mujoco/models.png)
 
@@ -243,7 +263,9 @@ exports what it learned into a copy of the file. It takes the way of
 - **first estimate**, **whole**: CPU time from the start of the import to the first network, and to
   the exported model. Other programs shared the two cores, so times vary by a factor of two.
 - **error**: before and after learning, on 60 s of held-out motion of the individual, norm over
-  the joints. One individual and a short exploration: the errors of longer runs are in the
+  the joints; median and range of {individuals} individuals, or of one if there is no range. Joints
+  after "without" cannot move over half of their range, because bodies of the file touch, and do not
+  count. The exploration is short: the errors of longer runs are in the
   [results](../results.md#mujoco-models).
 - **samples**: rest samples in {minutes:g} min.
 - **export**: difference from the individual, before (the file) and after (the exported model), over
@@ -287,12 +309,25 @@ def rows_of(
     return learned, refused
 
 
-def page(results: Sequence[tuple[Model, dict[str, Any]]], args: Namespace) -> str:
-    """Return the page of results in Markdown."""
-    commit = subprocess.run(
+def commit() -> str:
+    """Return the last commit that changed the package."""
+    return subprocess.run(
         ['git', 'log', '-1', '--format=%h', '--', 'musculoskeletal_ae'],
         cwd=ROOT, capture_output=True, text=True, check=False,
     ).stdout.strip()  # fmt: skip
+
+
+def commits(results: Sequence[tuple[Model, dict[str, Any]]]) -> str:
+    """Return a text that lists the commits at which the models were measured."""
+    at = dict[str, list[str]]()
+    for model, result in results:
+        at.setdefault(result['commit'], []).append(model.name)
+    main, *others = sorted(at, key=lambda each: -len(at[each]))
+    return '; '.join([f'at commit {main}', *(f'{", ".join(at[each])}: {each}' for each in others)])
+
+
+def page(results: Sequence[tuple[Model, dict[str, Any]]], args: Namespace) -> str:
+    """Return the page of results in Markdown."""
     learned, refused = rows_of(results)
     sources = [
         [model.name, model.repository, model.file, ', '.join(model.joints) or 'all']
@@ -307,9 +342,11 @@ def page(results: Sequence[tuple[Model, dict[str, Any]]], args: Namespace) -> st
         minutes=args.minutes,
         whole=' --whole' if args.whole else '',
         quick='' if args.whole else ' --quick',
-        seed=SEED,
+        seed=args.seeds[0],
+        seeds=','.join(map(str, args.seeds)),
+        individuals=len(args.seeds),
         count=len(results),
-        commit=commit,
+        commit=commits(results),
         postures=POSTURES,
         table=table(HEAD, learned),
         refused=table(REFUSED_HEAD, refused),
@@ -368,6 +405,7 @@ def main(argv: list[str]) -> None:
     parser.add_out('DIR', 'folder of the results; the same one continues an interrupted run')
     parser.add_argument('--only', type=names, help='names of models, or parts of them')
     parser.add_minutes('duration of the exploration', 1.0)
+    parser.add_seeds(SEEDS)
     text = 'measure the prospects only'
     parser.add_argument('--prospects', action='store_true', help=text)
     text = 'whole initial training, instead of a tenth as with --quick of train'

@@ -55,6 +55,13 @@ class InfeasibleError(MusculoskeletalError):
     """No muscle tensions within the limits produce the given torque, or an input is not finite."""
 
 
+class DivergedError(MusculoskeletalError):
+    """An emulated arm has left the range in which it can be simulated.
+
+    The text names the joint, its value, the legal range, the probable cause and a remedy.
+    """
+
+
 class MessageError(MusculoskeletalError):
     """A received message is invalid or refused; it is counted under the short text `reason`."""
 

@@ -56,6 +56,25 @@ MJCF = """<mujoco model="own">
 </mujoco>
 """
 
+#: a finger beside an obstacle, whose centre of mass is on the axes of its joints
+TOUCHING = """<mujoco><default><geom margin=".002"/></default>
+  <worldbody><geom name="obstacle" type="box" size=".01 .05 .1" pos=".035 0 -.1"/>
+    <site name="a" pos=".02 0 .05"/><site name="b" pos="-.02 0 .05"/>
+    <site name="c" pos="0 .02 .05"/><site name="d" pos="0 -.02 .05"/>
+    <body name="finger"><joint name="spread" axis="1 0 0" range="-20 20" damping=".05"
+        armature=".0001"/><joint name="bend" axis="0 1 0" range="-60 60" damping=".05"
+        armature=".0001"/><inertial pos="0 0 0" mass=".01" diaginertia="1e-5 1e-5 1e-5"/>
+      <geom type="capsule" fromto="0 0 -.02 0 0 -.1" size=".01"/>
+      <site name="e" pos=".02 0 -.05"/><site name="f" pos="-.02 0 -.05"/>
+      <site name="g" pos="0 .02 -.05"/><site name="h" pos="0 -.02 -.05"/></body></worldbody>
+  <tendon><spatial name="out"><site site="a"/><site site="e"/></spatial>
+    <spatial name="in"><site site="b"/><site site="f"/></spatial>
+    <spatial name="left"><site site="c"/><site site="g"/></spatial>
+    <spatial name="right"><site site="d"/><site site="h"/></spatial></tendon>
+  <actuator><motor tendon="out" ctrlrange="-50 0"/><motor tendon="in" ctrlrange="-50 0"/>
+    <motor tendon="left" ctrlrange="-50 0"/><motor tendon="right" ctrlrange="-50 0"/></actuator>
+</mujoco>"""
+
 URDF = """<robot name="own">
   <link name="base"><inertial><origin xyz="0 0.01 0.1"/><mass value="2"/>
     <inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.01"/></inertial></link>

@@ -2,6 +2,7 @@
 """`python -m bench` lists and starts all benches."""
 
 import importlib
+import json
 from pathlib import Path
 
 import numpy as np
@@ -105,3 +106,20 @@ def test_a_regression_learns_a_smooth_function(name):
 def test_an_unknown_body_is_refused_with_the_legal_ones(tmp_path):
     with pytest.raises(MusculoskeletalError, match=r'nose:20.*kin_SEED or foreign_SEED'):
         bodies.main(['nose:20', '--cache', str(tmp_path)])
+
+
+def test_models_that_several_individuals_have_learned_show_median_and_range(tmp_path, capsys):
+    individuals = [
+        {'seed': seed, 'before': 0.4, 'after': after, 'samples': 9, 'problem': ''}
+        for seed, after in ((1, 0.3), (2, 0.1), (3, 0.2))
+    ]
+    result = {'joints': 1, 'muscles': 6, 'known': 1.0, 'held': '100 %', 'first': 3.0, 'whole': 20.0}
+    result |= {
+        f'{kind}_{what}': 0.001 for kind in ('file', 'exported') for what in ('length', 'arm')
+    }
+    result |= {'individuals': individuals, 'still': ['elbow'], 'commit': 'abc'}
+    (tmp_path / 'arm26').mkdir()
+    (tmp_path / 'arm26' / 'result.json').write_text(json.dumps(result))
+    main(['mujoco_models', str(tmp_path), '--out', str(tmp_path), '--only', 'arm26'])
+    printed = capsys.readouterr().out
+    assert '0.400 (0.400 to 0.400) → 0.200 (0.100 to 0.300); without elbow' in printed

@@ -12,6 +12,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.design.checks import COUNTED_ARM_SHARE, LEAST_COUNTED_ARM
+from musculoskeletal_ae.design.contacts import Contacts, contacts
 from musculoskeletal_ae.motion.explored_postures import supported_postures
 from musculoskeletal_ae.robot.actuation import DESIRED_SHARE
 from musculoskeletal_ae.robot.equilibrium_states import has_followers
@@ -42,6 +43,7 @@ class Prospects(NamedTuple):
     idle: Bools  # whether no muscle moves each joint, (D,)
     #: joints that most often lack torque in a posture that is not held, and in how many postures
     lacking: tuple[tuple[str, int], ...]
+    contacts: Contacts | None  # contacts in random postures; None if the robot was not imported
 
     @property
     def share(self) -> float:
@@ -84,6 +86,8 @@ class Prospects(NamedTuple):
             lines.append(f'warning: {counts}, and only these are explored{lack}')
         else:
             lines.append(f'{counts}')
+        if self.contacts is not None:
+            lines += self.contacts.lines(robot)
         lines.append(f'{robot.joint_count} joints, {robot.muscle_count} muscles')
         return lines
 
@@ -113,4 +117,4 @@ def prospects(robot: Robot) -> Prospects:
     supported = 0
     if held < POINTLESS_SHARE * examined:
         supported = len(supported_postures(robot, theta[:NEAR_POSTURES]))
-    return Prospects(robot, held, examined, supported, idle, named)
+    return Prospects(robot, held, examined, supported, idle, named, contacts(robot))

@@ -26,12 +26,14 @@ from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT, ArmReadings, Faults
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exceptions import DivergedError, MusculoskeletalError
 from musculoskeletal_ae.robot.joint_units import SLIDE
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
 STEP = 0.001  # duration of a simulation step [s]
+#: count an arm as diverged if a joint is faster than this [rad/s] or [m/s]; it then stands still
+FASTEST = 1000.0
 
 #: modes of a module: safe state, following a target length, following a target tension
 SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
@@ -361,8 +363,36 @@ class Arm(ABC):
 
     @property
     def has_diverged(self) -> bool:
-        """Whether excessive forces have made a joint angle NaN or infinite; `reset` ends this."""
-        return not np.isfinite(self.theta).all()
+        """Whether a joint is so fast (FASTEST) that it cannot be simulated; `reset` ends this."""
+        # The comparison is False if the speed is NaN.
+        return not np.abs(self._rates[self._order]).max() <= FASTEST
+
+    @property
+    def divergence(self) -> str:
+        """Text on how the arm has diverged, with cause and remedy; empty if it has not."""
+        if not self.has_diverged:
+            return ''
+        speed = np.abs(self._rates[self._order])
+        j = int(np.flatnonzero(~(speed <= FASTEST))[0])
+        unit = self.robot.units[j].position
+        problem = f'joint {self.robot.joints[j]} moves at {speed[j]:.4g} {unit}/s'
+        return f'{problem}; legal: at most {FASTEST:g}. {self._divergence_cause()}'
+
+    def check(self) -> None:
+        """Check that the simulation is valid.
+
+        Raises:
+            DivergedError: If the arm has diverged.
+        """
+        if self.has_diverged:
+            raise DivergedError(f'the emulated arm has diverged: {self.divergence}')
+
+    def _divergence_cause(self) -> str:
+        """Return sentences with the probable cause of a divergence, and its remedy."""
+        return (
+            'The forces on the arm exceed what its inertia can carry in steps of 1 ms; reduce the '
+            'external wrench and `tension.limit`, or increase the inertia of the links'
+        )
 
     @property
     def safe(self) -> bool:
@@ -466,6 +496,8 @@ class Arm(ABC):
             self._age += STEP
             if self._age > self.command_timeout:
                 self._kind = SAFE
+            if self.has_diverged:
+                return
             self._step()
 
     @abstractmethod

@@ -57,7 +57,7 @@ class ContactLoop(ClosedLoop):
     def rest(self, theta: Array) -> None:
         """End the push, reset the controller, which may have stopped, and move to θ [rad] (D,)."""
         self.push(np.zeros(3))
-        self.core.reset(self._now)
+        self.core.reset(self.time)
         self.target(theta)
         self.contacts_during(MOVE)
 

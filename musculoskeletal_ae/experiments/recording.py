@@ -69,6 +69,7 @@ class ClosedLoop:
         estimator: The core of the estimator.
         core: The core of the controller.
         mae: The network in use.
+        time: Time since the beginning [s].
         stops: How often `explore` has ended a stop.
     """
 
@@ -88,7 +89,7 @@ class ClosedLoop:
         self.arm, self.core, self.stops = arm, Controller(arm.robot, settings, seed), 0
         self.estimator = Estimator(arm.robot, mae.preset)
         self.estimator.configure(EstimatorSettings(on_anomaly=on_anomaly))
-        self._read, self._now = arm.sense(), 0.0
+        self._read, self.time = arm.sense(), 0.0
         self.use(mae)
 
     def use(self, mae: Mae) -> None:
@@ -97,8 +98,12 @@ class ClosedLoop:
         self.core.use(self.mae)
 
     def step(self) -> tuple[Array, ...]:
-        """Advance by one message; return a row of a recording."""
-        arm, core, read, now = self.arm, self.core, self._read, self._now
+        """Advance by one message; return a row of a recording.
+
+        Raises:
+            DivergedError: If the emulated arm has diverged; no message comes from it then.
+        """
+        arm, core, read, now = self.arm, self.core, self._read, self.time
         with suppress(MessageError):  # the nodes count and drop bad messages
             core.take(read.muscles, now)
             core.estimated(self.estimate(read, now), now)
@@ -108,8 +113,9 @@ class ClosedLoop:
             follow = arm.command_length if command.kind == LENGTH else arm.command_tension
             follow(command.value)
         arm.step(SAMPLE_TIME)
+        arm.check()
         reading = arm.sense()
-        self._read, self._now = reading, now + SAMPLE_TIME
+        self._read, self.time = reading, now + SAMPLE_TIME
         sent = read.muscles.length if command is None else command.value
         return arm.theta, reading.theta, reading.muscles.length, reading.muscles.tension, sent
 
@@ -136,7 +142,7 @@ class ClosedLoop:
         if estimator.body.anomaly is Anomaly.FOUND:
             with suppress(MusculoskeletalError):  # refused while the suspect does not fit
                 estimator.reset()
-        if not supervisor.is_running and core.reset(self._now) is None:
+        if not supervisor.is_running and core.reset(self.time) is None:
             self.stops += 1
         if supervisor.is_running and not supervisor.explores:
             core.explore(True)
@@ -196,6 +202,9 @@ def record(
         stream: Random seed of the exploration steps, or the steps themselves.
         duration: Duration [s], rounded up to whole steps.
         script: Function that is called before every message; see `Script`.
+
+    Raises:
+        DivergedError: If the emulated arm has diverged.
     """
     planned, rows = 0.0, list[tuple[Array, ...]]()
     # The first ramp starts at the present lengths, so that the command does not jump.
@@ -216,6 +225,7 @@ def record(
             else:
                 arm.command_tension(np.where(off, 0.0, demand))
             arm.step(SAMPLE_TIME)
+            arm.check()
             read = arm.sense()
             muscles = read.muscles
             rows.append((arm.theta, read.theta, muscles.length, muscles.tension, command))
@@ -250,17 +260,23 @@ def end_tensions(mae: Mae, recording: Recording) -> Array:
     return mae.transmission.end(recording.tension, directions(recording.length))
 
 
-def make_error_function(recording: Recording, stride: int = 1) -> Callable[[Mae], float]:
+def make_error_function(
+    recording: Recording, stride: int = 1, joints: Bools | None = None
+) -> Callable[[Mae], float]:
     """Return a function that computes a network's mean error [rad] on every `stride`-th message.
 
-    The friction directions are computed once, because they are the same for all networks.
+    The friction directions are computed once, because they are the same for all networks. The mask
+    `joints`, (D,), selects the joints that count; by default, all do.
     """
     direction = directions(recording.length)[::stride]
     part = recording.part(np.s_[::stride])
 
     def error(mae: Mae) -> float:
         tension = mae.transmission.end(part.tension, direction)
-        return mean_error(mae.estimate(tension, part.length).theta, part.theta)
+        estimate = mae.estimate(tension, part.length).theta
+        if joints is None:
+            return mean_error(estimate, part.theta)
+        return mean_error(estimate[:, joints], part.theta[:, joints])
 
     return error
 

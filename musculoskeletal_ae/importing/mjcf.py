@@ -260,21 +260,27 @@ class _Reader:
         return fixed
 
     def _not_modelled(self) -> None:
-        m = self.model
+        """Note what the robot directory cannot represent; the emulated arm has most of it."""
+        m, only = self.model, 'only in model.xml'
+        if forces := self._named('joint', m.jnt_actfrclimited):
+            self.source.note('dropped', f"limits of the actuators' force: joint {forces}")
         for kind, effect, values in (
             ('joint', 'armature', m.dof_armature[m.jnt_dofadr]),
-            ('joint', "limits of the actuators' force", m.jnt_actfrclimited),
             ('joint', 'friction', m.dof_frictionloss[m.jnt_dofadr]),
             ('tendon', 'armature', m.tendon_armature),
             ('tendon', 'limits', m.tendon_limited),
             ('tendon', 'friction', m.tendon_frictionloss),
             ('body', 'compensated weight', m.body_gravcomp),
         ):
-            if named := ', '.join(self.names[kind][i] for i in np.flatnonzero(values).tolist()):
-                self.source.note('dropped', f'{effect}: {kind} {named}')
+            if named := self._named(kind, values):
+                self.source.note(only, f'{effect}: {kind} {named}')
         touching = int(np.count_nonzero(m.geom_contype | m.geom_conaffinity))
         if m.npair or touching > 1:
-            self.source.note('dropped', f'contacts: {touching} geoms may touch each other')
+            self.source.note(only, f'contacts: {touching} geoms may touch each other')
+
+    def _named(self, kind: str, values: Any) -> str:
+        """Return the names of the elements of a kind that have a value other than 0, as a text."""
+        return ', '.join(self.names[kind][i] for i in np.flatnonzero(values).tolist())
 
     def _bodies(self) -> None:
         """Add links and joints; a joint's frame lies at its anchor and has the axes of its body."""

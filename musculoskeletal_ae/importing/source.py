@@ -367,12 +367,14 @@ def cut(
     """Reduce the source in place to the links that descend from the base, and fix unwanted joints.
 
     All other links are removed, with their muscles. Joints that do not stay movable are held fixed,
-    with a note. Muscles that move no joint are removed as well.
+    with a note. Muscles that move no joint are removed as well. Without `joints`, this holds the
+    joints of a floating base, too.
 
     Args:
         source: The source, which is changed in place.
-        joints: Joints that stay movable; by default all. If `end` is given, joints that move
-            neither it nor a coupled joint on the path to it are held fixed as well.
+        joints: Joints that stay movable; by default all but those of a floating base. If `end` is
+            given, joints that move neither it nor a coupled joint on the path to it are held fixed
+            as well.
         muscles: Muscles that stay; by default all.
         without: Muscles to remove.
         base: The new root link; by default the present one.
@@ -401,7 +403,8 @@ def cut(
     movable = [n for n in inner if model.joints[model.getJointId(n)].shortname() in KINDS]
     couplings = source.couplings
     free = [name for name in movable if name not in {*couplings, *source.fixed}]
-    wanted = set(joints or free)
+    floating = set() if joints else _floating_joints(source) & set(free)
+    wanted = set(joints or free) - floating
     if missing := sorted(wanted - set(free)):
         kind = 'coupled' if missing[0] in couplings else 'unknown'
         raise SourceError(f'--joints: {kind} joint {missing[0]!r}; joints: {", ".join(free)}')
@@ -417,7 +420,9 @@ def cut(
     kept = wanted | set(source.couplings)
     for name in inner:
         if name not in kept:
-            source.note('held fixed', f'joint {name} at {source.rest.get(name, 0.0):.4g}')
+            reason = ', because it moves the whole body and no muscle moves it (keep it: --joints)'
+            at = f'joint {name} at {source.rest.get(name, 0.0):.4g}'
+            source.note('held fixed', at + reason * (name in floating))
     locked = [i for i in range(1, model.njoints) if model.names[i] not in kept]
     at_rest = pin.integrate(model, pin.neutral(model), velocity)
     source.model = reduced(model, locked, at_rest)
@@ -446,6 +451,17 @@ def cut(
         held = [note for note in source.notes if note.startswith('held fixed')]
         remedy = 'keep at least one by --joints, --base and --end'
         raise SourceError('; '.join(['no movable joint remains', *held[:3], remedy]))
+
+
+def _floating_joints(source: Source) -> set[str]:
+    """Return the joints of a floating base: they move all links to which muscles are attached.
+
+    No muscle can hold such a joint. It lets a whole animal fly or fall, for example.
+    """
+    model = source.model
+    carriers = {source.place(item.link)[0] for route in source.routes.values() for item in route}
+    above = [set(model.supports[carrier]) for carrier in carriers]
+    return {model.names[i] for i in set.intersection(*above)} if above else set()
 
 
 def _choose_end(source: Source) -> None:

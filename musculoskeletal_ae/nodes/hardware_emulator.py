@@ -131,7 +131,7 @@ class HardwareEmulatorNode(ArmNode):
         yield from super().conditions()
         kind = ConditionKind
         if self.arm.has_diverged:
-            yield kind.EMULATION_DIVERGED.condition()
+            yield kind.EMULATION_DIVERGED.condition(self.arm.divergence)
         elif self.arm.safe:
             yield kind.MODULES_IN_SAFE_STATE.condition()
         if faults := self.parameter('faults'):

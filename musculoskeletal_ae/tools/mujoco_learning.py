@@ -5,29 +5,34 @@ The emulated arm is an individual that deviates from the file (`emulator/foreign
 explores in closed loop, as fast as the computer can.
 """
 
+import sys
 import time
 from argparse import Namespace
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.design.contacts import movable_joints
 from musculoskeletal_ae.design.prospects import prospects
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
-from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.exceptions import DivergedError, MusculoskeletalError
 from musculoskeletal_ae.experiments.online_learning import explore, teach
 from musculoskeletal_ae.experiments.recording import (
     EXPLORATION_STREAM,
     HELD_OUT_STREAM,
     SAMPLE_TIME,
     ClosedLoop,
-    estimation_error,
+    make_error_function,
     record,
 )
 from musculoskeletal_ae.exporting.exported_mjcf import export_into
 from musculoskeletal_ae.importing import convert
+from musculoskeletal_ae.importing.source import listed
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -47,8 +52,13 @@ class Learned(NamedTuple):
     mae: Mae  # the learned network
     before: float  # error of the initial network on the held-out motion [rad]
     after: float  # error of the learned network on the held-out motion [rad]
+    #: joints that contacts keep from most of their range (`design/contacts.py`); errors are those
+    #: of the other joints, unless there are none
+    still: tuple[str, ...]
     samples: int  # number of samples that were learned
+    minutes: float  # duration of the exploration [min]
     speed: float  # speed of the exploration, as a multiple of real time
+    problem: str  # what ended the exploration early; empty if nothing did
 
 
 def train(args: Namespace) -> None:
@@ -69,9 +79,13 @@ def train(args: Namespace) -> None:
     learned = learn(robot, initial, robot_folder / 'model.xml', args.seed, args.minutes)
     checkpoint.save(learned.mae, args.out)
     speed, count = f'{learned.speed:.1f} times real time', f'{learned.samples} samples'
-    print(f'{args.minutes:g} min of exploration at {speed}, {count}')
+    if learned.problem:
+        print(f'warning: {learned.problem}; what was learned before is kept', file=sys.stderr)
+    print(f'{learned.minutes:.3g} min of exploration at {speed}, {count}')
     errors = f'{learned.before:.4f} → {learned.after:.4f} {robot.units.distance_unit}'
     print(f'error on {HELD_OUT:g} s of held-out motion: {errors}')
+    if learned.still:
+        print(f'not movable because of contacts, and not in this error: {listed(learned.still)}')
     report = export_into(robot, learned.mae, args.mujoco, model_folder, args.seed)
     print(next(line for line in report.splitlines() if line.startswith('muscles that keep')))
     print(f'robot: {robot_folder}')
@@ -82,12 +96,17 @@ def train(args: Namespace) -> None:
 def learn(robot: Robot, initial: Mae, model: Path, seed: int, minutes: float) -> Learned:
     """Let the emulated arm of an imported file explore and learn.
 
+    If the emulated arm diverges, the exploration ends. Nothing is learned from the diverged arm.
+
     Args:
         robot: The imported robot.
         initial: Its initial network.
         model: The `model.xml` that the import wrote.
         seed: Selects the emulated arm, which deviates from the file.
         minutes: Duration of the exploration [min].
+
+    Raises:
+        DivergedError: If the emulated arm diverges during the held-out motion.
     """
 
     def new_arm() -> Arm:
@@ -97,11 +116,17 @@ def learn(robot: Robot, initial: Mae, model: Path, seed: int, minutes: float) ->
     learner = Learner(robot, initial, initial.preset, seed)
     settings = Settings(preset=initial.preset)
     loop = ClosedLoop(new_arm(), initial, settings, EXPLORATION_STREAM + seed)
-    start = time.perf_counter()
-    teach(learner, _shown(loop, learner, 60.0 * minutes))
+    start, problem = time.perf_counter(), ''
+    try:
+        teach(learner, _shown(loop, learner, 60.0 * minutes))
+    except DivergedError as error:
+        minutes, problem = loop.time / 60.0, str(error)
     speed = 60.0 * minutes / (time.perf_counter() - start)
-    before, after = (estimation_error(mae, held_out) for mae in (initial, learner.mae))
-    return Learned(learner.mae, before, after, len(learner.samples), speed)
+    movable = movable_joints(robot)
+    error_of = make_error_function(held_out, joints=movable if movable.any() else None)
+    before, after, samples = error_of(initial), error_of(learner.mae), len(learner.samples)
+    still = tuple(robot.joints[j] for j in np.flatnonzero(~movable))
+    return Learned(learner.mae, before, after, still, samples, minutes, speed, problem)
 
 
 def _imported(args: Namespace, folder: Path) -> Robot:

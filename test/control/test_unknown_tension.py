@@ -93,7 +93,7 @@ def test_the_arm_reaches_a_target_by_lengths_alone_and_reports_missing_tensions(
     assert loop.core.supervisor.is_running
     assert np.abs(loop.arm.theta - THETA).max() < 0.15
     assert loop.core.limiter.command.kind == LENGTH
-    values = loop.core.report(loop._now).values
+    values = loop.core.report(loop.time).values
     assert 'heat limit' in values['tension'] and 'contact' in values['tension']
 
 

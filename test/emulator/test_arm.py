@@ -15,6 +15,7 @@ from musculoskeletal_ae.emulator.foreign.effects import NONE
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm, tension_from_elongation
 from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.emulator.reality import make_arm
+from musculoskeletal_ae.exceptions import DivergedError
 from musculoskeletal_ae.messages.message_reading import MOST_WRENCH
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
@@ -227,6 +228,9 @@ def test_no_legal_wrench_breaks_the_emulator_and_a_reset_mends_it(name, reality)
     arm.set_wrench(np.full(6, 1e7))
     arm.step(1.0)
     assert arm.has_diverged
+    legal = r'the emulated arm has diverged: joint \w+ moves at \S+ rad/s; legal: at most 1000\. .+'
+    with pytest.raises(DivergedError, match=f'{legal}(reduce|exclude)'):
+        arm.check()
     arm.reset()
     arm.step(1.0)
     assert not arm.has_diverged

@@ -4,12 +4,14 @@
 from dataclasses import fields, replace
 
 import bodies
+import mujoco
 import numpy as np
 import pytest
 from robots import read_muscles, write_muscles, write_robot
 
 from emulator.commands import to_mid_range
 from musculoskeletal_ae.emulator.foreign import arm as foreign
+from musculoskeletal_ae.emulator.foreign import mujoco_model
 from musculoskeletal_ae.emulator.foreign.arm import ForeignArm
 from musculoskeletal_ae.emulator.foreign.effects import NONE, Effects
 from musculoskeletal_ae.emulator.foreign.tendons import law
@@ -213,6 +215,43 @@ def test_a_users_mjcf_file_moves_as_the_robot_imported_from_it(imported):
     # MuJoCo's pose of the hand is that before the last step, hence the tolerance.
     np.testing.assert_allclose(arm.hand.translation, hand, atol=1e-3)
     assert arm.route_points().shape == robot.routes.points(arm.theta[None])[0].shape
+
+
+def test_a_step_of_the_emulated_body_is_that_of_mujoco_with_the_users_file(tmp_path):
+    dynamics = '<joint name="elbow" armature=".2" damping=".3" frictionloss=".1" '
+    text = bodies.MJCF.replace('<joint name="elbow" ', dynamics)
+    robot, rng = import_text(tmp_path, text), np.random.default_rng(0)
+    models = [
+        mujoco.MjModel.from_xml_path(str(tmp_path / 'own.xml')),
+        mujoco_model.from_file(robot, model_of(robot)),
+    ]
+    for theta in 0.9 * robot.random_postures(5, rng):
+        speed, torque = rng.normal(size=(2, models[0].nv))
+        after = []
+        for model in models:
+            mujoco_model.set_options(model)
+            model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION
+            data = mujoco.MjData(model)
+            for name, q in zip(
+                robot.kinematics.model.names[1:], robot.kinematics.tree.angles(theta)
+            ):
+                data.joint(name).qpos[:] = q
+            data.qvel[:], data.qfrc_applied[:] = speed, torque
+            mujoco.mj_step(model, data)
+            after.append(data.qvel)
+        np.testing.assert_allclose(after[1], after[0], rtol=1e-6, atol=1e-9)
+        assert np.abs(after[0] - speed).max() > 1e-3
+
+
+def test_a_touch_does_not_throw_a_finger_whose_centre_of_mass_is_on_its_axes(tmp_path):
+    robot = import_text(tmp_path, bodies.TOUCHING)
+    arm, rng = make_arm(robot, 1, str(model_of(robot)), deviates=True), np.random.default_rng(0)
+    arm.set_payload(0.0)
+    for tension in robot.tension.bias + rng.uniform(0.0, 40.0, (20, robot.muscle_count)):
+        for _ in range(10):
+            arm.command_tension(tension)
+            arm.step(0.02)
+            assert np.abs(arm.velocity).max() < 20.0
 
 
 @pytest.mark.parametrize(

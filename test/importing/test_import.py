@@ -183,7 +183,7 @@ def test_a_limit_is_never_above_what_the_tendon_is_allowed_to_pull(mjcf, tmp_pat
     mjcf.write_text(mjcf.read_text().replace('name="out"', ranged))
     result = import_robot(mjcf, tmp_path / 'out')
     assert result.robot.tension.limit[result.robot.muscles.index('out')] == pytest.approx(80.0)
-    assert 'dropped: armature: tendon out' in result.notes
+    assert 'only in model.xml: armature: tendon out' in result.notes
 
 
 def test_muscles_have_the_tensions_that_the_model_asks_for_and_tendons_hardly_stretch(
@@ -236,7 +236,7 @@ def test_what_is_included_must_be_a_regular_file(mjcf, tmp_path):
         import_robot(mjcf, tmp_path / 'out')
 
 
-def test_forces_that_are_not_modelled_are_reported_as_dropped(mjcf, tmp_path):
+def test_forces_that_only_the_emulated_arm_has_are_reported(mjcf, tmp_path):
     joint = '<joint name="elbow" damping="5" frictionloss="2" stiffness="2" armature="1" '
     tendon = 'limited="true" range="0 9" damping="1" frictionloss="2" stiffness="3" name="out"'
     text = mjcf.read_text().replace('<joint name="elbow" ', joint, 1)
@@ -245,11 +245,11 @@ def test_forces_that_are_not_modelled_are_reported_as_dropped(mjcf, tmp_path):
     )
     notes = import_robot(mjcf, tmp_path / 'out').notes
     for effect in ('friction', 'armature'):
-        assert f'dropped: {effect}: joint elbow' in notes
+        assert f'only in model.xml: {effect}: joint elbow' in notes
     for effect in ('friction', 'limits'):
-        assert f'dropped: {effect}: tendon out' in notes
-    assert 'dropped: compensated weight: body upper' in notes
-    assert any(re.match(r'dropped: contacts: \d+ geoms', note) for note in notes)
+        assert f'only in model.xml: {effect}: tendon out' in notes
+    assert 'only in model.xml: compensated weight: body upper' in notes
+    assert any(re.match(r'only in model.xml: contacts: \d+ geoms', note) for note in notes)
 
 
 def test_names_that_clash_here_lose_nothing(mjcf, tmp_path):
@@ -520,6 +520,18 @@ def test_a_chain_is_cut_out_and_what_is_held_is_named(mjcf, tmp_path, capsys):
     assert 'dropped: muscle front: attached to base, which is left out' in output
     assert 'largest length error over 1000 postures: 0.000 mm' in output
     assert 'check_robot: no faults' in output
+
+
+def test_a_floating_base_is_held_and_named_unless_it_is_asked_for(mjcf, tmp_path):
+    base = '<body name="base" pos="0 0.1 1" euler="0.2 0 0.1">'
+    slide = '<joint name="root_z" type="slide" axis="0 0 1" range="-1 1" limited="true"/>'
+    mjcf.write_text(mjcf.read_text().replace(base, f'{base}{slide}'))
+    result = import_robot(mjcf, tmp_path / 'held')
+    assert result.robot.joints == ('swing', 'lift', 'elbow')
+    (note,) = [note for note in result.notes if 'root_z' in note]
+    assert re.match(r'held fixed: joint root_z at 0, because .* no muscle moves it', note)
+    joints = 'root_z', 'swing', 'lift', 'elbow'
+    assert import_robot(mjcf, tmp_path / 'kept', joints=joints).robot.joints == joints
 
 
 def test_weight_pulls_in_the_same_direction_on_a_chain_that_was_cut_out(mjcf, tmp_path):

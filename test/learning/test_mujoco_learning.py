@@ -2,6 +2,7 @@
 """`train --mujoco`: one command from a MuJoCo file to a network and a learned model."""
 
 import re
+from collections import Counter
 from pathlib import Path
 
 import bodies
@@ -9,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from musculoskeletal_ae.emulator.foreign.arm import ForeignArm
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop
 from musculoskeletal_ae.importing.convert import import_robot
@@ -32,6 +34,26 @@ def test_a_mujoco_file_is_imported_explored_learned_and_reported(tmp_path, capsy
     robot = Robot.load(tmp_path / 'arm_robot')
     assert checkpoint.load(out, robot).joints == robot.joints
     mujoco.MjModel.from_xml_path(str(tmp_path / 'arm_model' / EXAMPLE.name))
+
+
+def test_nothing_is_learned_from_an_emulated_arm_that_has_diverged(tmp_path, capsys, monkeypatch):
+    step, steps = ForeignArm.step, Counter()
+
+    def thrown(arm, duration):
+        steps[arm] += 1
+        if len(steps) == 2 and steps[arm] == 2000:  # the second arm explores
+            arm.set_wrench(np.full(6, 1e7))
+        step(arm, duration)
+
+    monkeypatch.setattr(ForeignArm, 'step', thrown)
+    out = tmp_path / 'arm.safetensors'
+    options = ['--mujoco', str(EXAMPLE), '--minutes', '0.7', '--quick', '--seed', '1']
+    assert main([*options, '--out', str(out)]) == 0
+    printed = capsys.readouterr()
+    assert re.search(r'warning: the emulated arm has diverged: joint \w+ moves at', printed.err)
+    assert re.search(r'0\.333 min of exploration .*, [1-9]\d* samples', printed.out)
+    before, after = re.search(r'held-out motion: (\S+) → (\S+) rad', printed.out).groups()
+    assert float(after) < float(before)
 
 
 def test_a_finger_with_a_spring_return_explores_and_learns(tmp_path):

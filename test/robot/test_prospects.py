@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What makes training pointless is known within seconds, and before anything else."""
 
+import re
 import time
 from itertools import combinations
 
@@ -9,7 +10,9 @@ import numpy as np
 from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.design import prospects as module
+from musculoskeletal_ae.design.contacts import movable_joints
 from musculoskeletal_ae.design.prospects import prospects
+from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools import import_robot as tool
 from musculoskeletal_ae.tools.network_cache import network_file
@@ -46,6 +49,29 @@ def test_few_holdable_postures_are_said_with_the_joint_that_lacks_torque(tmp_pat
     (line, *_) = found.lines()
     assert line.startswith(f'warning: {found.held} of 150')
     assert f'{found.lacking[0][0]} (' in line
+
+
+def test_contacts_that_keep_a_joint_from_its_range_are_said_with_the_bodies(tmp_path):
+    # The obstacle of this finger is beside a part of the range; a second one is opposite.
+    wall = '<geom type="box" size=".01 .05 .1" pos="-.035 0 -.1"/><site name="a"'
+    free, walled = (tmp_path / name for name in ('free', 'walled'))
+    for folder, text in (
+        (free, bodies.TOUCHING.replace('type="box"', 'type="box" contype="0" conaffinity="0"')),
+        (walled, bodies.TOUCHING.replace('<site name="a"', wall)),
+    ):
+        folder.mkdir()
+        (folder / 'own.xml').write_text(text)
+    robots = [import_robot(folder / 'own.xml', folder / 'own').robot for folder in (free, walled)]
+    assert not any('contacts' in line for line in prospects(robots[0]).lines())
+    assert movable_joints(robots[0]).all()
+    (line,) = [line for line in prospects(robots[1]).lines() if 'contacts' in line]
+    assert re.match(r'warning: contacts: joint bend \(range -1.05 to 1.05 rad\) is free of', line)
+    assert 'world and finger' in line and 'counts as not movable' in line
+    assert dict(zip(robots[1].joints, movable_joints(robots[1]))) == {'spread': True, 'bend': False}
+    (tmp_path / 'walled' / 'own' / 'model.xml').write_text('<mujoco/>')
+    assert any('contacts were not examined' in line for line in prospects(robots[1]).lines())
+    (tmp_path / 'walled' / 'own' / 'model.xml').unlink()
+    assert not any('contacts' in line for line in prospects(robots[1]).lines())
 
 
 def test_a_large_arm_is_examined_only_for_some_seconds(tmp_path, monkeypatch):

@@ -24,6 +24,7 @@ from musculoskeletal_ae.emulator.foreign.effects import NONE, Draw, Effects
 from musculoskeletal_ae.emulator.modules import STEP, Arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.importing.adapted_mjcf import HAND
+from musculoskeletal_ae.importing.source import listed
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
@@ -416,7 +417,7 @@ class ForeignArm(Arm):
         """Set the payload: a ball of this mass [kg] and 5 cm radius at the end effector."""
         self._model.body_mass[self._hand] = mass
         self._model.body_inertia[self._hand] = 0.4 * mass * 0.05**2
-        mujoco.mj_setConst(self._model, mujoco.MjData(self._model))
+        mujoco_model.set_constants(self._model)
 
     def step(self, duration: float) -> None:
         """Advance the time by `duration` [s], rounded to whole steps of 1 ms."""
@@ -427,8 +428,6 @@ class ForeignArm(Arm):
 
     def _step(self) -> None:
         model, data = self._model, self._data
-        if self.has_diverged:
-            return
         mujoco.mj_step1(model, data)
         if not math.isfinite(data.ten_length.sum()):
             # MuJoCo's wrapping can return NaN in the posture where a tendon touches an object.
@@ -448,6 +447,19 @@ class ForeignArm(Arm):
             mujoco.mj_applyFT(model, data, force, torque, at, self._hand, data.qfrc_applied)
         mujoco.mj_step2(model, data)
         self._sensors.append(self.theta, self._module_readings())
+
+    def _divergence_cause(self) -> str:
+        model, touching = self._model, dict[str, None]()
+        for contact in self._data.contact:
+            pair = (model.body(model.geom_bodyid[geom]).name for geom in contact.geom)
+            touching[' and '.join(pair)] = None
+        if not touching:
+            return super()._divergence_cause()
+        return (
+            f'These bodies touch: {listed([*touching])}. Contacts of overlapping or very light '
+            'bodies can accelerate them without bounds; exclude contacts that the robot does not '
+            'have (contact/exclude in the MuJoCo file), or increase the armature of the joints'
+        )
 
     def _module_readings(self) -> MuscleReadings:
         """Return what the sensors of the modules measure at this moment."""

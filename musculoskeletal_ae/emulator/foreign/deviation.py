@@ -25,6 +25,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.emulator.foreign.effects import NONE, Draw, Effects
+from musculoskeletal_ae.emulator.foreign.mujoco_model import set_constants
 from musculoskeletal_ae.robot.robot import Robot
 
 #: standard deviation σ of the displacement of a point, relative to the typical moment arm
@@ -129,4 +130,4 @@ def change_masses(model: Any, draw: Draw) -> None:
     factor = np.exp(MASS * draw.rng('masses').normal(size=model.nbody))
     model.body_mass[:] *= factor
     model.body_inertia[:] *= factor[:, None]
-    mujoco.mj_setConst(model, mujoco.MjData(model))
+    set_constants(model)

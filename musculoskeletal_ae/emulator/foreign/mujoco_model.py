@@ -37,6 +37,9 @@ POSTURES = 300  # fit the radii of heads and muscles in this many random posture
 # coupling: a prismatic joint that follows a revolute one would lag by centimetres.
 STIFF = [0.9999, 0.9999, 0.001, 0.5, 2.0]
 SPRING = 'spring'  # first word of the names of springs that couple joints
+#: replace the inverse mass by which MuJoCo scales the contacts of a body if it is below this share
+#: of the inverse mass at the body's shapes
+LEAST_WEIGHT_SHARE = 0.01
 
 Place = tuple[int, Array]  # a place on a link: its joint, and the position in its frame [m]
 #: an object around which tendons wrap: its joint, and its centre [m] and axis in that joint's frame
@@ -366,7 +369,41 @@ def from_file(robot: Robot, file: Path) -> Any:
     # The stops of MuJoCo yield in proportion to torque over inertia: a strong muscle would press a
     # light finger far beyond its limits.
     model.jnt_solimp[ids] = STIFF
+    set_constants(model)
     return model
+
+
+def set_constants(model: Any) -> None:
+    """Compute the constants of a compiled model that depend on its masses, in place.
+
+    MuJoCo makes a contact softer in proportion to the inverse mass w = tr(J M⁻¹ Jᵀ) / 3 that the
+    body has at its centre of mass at qpos0. Many files place the centre of mass of a finger's first
+    link on the axes of its joints. If no joint before it can move, w is 0 there: the contact
+    becomes rigid, and a slight touch accelerates the finger beyond all limits. For such a body, w
+    is therefore the mean over the centres of those of its shapes that can touch others.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_setConst(model, data)
+    if not model.nv:
+        return
+    data.qpos[:] = model.qpos0
+    mujoco.mj_fwdPosition(model, data)
+    touches = (model.geom_contype | model.geom_conaffinity) != 0
+    touches[model.pair_geom1] = touches[model.pair_geom2] = True
+    for body in np.flatnonzero(model.body_weldid != 0).tolist():
+        shapes = np.flatnonzero(touches & (model.geom_bodyid == body))
+        weights = [_inverse_mass(model, data, body, data.geom_xpos[g]) for g in shapes]
+        weight = float(np.mean(weights)) if weights else 0.0
+        if model.body_invweight0[body, 0] < LEAST_WEIGHT_SHARE * weight:
+            model.body_invweight0[body, 0] = weight
+
+
+def _inverse_mass(model: Any, data: Any, body: int, point: Array) -> float:
+    """Return the inverse mass w [1/kg] of a body at a point in the world frame [m], (3,)."""
+    jacobian, solved = np.zeros((3, model.nv)), np.zeros((3, model.nv))
+    mujoco.mj_jac(model, data, jacobian, None, point, body)
+    mujoco.mj_solveM(model, data, solved, jacobian)
+    return float(np.sum(jacobian * solved)) / 3.0
 
 
 def other_robot(robot: Robot, file: Path, problem: str) -> MusculoskeletalError:
