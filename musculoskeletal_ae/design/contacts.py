@@ -26,7 +26,7 @@ PARTS = 10  # divide the range of a joint into this many equal parts
 FREE_SHARE = 0.1
 #: count a joint as not movable if its longest free part is smaller than this share of its range
 MOVABLE_SHARE = 0.5
-NAMED = 3  # name at most this many pairs of bodies
+NAMED = 3  # name at most this many pairs of bodies, and describe at most this many joints
 
 
 class Blocked(NamedTuple):
@@ -36,7 +36,12 @@ class Blocked(NamedTuple):
     low: float  # lower end of the longest part without contact [rad]
     high: float  # upper end of it [rad]; equals `low` if bodies touch everywhere
     pairs: tuple[str, ...]  # the bodies that touch, such as 'palm and nail', most frequent first
-    is_movable: bool
+    share: float  # the longest part without contact, relative to the range
+
+    @property
+    def is_movable(self) -> bool:
+        """Whether the joint counts as movable."""
+        return self.share >= MOVABLE_SHARE
 
 
 class Contacts(NamedTuple):
@@ -53,7 +58,9 @@ class Contacts(NamedTuple):
         if self.problem:
             return [f'warning: contacts were not examined: {self.problem}']
         lines = list[str]()
-        for each in self.blocked:
+        # The most restricted joints come first; of the others, only the names follow.
+        ordered = sorted(self.blocked, key=lambda each: each.share)
+        for each in ordered[:NAMED]:
             name, units = robot.joints[each.joint], robot.units[each.joint]
             whole = units.range_text(robot.lower[each.joint], robot.upper[each.joint])
             free = f'only from {units.range_text(each.low, each.high)}'
@@ -66,6 +73,8 @@ class Contacts(NamedTuple):
                 f'warning: contacts: {problem}; elsewhere, these bodies touch in nearly every '
                 f'random posture: {touching}{ending}; {remedy} (contact/exclude)'
             )
+        if others := ', '.join(robot.joints[each.joint] for each in ordered[NAMED:]):
+            lines.append(f'warning: contacts: they also restrict {others}')
         if not self.blocked and self.touching > 0.5 * self.postures:
             pairs = ', '.join(f'{pair} ({count})' for pair, count in self.pairs[:NAMED])
             counts = f'bodies touch in {self.touching} of {self.postures} random postures'
@@ -113,7 +122,7 @@ def contacts(robot: Robot) -> Contacts | None:
         if found is not None:
             share = (found[1] - found[0]) / (robot.upper[j] - robot.lower[j])
             named = tuple(pair for pair, _ in hindering[j].most_common(NAMED))
-            blocked.append(Blocked(j, *found, named, bool(share >= MOVABLE_SHARE)))
+            blocked.append(Blocked(j, *found, named, float(share)))
     touching = sum(bool(pairs) for pairs in touched)
     return Contacts(len(theta), touching, tuple(count.most_common()), tuple(blocked))
 

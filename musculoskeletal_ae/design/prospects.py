@@ -86,7 +86,7 @@ class Prospects(NamedTuple):
             lines.append(f'warning: {counts}, and only these are explored{lack}')
         else:
             lines.append(f'{counts}')
-        if self.contacts is not None:
+        if self.contacts is not None and not self.is_pointless:
             lines += self.contacts.lines(robot)
         lines.append(f'{robot.joint_count} joints, {robot.muscle_count} muscles')
         return lines
