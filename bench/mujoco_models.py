@@ -272,11 +272,13 @@ measured {commit}).
   {postures} random postures: standard deviation of the length, and root mean square of the moment
   arms, medians over the muscles.
 
-## Models that can learn
+## Models that were explored
+
+Where the error does not fall, a short exploration was not enough; in hands, moment arms are also as
+short as the errors that the learner expects in a description ([limitations](../limitations.md)).
+A dash, if there is one, means that only the prospects were measured (`--prospects`).
 
 {table}
-
-A dash means that only the prospects were measured (`--prospects`).
 
 ## Models that cannot work
 
