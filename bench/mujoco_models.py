@@ -54,7 +54,7 @@ from musculoskeletal_ae.exporting.exported_mjcf import export_into
 from musculoskeletal_ae.figures import save_figure
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae.initial_training import initial_mae
-from musculoskeletal_ae.options import Parser, names, seeds
+from musculoskeletal_ae.options import Parser, names
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.robot.robot import Robot
@@ -416,8 +416,6 @@ def main(argv: list[str]) -> None:
     parser.add_argument('--page', type=Path, metavar='FILE', help=text)
     text = 'make the experiments on each individual, instead of the page'
     parser.add_argument('--experiments', action='store_true', help=text)
-    text = 'seeds of the individuals with --experiments'
-    parser.add_argument('--seeds', type=seeds, default=(0, 1, 2), help=text)
     args = parser.parse_args(argv)
     chosen = [
         model for model in MODELS if not args.only or any(name in model.name for name in args.only)
