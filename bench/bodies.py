@@ -184,7 +184,7 @@ def package(case: Case, updates: int | None, seed: int) -> str:
     by_network, by_body = (
         1e3 * np.sqrt(np.square(length - test.length).mean()) for length in (of_network, of_body)
     )
-    assert mae.covariance is not None  # the method of preset default computes it
+    assert mae.covariance is not None  # the preset `default` computes it
     inside = (ellipsoids(mae.covariance, error) <= 1.0).mean()
     constants = ' '.join(group.text() for group in body.remainder.groups)
     return (
@@ -224,11 +224,11 @@ def body_alone(case: Case, fits: int = 2) -> str:
     theta = minimise_each(residuals, start, usual, ROUNDS, bounds=(robot.lower, robot.upper))
     error = np.linalg.norm(theta - test.theta, axis=1).mean()
     constants = ' '.join(group.text() for group in body.remainder.groups)
-    return f'{error:.4f} rad by least squares on the body ({constants})'
+    return f'mean error {error:.4f} rad by least squares on the body (remainder: {constants})'
 
 
 def regressions(case: Case) -> str:
-    """Return the errors of the baselines as text."""
+    """Fit the regressions; return their mean errors of θ in the test [rad] as text."""
 
     def inputs(observed: Observations) -> Array:
         return np.hstack([observed.length, observed.tension])

@@ -37,7 +37,7 @@ from musculoskeletal_ae.process_signals import STOP, Reaction
 from musculoskeletal_ae.robot.robot import Robot
 
 BRINGUP = Path(__file__).resolve().parents[1] / 'bringup.sh'
-STARTING = 60.0  # wait at most this long for the first commands, and so much longer per arm [s]
+STARTING = 60.0  # wait for the first commands at most this long × (1 + number of arms) [s]
 LOOK = 0.1  # time between two checks of a condition [s]
 HEAD = (
     'arms  processes  threads  start [s]  start CPU [s]  join [s]  CPU [%]  median, p99 [ms]  '

@@ -327,9 +327,10 @@ LENGTH, TENSION = MuscleReadings.length, MuscleReadings.tension
 
 
 def frozen(quantity: Quantity) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which one reading of a muscle freezes, with an effect once it changes.
+    """Return a mishap by which the length or the tension reading of a random muscle freezes.
 
-    `quantity` is the quantity that is read.
+    `quantity` says which of the two. The mishap has an effect once the true value differs clearly
+    from the frozen one.
     """
 
     def begin(lab: Lab, rng: Rng) -> Case:

@@ -202,7 +202,7 @@ def folder_name(model: Model) -> str:
 
 
 def run(model: Model, args: Namespace) -> dict[str, Any] | None:
-    """Measure a model and store its result; return None if its clone is missing."""
+    """Measure a model, store its result and return it; None if the file of the model is missing."""
     file = args.clones / model.repository / model.file
     if not file.is_file():
         return None

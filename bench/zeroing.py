@@ -48,8 +48,8 @@ AFTER = 30.0  # let the arm explore for this time after a calibration, and count
 LONGEST = 120.0  # give a calibration up after this time [s]
 SETTLING = 20.0  # let the arm hang for this time after power-on, so that it is still [s]
 STATED = 0.0  # standard deviation of the error of a stated posture [rad], the same for each joint
-#: report a calibration that takes longer than this [s], or after which the error exceeds the
-#: earlier error by more than this factor
+#: by what a calibration knows (joint sensors, nothing, or a stated posture): report it if it takes
+#: longer than the first value [s], or if it increases the error by more than the second, a factor
 GOALS = {'sensors': (30.0, 1.2), 'none': (60.0, 1.5), 'posture': (30.0, 1.5)}
 
 

@@ -700,7 +700,7 @@ class ConditionKind(Enum):
         'learner',
         'error',
         'samples and network cannot be saved',
-        'the learned state is not on disk',
+        'the newest samples and network are not on disk, and would be lost by a restart',
         (Step.FREE_DISK,),
     )
     SENSOR_OFFSET_IMPOSSIBLE = Declaration(

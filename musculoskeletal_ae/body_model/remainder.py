@@ -110,7 +110,7 @@ class Lengths(NamedTuple):
         return cls(observed.theta, observed.tension, deviation, by_body, weight)
 
     def part(self, rows: Ints) -> Lengths:
-        """Return the part with the samples in `rows` only."""
+        """Return these lengths for the samples with the indices `rows` only."""
         deviation, by_body = ([own[rows] for own in part] for part in self[2:4])
         return Lengths(self.theta[rows], self.tension[rows], deviation, by_body, self.weight[rows])
 

@@ -45,7 +45,9 @@ class Settings(CheckedSettings):
         'joints (0 or []: unconstrained)',
         'N·m/rad or N/m',
         0.0,
-        _most_stiffness(SLIDE.radian),  # the largest value for prismatic joints [N/m]
+        # the limit of prismatic joints [N/m], which is the larger one; `desired_stiffness` limits
+        # each joint by its own kind
+        _most_stiffness(SLIDE.radian),
     )
     first_duration: float = settable(
         5.0,

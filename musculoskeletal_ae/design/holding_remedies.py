@@ -31,8 +31,9 @@ from musculoskeletal_ae.robot.description import shown
 
 #: suggest a change only if it raises the share of held or stiff postures by at least this
 LEAST_GAIN = 0.01
-#: try these changes of muscles.yaml, links, moment arms or limits, the costliest first, each with
-#: its factors, the smallest step first
+#: try these changes of joint limits, moment arms, masses of links or keys of muscles.yaml, from the
+#: one that costs the user most to the cheapest; each with the factors by which it multiplies the
+#: value, the smallest change first
 CHANGES = {
     'limits': (0.8, 0.6),
     'moment arms': (1.25, 1.5, 2.0),

@@ -72,7 +72,10 @@ class Prospects(NamedTuple):
             counts_of = f'the lengths of {robot.muscle_count} muscles', f'{moved} joints'
             lines.append(f'warning: {counts_of[0]} {problem} {counts_of[1]}; {reason}')
         if self.is_pointless:
-            remedy = 'choose a part of it (--joints, --end), or run check_robot, which has remedies'
+            remedy = (
+                'choose a part of the model (--joints, --end), or run check_robot, which suggests '
+                'remedies'
+            )
             problem = 'training is pointless, because the arm cannot explore'
             lines.append(f'warning: {counts}: {problem}{lack}; {remedy}')
         elif self.share < POINTLESS_SHARE:

@@ -65,7 +65,10 @@ class BodyMemory:
         return f'{lost}, so a restarted estimator will not know them: {self._file.problem}'
 
     def _parse(self, text: str) -> BodyState:
-        """Return the body state in the text of the file; unknown offsets of 0 if it is damaged."""
+        """Return the body state that the text of the file states.
+
+        If the text is damaged, all length offsets are unknown, and no muscle is isolated.
+        """
         unknown = LengthOffsets.unknown(len(self._muscles))
         with suppress(ValueError, TypeError, KeyError, AttributeError):
             content = json.loads(text)

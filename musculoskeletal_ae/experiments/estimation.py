@@ -270,8 +270,8 @@ def deactivated(_: Study, rows: Rows) -> Plot:
     figure.legend(handles, labels, loc='outside lower center', ncols=2, fontsize=9)
     figure.suptitle(f'individual {seed}')
     return figure, (
-        f'Estimation error and A as in the paper: the arm grasps {PAYLOAD:g} kg (dashed), then '
-        f'{off["muscle"]} is switched off (yellow).'
+        f'Estimation error and anomaly score A, measured as in the paper: the arm grasps '
+        f'{PAYLOAD:g} kg (dashed line), then {off["muscle"]} is switched off (yellow).'
     )
 
 

@@ -141,7 +141,8 @@ class Measured(NamedTuple):
 
     #: contents of result.json: nested dictionaries of finite numbers, text, lists or None
     numbers: dict[str, Any]
-    #: data of the plots: values that `kept` can write, read from the file of this part
+    #: data of the plots, as `kept.read` returns them from a file: named tuples have become objects
+    #: with the same attributes, and tuples have become lists
     traces: dict[str, Any]
 
 

@@ -312,7 +312,7 @@ def _compare(
         model: The compiled MjModel.
         springs: Linear springs that represent the series elastic elements in the model.
         warnings: Warnings of MuJoCo about the model, for the report.
-        kept: For each muscle that keeps the points of the input, the reason, for the report.
+        kept: Why a muscle keeps the route points of the robot directory, by muscle; for the report.
 
     Returns:
         The report, and for each muscle the offset [m], (M,), that is added to a length l in

@@ -61,11 +61,11 @@ class UserFile:
         return next((path.resolve() for path in beside if path.is_file()), beside[0].resolve())
 
     def _movable_sites(self) -> dict[str, Array]:
-        """Return the positions of the sites that can be moved by changing the text [m], by name.
+        """Return the positions [m], by name, of the sites that an edit of the MJCF file can move.
 
-        These are the sites whose text states the position that they have in the compiled model. The
-        text of a site in a `frame` or a replica, or of one that `fromto` places, states another
-        position.
+        These are the sites of which the file states the position that they have in the compiled
+        model. Of a site in a `frame` or a replica, or of one that `fromto` places, the file states
+        another position.
         """
         found = dict[str, list[Array]]()
         for text in self.texts.values():

@@ -96,9 +96,9 @@ class LengthMethod(NamedTuple):
     """A control method that ramps to one length command and holds it.
 
     Attributes:
-        command: Computes the command.
-        takes_tension: Whether the command produces the tension that is passed to it. The caller
-            then limits this tension first.
+        command: Function that computes l_target from a target posture, a torque and tensions.
+        takes_tension: Whether the muscles should get the tensions that are passed to `command`, so
+            that the caller limits them before. Otherwise, `command` chooses the tensions.
         follows_first: Whether the arm first moves to the target by the method `first`.
     """
 

@@ -93,7 +93,7 @@ class BringupStatusNode(Shell):
             self.errors.append(theta - measured)
 
     def conditions(self) -> Iterable[Condition]:
-        """Yield the conditions of all nodes; the level of the arm is that of its worst node."""
+        """Yield the conditions of all nodes; this node reports the level of the worst of them."""
         yield from super().conditions()
         yield from (each.condition for each in self.situation.conditions())
 

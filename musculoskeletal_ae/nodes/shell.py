@@ -351,8 +351,8 @@ class Shell(Node):
         """Return the network in a file; None if the path is empty.
 
         Raises:
-            CheckpointError: If the network belongs to another robot, or its predictions are
-                implausible for this one.
+            CheckpointError: If the file cannot be read, or is invalid; if the network belongs to
+                another robot, or its predictions are implausible for this one.
         """
         if not path:
             return None

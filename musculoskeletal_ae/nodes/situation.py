@@ -69,7 +69,7 @@ class NodeReport(NamedTuple):
     values: dict[str, str]  # values that the node has reported, by name
     conditions: tuple[Condition, ...]
     message: str
-    heard_at: float  # time of arrival, excluding pauses of this process [s]
+    heard_at: float  # time of arrival, by a clock that stands still in pauses of this process [s]
 
 
 class Reported(NamedTuple):

@@ -90,7 +90,7 @@ class TensionProgramme:
             return quadprog.solve_qp(quadratic, linear, constraints, bounds, equalities)[0]
         except ValueError as error:
             torque = ', '.join(f'{value:.2f}' for value in self._torque.tolist())
-            problem = f'no tension within its limits produces the torque ({torque}) N·m'
+            problem = f'no tensions within their limits produce the joint torques ({torque}) N·m'
             raise InfeasibleError(problem) from error
 
     def nearest(self, desired: Array | float) -> Array:

@@ -152,11 +152,11 @@ def _preprocessor_parts(root: ET.Element) -> Iterator[tuple[str, str]]:
 
 
 def _limit_mimics(parts: list[ET.Element]) -> bool:
-    """Limit continuous joints with <mimic>, as revolute joints; return whether there are any.
+    """Turn continuous joints with <mimic> into limited revolute ones; return whether there are any.
 
     Pinocchio represents a continuous joint by two coordinates, which cannot follow the single
-    coordinate of the mimicked joint. A revolute joint must have limits. They are so wide that they
-    never act, because the limits of the mimicked joint suffice.
+    coordinate of the mimicked joint. A revolute joint must have limits. It gets limits so wide that
+    they never act, because the limits of the mimicked joint suffice.
     """
     followers = [
         part

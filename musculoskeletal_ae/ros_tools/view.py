@@ -62,7 +62,7 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 MANY = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 PERIOD = 1.0 / 30.0  # draw a picture at this interval [s]
 TEXT_PERIOD = 0.25  # update texts and curves at this interval [s]
-GRAPH_PERIOD = 1.0  # check the graph at this interval [s]
+GRAPH_PERIOD = 1.0  # look for running nodes and other arms at this interval [s]
 PATIENCE = 10.0  # wait at most this long for the response of a service [s]
 STOP_CHECK_PERIOD = 0.1  # check for a stop signal after at most this time [s]
 #: show the outcome of a reset after this time [s]; by then, a cause that is still present has

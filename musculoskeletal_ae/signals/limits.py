@@ -50,8 +50,8 @@ class Limits(NamedTuple):
         5.0  # largest change between readings, apart from its rise with time [°C]
     )
     temperature_rate: float = 50.0  # largest rate of a temperature [°C/s]
-    #: reject a length that exceeds the modelled range within the joint limits by more than this
-    #: [m]; healthy lengths exceed the range if tendons wrap, are wound in with slack, or are
+    #: reject a length that differs by more than this [m] from all lengths that the model has within
+    #: the joint limits; a healthy one differs if its tendon wraps, is slack and wound in, or is
     #: attached elsewhere than modelled
     length_margin: float = 0.1
     #: permit a slack tendon to be shorter than `length_margin` permits by this [m], because a

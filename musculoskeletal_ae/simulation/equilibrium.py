@@ -412,7 +412,7 @@ class QuasiStatics:
         robot = robot.with_elasticity(mae.elasticity)
         self._robot, elastic, self._mae = robot, robot.series_elastic, mae
         self.tree = Load(robot.kinematics).tree
-        # Raise a slightly negative friction, as a noisy fit may return it: it would drive the arm.
+        # A noisy fit may return a slightly negative friction, which would drive the arm: use 0.
         friction = np.maximum(mae.friction, 0.0)
         bias, most = robot.tension.bias, robot.tension.max
         farthest = np.full_like(most, FARTHEST)

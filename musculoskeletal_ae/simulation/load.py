@@ -48,7 +48,7 @@ class LoadTree(NamedTuple):
     mass: Array  # mass of the body that each of the J joints moves [kg], (J,)
     carried: Array  # total mass that each joint carries [kg], (J,)
     centre: Array  # centre of mass of each body in its joint's frame [m], (J, 3)
-    gravity: Array  # acceleration of gravity [m/s²], (3,)
+    gravity: Array  # acceleration of gravity in the root link's frame [m/s²], (3,)
     carries: Bools  # whether each joint carries the end effector, (J,)
     effector_joint: int  # index of the joint to whose body the end effector belongs
     effector: Array  # position of the end effector in the frame of that joint [m], (3,)

@@ -366,8 +366,8 @@ def _complete_and_show(learner: Learner) -> str:
     if len(errors) < MOST_UPDATES or not is_falling(errors):
         return ''
     return (
-        f'after {MOST_UPDATES} updates, the error of the network on the learned body still falls; '
-        'to continue, repeat the command with the network as --checkpoint'
+        f'after {MOST_UPDATES} updates, the network still comes closer to the learned body; to '
+        'continue, repeat the command with the written network as --checkpoint'
     )
 
 

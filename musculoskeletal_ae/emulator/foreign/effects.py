@@ -29,7 +29,7 @@ class Effects:
     kinks: float = 0.01  # detour of a tendon around the heads of bones and other muscles [m]
     #: jump of the length at a ridge, over which a tendon slips in 5 % of the postures [m]
     slip_over: float = 0.0057
-    give: float = 5e-5  # displacement of a route point under its load [m/N]
+    give: float = 5e-5  # displacement of a route point per newton of its load [m/N]
     #: friction of a joint, relative to its largest load by weight and muscles at T_bias
     joint_friction: float = 0.02
     #: factor of these σ: link lengths 5 mm, axes 2°, masses 15 %, centres of mass 20 mm
