@@ -43,10 +43,10 @@ HEAD = (
 
 
 def lengths_of_cardsflow(file: Path, source: Source) -> Callable[[dict[str, Array]], Any]:
-    """Return a function that computes the lengths of a cardsflow.xml's straight muscles by MuJoCo.
+    """Return a function by which MuJoCo computes the muscle lengths of a cardsflow.xml.
 
-    The function takes joint positions by name, each (N,). It returns muscle lengths by name [m],
-    each (N,).
+    The function takes joint positions by name [rad or m], each (N,), and returns muscle lengths by
+    name [m], each (N,). Muscles that wrap are left out.
     """
     urdf = file.with_name('model.urdf')
     tree, root = (parse_xml(each, read_text(each, refuse)) for each in (urdf, file))

@@ -162,14 +162,15 @@ def measure(
     share: float,
     seconds: float,
 ) -> list[tuple[str, Excess, int, tuple[int, float] | None]]:
-    """Let an individual explore, and move to targets by each method.
+    """Measure one individual while it explores, and while it moves to targets by each method.
 
-    `reality` and `seed` name the individual. It explores for `share` · `seconds` [s]; `share` also
-    scales the number of targets.
+    `reality` and `seed` select the individual. Every run begins with a new arm and the network
+    `initial`. The arm explores for `share` · `seconds` [s]; `share` also scales the number of
+    targets.
 
     Returns:
-        What the arm did, the excess of its tensions, the number of its stops, and if it explored,
-        the number of samples and the error after learning [rad].
+        For each run: what the arm did, the excess of its tensions, and the number of its stops. For
+        the exploration also the number of samples and the error after learning [rad], else None.
     """
     held_out = record(make_arm(robot, seed, reality), initial, HELD_OUT_STREAM, share * HELD_OUT)
     results = list[tuple[str, Excess, int, tuple[int, float] | None]]()

@@ -32,8 +32,8 @@ from musculoskeletal_ae.robot.description import shown
 #: suggest a change only if it raises the share of held or stiff postures by at least this
 LEAST_GAIN = 0.01
 #: try these changes of joint limits, moment arms, masses of links or keys of muscles.yaml, from the
-#: one that costs the user most to the cheapest; each with the factors by which it multiplies the
-#: value, the smallest change first
+#: one that costs the user most to the cheapest, because combinations reduce the first ones first;
+#: each with the factors by which it multiplies the value, the smallest change first
 CHANGES = {
     'limits': (0.8, 0.6),
     'moment arms': (1.25, 1.5, 2.0),

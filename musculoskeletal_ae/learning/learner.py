@@ -347,7 +347,7 @@ class Learner:
     # -- beginning and end ----------------------------------------------------------------------
 
     def begin(self, mae: Mae) -> None:
-        """Begin with the network `mae` if no saved network could be loaded; samples are kept."""
+        """Begin with the network `mae`, because no saved one could be loaded; samples are kept."""
         self._start(self.keeper.numbered(mae))
 
     def replace(self, mae: Mae | None) -> None:

@@ -38,14 +38,15 @@ class Calibrating(ActivityControl):
         l_target = l + ①(θ_goal, T_goal) − ①(θ_est, T) + l_comp(T_goal)
 
     ① is the network's prediction of the muscle lengths from a posture and tensions, and l_comp(T)
-    is −(T − T_bias)/K_stiff. The command uses only the difference of two predictions, so that
-    unknown length offsets cancel. The estimated posture θ_est and the muscle Jacobian G may be
-    wrong. Muscle stiffness control turns these errors into tension errors, which are limited.
+    is −(T − T_bias)/K_stiff, which makes the modules exert T. The command uses only the difference
+    of two predictions, so that unknown length offsets cancel. The estimated posture θ_est and the
+    muscle Jacobian G may be wrong. Muscle stiffness control turns these errors into tension errors,
+    which are limited.
 
     Each small, slow step ends at θ_goal, on the way from θ_est to a random posture in the joint
-    range. There, the arm rests for a moment with the random tensions T_goal. The calibration needs
-    varied postures and tensions, because it infers the posture from the torques that the tensions
-    exert through G.
+    range. There, the arm rests for a moment with T_goal: of the tensions that hold it there, those
+    nearest to random ones. The calibration needs varied postures and tensions, because it infers
+    the posture from the torques that the tensions exert through G.
     """
 
     def __init__(self, robot: Robot, settings: Settings, seed: int = 0) -> None:

@@ -97,8 +97,8 @@ class LengthMethod(NamedTuple):
 
     Attributes:
         command: Function that computes l_target from a target posture, a torque and tensions.
-        takes_tension: Whether the muscles should get the tensions that are passed to `command`, so
-            that the caller limits them before. Otherwise, `command` chooses the tensions.
+        takes_tension: Whether the tensions that are passed to `command` are those that the muscles
+            should exert. If so, the caller limits them before it calls `command`.
         follows_first: Whether the arm first moves to the target by the method `first`.
     """
 

@@ -50,9 +50,9 @@ class Limits(NamedTuple):
         5.0  # largest change between readings, apart from its rise with time [°C]
     )
     temperature_rate: float = 50.0  # largest rate of a temperature [°C/s]
-    #: reject a length that differs by more than this [m] from all lengths that the model has within
-    #: the joint limits; a healthy one differs if its tendon wraps, is slack and wound in, or is
-    #: attached elsewhere than modelled
+    #: reject a length if |l| exceeds by more than this [m] the largest |l| that the model has with
+    #: joints up to `joint_outside` beyond their ranges; a healthy |l| exceeds it if the tendon
+    #: wraps, is slack and has been wound in, or is attached elsewhere than modelled
     length_margin: float = 0.1
     #: permit a slack tendon to be shorter than `length_margin` permits by this [m], because a
     #: ruptured tendon can be wound in further than any posture requires
