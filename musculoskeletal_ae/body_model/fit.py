@@ -98,18 +98,25 @@ def fit_body(
             *fit_jointly(body, observed, start, means, spreads, LEAST_NOISE, is_learned)
         )
 
-    fit = fitted()
     own = np.isfinite(observed.theta) & (observed.spread == 0.0)
-    measured = replace(observed, theta=np.where(own, observed.theta - body.zero, fit.theta))
-    before = body.remainder.at(measured.theta, observed.tension)
-    # Angles from a camera are less accurate than the fitted ones, which combine them with lengths.
-    known = np.where(np.isnan(observed.theta), np.nan, measured.theta)
-    body.remainder = learned_remainder(body, replace(observed, theta=known), fit.weight, priors)
+
+    def corrected(fit: FittedBody) -> Array:
+        # Angles from a camera are less accurate than the fitted ones, which combine them with
+        # lengths.
+        return np.where(own, observed.theta - body.zero, fit.theta)
+
+    def measured(theta: Array) -> Observations:
+        return replace(observed, theta=np.where(np.isnan(observed.theta), np.nan, theta))
+
+    fit = fitted()
+    theta = corrected(fit)
+    before = body.remainder.at(theta, observed.tension)
+    body.remainder = learned_remainder(body, measured(theta), fit.weight, priors)
     # Fit the constants again if the remainder changed; otherwise both would explain the same
     # lengths.
-    if np.abs(body.remainder.at(measured.theta, observed.tension) - before).max() > LEAST_NOISE:
+    if np.abs(body.remainder.at(theta, observed.tension) - before).max() > LEAST_NOISE:
         fit = fitted()
-    body.regressions = learned_regressions(body, replace(observed, theta=known), fit)
+    body.regressions = learned_regressions(body, measured(corrected(fit)), fit)
     return fit
 
 

@@ -57,10 +57,16 @@ FEW_ROUNDS = 4  # end a search that continues from the last result after this ma
 CONSTANT = 0.3  # expect the mean of θ in all postures to differ from that in the samples by this²
 JITTER = 1e-8  # add this variance to keep covariances positive definite
 LEAST_SPREAD = 1e-6  # leave out inputs that vary less than this in the samples [m, N]
-MEASURED_SHARE = 0.5  # leave out joints that a smaller share of the samples measures
+#: leave out joints that a smaller share of the samples measures, and muscles whose lengths a
+#: smaller share of them contains
+MEASURED_SHARE = 0.5
+#: leave out joints that vary less than this in the samples [rad]: what moves them elsewhere is then
+#: unknown
+LEAST_ANGLE_SPREAD = 0.05
 #: expect the body's posture within this share of the joint ranges from their middle
 USUAL_SHARE = 0.3
 DIFFERENCE = 1e-4  # differentiate lengths with this step [rad]
+UNKNOWN_SPREAD = 1e3  # assume this standard deviation of a length that a sample lacks [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +115,8 @@ def learned_regressions(
 ) -> tuple[PostureRegression, ...]:
     """Learn the regression of each group from the samples in which its joints were measured.
 
-    Joints that fewer than half of the samples measure are left out.
+    Joints that fewer than half of the samples measure, or that hardly move in them, are left out,
+    and so are muscles that fewer than half of the samples contain.
 
     Args:
         body: The fitted body, with its remainder.
@@ -122,13 +129,17 @@ def learned_regressions(
         joints, muscles = np.array(group.joints, dtype=int), np.array(group.muscles, dtype=int)
         is_measured = np.isfinite(observed.theta[:, joints])
         is_estimated = is_measured.mean(axis=0) >= MEASURED_SHARE
-        joints = joints[is_estimated]
-        is_used = is_measured[:, is_estimated].all(axis=1)
-        is_used &= (fit.weight[:, muscles] > 0.0).all(axis=1)
+        is_known = fit.weight[:, muscles] > 0.0
+        is_input = is_known.mean(axis=0) >= MEASURED_SHARE
+        is_used = is_measured[:, is_estimated].all(axis=1) & is_known[:, is_input].all(axis=1)
         rows = np.flatnonzero(is_used)
-        if len(rows) < LEAST_SAMPLES or not len(joints) or not len(muscles):
+        if len(rows) < LEAST_SAMPLES or not is_input.any():
+            continue
+        is_estimated &= observed.theta[rows][:, joints].std(axis=0) >= LEAST_ANGLE_SPREAD
+        if not is_estimated.any():
             continue
         error, weight = _body_errors(body, observed, fit, rows, group)
+        joints, muscles = joints[is_estimated], muscles[is_input]
         weighted = weight[:, None] * np.square(error[:, is_estimated])
         body_variance = weighted.sum(axis=0) / weight.sum()
         start = starts.get(muscles.tobytes())
@@ -155,7 +166,7 @@ def _learned(
     mean, spread = inputs.mean(axis=0), inputs.std(axis=0)
     spread[spread < LEAST_SPREAD] = np.inf
     scale = spread * np.sqrt(len(muscles))
-    angle_mean, angle_spread = theta.mean(axis=0), theta.std(axis=0) + JITTER
+    angle_mean, angle_spread = theta.mean(axis=0), theta.std(axis=0)
     scaled, targets = (inputs - mean) / scale, (theta - angle_mean) / angle_spread
     evidence = _Evidence(np.split(scaled, 2, axis=1), targets, weight)
     starts, rounds = STARTS, ROUNDS
@@ -265,6 +276,8 @@ def _body_errors(
             part[place] for part in (known.left_out.error, known.left_out.weight)
         )
         spread[is_known] = np.sqrt(known.left_out.variance[place])
+    is_missing = ~(weight > 0.0)
+    error[is_missing], spread[is_missing] = 0.0, UNKNOWN_SPREAD
     direction = np.zeros_like(tension)
 
     def lengths(at: Array) -> Array:
@@ -280,5 +293,5 @@ def _body_errors(
     right = (by_length @ error[:, :, None])[:, :, 0] + away
     curvature = by_length @ slope + np.diag(precision)
     errors: Array = np.linalg.solve(curvature, right[:, :, None])[:, :, 0]
-    mean_weight: Array = weight.mean(axis=1)
+    mean_weight: Array = weight.sum(axis=1) / np.maximum((~is_missing).sum(axis=1), 1)
     return errors, mean_weight

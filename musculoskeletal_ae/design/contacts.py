@@ -5,7 +5,6 @@ MuJoCo computes which bodies overlap in random postures. The model is the `model
 robot directory, whose contacts are those of the user's file.
 """
 
-import time
 from collections import Counter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,9 +16,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 
 MODEL = 'model.xml'  # the file that `import_robot` writes into the robot directory
-POSTURES = 200  # examine at most this many random postures
-BUDGET = 2.5  # examine no further posture after this time [s]
-LEAST_POSTURES = 100  # examine at least this many postures, however long that takes
+POSTURES = 150  # examine this many random postures
 DEEP = 1e-3  # count bodies as touching if they overlap by more than this [m]
 PARTS = 10  # divide the range of a joint into this many equal parts
 #: count a part of a joint's range as blocked if fewer of the postures in it are free of contact
@@ -98,12 +95,7 @@ def contacts(robot: Robot) -> Contacts | None:
     tree = robot.kinematics.tree
     of_joint = np.array([model.joint(name).qposadr[0] for name in robot.kinematics.model.names[1:]])
     movers = _movers(robot, model)
-    start, touched = time.monotonic(), list[set[tuple[int, int]]]()
-    for q in tree.angles(theta):
-        if len(touched) >= LEAST_POSTURES and time.monotonic() - start > BUDGET:
-            break
-        touched.append(_touching(model, of_joint, q))
-    theta = theta[: len(touched)]
+    touched = [_touching(model, of_joint, q) for q in tree.angles(theta)]
     #: whether a joint moves two bodies that touch against each other, (N, D)
     hindered = np.zeros(theta.shape, dtype=bool)
     hindering = [Counter[str]() for _ in robot.joints]

@@ -93,7 +93,6 @@ class BodyMemory:
         is_noted = body is self._noted and not self.problem
         if self._file is None or is_noted:
             return
-        self._noted = body
         offsets = body.offsets
         is_decided = offsets.known or bool(offsets.revoked)
         if self._saved is not None and not (is_decided or self._was_decided):
@@ -104,9 +103,9 @@ class BodyMemory:
             self._file.problem = ''  # an attempt to save another body state may have failed
         elif self._file.write(self._text(offsets, body)):
             self._saved, self._has_file = (offsets, body.isolated), True
-        else:
+        else:  # a later call tries again
             return
-        self._was_decided = is_decided
+        self._noted, self._was_decided = body, is_decided
 
     def _text(self, offsets: LengthOffsets, body: BodyState) -> str:
         by_name = dict(zip(self._muscles, offsets.offset.tolist(), strict=True))

@@ -87,15 +87,15 @@ def _isolated(core: Estimator) -> Iterator[Condition]:
     Another condition names the muscles that must not be lost as well.
     """
     verification = core.suspects.verification
-    for muscle in core.body.isolated:
-        if verification is not None and verification.muscle == muscle:
-            continue
+    verified = None if verification is None else verification.muscle
+    isolated = [muscle for muscle in core.body.isolated if muscle != verified]
+    for muscle in isolated:
         name, fault = core.robot.muscles[muscle], core.suspects.faults.get(muscle)
         detail = name if fault is None else f'{name} ({fault})'
         # Advise no repair of a muscle that a user has isolated, because it need not be faulty.
         steps = None if fault is not None else (Step.RESTORE_MUSCLES,)
         yield ConditionKind.MUSCLE_ISOLATED.condition(detail, [name], steps=steps)
-    if needed := core.needed_muscles:
+    if isolated and (needed := core.needed_muscles):
         detail = ', '.join(f'{name} ({joints})' for name, joints in needed.items())
         yield ConditionKind.MUSCLE_NEEDED.condition(detail, needed)
 

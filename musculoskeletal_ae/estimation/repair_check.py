@@ -42,7 +42,7 @@ class RepairCheck(NamedTuple):
     sample: MuscleSample  # the readings
     isolated: Iterable[int]  # indices of the muscles that do not indicate the posture
     theta: Array | None  # θ from joint sensors [rad], (D,), or None without them
-    demand: Array | None  # tensions that the newest command demands [N], (M,); None if unknown
+    demand: Array | None  # tensions that were demanded at the readings [N], (M,); None if unknown
     jumping: Collection[int]  # indices of the muscles whose lengths have just jumped
     #: largest legal difference |l − l'| of a length from the predicted one [m]; infinite while the
     #: length offsets are unknown

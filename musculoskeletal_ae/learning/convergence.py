@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decides how many updates are made where all samples are known: as many as the network needs.
 
-    e = exp(mean of log ‖θ_est − θ_r‖) over synthetic samples that were not trained
+    e = exp(mean of log ‖θ_est − θ_w‖) over synthetic samples that were not trained
 
-The network learns from the fitted body (`body_model/`), which hardly changes once all samples are
-known. Its error e on synthetic samples of this body falls to what their noise and the uncertainty
-of the body leave, after 3 000 steps for a body that is nearly the geometric model, and after 8 000
-for a rough one. The updates end when e has stopped falling. No measured posture is held out for
-this decision, so all of them can be learned.
+θ_w is the posture that the network should estimate (`body_model/synthetic.py`). The network learns
+from the fitted body (`body_model/`), which hardly changes once all samples are known. Its error e on
+synthetic samples of this body falls to what their noise and the uncertainty of the body leave,
+after 3 000 steps for a body that is nearly the geometric model, and after 8 000 for a rough one.
+The updates end when e has stopped falling. No measured posture is held out for this decision, so
+all of them can be learned.
 
 On a running arm, each rest causes an update instead (`scheduler`).
 """
@@ -35,7 +36,7 @@ HELD_OUT = 1000  # compute the error on this many synthetic samples
 def model_error(update: Update, body: CalibratedBody) -> float:
     """Return the error of an update's network on synthetic samples of the body [rad].
 
-    It is the geometric mean of ‖θ_est − θ_r‖. Postures far from all samples, whose lengths are
+    It is the geometric mean of ‖θ_est − θ_w‖. Postures far from all samples, whose lengths are
     hardly known, therefore count no more than others. Equal bodies give equal samples.
     """
     data = synthetic_samples(body, update.noise, HELD_OUT, np.random.default_rng(0xE0))

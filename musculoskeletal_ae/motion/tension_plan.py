@@ -182,7 +182,7 @@ class TensionPlan:
             near = self._stiffening.step(mae, trajectory, time, self.effort, limit, dt)
         if actuation.knows_tension:
             limits = np.minimum(low, inputs.limit) / loss, inputs.limit / loss
-            stops = supporting_stops(robot, at.theta)
+            stops = supporting_stops(robot, at.theta, at.velocity)
             supporting = torque + self._support * shift.torque
             exertion = least_tension(jacobian, supporting, *limits, near, stops)
             tension, missing_torque = exertion

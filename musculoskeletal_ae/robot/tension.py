@@ -38,6 +38,7 @@ SOFT_WEIGHT = 1e-7
 #: let a stop support a joint that is nearer to its limit than this [rad]; a joint with a target
 #: nearer than this may come to rest at the stop instead
 AT_STOP = 0.02
+LEAVING = 1e-3  # no stop supports a joint that is to move away from it faster than this [rad/s]
 STOP_TORQUE = 100.0  # let a stop support a joint with at most this torque [N·m]
 
 
@@ -170,13 +171,15 @@ def least_tension(
     return exertion._replace(tension=exertion.tension[:count])
 
 
-def supporting_stops(robot: Robot, theta: Array) -> Array:
+def supporting_stops(robot: Robot, theta: Array, velocity: Array | float = 0.0) -> Array:
     """Return the stops that support joints at θ [rad], (D,), as the rows of a Jacobian (S, D).
 
     A stop pushes its joint back with any torque, but does not pull it. It is therefore modelled as
-    a muscle that turns its joint away from the limit, and whose tension is the torque.
+    a muscle that turns its joint away from the limit, and whose tension is the torque. A joint that
+    is to move away from its stop, with a velocity θ̇ [rad/s], (D,), needs its muscles for that.
     """
-    is_low, is_high = theta < robot.lower + AT_STOP, theta > robot.upper - AT_STOP
+    is_low = (theta < robot.lower + AT_STOP) & (velocity < LEAVING)
+    is_high = (theta > robot.upper - AT_STOP) & (velocity > -LEAVING)
     joints = np.eye(robot.joint_count)
     return np.concatenate([-joints[is_low], joints[is_high]])
 

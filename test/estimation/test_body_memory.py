@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A restarted estimator knows which offsets were calibrated or revoked, and who was isolated."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -91,3 +92,23 @@ def test_a_body_that_cannot_be_saved_is_reported_and_changes_nothing_else(tmp_pa
     memory.note(FOUND)
     assert 'cannot be saved' in memory.problem
     assert BodyMemory(None, MUSCLES).found is None
+
+
+def test_a_body_that_could_not_be_saved_in_time_is_saved_later(tmp_path, monkeypatch):
+    """After a failed attempt, the memory waits; meanwhile, the body may return and change again."""
+    monkeypatch.setattr('musculoskeletal_ae.remembered_text.RETRY_INTERVAL', 0.3)
+    memory, away = BodyMemory(tmp_path / 'new', MUSCLES), tmp_path / 'away'
+    memory.note(FOUND)
+    (tmp_path / 'new').rename(away)
+    (tmp_path / 'new').write_text('')
+    memory.note(replace(FOUND, isolated=(0,), generation=13))
+    assert memory.problem
+    (tmp_path / 'new').unlink()
+    away.rename(tmp_path / 'new')
+    memory.note(replace(FOUND, generation=14))
+    newest = replace(FOUND, isolated=(), generation=15)
+    end = time.monotonic() + 30.0
+    while found_later(tmp_path).isolated and time.monotonic() < end:
+        memory.note(newest)
+        time.sleep(0.05)
+    assert found_later(tmp_path).isolated == () and not memory.problem

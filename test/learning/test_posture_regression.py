@@ -80,6 +80,27 @@ def test_only_measured_joints_are_estimated_by_regression(arm26, stage):
     assert not fit.body.regressions
 
 
+@pytest.mark.parametrize('spread', [0.0, 0.01])
+def test_a_joint_that_hardly_moved_in_the_samples_is_left_to_the_body(arm26, stage, spread):
+    observed = stage.observations(20)
+    theta, rng = observed.theta.copy(), np.random.default_rng(0)
+    theta[:, 0] = spread * rng.uniform(-1.0, 1.0, len(theta))
+    length = stage.body.lengths(theta, observed.tension, np.zeros_like(observed.tension))[0]
+    body = fitted(arm26, replace(observed, theta=theta, length=length))
+    theta, tension, length = stage.states(300)
+    estimate = body.estimated(theta, tension, length)
+    np.testing.assert_array_equal(estimate[:, 0], theta[:, 0])
+
+
+def test_a_muscle_that_no_sample_contains_is_no_input_of_the_regression(arm26, stage):
+    observed = stage.observations(20)
+    known = np.tile(np.arange(6) != 2, (20, 1))
+    body = fitted(arm26, replace(observed, length=with_slack(observed.length), known=known))
+    assert body.regressions[0].muscles.tolist() == [0, 1, 3, 4, 5]
+    theta, tension, length = stage.states(300)
+    assert np.isfinite(body.estimated(theta, tension, with_slack(length))).all()
+
+
 def test_synthetic_samples_have_the_combined_estimate_as_target(arm26, stage):
     observed = stage.observations(60)
     body = fitted(arm26, replace(observed, length=with_slack(observed.length)))

@@ -36,7 +36,7 @@ def test_the_programme_finds_the_nearest_feasible_tension(seed, desired):
 
 def test_a_torque_out_of_reach_is_refused():
     jacobian = np.array([[0.05], [-0.05]])
-    with pytest.raises(InfeasibleError, match='within its limits'):
+    with pytest.raises(InfeasibleError, match='within their limits'):
         TensionProgramme(jacobian, np.array([0.05 * 171.0]), LOW, HIGH).nearest(60.0)
 
 
