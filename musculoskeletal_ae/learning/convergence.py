@@ -4,7 +4,7 @@
     e = exp(mean of log ‖θ_est − θ_w‖) over synthetic samples that were not trained
 
 θ_w is the posture that the network should estimate (`body_model/synthetic.py`). The network learns
-from the fitted body (`body_model/`), which hardly changes once all samples are known. Its error e on
+from the fitted body (`body_model/`), which hardly changes once all samples are known. Its error on
 synthetic samples of this body falls to what their noise and the uncertainty of the body leave,
 after 3 000 steps for a body that is nearly the geometric model, and after 8 000 for a rough one.
 The updates end when e has stopped falling. No measured posture is held out for this decision, so
