@@ -158,7 +158,7 @@ class Pushes(NamedTuple):
 
 
 def push(lab: BusyLoop, seed: int, count: int) -> Pushes:
-    """Push each joint of a healthy arm `count` times with each torque, while the arm explores.
+    """Push each joint of a healthy exploring arm `count` times with each of several torques.
 
     Raises:
         MusculoskeletalError: If the arm has not moved long enough to calibrate contact detection.
@@ -188,7 +188,7 @@ def _delay(loop: ContactLoop, joint: int, torque: float, rng: np.random.Generato
             break
     try:
         for n in range(round(MOVED / SAMPLE_TIME) + 1):
-            # This wrench on the hand has no torque at the other joints.
+            # This wrench on the hand exerts no torque at the other joints.
             jacobian = robot.kinematics.end_effector_jacobian(loop.arm.theta)
             torques = torque * np.eye(robot.joint_count)[joint]
             wrench = np.linalg.lstsq(jacobian.T, torques)[0]

@@ -148,9 +148,8 @@ class Course:
         #: false statements that came only after the fault was mended
         self.later: dict[str, str] = {}
         self.stated: dict[str, Any] = {}  # all different statements, with time and judgement
-        self.taken: list[
-            str
-        ] = []  # steps that the operator took, each with its refusal if there was one
+        #: steps that the operator took, each with its refusal if there was one
+        self.taken: list[str] = []
         self.peak = 0.0  # highest tension, in multiples of tension.limit
         self.quiet_since = lab.now
         self._next_look = lab.now

@@ -61,8 +61,8 @@ In short, on two idle cores and for the arm of ten muscles: the four nodes and t
 {missed:.1f} % of the messages are missed. A command follows its message within {latency:.1f} ms at
 100 Hz (99 %).
 
-Choose 100 to 200 Hz for an arm. 500 Hz suit about ten muscles on two cores with nothing else to do,
-but no larger body.
+Choose 100 to 200 Hz for an arm. 500 Hz is possible with about ten muscles on two cores that do
+nothing else, but not with a larger body.
 
 This page was written by `python -m bench performance {options}--out doc` on {day}, on
 {machine}. The columns "before" show the first version that was measured (commit

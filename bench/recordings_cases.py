@@ -33,8 +33,7 @@ class Case(NamedTuple):
     training: Run
     test: Run
     draw: int = 0
-    #: the postures of `training`, separately for each run, for the fit of `Statics`; empty if there
-    #: is no such fit
+    #: the runs of `training`, to which `Statics` is fitted; empty if it is not fitted
     rests: tuple[Run, ...] = ()
 
 

@@ -48,8 +48,8 @@ AFTER = 30.0  # let the arm explore for this time after a calibration, and count
 LONGEST = 120.0  # give a calibration up after this time [s]
 SETTLING = 20.0  # let the arm hang for this time after power-on, so that it is still [s]
 STATED = 0.0  # standard deviation of the error of a stated posture [rad], the same for each joint
-#: by what a calibration knows (joint sensors, nothing, or a stated posture): report it if it takes
-#: longer than the first value [s], or if it increases the error by more than the second, a factor
+#: for calibrations by joint sensors, without any, and in a stated posture: report one that takes
+#: longer than the first value [s], or that multiplies the error by more than the second
 GOALS = {'sensors': (30.0, 1.2), 'none': (60.0, 1.5), 'posture': (30.0, 1.5)}
 
 

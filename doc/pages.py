@@ -38,11 +38,12 @@ each exerts T_bias. Modules that follow positions are paid out until their measu
 T_bias, or by `release` of muscles.yaml where no tension is known.
 - `release at once` does not wait for `hold_time`.
 
-A cause ends with `controller/reset`, or earlier where the column *ends earlier* says so: by \
-default, only a short interruption of readings or estimates does; with `on_anomaly: isolate`, also \
-causes that the verification of a muscle explains. `anomaly_detected` stands for any of the \
-[findings](diagnostics.md#conditions) of the estimator. If several causes begin together, the \
-first one in this table is reported. Each remedy ends with `controller/reset`.
+Most causes last until `controller/reset`. The column *ends earlier* names those that also end by \
+themselves: by default, these are only short interruptions of readings or estimates. With \
+`on_anomaly: isolate`, a verification of a muscle ends those that the fault of this muscle caused. \
+All [findings](diagnostics.md#conditions) of the estimator lead to the cause `anomaly_detected`. \
+If several causes begin together, the first one in this table is reported. Each remedy ends with \
+`controller/reset`.
 
 {table}
 

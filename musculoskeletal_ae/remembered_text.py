@@ -21,12 +21,18 @@ class RememberedText:
     """Reads and replaces one such file.
 
     Attributes:
-        problem: Why the last text could not be saved; '' if it was saved.
+        problem: What is lost because the last text could not be saved, and why, as a text for
+            users; '' if it was saved.
     """
 
-    def __init__(self, file: Path) -> None:
-        """Use a file, whose directory is created by the first `write`."""
-        self._file = file
+    def __init__(self, file: Path, lost: str) -> None:
+        """Use a file, whose directory is created by the first `write`.
+
+        Args:
+            file: The file.
+            lost: What is lost if a text cannot be saved, for `problem`.
+        """
+        self._file, self._lost = file, lost
         self._next_attempt = 0.0
         self.problem = ''
 
@@ -58,10 +64,14 @@ class RememberedText:
             new.replace(self._file)
         except OSError as error:
             self._next_attempt = time.monotonic() + RETRY_INTERVAL
-            self.problem = str(error)
+            self.problem = f'{self._lost}: {error}'
             return False
         self.problem = ''
         return True
+
+    def keep(self) -> None:
+        """Keep the text of the file, because it is right again; this ends a problem."""
+        self.problem = ''
 
     def delete(self) -> None:
         """Delete the file, if that is possible."""

@@ -41,9 +41,8 @@ class BagWriter:
         self._name = f'{self.directory.resolve().name}_0.mcap'
         try:
             self._name.encode()
-        except (
-            UnicodeEncodeError
-        ) as error:  # Python replaces bytes that are not UTF-8 by surrogates
+        except UnicodeEncodeError as error:
+            # Python replaces bytes that are not UTF-8 by surrogates, which cannot be encoded.
             problem = 'the name is not UTF-8'
             raise BagError(self.directory, problem, 'choose another name') from error
         #: further entries of metadata.yaml, which are written when the bag is completed

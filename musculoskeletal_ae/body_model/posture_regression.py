@@ -20,8 +20,8 @@ v_body is the mean squared error of the body at samples that are left out, and v
 predictive variance. If the body explains the lengths, v_body is a hundredth of v_regression, and
 the body decides. It also decides far from all samples, because v_regression is large there.
 
-The network learns θ_est from synthetic samples (`synthetic`). The lengths that it computes from θ
-and T are those of the body.
+The network learns to estimate θ_est from synthetic samples (`synthetic`). From θ and T, however, it
+computes the lengths of the body, which the regression does not change.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ LEAST_SPREAD = 1e-6  # leave out inputs that vary less than this in the samples 
 #: leave out joints that a smaller share of the samples measures, and muscles whose lengths a
 #: smaller share of them contains
 MEASURED_SHARE = 0.5
-#: leave out joints that vary less than this in the samples [rad]: what moves them elsewhere is then
-#: unknown
+#: leave out joints that vary less than this in the samples [rad], because such samples do not show
+#: which lengths follow from a motion of the joint
 LEAST_ANGLE_SPREAD = 0.05
 #: expect the body's posture within this share of the joint ranges from their middle
 USUAL_SHARE = 0.3
@@ -252,7 +252,7 @@ class _Evidence:
 def _body_errors(
     body: CalibratedBody, observed: Observations, fit: FittedBody, rows: Ints, group: Group
 ) -> tuple[Array, Array]:
-    """Return errors of the body's postures at samples, and the robust weights of the samples.
+    """Return by how much the body misestimates the postures of samples, and the samples' weights.
 
         e = (Gᵀ Σ⁻¹ G + S⁻²)⁻¹ (Gᵀ Σ⁻¹ ρ + S⁻² (θ̄ − θ))
 

@@ -21,6 +21,7 @@ from musculoskeletal_ae.remembered_text import RememberedText
 
 FILE, LOCK = 'controller.stop', 'controller.lock'
 BEFORE = 'before this controller was started'
+LOST = 'the stop cannot be saved, so a restarted controller will not know it'
 
 
 class StopMemory:
@@ -52,7 +53,7 @@ class StopMemory:
             file = directory.expanduser() / FILE
             file.parent.mkdir(parents=True, exist_ok=True)
             self._lock = locked(file.with_name(LOCK))
-            remembered = RememberedText(file)
+            remembered = RememberedText(file, LOST)
             text = remembered.read()
         except BlockingIOError as error:
             self.close()
@@ -94,10 +95,7 @@ class StopMemory:
     @property
     def problem(self) -> str:
         """Why the present stop cannot be kept, as a text for users; '' if it is kept."""
-        if self._file is None or not self._file.problem:
-            return ''
-        lost = 'the stop cannot be saved, so a restarted controller will not know it'
-        return f'{lost}: {self._file.problem}'
+        return '' if self._file is None else self._file.problem
 
     def close(self) -> None:
         """Delete the file unless a stop is latched, and release the directory."""

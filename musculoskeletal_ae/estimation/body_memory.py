@@ -24,6 +24,10 @@ from musculoskeletal_ae.remembered_text import RememberedText
 from musculoskeletal_ae.signals.body_state import MOST_OFFSET, BodyState, LengthOffsets
 
 FILE = 'estimator.offsets'  # name of the file, in the directory that the user chooses
+LOST = (
+    'length offsets and isolated muscles cannot be saved, so a restarted estimator will not know '
+    'them'
+)
 
 
 class BodyMemory:
@@ -52,17 +56,14 @@ class BodyMemory:
         # A NUL in the path raises a ValueError, and an unknown home directory a RuntimeError.
         with suppress(OSError, ValueError, RuntimeError):
             if directory is not None:
-                self._file = RememberedText(directory.expanduser() / FILE)
+                self._file = RememberedText(directory.expanduser() / FILE, LOST)
                 if (text := self._file.read()) is not None:
                     self.found, self._has_file = self._parse(text), True
 
     @property
     def problem(self) -> str:
         """Why the present body state could not be saved, as a text for users; '' if it was."""
-        if self._file is None or not self._file.problem:
-            return ''
-        lost = 'length offsets and isolated muscles cannot be saved'
-        return f'{lost}, so a restarted estimator will not know them: {self._file.problem}'
+        return '' if self._file is None else self._file.problem
 
     def _parse(self, text: str) -> BodyState:
         """Return the body state that the text of the file states.
@@ -100,7 +101,7 @@ class BodyMemory:
         is_healthy = _are_zero(offsets) and not body.isolated
         is_known = self._saved == (offsets, body.isolated)
         if is_known or (is_healthy and not self._has_file):
-            self._file.problem = ''  # an attempt to save another body state may have failed
+            self._file.keep()  # an attempt to save another body state may have failed
         elif self._file.write(self._text(offsets, body)):
             self._saved, self._has_file = (offsets, body.isolated), True
         else:  # a later call tries again

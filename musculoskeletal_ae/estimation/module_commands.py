@@ -31,8 +31,8 @@ class _Command(NamedTuple):
     """A command to the muscle modules: target lengths or target tensions."""
 
     time: float  # when the estimator received it [s]
-    length: Array | None  # l_target [m], (M,)
-    tension: Array | None  # T_target [N], (M,)
+    length: Array | None  # target lengths [m], (M,); None if it commands tensions
+    tension: Array | None  # target tensions [N], (M,); None if it commands lengths
 
 
 class ModuleCommands:

@@ -184,11 +184,11 @@ class TensionPlan:
             limits = np.minimum(low, inputs.limit) / loss, inputs.limit / loss
             stops = supporting_stops(robot, at.theta, at.velocity)
             supporting = torque + self._support * shift.torque
-            exertion = least_tension(jacobian, supporting, *limits, near, stops)
-            tension, missing_torque = exertion
+            tension, missing_torque = least_tension(jacobian, supporting, *limits, near, stops)
             if missing_torque.any():  # report only what is missing without the feedback
-                exertion = least_tension(jacobian, torque, *limits, near, stops)
-            self.tension = PlannedTension(tension, tension * loss, exertion.missing_torque)
+                without_feedback = least_tension(jacobian, torque, *limits, near, stops)
+                missing_torque = without_feedback.missing_torque
+            self.tension = PlannedTension(tension, tension * loss, missing_torque)
         else:
             assumed = actuation.assumed_tension
             self.tension = PlannedTension(assumed, assumed, self.tension.missing_torque)

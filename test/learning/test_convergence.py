@@ -18,10 +18,10 @@ from musculoskeletal_ae.tables.table import Table
 
 def updates(errors):
     """Return the number of updates until the errors, of which the last one repeats, converge."""
-    seen = list[float]()
-    while not is_reached(seen):
-        seen.append(errors[min(len(seen), len(errors) - 1)])
-    return len(seen)
+    model_errors = list[float]()
+    while not is_reached(model_errors):
+        model_errors.append(errors[min(len(model_errors), len(errors) - 1)])
+    return len(model_errors)
 
 
 def test_updates_go_on_while_the_error_falls():
