@@ -23,7 +23,7 @@ Refuse = Callable[[Path, str], Exception]
 
 LARGEST = 5_000_000  # refuse a larger file, unless the caller states another limit [bytes]
 LARGEST_YAML = 1 << 19  # refuse a larger YAML file, because parsing YAML is slow [bytes]
-#: refuse a larger CSV file, because each cell takes fifty bytes of memory [bytes]
+#: refuse a CSV file that is larger than this [bytes], because each cell takes fifty bytes of memory
 LARGEST_CSV = 1 << 20
 MOST_ENTRIES = 100_000  # refuse a YAML file with more entries after aliases are expanded
 DEEPEST = 50  # refuse a YAML file that is nested more deeply than this number of levels

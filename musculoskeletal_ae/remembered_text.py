@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A small text file by which a node that is started again knows what it was before.
+"""A small text file from which a restarted node reads the state that it had before.
 
 The file is replaced as a whole, but without fsync, which could delay a command or an estimate by
 0.1 s. If the process is killed, nothing that was written is lost. A power failure may leave an

@@ -215,7 +215,7 @@ def _contents(bag: Bag, times: dict[str, array[int]]) -> list[str]:
 class _Fit(NamedTuple):
     faults: list[str]  # reasons why the bag does not fit the robot
     notes: list[str]  # remarks on unused messages
-    motion: str = ''  # text for users on how much the recorded motion teaches
+    motion: str = ''  # text for users: how much can be learned from the motion
     has_its_messages: bool = False  # whether the messages have the joints and muscles of the robot
 
 

@@ -40,7 +40,7 @@ MOST_EXPANDED, LARGEST_EXPANSION = 8 << 20, 100
 
 #: remedy if log times go back
 _JUMP = 'record again without `replay --loop`, a second publisher of /clock, or other jumps of time'
-_LONGEST_QOS = 10_000  # ignore longer QoS profiles, as YAML [characters]
+_LONGEST_QOS = 10_000  # ignore QoS profiles with more characters of YAML than this
 
 
 class _Span(NamedTuple):
@@ -143,7 +143,7 @@ class McapFile:
             raise ValueError('it ends within its first record')
         with open_file(self.path) as file:
             file.seek(-len(MAGIC), 2)
-            if file.read() == MAGIC:  # the file was closed, so the length of a record is wrong
+            if file.read() == MAGIC:  # complete, so a stated length is wrong
                 raise ValueError('a record reaches beyond the end of the file')
         self.unfinished = (
             f'{self.path.name} ends within a record at byte {self._size}; '

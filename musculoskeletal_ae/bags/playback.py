@@ -27,7 +27,7 @@ from musculoskeletal_ae.exceptions import BagError, MessageError
 from musculoskeletal_ae.messages.arrival import SILENCE
 from musculoskeletal_ae.messages.message_reading import MOST_ENTRIES, target_values
 
-LONGEST_LAG = 1.0  # after a longer interruption, resume playback instead of catching up [s]
+LONGEST_LAG = 1.0  # after an interruption longer than this [s], do not catch up
 #: when a pause of the recording is skipped, continue at this recorded time before the next message
 #: [ns]
 SKIP_LEAD = 500_000_000

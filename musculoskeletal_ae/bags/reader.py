@@ -40,7 +40,7 @@ class Bag:
 
     path: Path
     files: list[StorageFile]
-    topics: dict[str, BagTopic] = field(default_factory=dict)  # by recorded name
+    topics: dict[str, BagTopic] = field(default_factory=dict)  # topics by recorded name
     unfinished: list[str] = field(default_factory=list)  # why the recording may be incomplete
 
     @classmethod

@@ -101,7 +101,7 @@ class StorageFile(Protocol):
     """One mcap or sqlite3 file of a recording, from which messages are read."""
 
     path: Path
-    topics: dict[str, BagTopic]  # by recorded name
+    topics: dict[str, BagTopic]  # topics by recorded name
     start: int  # earliest log time [ns]; LATEST without messages
     end: int  # latest log time [ns]; 0 without messages
     unfinished: str  # why the end of the file is missing; '' if the file is complete

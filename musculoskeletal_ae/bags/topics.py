@@ -123,7 +123,8 @@ def select(
         for one in wanted:
             if one not in {*names, *names.values()}:
                 raise BagError(bag.path, f'topic {one} is not in the bag', topics_of_bag)
-    leave_out = ', or leave it out with --topics' if list(wanted) in ([DEFAULT], [ALL]) else ''
+    is_choice = list(wanted) not in ([DEFAULT], [ALL])
+    leave_out = '' if is_choice else ', or select the other topics with --topics NAME,…'
     for name in chosen:
         topic = topics.get(names[name])
         _compare_type(bag, name, topic.type if topic else bag.topics[name].type, leave_out)

@@ -79,10 +79,10 @@ TYPICAL_STEP = 0.3  # scale the damping of the solver to changes of an angle by 
 class Weights(NamedTuple):
     """Weights of all residuals: robust weights ω, divided by the variances."""
 
-    length: Array  # of the lengths [1/m²], (N, M)
-    torque: Array  # of the torque balances [1/(N·m)²], (N, D)
-    angle: Array  # of the measured angles [1/rad²], (N, D); 0 where none was measured
-    gravity: Array  # of the directions of gravity, (N, 3J); 0 where none was measured
+    length: Array  # weights of the lengths [1/m²], (N, M)
+    torque: Array  # weights of the torque balances [1/(N·m)²], (N, D)
+    angle: Array  # weights of the angles [1/rad²], (N, D); 0 where none was measured
+    gravity: Array  # weights of the directions of gravity, (N, 3J); 0 where none was measured
 
 
 class PosturePoint(NamedTuple):

@@ -51,7 +51,7 @@ class ActivityControl(ABC):
 
     @property
     def has_arrived(self) -> bool:
-        """Whether the requested motion has ended, so that the arm should rest at its target."""
+        """Whether the requested motion has ended. If so, the arm should rest at its target."""
         return False
 
     @property

@@ -65,7 +65,7 @@ class SafeStop:
 
     @property
     def is_releasing(self) -> bool:
-        """Whether the hold time is over, so that the muscles are being paid out."""
+        """Whether the hold time is over. If so, the muscles are paid out."""
         return self._held > self._settings.hold_time
 
     def step(

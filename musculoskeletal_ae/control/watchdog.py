@@ -200,8 +200,8 @@ class HeatLimit:
         warm, most = distinct(winding[m], highest)
         rest = self.heat.rest_needed(highest, robot.tension.bias)[robot.used & self.heat.is_known]
         detail = (
-            f'{robot.muscles[m]} {warm} °C, limit {most} °C; at rest, all have cooled '
-            f'{soon(float(rest.max(initial=0.0)))}'
+            f'{robot.muscles[m]} {warm} °C, limit {most} °C; if the arm rests, all motors '
+            f'will have cooled {soon(float(rest.max(initial=0.0)))}'
         )
         return [ConditionKind.OVERHEATED.condition(detail, [robot.muscles[m]])]
 

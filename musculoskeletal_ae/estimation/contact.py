@@ -40,8 +40,8 @@ LARGEST_USUAL = 20.0  # F₀: expect no larger force at the hand in normal use [
 #: regularise the estimated force F with ‖F‖²/F₀² [1/N²], so that components stay small that produce
 #: no joint torque
 REGULARISATION = np.eye(3) / LARGEST_USUAL**2
-#: assume that a joint may rest against its stop within this distance from its limit [rad]; this is
-#: about the error of the estimated angle
+#: assume that a joint may rest against its stop within this distance from its limit [rad], which is
+#: roughly the error of an estimated angle
 AT_STOP = 0.06
 #: evaluate the muscle Jacobian G again once a joint has moved by this much [rad], not at every
 #: message, because G changes slowly

@@ -6,7 +6,7 @@
     A = ‖T_est − T_end‖₂ + ‖l_est − l‖₂
 
 From the bone-side tensions T_end and the lengths l, the network estimates the joint angles θ and
-restores tensions and lengths. e is the residual and A the anomaly score, both in scaled units.
+reconstructs tensions and lengths. e is the residual and A the anomaly score, both in scaled units.
 """
 
 import math
@@ -24,8 +24,8 @@ class Estimate:
 
     Attributes:
         state: Joint angles [rad], (D,), and tensions [N] and lengths [m], (M,), as the network
-            restores them.
-        residual: Restored minus measured tensions and lengths in scaled units, 0 for isolated
+            reconstructs them.
+        residual: Reconstructed minus measured tensions and lengths in scaled units, 0 for isolated
             muscles, (2M,).
         anomaly: Anomaly score A, the size of the residual.
         covariance: Covariance of the joint angles [rad²], (D, D); None if the network has none.
@@ -44,7 +44,7 @@ def estimate(mae: Mae, bone_tension: Array, length: Array, state: State | None =
         mae: The network; its isolated muscles are ignored.
         bone_tension: Bone-side tensions [N], (M,).
         length: Muscle lengths [m], (M,).
-        state: The state that the network restores from them; None to compute it here.
+        state: The state that the network reconstructs from them; None to compute it here.
     """
     state = mae.estimate(bone_tension, length) if state is None else state
     error = residuals(state, bone_tension, length, mae.isolated)

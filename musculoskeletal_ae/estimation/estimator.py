@@ -299,7 +299,7 @@ class Estimator:
         return (*self.joint_check.confirm(), *self.joint_stream.do_without_missing())
 
     def restore(self, muscles: Iterable[int]) -> None:
-        """Use isolated muscles (indices) again; muscles that are not isolated are ignored.
+        """Restore isolated muscles (indices); muscles that are not isolated are ignored.
 
         Raises:
             MusculoskeletalError: If one of these muscles is being verified, or if its readings

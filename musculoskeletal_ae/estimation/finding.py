@@ -101,7 +101,7 @@ def observe(
         bone_tension: Bone-side tensions [N], (M,).
         dt: Time since the previous message [s].
         demand: Tensions demanded of the modules [N], (M,), or None if they are unknown.
-        state: The state that the network restores from the readings; None to compute it here.
+        state: The state that the network reconstructs from the readings; None to compute it here.
         command: Target lengths of the modules [m], (M,), or None without a length command.
     """
     unknown, usable = np.full(len(length), np.nan), np.ones(len(length), dtype=bool)

@@ -2,8 +2,8 @@
 """Names the muscles that the estimate of the posture still needs while a muscle is isolated.
 
 If too few muscles cross a joint, its angle follows from the training data rather than from the
-readings, and the covariance of the fitted posture is large (`Mae.posture_covariance`). This is
-computed for the loss of each further muscle, before it happens.
+readings, and the covariance of the fitted posture is large (`Mae.posture_covariance`). The
+covariance is therefore computed in advance for the loss of each further muscle.
 """
 
 import numpy as np

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks whether a muscle that was isolated or suspected may be used again.
+"""Checks whether a muscle that was isolated or suspected may be restored.
 
-A muscle must not be used again while one of these problems is present:
+A muscle must not be restored while one of these problems is present:
 
     the length has just jumped      its new level is not accepted yet
     a reading is NaN                the sensor is faulty (`MuscleSample.missing`)
@@ -35,7 +35,7 @@ LARGEST_LEARNED, LARGEST_YOUNG = 0.02, 0.08
 
 
 class RepairCheck(NamedTuple):
-    """Checks by the readings of one message whether repaired muscles may be used again."""
+    """Checks, from the readings of one message, whether repaired muscles may be restored."""
 
     robot: Robot  # the nominal body with all muscles
     mae: Mae  # the network with all muscles

@@ -4,9 +4,9 @@
     d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),   threshold of d = margin · (1 + n_few/samples) · max d
                                    threshold of A = margin · (1 + n_few/samples) · max A
 
-e are the residuals of a message: the tensions and lengths that the network restores from it, minus
-the measured ones. A is one number for the magnitude of e (`mae.residuals`). μ and Σ are mean and
-covariance of e, margin is `MARGIN`, and n_few is `FEW_SAMPLES`.
+e are the residuals of a message: the tensions and lengths that the network reconstructs from it,
+minus the measured ones. A is one number for the magnitude of e (`mae.residuals`). μ and Σ are mean
+and covariance of e, margin is `MARGIN`, and n_few is `FEW_SAMPLES`.
 
 A reservoir keeps a uniform random selection of all messages, from motion and from rest. Each new
 network gets the statistics of its own residuals on these messages. The thresholds use the maximum,

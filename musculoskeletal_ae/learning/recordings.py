@@ -262,7 +262,7 @@ def errors(mae: Mae, recording: Pairs, at_rest: bool = False) -> Array:
     Args:
         mae: The network.
         recording: The readings.
-        at_rest: Whether each row is a resting posture, so that rows do not show how tendons slid.
+        at_rest: Whether each row is a resting posture. Such rows do not show how tendons slid.
     """
     sliding = np.zeros_like(recording.length) if at_rest else directions(recording.length)
     tension = mae.transmission.end(recording.tension, sliding)

@@ -152,9 +152,9 @@ def _fits(sample: SavedSample, robot: Robot, muscle_count: int) -> bool:
 
 
 def restore_samples(state: SavedState, robot: Robot, samples: SampleStore) -> None:
-    """Add the saved samples to an empty store; those that were held back remain held back.
+    """Add the saved samples to an empty store. Samples that were held back remain held back.
 
-    The saved samples do not describe muscles that were added to the robot after the save.
+    In these samples, muscles that were added to the robot after the save count as unknown.
     """
     for saved in state.samples:
         stored = _restored(saved, state, robot)

@@ -4,8 +4,8 @@
     L = ‖θ − θ_calc‖ + ‖T − T_calc‖ + ‖l − l_calc‖ + ‖G − G_calc‖
 
 Each norm is in units of the standard deviation of the data, so that all have similar weight. G is
-the muscle Jacobian ∂l/∂θ of the lengths that the network restores from θ and T; control needs it.
-Each sample has a close neighbour, its twin. The error of G is the difference between the length
+the muscle Jacobian ∂l/∂θ of the lengths that the network reconstructs from θ and T; control needs
+it. Each sample has a close neighbour, its twin. The error of G is the difference between the length
 errors of sample and twin, divided by their distance. Every sample passes through all three masks.
 Muon updates the matrices, with a step size that rises and then falls to zero.
 

@@ -11,9 +11,9 @@ The products use single precision, because the weights of a large body then fit 
 The rounding error of 1e-6 is far below the error of a network. Inputs and outputs are arrays of
 double precision.
 
-Here ①(θ, T) are the lengths that the network restores from θ and T, and ② restores (θ, T, l) from
-measured T and l. Sensor values of isolated muscles have no influence. If muscles are isolated, θ is
-the most likely posture for the lengths of all other muscles:
+Here ①(θ, T) are the lengths that the network reconstructs from θ and T, and ② reconstructs (θ, T,
+l) from measured T and l. Sensor values of isolated muscles have no influence. If muscles are
+isolated, θ is the most likely posture for the lengths of all other muscles:
 
     θ = argmin eᵀ Σ⁻¹ e + ‖(θ − θ̄)/s‖²,  e = l − ①(θ, T) of the muscles that are not isolated
 
@@ -551,7 +551,7 @@ class Mae:
     def lengths_with_pullback(
         self, theta: Array, tension: Array
     ) -> tuple[Array, Callable[[Array], Array]]:
-        """Return the lengths l [m] (N, M) that the network restores from θ and T, and a pullback.
+        """Return the lengths l [m] (N, M) reconstructed from θ and T, and a pullback.
 
         The pullback is a function that maps the gradient dL/dl of any scalar L to dL/dθ. Applied to
         T, it returns Gᵀ T at the cost of one evaluation instead of D.

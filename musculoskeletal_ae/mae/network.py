@@ -129,7 +129,7 @@ class Network(nn.Module):
         return self.decoder(z) * self.std + self.mean
 
     def forward(self, values: Tensor, mask: Tensor) -> Tensor:
-        """Return scaled (θ, T, l), restored from the two quantities that the mask selects."""
+        """Return scaled (θ, T, l), reconstructed from the two quantities that the mask selects."""
         return self.decode(self.encode(values, mask))
 
     def _stack(self, sizes: tuple[int, ...]) -> nn.Sequential:

@@ -130,7 +130,7 @@ OUTPUTS = (('theta', 'rad', 1.0), ('tension', 'N', 1.0), ('length', 'mm', 1e3))
 
 
 class PairError(NamedTuple):
-    """Error of one output that the network restores with one mask."""
+    """Error of one output that the network reconstructs with one mask."""
 
     mask: Mask
     output: str  # 'theta', 'tension' or 'length'
@@ -142,7 +142,7 @@ class PairError(NamedTuple):
 def pair_errors(mae: Mae, states: State) -> list[PairError]:
     """Return the mean errors over N states, for all nine pairs of mask and output.
 
-    The states are true; the network restores each from the two quantities that a mask selects.
+    The states are true; the network reconstructs each from the two quantities that a mask selects.
     """
     result = []
     for mask in Mask:

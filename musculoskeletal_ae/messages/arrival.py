@@ -36,8 +36,8 @@ from musculoskeletal_ae.awake_clock import AwakeClock
 #: treat a topic that should be published continually as silent, and its last message as out of
 #: date, without a usable message for this time [s]
 SILENCE = 1.0
-#: after a longer gap between two messages of a running arm, the state of the arm is unknown: the
-#: controller pauses (`max_age`), and the detectors discard their evidence [s]
+#: treat the state of a running arm as unknown after a gap between two messages that is longer than
+#: this [s]: the controller pauses (`max_age`), and the detectors discard their evidence
 INTERRUPTION = 0.2
 #: let at most this much time between two messages or steps advance detectors, commands and emulated
 #: arms [s]; after a longer pause, they do not catch up

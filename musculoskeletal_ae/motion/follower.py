@@ -144,7 +144,7 @@ class Follower(ActivityControl):
 
     @property
     def has_arrived(self) -> bool:
-        """Whether the last trajectory has ended, so that the arm should rest at its end."""
+        """Whether the last trajectory has ended. If so, the arm should rest at its end."""
         return not self.progress.is_moving
 
     @property

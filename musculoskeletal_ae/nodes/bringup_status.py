@@ -129,7 +129,7 @@ class BringupStatusNode(Shell):
             return
         if self.started is None:
             reason = self._why_no_estimate()
-            sys.exit(f'the recording brought no estimate: {reason}; see the logs of the nodes')
+            sys.exit(f'the recording led to no estimate: {reason}; see the logs of the nodes')
         if self.ended is None:
             self.ended = time.monotonic()
             self.ended_report = self.situation.heard_at('replay')

@@ -165,7 +165,7 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {  # all parameters of all nodes, 
         ),
         'end_with_replay': Parameter(
             False,
-            'end with the recording that `replay` plays, with an error if it brought no estimate',
+            'exit when the recording that `replay` plays ends; without any estimate, as an error',
         ),
     },
 }

@@ -55,8 +55,8 @@ class SimNode(ArmNode):
         else:
             self.follow_muscles('muscle_length_command', self._command)
         self.follow_wrench('sim', partial(setattr, self, 'wrench'))
-        # The sensors of a simulated robot have no offsets, and isolation does not change it, as it
-        # does not change a real arm.
+        # With `as_robot`, this node replaces a real arm: its sensors have no offsets, and isolation
+        # does not change how it moves. Therefore it does not follow the body state.
         if not self.as_robot:
             self.follow_body(self._isolate)  # `_command` reads `body.offsets`
         self.listen(JointState, 'sim/fixed_joint_states', self._fix, RELIABLE)

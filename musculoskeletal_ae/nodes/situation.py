@@ -117,7 +117,7 @@ class Situation:
         self._reports: dict[str, NodeReport] = {}  # by the name of the node, without namespace
 
     def forget_ended(self) -> None:
-        """Forget the reports of nodes that may end at any time, and have ended."""
+        """Forget the reports of ended nodes, except for the nodes that an arm needs."""
         now = self._clock()
         for name, report in list(self._reports.items()):
             if name not in NEEDED and now - report.heard_at > FORGET_TIME:
@@ -278,7 +278,7 @@ class Situation:
 
     @property
     def has_learner(self) -> bool:
-        """Whether a learner has reported, so that the arm may learn."""
+        """Whether a learner has reported. If none has, the arm does not learn."""
         return 'learner' in self._reports
 
     def number(self, node: str, key: str) -> float:
@@ -347,7 +347,7 @@ class Arms:
         return self._situations[key]
 
     def forget_ended(self) -> None:
-        """Forget the reports of nodes that may end at any time, and have ended."""
+        """Forget the reports of ended nodes, except for the nodes that an arm needs."""
         for situation in self._situations.values():
             situation.forget_ended()
 

@@ -112,7 +112,7 @@ def torque_term(weight: float, jacobian: Array, tension_rows: Array, torque: Arr
 def muscle_jacobian(mae: Mae, theta: Array, tension: Array, step: float = JOINT_STEP) -> Array:
     """Return the muscle Jacobian G(θ, T) [m/rad], (..., M, D), by forward differences.
 
-    The lengths are those that the network restores from θ and T.
+    The lengths are those that the network reconstructs from θ and T.
     """
     joints = theta.shape[-1]
     offsets = np.vstack([np.zeros(joints), step * np.eye(joints)])

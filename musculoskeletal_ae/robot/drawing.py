@@ -14,7 +14,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.figures import save_figure
 from musculoskeletal_ae.robot.robot import Robot
 
-SHORTEST_BONE = 1e-3  # draw no shorter bone, because it connects two joints in the same place [m]
+SHORTEST_BONE = 1e-3  # draw no bone that is shorter than this [m]: its joints coincide
 BONE_WIDTH, MUSCLE_WIDTH = 0.02, 0.006  # widths of the lines that represent bones and muscles [m]
 BONE_COLOUR = (0.8, 0.8, 0.75)  # colour of bones: red, green, blue
 #: diameter of the balls that mark joints and via points, divided by the width of the line

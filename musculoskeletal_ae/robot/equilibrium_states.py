@@ -163,7 +163,7 @@ class _Law(NamedTuple):
 
 
 class _Linearised(NamedTuple):
-    """What determines the next step from N postures."""
+    """Equations linearised at N postures, from which the next step is computed."""
 
     tension: Array  # T [N], (N, M)
     jacobian: Array  # G [m/rad], (N, M, D)

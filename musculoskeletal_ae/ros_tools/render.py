@@ -17,7 +17,7 @@ from musculoskeletal_ae.ros_tools.ros_tool import ROS_HELP, Spinner, run_tool, s
 
 #: topics of markers: a picture shows the emulated arm if it is published, otherwise the estimate
 BODY, ESTIMATE = 'hardware_emulator/markers', 'estimated/markers'
-#: wait this long for the preferred topic after another topic has brought markers [s]
+#: wait this long for the preferred topic after markers have arrived on another topic [s]
 DISCOVERY_TIME = 2.0
 
 

@@ -180,7 +180,7 @@ class BodyState:
 
     @property
     def has_anomaly(self) -> bool:
-        """Whether an anomaly is present, so that the arm is stopped."""
+        """Whether an anomaly is present. If so, the arm is stopped."""
         return self.anomaly in PRESENT
 
     def with_isolated(self, muscles: Iterable[int]) -> BodyState:

@@ -54,10 +54,10 @@ WALK = np.array([0.1, 0.02, 0.003, 0.002, 0.002, 0.02])
 #: estimates
 FAR = 2.5
 SLOPE = 1e-4  # compute the numerical derivatives of the filter with this step
-#: take the first reference of the thermal constants only after learning for this time [s]
+#: compare later thermal constants with those that were learned after this time [s]
 LEARNED = 1200.0
-#: take the first reference of the thermal constants only below this standard deviation of their
-#: logarithms
+#: use learned thermal constants as this reference only if the standard deviation of their
+#: logarithms is below this
 KNOWN = 0.2
 REST_STEP = 30.0  # search for the end of a rest in steps of this [s]
 LONGEST_REST = 3600.0  # end this search here, and report a longer rest as 'more than 60 min' [s]

@@ -240,10 +240,10 @@ def _has_wrong_scale(time: Array, theta: Array, is_outside: Bools) -> bool:
 
 
 def _interrupting(which: Ints, readings: Array, largest: Array) -> list[int]:
-    """Return which of the repeated values are read between other, changing readings.
+    """Return the indices of the repeated values that interrupt a series of changing readings.
 
     Args:
-        which: Number of the repeated value in each message, (N,).
+        which: Index of the repeated value in each message, (N,).
         readings: The messages [rad], (N, K).
         largest: Largest possible change from each message to the next one [rad], (N − 1,).
     """

@@ -63,7 +63,7 @@ class Change:
 
     @property
     def is_jump(self) -> bool:
-        """Whether a change was too fast for a winch, so that the lengths count as jumped."""
+        """Whether a change was too fast for a winch. If so, the lengths count as jumped."""
         return self.jumped_at > -math.inf
 
     @property

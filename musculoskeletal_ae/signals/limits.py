@@ -159,11 +159,11 @@ def check_posture(robot: Robot, theta: Array, outside: float) -> None:
 
 
 class Persistence:
-    """Distinguishes a lasting fault from a glitch. Times are of a steady clock [s].
+    """Distinguishes a lasting fault from a glitch. Times come from a steady clock [s].
 
-    A fault lasts from its first message to its newest one. The time since the newest message is
-    added, but at most half of `LIMITS.glitch`. A pause of this process therefore does not turn a
-    glitch into a lasting fault.
+    A fault lasts from its first message to its newest one, and at most half of `LIMITS.glitch`
+    longer if no message follows. A pause of this process therefore does not turn a glitch into a
+    lasting fault.
     """
 
     def __init__(self) -> None:

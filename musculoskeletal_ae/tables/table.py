@@ -62,7 +62,7 @@ class Table:
         tension: ArrayLike | None = None,
         time: ArrayLike | None = None,
     ) -> Table:
-        """Return a table of arrays.
+        """Build a table from arrays.
 
         Rows without any joint position, and rows in which a length, a measured tension or the time
         is missing, are left out; `left_out` has their number.

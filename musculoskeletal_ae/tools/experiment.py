@@ -36,9 +36,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_out('DIR', 'results and report', Path('experiments'))
     parser.add_workers()
     text = (
-        'folder that keeps networks, recordings and measured parts; a later run with the same '
-        'options measures only the parts that are missing (use only folders of your own runs); '
-        '--scheduler needs a folder that all workers share'
+        'folder for networks, recordings and results; a later run with the same options computes '
+        'only the results that are missing. Use only folders of your own runs. With --scheduler, '
+        'all workers must share the folder'
     )
     parser.add_argument('--keep', type=Path, metavar='DIR', help=text)
     text = 'also write the results table between the markers of this page'

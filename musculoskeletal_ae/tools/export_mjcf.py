@@ -21,7 +21,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('checkpoint', type=Path, metavar='CHECKPOINT', help='.safetensors file')
     parser.add_robot(default=None)
     parser.add_out('DIR', 'new or empty directory, for model.xml and report.txt')
-    text = 'the MJCF file from which the robot was imported: write a copy with learned points'
+    text = 'MJCF file of the robot; the command writes a copy of it with the learned via points'
     parser.add_argument('--into', type=Path, metavar='FILE', help=text)
     args = parser.parse_args(argv)
     return exit_status(lambda: _run(args), out=args.out)

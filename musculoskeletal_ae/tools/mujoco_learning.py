@@ -96,7 +96,8 @@ def train(args: Namespace) -> None:
 def learn(robot: Robot, initial: Mae, model: Path, seed: int, minutes: float) -> Learned:
     """Let the emulated arm of an imported file explore and learn.
 
-    If the emulated arm diverges, the exploration ends. Nothing is learned from the diverged arm.
+    If the emulated arm diverges, the exploration ends early. The network keeps what it has learned
+    before.
 
     Args:
         robot: The imported robot.

@@ -411,7 +411,7 @@ def other_robot(robot: Robot, file: Path, problem: str) -> MusculoskeletalError:
     directory = robot.description.directory
     remedy = 'import the MuJoCo model again, and use the model.xml that import_robot writes'
     return MusculoskeletalError(
-        f'reality {file}: it is not the model of {directory}: {problem}; {remedy}'
+        f'{file} (parameter reality) is not the model of {directory}: {problem}; {remedy}'
     )
 
 

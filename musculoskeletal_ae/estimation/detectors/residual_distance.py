@@ -3,12 +3,12 @@
 
     d = √((e − μ)ᵀ Σ⁻¹ (e − μ)),  e = (T_est − T, l_est − l)      (arXiv 2407.08050)
 
-The residual e is the difference between the tensions and lengths that the network restores from all
-readings (T_est, l_est) and the readings themselves (T, l). Its size A is published, but the healthy
-value of A varies with the posture. The decision is based on d instead, which relates the residual
-of every muscle to its healthy spread. The healthy mean μ and covariance Σ have to be measured on
-the real arm: with statistics of the geometric model, most healthy postures would count as
-anomalous. Without calibrated statistics, d is published, but not compared with a threshold.
+The residual e is the difference between the tensions and lengths that the network reconstructs from
+all readings (T_est, l_est) and the readings themselves (T, l). Its size A is published, but the
+healthy value of A varies with the posture. The decision is based on d instead, which relates the
+residual of every muscle to its healthy spread. The healthy mean μ and covariance Σ have to be
+measured on the real arm: with statistics of the geometric model, most healthy postures would count
+as anomalous. Without calibrated statistics, d is published, but not compared with a threshold.
 
 Threshold. Far from calibrated postures, the network is less accurate, so the threshold grows with
 the distance to the nearest one (`unfamiliarity`). It also grows in proportion to a tension above
@@ -20,7 +20,7 @@ without which the remaining residual is most likely. Other muscles without which
 likely are named as well, because in one posture, muscles that span the same joints can explain an
 anomaly equally well. If tendons are slack, only they can be suspect.
 
-Slack. While a slack tendon is being wound in, its measured length is longer than the restored
+Slack. While a slack tendon is being wound in, its measured length is longer than the reconstructed
 length, and messages are no evidence. The measured length of a ruptured tendon is shorter than the
 restored length, so its messages are evidence.
 """
@@ -198,8 +198,8 @@ class ResidualDistance(Detector):
         Args:
             observation: The message.
             distance: Residual distance d of the message.
-            has_slack: Whether a tendon is slack, so that the threshold does not grow.
-            waits: Whether the message is ignored, because a slack tendon is being wound in.
+            has_slack: Whether a tendon is slack. If so, the threshold does not grow.
+            waits: Whether a slack tendon is being wound in. If so, the message is ignored.
         """
         if not self.is_calibrated:
             return ''

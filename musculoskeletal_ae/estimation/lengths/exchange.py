@@ -153,7 +153,7 @@ class ExchangeCheck:
 
     @property
     def _may_have_restarted(self) -> bool:
-        """Whether all messages paused recently, so that the driver may have restarted."""
+        """Whether all messages paused recently, as when a driver restarts."""
         if self._silence is None or self._newest is None:
             return False
         return self._newest[0] - self._silence[0] <= RESTARTED

@@ -174,7 +174,7 @@ class LengthPoint(NamedTuple):
     #: (3M + D,)
     constants: Array
     theta: Array  # postures of K moments [rad], (K, D)
-    residual: Array  # in standard deviations, (K, M + 2D)
+    residual: Array  # residuals [standard deviations], (K, M + 2D)
 
 
 class MomentFit:

@@ -47,7 +47,7 @@ def measures(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> Ite
         return float(np.median(statistics.distances(error) / threshold))
 
     yield measure(tension, length)
-    # Test the detector on LEAST messages for each simulated rupture; more would not change it.
+    # Use only LEAST messages for each simulated rupture; more would not change the result.
     rows = np.linspace(0, len(length) - 1, LEAST).astype(int)
     is_intact = 1.0 - np.eye(tension.shape[1])
     for factors in np.delete(is_intact, tuple(isolated), axis=0):

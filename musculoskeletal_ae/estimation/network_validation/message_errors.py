@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks how exactly a candidate network restores the readings of recent messages.
+"""Checks how exactly a candidate network reconstructs the readings of recent messages.
 
 Three errors are compared. With mask ②, the network estimates joint angles from tensions and
-lengths, and restores both: two errors. With mask ①, it computes the lengths at these joint angles:
-the third error. The median error of each muscle over the messages must be below WORSE times that
-of the network in use, or below FLOOR.
+lengths, and reconstructs both: two errors. With mask ①, it computes the lengths at these joint
+angles: the third error. The median error of each muscle over the messages must be below WORSE times
+that of the network in use, or below FLOOR.
 """
 
 from collections.abc import Iterable, Iterator
@@ -26,7 +26,7 @@ CLEAR = 0.01
 
 
 def message_errors(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> dict[str, Array]:
-    """Return the median errors with which a network restores the readings of recent messages.
+    """Return the median errors with which a network reconstructs the readings of recent messages.
 
     Returns:
         By each name in FLOOR, such as 'T by ②', the error of every muscle [N] or [m], (M,). The
