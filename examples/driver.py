@@ -31,7 +31,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros.messages import array_message, joint_message
 
-RATE = 100.0  # rate at which sensors are read and tensions regulated [Hz]
+RATE = 100.0  # rate at which sensors are read and motors commanded [Hz]
 TURN = 10.0  # time in which a hand moves the first joint to and fro, if `moved` [s]
 SPOOL = 0.01  # radius of the spools [m]
 SILENCE = 0.5  # time without a command after which tensions decrease to T_bias [s]
@@ -54,7 +54,8 @@ class Bus:
     def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return spool angles [rad], T [N], temperatures [°C] and θ [rad].
 
-        Positive spool angles wind in. They are 0 at θ = 0 without tension.
+        Positive spool angles wind in. They are 0 at θ = 0 without tension. If `tension_source` of
+        muscles.yaml is current, return the motor currents [A] in place of T.
         """
         now = time.monotonic()
         if self.moved:  # all motors hold T_bias while a hand moves the arm
@@ -66,16 +67,20 @@ class Bus:
         self.read_at = now
         reading = self.arm.sense()
         # If your modules have no temperature sensors, return NaN for each muscle instead.
-        muscles = reading.muscles
-        return -muscles.length / SPOOL, muscles.tension, muscles.temperature, reading.theta
+        length, tension, temperature = reading.muscles.to_message(self.robot.tension_source)
+        return -length / SPOOL, tension, temperature, reading.theta
 
     def regulate(self, tension: np.ndarray) -> None:
         """Make every motor regulate its tendon to a tension [N] (M,)."""
         self.arm.command_tension(tension)
 
+    def go_to(self, length: np.ndarray) -> None:
+        """Make every motor go to a length [m] (M,), and stay there; for `actuation: position`."""
+        self.arm.command_length(length)
+
 
 class Driver(Node):
-    """Publishes the states, and regulates each tension by the last command."""
+    """Publishes the states, and moves the motors by the last command."""
 
     def __init__(self) -> None:
         super().__init__('driver')
@@ -86,7 +91,8 @@ class Driver(Node):
         self.setpoint = np.full(self.robot.muscle_count, self.robot.tension.bias)
         self.states = self.create_publisher(Float64MultiArray, 'muscle_states', 10)
         self.joints = self.create_publisher(JointState, 'joint_states', 10)
-        for kind in ('length', 'tension'):
+        self.by_position = self.robot.description.actuation == 'position'
+        for kind in ('length',) if self.by_position else ('length', 'tension'):
             follow = partial(self.command, by_tension=kind == 'tension')
             self.create_subscription(Float64MultiArray, f'muscle_{kind}_command', follow, 10)
         self.create_timer(1.0 / RATE, self.tick)
@@ -100,24 +106,32 @@ class Driver(Node):
             self.target, self.by_tension, self.commanded_at = target, by_tension, time.monotonic()
 
     def tick(self) -> None:
-        """Read the sensors, regulate the tensions, and publish the states.
-
-        The tension of a muscle follows from its length and command by muscle stiffness control.
-        """
+        """Read the sensors, move the motors, and publish the states."""
         angle, tension, temperature, theta = self.bus.read()
         length = -SPOOL * angle
+        is_commanded = self.target is not None and time.monotonic() - self.commanded_at < SILENCE
+        if not self.by_position:
+            self.regulate(length, is_commanded)
+        elif is_commanded:  # without commands, the motors stay where they are
+            self.bus.go_to(self.target)
+        rows = np.stack([length, tension, temperature])
+        self.states.publish(array_message(rows, 'quantity', 'muscle'))
+        now = self.get_clock().now().to_msg()
+        self.joints.publish(joint_message(self.robot.joints, theta, now))
+
+    def regulate(self, length: np.ndarray, is_commanded: bool) -> None:
+        """Regulate the tensions that follow from lengths and command by muscle stiffness control.
+
+        Without a command, they decrease to T_bias.
+        """
         bias, most = self.robot.tension.bias, self.robot.tension.max
-        if self.target is not None and time.monotonic() - self.commanded_at < SILENCE:
+        if is_commanded:
             stretched = self.robot.stiffness * (length - self.target)
             wanted = self.target if self.by_tension else bias + np.maximum(0.0, stretched)
         else:
             wanted = np.maximum(bias, self.setpoint - RELEASE / RATE)
         self.setpoint = np.clip(wanted, 0.0, most)
         self.bus.regulate(self.setpoint)
-        rows = np.stack([length, tension, temperature])
-        self.states.publish(array_message(rows, 'quantity', 'muscle'))
-        now = self.get_clock().now().to_msg()
-        self.joints.publish(joint_message(self.robot.joints, theta, now))
 
 
 def main() -> None:

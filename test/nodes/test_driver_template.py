@@ -2,6 +2,8 @@
 """The driver template meets the requirements of the controller."""
 
 import importlib.util
+import re
+import shutil
 import signal
 import sys
 from pathlib import Path
@@ -45,6 +47,36 @@ def test_the_driver_template_follows_the_last_command_and_ends_silently(graph):
             return (least < tension).all() and (tension < most).all()
 
         graph.wait(pulled, f'{kind}s to be followed')
+    driver.ends_silently(signal.SIGTERM)
+
+
+def test_the_driver_template_goes_to_lengths_and_publishes_currents_if_muscles_yaml_says_so(
+    graph, tmp_path
+):
+    folder = shutil.copytree(ROBOT.description.directory, tmp_path / 'servos')
+    modules = 'actuation: position\nspeed: 0.2\ntension_source: current\n'
+    modules += 'drive: {torque_constant: 0.03, gear: 20.0, spool_radius: 0.01}'
+    text, count = re.subn('(?m)^stiffness: .*$', modules, (folder / 'muscles.yaml').read_text())
+    assert count == 1
+    (folder / 'muscles.yaml').write_text(text)
+    command = [sys.executable, str(TEMPLATE), '--ros-args', '-r', f'__ns:={graph.namespace}']
+    driver = Process('driver.py', [*command, '-p', f'robot:={folder}'])
+    graph.processes.append(driver)
+    graph.listen(Float64MultiArray, 'muscle_states')
+
+    def read():
+        return np.reshape(graph.next('muscle_states').data, (3, -1))
+
+    known, current, _ = read()
+    assert (np.abs(current) < 2.0).all()  # at T_bias, 30 N are 0.5 A
+    publisher, target = graph.publisher(Float64MultiArray, 'muscle_length_command'), known - 0.001
+
+    def arrives():
+        publisher.publish(Float64MultiArray(data=target.tolist()))
+        length, pulled, _ = read()
+        return np.abs(length - target).max() < 5e-4 and (pulled > current + 0.2).all()
+
+    graph.wait(arrives, 'the motors to be at their lengths, and to pull harder')
     driver.ends_silently(signal.SIGTERM)
 
 
