@@ -19,14 +19,14 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, MuscleReadings
 
-SPEED_LIMIT = 0.25  # fastest speed of a muscle module's motor [m/s]; chosen by hand
+SPEED_LIMIT = 0.25  # wind no muscle module faster than this [m/s]; chosen by hand
 TURN = 6.2832  # reject a turn of the base by more than this [rad], one revolution
 SPIKE_SHARE = 0.05  # give one muscle a spike in this share of the readings
 BURST_TIME, BURST_PAUSE = 0.3, 3.0  # let bursts and the pauses before them last this on average [s]
 
 
 class FaultKind(NamedTuple):
-    """What a kind of fault does, and which sizes, muscles and quantities its line may state."""
+    """A kind of fault: its effect, and the sizes, muscles and quantities that a line may state."""
 
     meaning: str
     size: float = 0.0  # size of the fault if its line states none, in the unit `unit`
@@ -73,7 +73,7 @@ LEGAL = 'KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]; kinds: ' + ', '.join(KINDS)
 
 
 class ArmReadings(NamedTuple):
-    """What all sensors of an arm read at one moment."""
+    """Readings of all sensors of an arm at one moment."""
 
     theta: Array  # joint angles [rad], (D,)
     muscles: MuscleReadings
@@ -192,7 +192,7 @@ class Faults:
         self._bursts = {key: self._bursts.get(key, (self._time, True)) for key in bursts}
         if not self._of('reorder'):
             self._reordered = None
-        if self._delay() != delay:  # queued readings would arrive between newer ones
+        if self._delay() != delay:  # otherwise, queued readings would arrive out of order
             self._queue.clear()
         self.stuck[:] = self.slack[:] = self.zero[:] = 0.0
         self.hot[:], self.ceiling[:] = -np.inf, np.inf

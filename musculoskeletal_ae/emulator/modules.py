@@ -32,7 +32,7 @@ from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
 STEP = 0.001  # duration of a simulation step [s]
-#: count an arm as diverged if a joint is faster than this [rad/s] or [m/s]; it then stands still
+#: count an arm as diverged, and stop simulating it, if a joint is faster than this [rad/s or m/s]
 FASTEST = 1000.0
 
 #: modes of a module: safe state, following a target length, following a target tension
@@ -363,7 +363,7 @@ class Arm(ABC):
 
     @property
     def has_diverged(self) -> bool:
-        """Whether a joint is so fast (FASTEST) that it cannot be simulated; `reset` ends this."""
+        """Whether a joint has become too fast to simulate (FASTEST); true until `reset`."""
         # The comparison is False if the speed is NaN.
         return not np.abs(self._rates[self._order]).max() <= FASTEST
 
@@ -396,7 +396,7 @@ class Arm(ABC):
 
     @property
     def safe(self) -> bool:
-        """Whether the modules ignore the last command, because it is too old (safe state)."""
+        """Whether the modules are in the safe state, because the last command is too old."""
         return self._kind == SAFE
 
     def command_length(self, length: Array) -> None:
@@ -435,7 +435,7 @@ class Arm(ABC):
     def set_friction(self, factor: float) -> None:
         """Set the friction of the tendons (`kin`) or of the joints (`foreign`).
 
-        `factor` is the multiple of the individual's own friction, and above 0.
+        `factor`, which is above 0, multiplies the individual's own friction.
         """
         friction = self._varying_friction
         friction *= factor / self._friction_factor
@@ -516,7 +516,7 @@ class Arm(ABC):
         """Read all sensors once, with noise, bias, resolution and faults."""
         theta, muscles = self._raw_readings()
         ruptured, rng = self._muscle.ruptured > 0.0, self._rng
-        # Let the sensor of a ruptured tendon read 0, and no tension sensor less than 0.
+        # The tension sensor of a ruptured muscle reads 0; no tension sensor reads less than 0.
         finest = TENSION_NOISE_SHARE * self.robot.description.tension.bias
         fineness = np.minimum(1.0, finest / TENSION_NOISE)
         noise, resolution = fineness * TENSION_NOISE, fineness * TENSION_RESOLUTION

@@ -52,7 +52,7 @@ def make_arm(
         if file is None:
             legal = f'{KIN}, {FOREIGN} or the model.xml that import_robot writes'
             raise MusculoskeletalError(f'reality {reality[:80]!r} is unknown; legal: {legal}')
-    # Imported here because `kin` does not need MuJoCo.
+    # Import MuJoCo only here, because `kin` does not need it.
     from musculoskeletal_ae.emulator.foreign.arm import ForeignArm
     from musculoskeletal_ae.emulator.foreign.effects import Effects
 

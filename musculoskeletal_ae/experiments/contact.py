@@ -19,11 +19,11 @@ CONTACT_STREAM = 7000
 #: numbers of postures in which the resting arm is pushed twice, of collisions, and of tests of
 #: method `float`
 POSTURES, COLLISIONS, FLOATS = 15, 20, 4
-#: try each collision at most this often; a try fails if the arm hardly moves, or if a contact is
-#: detected before the push
+#: try each collision at most this many times; a try fails if the arm hardly moves, or if a contact
+#: is detected before the push
 TRIES_PER_COLLISION = 20
-#: explore without contact for this time, shared by the individuals, and count detected contacts as
-#: false [s]
+#: let healthy arms explore without contact for this time [s], shared by the individuals; count
+#: every detected contact as false
 HEALTHY = 3600.0
 LEAST, MOST = 10.0, 50.0  # range of the forces with which the hand is pushed [N]
 LIGHT, FIRM = 15.0, 20.0  # range of the forces that guide the hand in method `float` [N]

@@ -175,15 +175,14 @@ def _causes(
 ) -> dict[str, float]:
     """Return measures that show why `proposed` needs more than the least tension.
 
-    `proposed` first plans the tensions that hold each target. It then moves the same body without
-    tendon friction to the target. The arm with friction needs still more tension, because of the
-    friction.
+    `proposed` first plans the tensions that hold each target. It then moves the same body, but
+    without tendon friction, to the target. Friction is why the arm itself needs still more tension.
 
     Returns:
-        planned_to_bound, the mean ratio of the planned ‖T‖ to the least ‖T‖ with which the true
-        body holds the target. It shows the error of the learned body. frictionless_to_bound, the
-        same ratio for ‖T‖ after the motion. It also includes that tensions are commanded as
-        lengths. frictionless_rad, the mean distance [rad] of the frictionless arm from the target.
+        Three means. planned_to_bound: ratio of the planned ‖T‖ to the least ‖T‖ with which the true
+        body holds the target, which shows the error of the learned body. frictionless_to_bound: the
+        same ratio for ‖T‖ after the motion, which also shows the effect of commanding tensions as
+        lengths. frictionless_rad: distance [rad] of the frictionless arm from the target.
     """
     robot, rows = frictionless.robot, []
     for theta in ended.target:

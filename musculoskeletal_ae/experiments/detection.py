@@ -29,7 +29,7 @@ CARRYING = 10.0
 SLOT = 20.0
 LATEST_RUPTURE = 14.0  # rupture a muscle no later than this after the beginning of its slot [s]
 RUPTURE_TIME = 3.0  # repair a muscle this long after its rupture [s]
-SLACKENING = 0.1  # expect no tension from this time after a rupture on [s]
+SLACKENING = 0.1  # expect a ruptured muscle to be slack this long after its rupture [s]
 RECOVERY = 2.0  # let the arm swing back for this time after a repair [s]
 #: wait for a random time of up to this before a rupture [s], so that muscles rupture both in motion
 #: and at rest
@@ -93,7 +93,7 @@ class GraspAndRupture:
 
     @property
     def counted(self) -> list[int]:
-        """Those of `muscles` that carried tension when they ruptured, or all if none did."""
+        """The `muscles` that carried tension when they ruptured; all of them if none did."""
         return [m for m in self.muscles if self.carried[m]] or self.muscles
 
     def while_ruptured(self, muscle: int) -> slice:
@@ -289,7 +289,7 @@ def auroc(healthy: Array, faulty: Array) -> float:
 
     Equal scores count half. The result is 0.5 if either array is empty.
     """
-    from scipy.stats import mannwhitneyu  # the import takes 0.7 s
+    from scipy.stats import mannwhitneyu  # import only if needed: it takes 0.7 s
 
     pairs = len(healthy) * len(faulty)
     return float(mannwhitneyu(faulty, healthy).statistic / pairs) if pairs else 0.5

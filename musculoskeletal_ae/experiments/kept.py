@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of a run in files: values with arrays as npz, without pickle, which could contain code.
+"""Saves parts of a run in npz files without pickle, because a pickle can contain code.
 
 A value consists of None, numbers, texts, arrays, and of dictionaries, lists and named tuples of
 values. Every array is a member of the npz file. A further member, `document`, contains the rest of

@@ -96,7 +96,7 @@ LAP = 2.0 * np.pi * RADIUS / SPEED  # duration of a circle [s]
 
 
 class TrackedMotion(NamedTuple):
-    """Desired and true postures of one motion and the rest after it, and the tensions.
+    """Postures and tensions during one motion and the rest after it.
 
     N messages cover the motion and the rest, and the first N' of them the motion itself.
     """

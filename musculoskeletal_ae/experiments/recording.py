@@ -140,7 +140,7 @@ class ClosedLoop:
         core, estimator = self.core, self.estimator
         supervisor = core.supervisor
         if estimator.body.anomaly is Anomaly.FOUND:
-            with suppress(MusculoskeletalError):  # refused while the suspect does not fit
+            with suppress(MusculoskeletalError):  # refused while the suspect is implausible
                 estimator.reset()
         if not supervisor.is_running and core.reset(self.time) is None:
             self.stops += 1

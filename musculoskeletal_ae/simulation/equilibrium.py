@@ -137,7 +137,7 @@ def follow(
         most: Largest distance that the module winds in a step [m].
     """
     reached = followed + clip(command - followed, -most, most)
-    # Stop the module where the tension no longer changes; it would only lose time on the way back.
+    # Stop the module where the tension no longer changes: winding further would delay its way back.
     return clip(reached, length - span, length + max(loose, most))
 
 
@@ -465,7 +465,7 @@ class Slopes:
     """
 
     def __init__(self, robot: Robot) -> None:
-        """Draw postures over all joint ranges, to which `fit` fits; tensions are in mid-range."""
+        """Draw the postures, over all joint ranges, at which `fit` fits the cubics."""
         most = max(len(group.joints) for group in robot.groups)
         count = POSTURES_PER_COEFFICIENT * comb(most + 3, 3)
         self._postures = robot.random_postures(count, np.random.default_rng(0))

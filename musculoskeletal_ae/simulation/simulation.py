@@ -28,7 +28,7 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState
 
-LONGEST_STEP = 0.01  # divide a longer time into several steps [s]
+LONGEST_STEP = 0.01  # divide a longer step into several [s]
 #: simulate this many arms in a call of the compiled code, so that their arrays fit into a core's
 #: cache
 CHUNK = 384

@@ -86,8 +86,8 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
     limits = [*zip(units.to_position(robot.lower), units.to_position(robot.upper))]
     for i in range(1, model.njoints):
         at, inertia, name = model.jointPlacements[i], model.inertias[i], names[i]
-        # A joint that is hardly apart from its parent belongs to a joint module with several axes
-        # through one point. Its origin is not moved, so that these axes still meet.
+        # Do not move the origin of a joint that almost coincides with its parent: both belong to a
+        # joint module, whose axes meet in one point.
         is_apart = np.linalg.norm(at.translation) > 2.0 * LENGTH_SPREAD
         place = at.translation + LENGTH_SPREAD * off[i, 0] * is_apart
         placement = {'name': f'moved by {name}', 'pos': place, 'quat': _turn(at.rotation)}
@@ -310,8 +310,8 @@ def _obstacle(
 def _add_round(body: Any, name: str, place: Array, axis: Array | None, radius: float) -> None:
     """Add an object without collisions to a body, for tendons to wrap around.
 
-    In the frame of the body, it is a sphere around `place` [m], or a cylinder along `axis` if there
-    is one.
+    The object is a sphere around `place` [m] in the body's frame, or a cylinder along `axis` if one
+    is given.
     """
     kind, turn = mujoco.mjtGeom.mjGEOM_SPHERE, pin.Quaternion.Identity()
     if axis is not None:
@@ -380,7 +380,7 @@ def set_constants(model: Any) -> None:
     body has at its centre of mass at qpos0. Many files place the centre of mass of a finger's first
     link on the axes of its joints. If no joint before it can move, w is 0 there: the contact
     becomes rigid, and a slight touch accelerates the finger beyond all limits. For such a body, w
-    is therefore the mean over the centres of those of its shapes that can touch others.
+    is therefore averaged over the centres of its shapes that can touch other bodies.
     """
     data = mujoco.MjData(model)
     mujoco.mj_setConst(model, data)
