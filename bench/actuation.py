@@ -8,8 +8,8 @@ network. With the learned network, the bench measures:
 
 - estimate: mean ‖θ_est − θ‖ in further exploration, before and after learning,
 - control: mean ‖θ_target − θ‖ of `proposed` at random holdable postures, --held seconds after each
-  target (a motion of stiffness-controlled muscles that its tensions would not suffice for is
-  slowed, so that it can take up to 9 s),
+  target (a motion for which the tensions of stiffness-controlled muscles would not suffice is
+  slowed, and can take up to 9 s),
 - rupture: several muscles rupture in turn while the arm explores. The columns are the share of
   ruptures after which a muscle is isolated within 10 s, the share after which only the ruptured
   muscle is isolated, and the mean time from a rupture to the first isolation (10 s if there is

@@ -51,7 +51,7 @@ YOUNG = 300.0  # compare later memory of a node with that at this age [s]
 #: Report a tension that exceeds ABOVE times tension.limit for longer than MOMENT [s].
 ABOVE, MOMENT = 1.1, 0.5
 STILL = 0.002  # report a muscle of a stopped arm that is wound in by more than this [m]
-MOST_MEMORY = 500.0  # report a node that uses more memory at any time [MB]
+MOST_MEMORY = 500.0  # report a node that ever uses more memory than this [MB]
 
 
 class Size(NamedTuple):

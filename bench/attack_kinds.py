@@ -291,7 +291,7 @@ def isolate_in_turns(scene: Scene) -> None:
 
 
 def _denials(scene: Scene) -> list[Float64MultiArray]:
-    """Return body states by which there was no anomaly, or the anomaly has ended."""
+    """Return false body states: that there was no anomaly, and that the anomaly has ended."""
     return [_body(scene, anomaly=each) for each in (Anomaly.NONE, Anomaly.ENDED)]
 
 

@@ -11,11 +11,11 @@ many as the learner keeps, and DRAW the seed with which they are drawn.
                             standard deviation of 6 mm is added to each length. With `+blind`, the
                             learner has no joint sensors
 
-A line has the mean error ‖θ_est − θ‖ [rad] after the updates, the share of test errors in the 95 %
-ellipsoid, the error of the lengths of network and body [mm], the size of the remainder [mm] and its
-constants, the processor time of an update [s], and the errors of the regressions. With --body, only
-the body is fitted, and θ is estimated by least squares on it, with the covariance that the fit
-expects. This takes a quarter of the time. notes/real_bodies.md contains the figures;
+The line of a case has the mean error ‖θ_est − θ‖ [rad] after the updates, the share of test errors
+in the 95 % ellipsoid, the error of the lengths of network and body [mm], the size of the remainder
+[mm] and its constants, the processor time of an update [s], and the errors of the regressions. With
+--body, only the body is fitted, and θ is estimated by least squares on it, with the covariance that
+the fit expects. This takes a quarter of the time. notes/real_bodies.md contains the figures;
 `bench recordings` measures recorded robots.
 """
 

@@ -18,7 +18,7 @@ themselves, for example after 0.2 s without messages), the number of messages th
 lost, and the longest delay of a message. It also prints the number of false contacts, and the
 largest evidence d for contact after the first MINUTE of detection; contact is reported above 10
 (`estimation/contact.py`). An individual's hour ends with its first finding, doubt or stop. The exit
-status is 1 if there was one.
+status is 1 if there was any.
 
 With --pushes N, the arm then continues to explore with the network that it has learned, and a
 torque acts on one joint at a time for at most a second. The torques are multiples of σ, the
@@ -56,11 +56,11 @@ class Result(NamedTuple):
     """Results of one healthy arm: a false finding or stop, pauses, lost and late messages."""
 
     seconds: float  # simulated time [s]
-    problem: str  # the false finding or stop that ended it, or ''
+    problem: str  # the false finding or stop that ended the exploration, or ''
     pauses: int  # how often the arm paused
     lost: int  # number of muscle_states that the controller lost
     delay: float  # longest delay of muscle_states at the controller [s]
-    samples: int  # number of samples that the learner took
+    samples: int  # number of samples that the learner accepted
     contacts: int  # number of false contacts
     evidence: float  # largest d, the evidence for contact
 
@@ -236,7 +236,7 @@ def main(argv: list[str]) -> int:
         '--pushes',
         type=whole(0, 1000),
         default=0,
-        help='afterwards, push each joint this often with each of several torques',
+        help='afterwards, push each joint this many times with each of several torques',
     )
     parser.add_initial()
     parser.add_quick('a minute of each arm')

@@ -52,12 +52,12 @@ class Fleet(NamedTuple):
     processes: int
     threads: int
     started: int  # number of arms whose controllers send commands
-    start: float  # [s]
-    start_cpu: float  # [s]
-    join: float  # [s]
-    cpu: dict[str, float]  # of all arms, by executable [% of a core]
+    start: float  # time until every controller sent commands [s]
+    start_cpu: float  # processor time of all processes until then [s]
+    join: float  # time in which a new node received commands of all these arms [s]
+    cpu: dict[str, float]  # processor time of all arms, by executable [% of a core]
     losses: tuple[tuple[float, ...], float, float]  # latency [ms], late and missed [%]
-    memory: float  # [MB]
+    memory: float  # memory of all processes [MB]
     load: float
 
     def __str__(self) -> str:
@@ -80,7 +80,7 @@ def topic(arm: int, name: str) -> str:
 
 
 def wait(condition: Callable[[], bool], seconds: float) -> float:
-    """Wait until a condition holds, for at most some seconds; return how long it took [s]."""
+    """Wait until a condition holds, at most `seconds` [s]; return the time that this took [s]."""
     start = time.monotonic()
     while not condition() and time.monotonic() < start + seconds:
         time.sleep(LOOK)
@@ -127,18 +127,18 @@ def used(runs: list[subprocess.Popen[bytes]]) -> dict[str, float]:
     times: dict[str, float] = defaultdict(float)
     for run in runs:
         for child in children(run.pid):
-            with suppress(FileNotFoundError):  # it has ended
+            with suppress(FileNotFoundError):  # the process has ended
                 words = Path(f'/proc/{child}/cmdline').read_text('utf-8').split('\0')
                 times[Path(words[1]).name] += cpu(child)  # the first word is the interpreter
     return times
 
 
 def resident(runs: list[subprocess.Popen[bytes]]) -> tuple[int, int, float]:
-    """Return the numbers of processes and threads, and the memory of all [MB]."""
+    """Return the numbers of processes and threads, and the memory of all processes [MB]."""
     threads, memory = [], []
     for run in runs:
         for pid in family(run.pid):
-            with suppress(FileNotFoundError, ProcessLookupError):  # it has ended
+            with suppress(FileNotFoundError, ProcessLookupError):  # the process has ended
                 memory.append(memory_share(pid))
                 threads.append(thread_count(pid))
     return len(threads), sum(threads), sum(memory)

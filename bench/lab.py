@@ -140,7 +140,7 @@ CommandFault = Callable[[float, Array], Array | None]
 
 
 class Wire:
-    """What lies between the arm and the nodes: sensors, cables and the driver.
+    """The wire between the arm and the nodes: sensors, cables and the driver.
 
     Faults are applied to readings in the order of `reading_faults`, and to commands in the order of
     `command_faults`.
@@ -185,7 +185,7 @@ class Lab:
         learner: The core of the learner.
         now: The steady clock [s].
         clock_shift: The ROS clock minus the steady clock [s].
-        before_step: Functions of this object that are called before each step.
+        before_step: Functions that are called before each step, with this laboratory as argument.
     """
 
     def __init__(self, arm: Arm, initial: Mae, seed: int, load: float = 0.0) -> None:
@@ -218,7 +218,7 @@ class Lab:
 
     @property
     def clock(self) -> float:
-        """The ROS clock [s], by which the learner and the messages' times are kept."""
+        """The ROS clock [s], which the learner and the time stamps of messages use."""
         return self.now + self.clock_shift
 
     def run(self, seconds: float) -> None:
@@ -300,7 +300,7 @@ class Lab:
             core.networks.follow(body, self.now)
 
     def _connect_networks(self) -> None:
-        """Tell the other nodes what the estimator decides on networks."""
+        """Let controller and learner hear the estimator's decisions on networks."""
         self.estimator.networks.accepted = self._accepted
         self.estimator.networks.rejected = self._rejected
 
@@ -319,7 +319,7 @@ class Lab:
     def _accepted(self, mae: Mae) -> None:
         self.controller.use(mae)
         self._to_learner.append(lambda: self.learner.note_accepted(mae))
-        if Evidence.NOT_CALIBRATED in self.estimator.trust.evidence:  # it waits for a network
+        if Evidence.NOT_CALIBRATED in self.estimator.trust.evidence:  # it waited for a network
             self.estimator.calibrate_lengths()
 
     def _control(self, now: float) -> None:
@@ -377,7 +377,7 @@ class Lab:
         robot = self.arm.robot
         self._process_of(node).restart(self.now + RESTARTING)
         if node == ESTIMATOR:
-            left = self.estimator.body  # a real estimator saves it
+            left = self.estimator.body  # a real estimator saves its state
             self.estimator = Estimator(robot, first_generation=left.generation + 1)
             self.estimator.isolate(left.isolated)
             self._connect_networks()

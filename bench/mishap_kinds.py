@@ -3,9 +3,9 @@
 
 A mishap declares which identifiers state it truly, and which are true but secondary. Statements of
 `SELF` describe what a node itself does, and are never false. Every other warning or error while the
-mishap lasts counts as false, and so does a statement that names muscles and joints of which none is
-concerned. The words in `says` recognize a true statement by its text, for conditions whose
-identifier this file does not know.
+mishap lasts counts as false, and so does a statement that names only muscles and joints that are
+not concerned. For conditions whose identifier this file does not know, the regular expression
+`says` recognizes the text of a true statement.
 """
 
 from __future__ import annotations
@@ -76,9 +76,9 @@ SOFTWARE = frozenset({
     Step.CHANGE_TARGET,
 })  # fmt: skip
 
-SHOWN_ANGLE = 0.1  # a wrong joint angle can be noticed from this error on [rad]
-SHOWN_LENGTH = 0.02  # a wrong length can be noticed from this error on [m]
-SHOWN_TENSION = 20.0  # a wrong tension can be noticed from this error on [N]
+SHOWN_ANGLE = 0.1  # expect a wrong joint angle to be noticed from this error on [rad]
+SHOWN_LENGTH = 0.02  # expect a wrong length to be noticed from this error on [m]
+SHOWN_TENSION = 20.0  # expect a wrong tension to be noticed from this error on [N]
 
 
 def _at_once(_: Lab) -> bool:
@@ -91,11 +91,12 @@ class Case:
 
     Attributes:
         detail: The random size, muscle or joint of the mishap.
-        mend: What a person does who has understood the mishap.
+        mend: Mends the mishap, as a person does who has understood it.
         subjects: The muscles and joints that are concerned; () if the whole arm is.
-        is_visible: Whether the mishap can be seen in what the nodes receive; asked until it is.
+        is_visible: Returns whether the nodes can notice the mishap in what they receive; called
+            until it returns True.
         lasts: Time after which it ends by itself [s].
-        settled_by: Steps of which each mends the mishap, without `mend`.
+        settled_by: Steps of the nodes' advice each of which mends the mishap, without `mend`.
         found_at: Muscles and joints at which a person finds the fault, besides `subjects`.
     """
 
@@ -118,7 +119,7 @@ class Mishap:
         true: Identifiers that state it truly.
         says: Regular expression; a statement with such a text states the mishap truly.
         allowed: Identifiers that are true but secondary.
-        is_harmless: Whether nothing needs to be stated, because the arm can simply go on.
+        is_harmless: Whether the arm can simply go on. If so, nothing needs to be stated.
         holds: Whether the arm holds a posture when it begins; otherwise it explores.
         patience: Time for which an operator follows the advice [s].
     """
@@ -197,10 +198,9 @@ def _loaded(lab: Lab, rng: Rng) -> int:
 
 
 def _is_demanded(muscle: int) -> Callable[[Lab], bool]:
-    """Return a function that says whether a module pulls otherwise than it should.
+    """Return a function that says whether the module of `muscle` does not pull as demanded.
 
-    The function is that for the module of `muscle`: its tension must deviate from the demanded one
-    by more than SHOWN_TENSION.
+    This is so if the tension deviates from the demanded one by more than SHOWN_TENSION.
     """
 
     def shown(lab: Lab) -> bool:
@@ -238,7 +238,7 @@ def rupture_at_rest(lab: Lab, rng: Rng) -> Case:
 
 
 def _slackening(largest: float, speed: float) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which a tendon becomes longer, up to `largest` [m], by `speed` [m/s]."""
+    """Return a mishap by which a tendon lengthens by about `largest` [m], at about `speed` m/s."""
 
     def begin(lab: Lab, rng: Rng) -> Case:
         _, name = _any(rng, lab.arm.robot.muscles)
@@ -314,7 +314,7 @@ def module_fault(kind: str, low: float = 0.0, high: float = 0.0) -> Callable[[La
 
 
 def hot_motor(lab: Lab, rng: Rng) -> Case:
-    """A module becomes at least 88 to 100 °C hot, whatever its muscle exerts."""
+    """A module has a temperature of at least 88 to 100 °C, whatever its muscle exerts."""
     _, name = _any(rng, lab.arm.robot.muscles)
     size = rng.uniform(88.0, 100.0)
     lab.arm.set_faults([f'overheat:{name}:{size:.0f}'])

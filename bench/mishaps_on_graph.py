@@ -142,9 +142,9 @@ GRAPH_MISHAPS: tuple[GraphMishap, ...] = (
 
 
 def play(scene: Scene, mishap: GraphMishap, seed: int) -> dict[str, Any] | None:
-    """Play a mishap, and recover; return its result, or None if the arm is not well.
+    """Play a mishap, and recover; return its result, or None if the arm was not ready for it.
 
-    The names are those of the results of `bench mishaps`.
+    The result has the same keys as those of `bench mishaps`.
     """
     attack = scene.attack
     scene.what = mishap.name
@@ -223,7 +223,7 @@ def run(
     with Attack(folder, initial, seed) as attack:
         scene = Scene(attack)
         attack.wait(lambda: set(attack.levels) == set(NODES), 'every node goes on', 'all nodes')
-        attack.spin(30.0)  # the learner learns from the first postures
+        attack.spin(30.0)  # let the learner learn from the first postures
         for mishap in GRAPH_MISHAPS:
             if mishap.name in kinds:
                 result = play(scene, mishap, seed)

@@ -36,7 +36,7 @@ def record(
         seed: Seed of the emulated individual.
         seconds: Duration of the recording [s].
         motion: Duration of each motion [s].
-        rest: Duration of the rest after it [s].
+        rest: Duration of the rest after each motion [s].
         order: Seed of the postures.
     """
     arm, rng = make_arm(robot, seed, reality), np.random.default_rng([order, 7])

@@ -63,7 +63,7 @@ class Builder:
         """Run a command, after printing `title`; return its standard output.
 
         Raises:
-            MusculoskeletalError: If it fails. The end of its output has then been printed.
+            MusculoskeletalError: If the command fails. The end of its output has then been printed.
         """
         print(f'   {title}', flush=True)
         ended = subprocess.run(

@@ -25,7 +25,7 @@ class Statement(NamedTuple):
         identifier: Identifier of the condition that is stated.
         level: 'ok', 'warn' or 'error'.
         text: The statement as users read it.
-        steps: What users are advised to do.
+        steps: The steps that users are advised to take.
         subjects: The muscles and joints that the statement names.
     """
 
@@ -47,7 +47,7 @@ def statements(
         'learner': learner,
     }
     robot = estimator.robot
-    body = {*robot.muscles, *robot.joints}  # subjects may also be topics and nodes
+    body = {*robot.muscles, *robot.joints}  # conditions also name topics and nodes
     return [
         Statement(
             owner,

@@ -294,7 +294,7 @@ def delays(
 
     Args:
         state_stamps: Times of the messages of muscle_states [ns].
-        command_stamps: Times of those of muscle_length_command [ns].
+        command_stamps: Times of the messages of muscle_length_command [ns].
         rate: Rate of the emulator [Hz].
         seconds: Time in which the messages were sent [s].
 

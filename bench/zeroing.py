@@ -79,7 +79,7 @@ class Loop:
             control.estimated(estimate.state.theta, now)
             if estimate.detected:
                 self.alarms += 1
-                with suppress(MusculoskeletalError):  # refused while the suspect does not fit
+                with suppress(MusculoskeletalError):  # refused while the suspect is implausible
                     estimator.reset()
             if (command := control.step(now)) is not None:
                 self.arm.command_length(command.value + zeros.offset)
@@ -144,7 +144,7 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
 
 
 def measure(robot: Robot, folder: Path, seed: int) -> dict[str, dict[str, Any]]:
-    """Measure how well one individual is zeroed, with and without joint sensors."""
+    """Calibrate the lengths of one individual in every way; return the results by the way."""
     learned = learned_arm(robot, seed, folder, MINUTES)
     held_out = record(EmulatedArm(robot, seed), learned.driver, HELD_OUT_STREAM, HELD_OUT)
     return {how: zeroed(robot, learned.mae, seed, how, held_out) for how in GOALS}

@@ -37,7 +37,8 @@ HOUR = 3600.0  # one hour in seconds
 BEDDING_TIME = 2.0 * HOUR  # time constant with which a new tendon lengthens under load [s]
 NUDGE = 1e-7  # change the joint angles by this if MuJoCo's wrapping returns NaN in a posture [rad]
 SLIP_TIME = 5.0 * HOUR  # mean time between two slips of a tendon on its spool [s]
-#: refuse a file if a muscle's length differs from the robot's by more than this [m] in most postures
+#: refuse a file if the length of a muscle differs from the robot's by more than this [m] in most
+#: postures
 OTHER_ROUTE = 0.02
 
 
