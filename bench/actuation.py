@@ -229,9 +229,9 @@ def main(argv: list[str]) -> int:
     parser.add_quick('a quarter of the time')
     add = parser.add_argument
     add('--realities', type=names, default=(KIN, FOREIGN), help='emulator models: kin, foreign')
-    add('--modules', type=names, default=tuple(KINDS), help=f'kinds: {", ".join(KINDS)}')
-    add('--seconds', type=positive, default=EXPLORED, help='time of exploration [s]')
-    add('--held', type=positive, default=HELD, help='time for each target [s]')
+    add('--modules', type=names, default=tuple(KINDS), help=f'modules: {", ".join(KINDS)}')
+    add('--seconds', type=positive, default=EXPLORED, help='duration of the exploration [s]')
+    add('--held', type=positive, default=HELD, help='hold each target this long [s]')
     parser.add_initial()
     parser.add_workers()
     options = parser.parse_args(argv)

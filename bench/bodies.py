@@ -260,7 +260,7 @@ def main(argv: list[str]) -> None:
     """Learn each case that the command line names, and print a line with its errors."""
     parser = Parser('bodies', (__doc__ or '').partition('\n')[0])
     parser.add_argument('cases', nargs='+', metavar='CASE', help='INDIVIDUAL[:COUNT[:DRAW]]')
-    help_cache = 'directory for first networks, and for samples of emulated arms'
+    help_cache = 'directory that keeps initial networks, and samples of emulated arms'
     parser.add_argument('--cache', type=Path, required=True, help=help_cache)
     text = 'number of updates; by default, as many as the network needs to converge'
     parser.add_argument('--updates', type=whole(1, 100), help=text)

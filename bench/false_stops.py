@@ -130,7 +130,7 @@ class BusyLoop(Lab):
 
 
 class Pushes(NamedTuple):
-    """What was noticed when a torque acted on one joint of an exploring arm.
+    """Delays until contact was noticed while a torque acted on one joint of an exploring arm.
 
     Attributes:
         spread: Residual torque σ of each joint on the healthy moving arm [N·m], (D,).

@@ -176,7 +176,7 @@ def measure(count: int, robot: str, network: Path, rate: float, seconds: float) 
             losses = delays(states, commands, rate, passed)
             processes, threads, memory = resident(runs)
             if ended := [arm for arm, run in enumerate(runs, 1) if run.poll() is not None]:
-                raise MusculoskeletalError(f'arms {ended} have ended; see the logs of bringup.sh')
+                raise MusculoskeletalError(f'bringup.sh of arms {ended} has ended; see its logs')
     finally:
         listener.end()
     return Fleet(
@@ -188,7 +188,7 @@ def main(argv: list[str]) -> None:
     """Measure each number of arms, and print a table."""
     parser = Parser('fleet', (__doc__ or '').partition('\n')[0])
     parser.add_robot(default='arm26')
-    parser.add_argument('--arms', type=seeds, default='1,2,5,10', help='numbers of arms')
+    parser.add_argument('--arms', type=seeds, default='1,2,5,10', help='numbers of arms to measure')
     parser.add_argument(
         '--rate', type=number(1.0, 1000.0), default=20.0, help='message rate of each arm [Hz]'
     )

@@ -127,7 +127,7 @@ class Process:
 
 
 class Packet(NamedTuple):
-    """What the driver publishes in one period."""
+    """The readings that the driver publishes in one period."""
 
     muscles: MuscleReadings
     theta: Array | None  # joint angles [rad], (D,), with NaN for missing ones; None: no message

@@ -292,7 +292,7 @@ def main(argv: list[str]) -> None:
         help='duration of the test for late messages [s]',
     )
     parser.add_argument('--flames', action='store_true', help='draw flame graphs; requires py-spy')
-    parser.add_out('DIR', 'performance.md and flames/')
+    parser.add_out('DIR', 'folder for performance.md and flames/')
     args = parser.parse_args(argv)
     if args.flames and shutil.which('py-spy') is None:
         parser.error('--flames requires py-spy: pip install py-spy')

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Collects what the nodes state about the arm, as one list of values for benches.
+"""Collects the statements of all nodes about the arm in one list, for benches.
 
 The statements are the conditions of the cores, with the muscles and joints that each concerns.
 """
@@ -40,7 +40,7 @@ class Statement(NamedTuple):
 def statements(
     estimator: Estimator, controller: Controller, learner: Learner, now: float
 ) -> list[Statement]:
-    """Return what the nodes state at the time `now` of the steady clock [s]."""
+    """Return the statements of the nodes at the time `now` of the steady clock [s]."""
     cores: dict[str, Any] = {
         'estimator': estimator,
         'controller': controller,

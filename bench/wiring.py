@@ -155,7 +155,7 @@ def _named(estimator: Estimator, text: str) -> set[int]:
 
 
 class Case(NamedTuple):
-    """One restart of a driver, with what has changed in it."""
+    """One restart of a driver, and what differs after it."""
 
     what: str  # what changes in the driver: 'exchange', 'sign' or 'healthy'
     wiring: Wiring

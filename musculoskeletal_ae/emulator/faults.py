@@ -161,7 +161,7 @@ class Faults:
         self._reordered: ArmReadings | None = None  # readings that are sent after the next ones
         self._queue: list[tuple[float, ArmReadings]] = []
         self._time = 0.0  # time since the start [s]
-        self._begins: dict[tuple[object, ...], float] = {}  # begin of each drift [s], by its key
+        self._begins: dict[tuple[object, ...], float] = {}  # start of each drift [s], by its key
         #: time of the next change of each burst [s], and whether the burst is present, by its key
         self._bursts: dict[tuple[object, ...], tuple[float, bool]] = {}
         # Effects on the mechanics, each (M,): relative loss of motor speed, excess length of the
@@ -252,7 +252,7 @@ class Faults:
                 if fault.kind == 'bias':
                     value[which] += size
                 elif fault.kind == 'exchange':
-                    units = self._robot.units  # the sensors publish positions
+                    units = self._robot.units  # positions are what the sensors publish
                     value[which] = units.to_theta(units.to_position(value)[which[::-1]], which)
                 elif fault.kind == 'drift':
                     value[which] += size * (self._time - self._begins[fault.key])

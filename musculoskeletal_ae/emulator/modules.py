@@ -46,7 +46,7 @@ MOTOR_GAIN = 0.004  # speed at which a module winds in for each newton of missin
 #: to 0 at half of T_bias. MOTOR_GAIN alone would be too slow for weak muscles: 2 mm/s with a T_bias
 #: of 0.5 N.
 TAKE_UP_SPEED = 0.03
-#: time constant with which a position-controlled module follows its target length [s]
+#: let a position-controlled module follow its target length with this time constant [s]
 POSITION_LAG = 0.02
 # Heat. Each motor is sized for its muscle: constant T_limit heats the average module to 85 °C at
 # the housing and 105 °C in the winding.
@@ -72,8 +72,8 @@ CURRENT_NOISE, CURRENT_RESOLUTION = 1.0, 2.0**-3
 #: draw errors of a motor current as a measure of tension: standard deviation of the scale's
 #: logarithm, standard deviation of the offset [N], and mean drive friction as a share of T_limit
 CURRENT_SCALE, CURRENT_ZERO, DRIVE_FRICTION = 0.15, 5.0, 0.1
-ACCELERATION_NOISE = 0.05  # standard deviation of the noise of each axis of an accelerometer [m/s²]
-#: standard deviations of the noise of a marker's position [m] and orientation [rad]
+ACCELERATION_NOISE = 0.05  # give accelerometer axes noise of this standard deviation [m/s²]
+#: give a marker's position [m] and orientation [rad] noise of these standard deviations
 MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01
 
 

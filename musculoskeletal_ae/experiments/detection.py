@@ -144,7 +144,7 @@ def grasp_and_release(arm: Arm, time: float) -> None:
 
 
 class DetectorOutput(NamedTuple):
-    """What estimator and detector report for each of N messages."""
+    """Outputs of estimator and detector for each of N messages."""
 
     theta: Array  # estimated joint angles θ [rad], (N, D)
     anomaly: Array  # anomaly A [scaled units], (N,)
@@ -156,7 +156,7 @@ class DetectorOutput(NamedTuple):
 def run_detector(
     robot: Robot, mae: Mae, recording: Recording, sliding: Array | None = None
 ) -> DetectorOutput:
-    """Return what estimator and detector report for each message of a recording.
+    """Run estimator and detector on a recording; return their outputs for each message.
 
     Both run as in the estimator node, but they continue after an alarm.
 

@@ -61,7 +61,7 @@ class Study:
         return tuple(dict.fromkeys((PAPER_PRESET, self.preset)))
 
     def number(self, whole: int) -> int:
-        """Return how often to measure something: `whole` times, or once in a shortened run."""
+        """Return a number of measurements: `whole`, or 1 in a shortened run."""
         return 1 if self.quick else whole
 
     def seconds(self, whole: float) -> float:

@@ -129,7 +129,7 @@ def follow(
     """Follow a command: return the length [m] that a muscle module has reached on the way.
 
     Args:
-        command: Length commands l_target [m].
+        command: Length command l_target [m].
         followed: The length that the module had reached before this step [m].
         length: Muscle length [m].
         span: Distance of the command below `length` at which the tension reaches T_max [m].

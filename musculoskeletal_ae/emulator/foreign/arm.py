@@ -432,7 +432,7 @@ class ForeignArm(Arm):
         model, data = self._model, self._data
         mujoco.mj_step1(model, data)
         if not math.isfinite(data.ten_length.sum()):
-            # MuJoCo's wrapping can return NaN in the posture where a tendon touches an object.
+            # MuJoCo's wrapping can return NaN in the posture where a tendon just touches an object.
             data.qpos += NUDGE
             mujoco.mj_step1(model, data)
         self._steps += 1

@@ -46,7 +46,8 @@ Place = tuple[int, Array]  # a place on a link: its joint, and the position in i
 Obstacle = tuple[int, Array, Array]
 
 check_mujoco()
-mujoco.set_mju_user_warning(lambda _: None)  # the default writes a file to the current directory
+# Drop warnings; by default, MuJoCo writes them to a file in the current directory.
+mujoco.set_mju_user_warning(lambda _: None)
 
 
 def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
