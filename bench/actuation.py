@@ -42,7 +42,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: explore and learn for EXPLORED, and then measure in a held-out motion of HELD_OUT [s]
 EXPLORED, HELD_OUT = 300.0, 60.0
-#: number of targets to which an arm moves, and default time for which it holds each [s]
+#: move to this many targets, and by default hold each for this time [s]
 TARGETS, HELD = 5, 4.0
 RUPTURES = 3  # rupture this many muscles, one after another
 MOVING = 4.0  # explore for this time before a rupture [s]

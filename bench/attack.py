@@ -246,7 +246,7 @@ def evaluate(attack: 'Attack') -> list[Row]:
         for begin, end, mode in stops:
             if (length := wound_in(at, value, begin + JITTER, end)) > STILL:
                 wound.append(f'{1e3 * length:.1f} mm in {mode}, from {begin:.2f} s')
-    # The driver obeys other nodes as well, so their tensions are not the controller's.
+    # Leave out tensions while other nodes command the driver, or while sensor data are wrong.
     excluded = [*attack.lying, *attack.foreign]
     true = [load for load in attack.loads if without(np.array([load[0]]), excluded)[0]]
     highest, when = max(((float(load.max()), at) for at, load in true), default=(0.0, 0.0))

@@ -53,11 +53,11 @@ from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
 
-ROBOT = 'musashi_left_arm'  # robot that the emulated cases use
+ROBOT = 'musashi_left_arm'  # use this robot in the emulated cases
 #: let an emulated arm explore for EXPLORED, and test on a held-out motion of HELD_OUT [s]
 EXPLORED, HELD_OUT = 300.0, 60.0
 THINNED = 10  # use only every tenth message of the held-out motion for the test
-#: standard deviation of the coupling of joints that `+coupled` adds to each length [m]
+#: let `+coupled` add a coupling of the joints with this standard deviation to each length [m]
 COUPLING = 0.006
 MOST_FITTED = 150  # fit at most this many test rows by least squares, because each fit is slow
 #: constants of least squares: step of finite differences [rad], typical step as a share of the

@@ -195,7 +195,7 @@ def _delay(loop: ContactLoop, joint: int, torque: float, rng: np.random.Generato
             if np.abs(jacobian.T @ wrench - torques).max() > INEXACT * abs(torque):
                 return float('nan')
             loop.arm.set_wrench(wrench)
-            # The first message was read before the push.
+            # The message with n = 0 was read before the push, so n is the delay in messages.
             if loop.contact(exploring=True).is_contact:
                 return n * SAMPLE_TIME
         return float('inf')

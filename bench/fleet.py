@@ -38,7 +38,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 BRINGUP = Path(__file__).resolve().parents[1] / 'bringup.sh'
 STARTING = 60.0  # wait for the first commands at most this long × (1 + number of arms) [s]
-LOOK = 0.1  # time between two checks of a condition [s]
+LOOK = 0.1  # check a condition at this interval [s]
 HEAD = (
     'arms  processes  threads  start [s]  start CPU [s]  join [s]  CPU [%]  median, p99 [ms]  '
     'late [%]  missed [%]  memory [MB]  load'

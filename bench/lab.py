@@ -43,12 +43,12 @@ from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
-CORES = 2  # number of cores of the simulated computer
+CORES = 2  # simulate a computer with this many cores
 #: let a process wait for the processor for this mean time, for each process per core [s]
 WAIT = 0.0008
 STALL_EVERY = 10.0  # stall a process at this mean interval [s]
 STALL = 0.015  # let a stall take this mean time, for each process per core [s]
-HANDLING = 0.0005  # time in which a node handles a message [s]
+HANDLING = 0.0005  # let a node handle a message in this time [s]
 QUEUE = 10  # let at most this many messages wait in a subscription; drop older ones
 #: set the publisher's clock ahead of the steady clock by this time [s]; no node may depend on it
 AHEAD = 1.7e9

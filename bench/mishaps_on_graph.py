@@ -30,7 +30,7 @@ WATCHED = 15.0  # watch the status line for this time while the mishap lasts [s]
 ERROR_TIME = 10.0  # measure the true error over this time [s]
 #: statements that blame the computer; count them as false unless other programs use it up
 OVERLOADED = 'overloaded|stop other programs'
-BUSY = 8  # number of programs that keep the computer busy
+BUSY = 8  # keep the computer busy with this many programs
 
 
 class GraphMishap(NamedTuple):

@@ -21,7 +21,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-PERIOD = 0.01  # interval between two readings [s]
+PERIOD = 0.01  # record a reading at this interval [s]
 TENSIONS = 40.0, 120.0  # draw the tensions at the postures from this range [N]
 
 

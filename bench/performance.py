@@ -34,7 +34,7 @@ ARM = 'musashi_left_arm'
 LARGE = 'musashi_upper_body'
 RATES, SIZES = (100.0, 200.0, 500.0), ('arm26', ARM, LARGE)
 EXPLORING = 60.0  # explore for this time, to fill the sample store before an update is timed [s]
-#: rate of muscle_states for start-up, memory, late messages and profiles [Hz]
+#: publish muscle_states at this rate [Hz] to measure start-up, memory, late messages and profiles
 FLAME_RATE = 200.0
 STARTING = 60.0  # wait at most this long for the first command [s]
 SETTLING = 15.0  # let the nodes run for this time before memory or a profile is measured [s]

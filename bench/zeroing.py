@@ -47,7 +47,7 @@ HELD_OUT = 300.0  # measure errors on a held-out motion of this duration [s]
 AFTER = 30.0  # let the arm explore for this time after a calibration, and count false alarms [s]
 LONGEST = 120.0  # give a calibration up after this time [s]
 SETTLING = 20.0  # let the arm hang for this time after power-on, so that it is still [s]
-STATED = 0.0  # standard deviation of the error of a stated posture [rad], the same for each joint
+STATED = 0.0  # draw errors of a stated posture with this standard deviation [rad]
 #: for calibrations by joint sensors, without any, and in a stated posture: report one that takes
 #: longer than the first value [s], or that multiplies the error by more than the second
 GOALS = {'sensors': (30.0, 1.2), 'none': (60.0, 1.5), 'posture': (30.0, 1.5)}

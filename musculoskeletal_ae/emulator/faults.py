@@ -127,7 +127,7 @@ def read_fault(line: str, robot: Robot) -> EmulatedFault:
     if quantities and kind.size:
         size, largest, unit = (RATES if name == 'drift' else SIZES)[quantities[0]]
         unit, smallest = f'{unit} of {quantities[0]}', -largest
-    # The name of a muscle may be a number.
+    # The last word is the size, or the name of a muscle, which may be a number.
     if words and largest and ':'.join(words) not in robot.muscles:
         try:
             size = float(words[-1])
@@ -239,7 +239,7 @@ class Faults:
         """Apply all sensor faults to readings, and return the result."""
         theta, muscles = readings.theta.copy(), readings.muscles.copy()
         muscles.tension = np.minimum(muscles.tension, self.ceiling)
-        # These arrays are views, which are changed in place.
+        # Most of these arrays are views of `muscles`, so the faults change its readings in place.
         values = {each.name: each.of(muscles) for each in QUANTITIES} | {'theta': theta}
         kinds = 'exchange', 'bias', 'drift', 'burst', 'spike', 'dead_sensor', 'nan_sensor', 'freeze'
         for fault in self._of(*kinds):

@@ -41,7 +41,7 @@ SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 # The following values are chosen by hand, because those of Musashi are not public.
 #: let a module in the safe state change its tension towards T_bias at this rate [N/s]
 RELEASE_RATE = 100.0
-MOTOR_GAIN = 0.004  # speed at which a module winds in for each newton of missing tension [m/s/N]
+MOTOR_GAIN = 0.004  # wind in at this speed for each newton of missing tension [m/s/N]
 #: Wind in a tendon without tension at this speed [m/s], and more slowly as the tension rises, down
 #: to 0 at half of T_bias. MOTOR_GAIN alone would be too slow for weak muscles: 2 mm/s with a T_bias
 #: of 0.5 N.

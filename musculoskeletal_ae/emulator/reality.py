@@ -47,7 +47,7 @@ def make_arm(
         return EmulatedArm(robot, seed, individual)
     file = None
     if reality != FOREIGN:
-        with suppress(RuntimeError, OSError):  # unknown home directory, name too long
+        with suppress(RuntimeError, OSError):  # home directory unknown, or name too long
             file = path if (path := Path(reality).expanduser()).is_file() else None
         if file is None:
             legal = f'{KIN}, {FOREIGN} or the model.xml that import_robot writes'

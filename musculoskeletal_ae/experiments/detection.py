@@ -21,11 +21,11 @@ from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
 
-PAYLOAD = 3.6  # mass of the dumbbell in the paper (§IV-B) [kg]
+PAYLOAD = 3.6  # let the arm grasp this mass, that of the paper's dumbbell (§IV-B) [kg]
 GRASPING = 60.0  # grasp or release the payload at this interval [s]
 #: a muscle carries tension if T exceeds T_bias by this much [N], far beyond the sensor's noise
 CARRYING = 10.0
-#: time for each muscle [s]: wait until it carries tension, rupture, repair, recover
+#: give each muscle this time to wait until it carries tension, rupture, be repaired and recover [s]
 SLOT = 20.0
 LATEST_RUPTURE = 14.0  # rupture a muscle no later than this after the beginning of its slot [s]
 RUPTURE_TIME = 3.0  # repair a muscle this long after its rupture [s]

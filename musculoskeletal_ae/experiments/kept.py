@@ -52,8 +52,8 @@ def read(file: Path) -> Any:
     try:
         with np.load(file, allow_pickle=False) as arrays:
             return _decoded(json.loads(str(arrays[DOCUMENT])), arrays)
-    # zipfile, numpy and json raise these for damaged files and for other files. A file that is no
-    # npz file is read as an array, which is no context manager.
+    # zipfile, numpy and json raise these errors for damaged files and for other files. From an npy
+    # file, numpy reads an array, which is no context manager.
     except (
         OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, BadZipFile,
     ) as error:  # fmt: skip

@@ -40,8 +40,8 @@ from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.presets.paper import PaperPreset
 
-#: units of the encoder's hidden layers. The decoder has the same layers in reverse order, and the
-#: latent layer has D + M units.
+#: compare encoders with hidden layers of these numbers of units. The decoder has the same layers in
+#: reverse order, and the latent layer has D + M units.
 HIDDEN = {
     'as in the paper: 200, 30': (200, 30),
     'fewer layers: 200': (200,),

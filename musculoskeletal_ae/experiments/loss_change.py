@@ -39,8 +39,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-STEP = 0.02  # duration of a simulation step [s]
-FORCED = 30.0  # angle at which the shoulder is held in the phase `shoulder forced` [deg]
+STEP = 0.02  # simulate in steps of this duration [s]
+FORCED = 30.0  # hold the shoulder at this angle in the phase `shoulder forced` [deg]
 
 
 class Phase(NamedTuple):

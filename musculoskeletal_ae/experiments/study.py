@@ -27,7 +27,7 @@ from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot
 
-HELD_OUT = 300.0  # duration of the held-out motion [s]
+HELD_OUT = 300.0  # let the held-out motion last this long [s]
 #: in a shortened run, shorten a motion to this share of the whole one, and to at most this time [s]
 QUICK_SHARE, QUICK_LIMIT = 0.25, 10.0
 DIGITS = 6  # round results to this many significant digits; further digits are noise

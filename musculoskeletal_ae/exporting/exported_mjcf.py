@@ -41,8 +41,8 @@ from musculoskeletal_ae.robot.robot import Robot
 POSTURES = 1000  # compare the model and the network in this many postures
 #: multiply this damping by the `joint_gear` of a joint [N·m·s/rad]; chosen for a stable simulation
 DAMPING = 0.05
-THIN = 0.008  # radius of the capsules that represent bones [m]
-TIMESTEP = 0.002  # time step of the exported model [s]
+THIN = 0.008  # represent bones by capsules of this radius [m]
+TIMESTEP = 0.002  # let MuJoCo simulate the exported model with this time step [s]
 LEGEND = """\
 length      standard deviation of the difference of lengths
 moment arm  difference of dl/dq (norm over all joints, root mean square over the postures), and the

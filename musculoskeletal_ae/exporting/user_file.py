@@ -172,6 +172,7 @@ class UserFile:
                     absolute = (self.file.parent / inside[2]).resolve()
                     edits.append((start, end, str(absolute)))
         # MuJoCo looks for an asset in the folder of assets, and then beside the including file.
+        # Only an asset of the second kind needs another path.
         for match in ASSET.finditer(plain):
             key = 'texturedir' if match[1] == 'texture' else 'meshdir'
             place = folders.get(key) or folders.get('assetdir') or self.file.parent

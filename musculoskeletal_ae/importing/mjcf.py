@@ -191,7 +191,7 @@ class _Reader:
         self.polynomials: dict[int, tuple[int, Array]] = {}
         self.tendons: dict[str, int] = {}
         self.passive: dict[str, int] = {}
-        self.radius = model.geom_size[:, 0].copy()  # as in the file; `tie_rims` changes them
+        self.radius = model.geom_size[:, 0].copy()  # radii of the file, before `tie_rims`
         self._tie_rims()
         self._bodies()
         self._points()

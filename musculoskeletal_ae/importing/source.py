@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reduces an imported body to a chain, writes its robot directory, and compares it."""
+"""Reduces an imported body to a chain, writes its directory, and compares it with the source."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -37,7 +37,7 @@ ARM_POSTURES = 200
 PROBES = 20
 MOVED = 1e-8  # count a joint as moving a tendon if it changes the length by at least this [m]
 WRONG_LENGTH = 5e-5  # report a passive tendon whose polynomial is wrong by at least this [m]
-TURN = 1e-5  # step of the numerical derivatives of the lengths, which give moment arms [rad]
+TURN = 1e-5  # compute moment arms as numerical derivatives of the lengths with this step [rad]
 SHORT_ARM = 1e-3  # do not compare the sign of a shorter moment arm [m]
 LISTED = 12  # name at most this many elements in a message, so that it stays readable
 # The largest tension that the source states for a muscle becomes its tension.limit.
@@ -51,7 +51,7 @@ RIGID_STIFFNESS = 1e5  # make no element stiffer than this at tension.max [N/m]
 #: let an element that stands for a rigid tendon stretch by this at tension.limit [m], which is
 #: negligible
 RIGID_ELONGATION = 5e-4
-EARTH = 9.81  # standard gravity of the earth, which replaces another gravity of the source [m/s²]
+EARTH = 9.81  # replace another gravity of the source by that of the earth [m/s²]
 #: limit a joint without usable limits to ± this: a revolute joint [rad] and a prismatic one [m]
 UNLIMITED = {False: np.pi, True: 0.5}
 
@@ -139,7 +139,8 @@ class Source:
     def rename(self, kind: str, original: str | None, fallback: str, taken: Iterable[str]) -> str:
         """Return a legal name that is not in `taken`, and add a note if it is not the original.
 
-        `fallback` is used without an original name. The note begins with `kind`, such as 'muscle'.
+        `fallback` is used if there is no original name. The note begins with `kind`, such as
+        'muscle'.
         """
         (name,) = distinct([safe_name(original, fallback)], taken)
         self.renamed(kind, original, name)
@@ -337,7 +338,7 @@ def names_of_all(kind: str, originals: Iterable[str]) -> list[str]:
     Elements without a name are numbered, such as 'joint_2'.
     """
     safe = (safe_name(name, f'{kind}_{i}') for i, name in enumerate(originals))
-    return distinct(safe, ['universe'])  # pinocchio's name of the world
+    return distinct(safe, ['universe'])  # reserved: pinocchio's name of the world
 
 
 def unique(

@@ -44,7 +44,7 @@ from musculoskeletal_ae.simulation.load import Load, LoadTree, hold
 #: value of l_target for muscles without a command [m]; MSC then holds T_bias, and modules that
 #: follow positions hold their length
 PAID_OUT = np.inf
-#: K_stiff that represents a position-controlled module [N/m]; 400 N move such a module by 1 mm
+#: represent a position-controlled module by this K_stiff [N/m]; 400 N move such a module by 1 mm
 RIGID = 4e5
 #: Multiply Σ_i |∂l_i/∂θ| by this to get B without the dampers [N·s/rad]. Motions then take as long
 #: as on the emulated arm; values from 8 to 20 do equally well.

@@ -34,9 +34,9 @@ GUIDES_EVERY = 5
 #: reject delays of sensors that exceed this many steps of 1 ms, which is the length of the history
 HISTORY = 64
 HOUR = 3600.0  # one hour in seconds
-BEDDING_TIME = 2.0 * HOUR  # time constant with which a new tendon lengthens under load [s]
+BEDDING_TIME = 2.0 * HOUR  # let a new tendon lengthen under load with this time constant [s]
 NUDGE = 1e-7  # change the joint angles by this if MuJoCo's wrapping returns NaN in a posture [rad]
-SLIP_TIME = 5.0 * HOUR  # mean time between two slips of a tendon on its spool [s]
+SLIP_TIME = 5.0 * HOUR  # let a tendon slip on its spool at this mean interval [s]
 #: refuse a file if the length of a muscle differs from the robot's by more than this [m] in most
 #: postures
 OTHER_ROUTE = 0.02
@@ -159,7 +159,7 @@ def _imported_model(robot: Robot, file: Path, draw: Draw, deviates: bool) -> Any
     typical = np.median(off, axis=0)  # the median ignores the few postures in which a length jumps
     for m in np.flatnonzero(typical > OTHER_ROUTE):
         name, millimetres = robot.muscles[m], 1e3 * typical[m]
-        problem = f'muscle {name!r} is typically {millimetres:.0f} mm longer or shorter there'
+        problem = f'the length of muscle {name!r} typically differs by {millimetres:.0f} mm'
         raise mujoco_model.other_robot(robot, file, problem)
     if deviates:
         _deviate(robot, model, given, draw)

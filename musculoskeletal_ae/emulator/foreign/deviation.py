@@ -80,7 +80,7 @@ class Attachments:
         self._model, self._rest, self._rng = model, model.site_pos.copy(), draw.rng('attachment')
         sigma = np.minimum(ATTACHMENT * typical_arms(robot), FARTHEST)
         self._sites = [_sites(model, model.tendon(name).id) for name in robot.muscles]
-        #: σ of each site: the smallest of all muscles that pass it [m]
+        #: σ of each site [m]: the smallest σ of the muscles that pass through it
         self._sigma = np.zeros(model.nsite)
         for own, size in zip(self._sites, sigma.tolist()):
             is_new = self._sigma[own] == 0.0

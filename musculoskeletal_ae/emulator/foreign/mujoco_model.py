@@ -359,7 +359,7 @@ def from_file(robot: Robot, file: Path) -> Any:
         if missing := [name for name in needed if name not in names]:
             raise other_robot(robot, file, f'{kind} {missing[0]!r} is missing')
         if kind == 'joint' and (more := [name for name in names if name not in [*needed]]):
-            raise other_robot(robot, file, f'joint {more[0]!r} is not one of the robot')
+            raise other_robot(robot, file, f'joint {more[0]!r} is not a joint of the robot')
     kinds = mujoco.mjtJoint
     for name, slides in zip(joints, robot.kinematics.tree.prismatic[1:], strict=True):
         if model.joint(name).type != (kinds.mjJNT_SLIDE if slides else kinds.mjJNT_HINGE):
