@@ -42,7 +42,7 @@ from musculoskeletal_ae.robot.robot import Robot
 if TYPE_CHECKING:
     from bench.attack_graph import Attack
 
-#: accept a delay of this size between computing and publishing a command on a loaded machine [s]
+#: accept a delay of up to this between computing and publishing a command on a loaded machine [s]
 JITTER = 0.03
 RELIEF = 0.3  # let paying out exceed the rate limit for this time after an excess tension [s]
 SILENT = 10.0  # report a node under attack that has not reported on /diagnostics for this time [s]

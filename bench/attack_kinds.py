@@ -44,7 +44,7 @@ REPAIRS = {
     Step.CHECK_JOINT_SENSOR,
     Step.REPAIR_SENSOR,
 }
-OFFSET = 0.08  # absolute value of the false length offsets that are published [m]
+OFFSET = 0.08  # publish false length offsets of this absolute value [m]
 
 
 class Scene:

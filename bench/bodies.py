@@ -184,7 +184,7 @@ def package(case: Case, updates: int | None, seed: int) -> str:
     by_network, by_body = (
         1e3 * np.sqrt(np.square(length - test.length).mean()) for length in (of_network, of_body)
     )
-    assert mae.covariance is not None  # the preset `default` computes it
+    assert mae.covariance is not None  # preset `default` has one
     inside = (ellipsoids(mae.covariance, error) <= 1.0).mean()
     constants = ' '.join(group.text() for group in body.remainder.groups)
     return (

@@ -139,7 +139,7 @@ def measure(
     results = {}
     for source in VIEWS:
         mae = learned(robot, driver, exploring, seed, source)
-        assert mae.covariance is not None  # the preset `default` computes it
+        assert mae.covariance is not None  # preset `default` has one
         results[source] = honesty(scale * mae.covariance, errors(mae, held_out))
     return results
 

@@ -47,8 +47,8 @@ from musculoskeletal_ae.robot.robot import Robot
 
 MINUTE = 60.0  # ignore the evidence for contact during this time after the first network [s]
 FACTORS = 5.0, 10.0, 15.0, 20.0, 40.0  # push joints with these multiples of σ
-#: leave a push out if the wrench on the hand that exerts it would have more than this share of the
-#: torque at other joints
+#: leave a push out if the wrench on the hand would exert more than this share of its torque at
+#: other joints
 INEXACT = 0.05
 
 
@@ -142,7 +142,7 @@ class Pushes(NamedTuple):
     delays: Array
 
     def lines(self, robot: Robot) -> list[str]:
-        """Return the table."""
+        """Return the lines of the table: its head, and a line for each joint."""
         lines = [
             f'      {"joint":<16}{"σ":>6}   torque [N·m]: % in {SOON} s, % in {MOVED} s, median'
         ]

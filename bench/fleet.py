@@ -91,7 +91,7 @@ def wait(condition: Callable[[], bool], seconds: float) -> float:
 def running(
     count: int, robot: str, network: Path, rate: float
 ) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Run some arms, each in a namespace; end them after the block."""
+    """Run `count` arms, each in a namespace of its own; end them after the block."""
     parameters = network.with_name('rate.yaml')
     parameters.write_text(f'/**: {{ros__parameters: {{rate: {rate}}}}}\n')
     files = ['--checkpoint', str(network), '--params-file', str(parameters)]
@@ -145,7 +145,7 @@ def resident(runs: list[subprocess.Popen[bytes]]) -> tuple[int, int, float]:
 
 
 def measure(count: int, robot: str, network: Path, rate: float, seconds: float) -> Fleet:
-    """Start some arms, and measure them for some seconds.
+    """Start `count` arms, and measure them for `seconds` [s].
 
     Raises:
         MusculoskeletalError: If a bringup.sh ends, or if the first arm sends nothing.

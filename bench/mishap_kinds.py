@@ -138,7 +138,7 @@ class Mishap:
 
 
 def on_muscles(change: Callable[[float, MuscleReadings], None]) -> ReadingFault:
-    """Return a fault that changes a copy of the readings of the muscle modules in place."""
+    """Return a fault that applies `change` to a copy of the readings of the muscle modules."""
 
     def fault(now: float, packet: Packet) -> list[Packet]:
         muscles = packet.muscles.copy()
@@ -149,7 +149,7 @@ def on_muscles(change: Callable[[float, MuscleReadings], None]) -> ReadingFault:
 
 
 def on_theta(change: Callable[[float, Array], None]) -> ReadingFault:
-    """Return a fault that changes a copy of the joint angles, (D,), in place."""
+    """Return a fault that applies `change` to a copy of the joint angles, (D,)."""
 
     def fault(now: float, packet: Packet) -> list[Packet]:
         if packet.theta is None:
@@ -397,7 +397,7 @@ def changed(
 
 
 def bias(value: float, size: float) -> float:
-    """Return a value to which `size` is added, at least 0 as the reading of a tension sensor."""
+    """Return `value` plus `size`, but at least 0, like the reading of a tension sensor."""
     return max(value + size, 0.0)
 
 
@@ -834,7 +834,7 @@ def pushed(lab: Lab, rng: Rng) -> Case:
 
 
 def more_friction(lab: Lab, _: Rng) -> Case:
-    """Dust doubles the friction of the tendons, or of the joints in the other emulator model."""
+    """Dust doubles the friction of the tendons (`kin`) or of the joints (`foreign`)."""
     lab.arm.set_friction(2.0)
     return Case('× 2', lambda lab: lab.arm.set_friction(1.0), lasts=30.0)
 

@@ -72,7 +72,7 @@ LEARNING = 180.0  # let an individual explore and learn for this time before its
 #: learn for this time [s] with the individual of this seed, whose network serves as a wrong one
 OTHER_LEARNING, OTHER_SEED = 90.0, 990
 LOOK = 0.1  # read the statements at this interval [s]
-GOAL = 5.0  # count a true statement as in time within this time after the first effect [s]
+GOAL = 5.0  # count a true statement as timely up to this time after the first effect [s]
 PATIENCE = 30.0  # let a person find an unstated fault this long after its first effect [s]
 LONGEST_WAIT = 75.0  # wait at most this long for the first effect and PATIENCE together [s]
 REACTION = 5.0  # let the operator react this long after a node has first advised a step [s]
@@ -596,7 +596,7 @@ WHEN = 'before', 'after'
 
 
 def totals(of: Sequence[dict[str, Any]]) -> tuple[float, int, float]:
-    """Return the shares that were true in time and ended well, and the number of false statements.
+    """Return the shares of timely true statements and of good ends, and the false statements.
 
     Returns:
         Share of true statements within GOAL of the cases that need one [%], number of false

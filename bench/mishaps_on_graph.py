@@ -42,7 +42,7 @@ class GraphMishap(NamedTuple):
             of `Scene` has to end it.
         says: Regular expression of status lines that state the mishap truly.
         denies: Regular expression of false status lines, or ''.
-        moment: What the arm does before, 'holding' or 'exploring'.
+        moment: State of the arm before the mishap, 'holding' or 'exploring'.
     """
 
     name: str
@@ -95,7 +95,7 @@ def zeros(scene: Scene) -> Callable[[], object]:
 
 
 def busy(scene: Scene, *rest: Callable[[Scene], Any]) -> Callable[[], object]:
-    """Let other programs use up the computer, and then let the mishaps `rest` happen."""
+    """Let other programs keep the computer busy, and then let the mishaps `rest` happen."""
     code = 'while True: pass'
     programs = [subprocess.Popen([sys.executable, '-c', code]) for _ in range(BUSY)]
     scene.attack.spin(5.0)

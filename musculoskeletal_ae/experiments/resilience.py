@@ -132,7 +132,7 @@ def run_with_fault(
 
 
 class Reach(NamedTuple):
-    """The postures that an arm can hold and approach without one of its muscles, in numbers.
+    """Results on the postures that an arm can hold and approach without one of its muscles.
 
     Attributes:
         share: Share of the holdable postures of the true body that remain holdable.
