@@ -140,7 +140,7 @@ class Attack:
         self.processes: dict[str, Process] = {}
         self.publishers: dict[str, Any] = {}
         self.clients: dict[str, Any] = {}
-        #: digests of the hostile messages, by which they are told from genuine ones
+        #: digests by which hostile messages are told from genuine ones
         self.sent: set[int] = set()
         self.genuine: dict[str, Any] = {}  # last message that the system itself sent, by topic
         self.commands: list[Command] = []

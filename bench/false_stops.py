@@ -206,7 +206,7 @@ def _delay(loop: ContactLoop, joint: int, torque: float, rng: np.random.Generato
 def watch(
     robot: Robot, reality: str, seed: int, initial: Mae, load: float, seconds: float, pushes: int
 ) -> tuple[Result, Pushes | None]:
-    """Let an emulated arm explore for `seconds` [s], push it, and return what happened.
+    """Let an emulated arm explore for `seconds` [s], push it, and return the results.
 
     `reality` and `seed` select the arm; `load` is the number of processes that compete with it.
     """

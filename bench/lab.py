@@ -287,7 +287,7 @@ class Lab:
             self.publish()
 
     def publish(self) -> None:
-        """Publish what has changed in the estimator to the other nodes."""
+        """Publish the changes in the estimator to the other nodes."""
         core = self.estimator
         if (trust := core.joint_trust) is not self._published_trust:
             self._published_trust = trust
@@ -319,7 +319,8 @@ class Lab:
     def _accepted(self, mae: Mae) -> None:
         self.controller.use(mae)
         self._to_learner.append(lambda: self.learner.note_accepted(mae))
-        if Evidence.NOT_CALIBRATED in self.estimator.trust.evidence:  # it waited for a network
+        # The lengths could not be calibrated without a network.
+        if Evidence.NOT_CALIBRATED in self.estimator.trust.evidence:
             self.estimator.calibrate_lengths()
 
     def _control(self, now: float) -> None:

@@ -162,12 +162,12 @@ def on_theta(change: Callable[[float, Array], None]) -> ReadingFault:
 
 
 def silent(start: float, seconds: float) -> ReadingFault:
-    """Return a fault by which the driver is silent for `seconds` after the time `start` [s]."""
+    """Return a fault in which the driver is silent for `seconds` after the time `start` [s]."""
     return lambda now, packet: [] if now < start + seconds else [packet]
 
 
 def deaf(start: float, seconds: float) -> CommandFault:
-    """Return a fault by which no command arrives for `seconds` after the time `start` [s]."""
+    """Return a fault in which no command arrives for `seconds` after the time `start` [s]."""
     return lambda now, value: None if now < start + seconds else value
 
 
@@ -238,7 +238,7 @@ def rupture_at_rest(lab: Lab, rng: Rng) -> Case:
 
 
 def _slackening(largest: float, speed: float) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which a tendon lengthens by about `largest` [m], at about `speed` m/s."""
+    """Return a mishap in which a tendon lengthens by about `largest` [m], at about `speed` m/s."""
 
     def begin(lab: Lab, rng: Rng) -> Case:
         _, name = _any(rng, lab.arm.robot.muscles)
@@ -299,7 +299,7 @@ def retied(lab: Lab, rng: Rng) -> Case:
 
 
 def module_fault(kind: str, low: float = 0.0, high: float = 0.0) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which one module has the emulator's fault `kind`.
+    """Return a mishap in which one module has the emulator's fault `kind`.
 
     The size of the fault is drawn between `low` and `high`, in the unit of the fault.
     """
@@ -327,7 +327,7 @@ LENGTH, TENSION = MuscleReadings.length, MuscleReadings.tension
 
 
 def frozen(quantity: Quantity) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which the length or the tension reading of a random muscle freezes.
+    """Return a mishap in which the length or the tension reading of a random muscle freezes.
 
     `quantity` says which of the two. The mishap has an effect once the true value differs clearly
     from the frozen one.
@@ -370,7 +370,7 @@ def changed(
     quantity: Quantity, change: Callable[[float, float], float], low: float, high: float, unit: str,
     is_signed: bool = True,
 ) -> Callable[[Lab, Rng], Case]:  # fmt: skip
-    """Return a mishap by which one reading of a muscle is changed by a random size.
+    """Return a mishap in which one reading of a muscle is changed by a random size.
 
     `quantity` is the quantity that is read. `change` gets the true value and the size,
     which is drawn between `low` and `high`, and is negative at random if `is_signed`.
@@ -521,7 +521,7 @@ def joint_drifts(lab: Lab, rng: Rng) -> Case:
 
 
 def joint_fault(change: Callable[[float], float], what: str) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which a joint sensor reads the function `change` of its true angle.
+    """Return a mishap in which a joint sensor reads the function `change` of its true angle.
 
     `what` describes the mishap in the results.
     """
@@ -707,7 +707,7 @@ def half_rate(lab: Lab, _: Rng) -> Case:
 
 
 def pause(seconds: float) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which the driver is silent for a time [s], and then goes on."""
+    """Return a mishap in which the driver is silent for a time [s], and then goes on."""
 
     def begin(lab: Lab, _: Rng) -> Case:
         lab.wire.reading_faults.append(silent(lab.now, seconds))
@@ -768,7 +768,7 @@ def lost_module(lab: Lab, rng: Rng) -> Case:
 
 
 def mounted(least: float, most: float) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which the base is mounted at an angle to the vertical.
+    """Return a mishap in which the base is mounted at an angle to the vertical.
 
     The angle is drawn between `least` and `most` [rad].
     """
@@ -876,7 +876,7 @@ def needless_calibration(lab: Lab, _: Rng) -> Case:
 
 
 def restarts(node: str, settled_by: tuple[Step, ...] = ()) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which a node is killed and started again."""
+    """Return a mishap in which a node is killed and started again."""
 
     def begin(lab: Lab, _: Rng) -> Case:
         lab.restart(node)
@@ -890,7 +890,7 @@ def restarts(node: str, settled_by: tuple[Step, ...] = ()) -> Callable[[Lab, Rng
 
 
 def stalls(*nodes: str) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which nodes do not run for some seconds."""
+    """Return a mishap in which nodes do not run for some seconds."""
 
     def begin(lab: Lab, rng: Rng) -> Case:
         seconds = rng.uniform(1.0, 4.0)

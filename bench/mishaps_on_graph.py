@@ -28,7 +28,7 @@ from bench.processes import end_processes
 
 WATCHED = 15.0  # watch the status line for this time while the mishap lasts [s]
 ERROR_TIME = 10.0  # measure the true error over this time [s]
-#: statements that blame the computer; count them as false unless other programs use it up
+#: count statements that blame the computer as false, unless other programs keep it busy
 OVERLOADED = 'overloaded|stop other programs'
 BUSY = 8  # keep the computer busy with this many programs
 
@@ -53,7 +53,7 @@ class GraphMishap(NamedTuple):
 
 
 def killed(node: str) -> Callable[[Scene], None]:
-    """Return a mishap by which a node is killed."""
+    """Return a mishap in which a node is killed."""
 
     def begin(scene: Scene) -> None:
         scene.attack.watches_processes = False
@@ -63,12 +63,12 @@ def killed(node: str) -> Callable[[Scene], None]:
 
 
 def suspended(node: str) -> Callable[[Scene], None]:
-    """Return a mishap by which a node is suspended until somebody resumes or restarts it."""
+    """Return a mishap in which a node is suspended until somebody resumes or restarts it."""
     return lambda scene: scene.pause(node)
 
 
 def second(node: str) -> Callable[[Scene], Callable[[], object]]:
-    """Return a mishap by which a node runs a second time, under another name."""
+    """Return a mishap in which a node runs a second time, under another name."""
 
     def begin(scene: Scene) -> Callable[[], object]:
         scene.attack.start_second(node, f'other_{node}')

@@ -78,7 +78,7 @@ def measure(robot: Robot, mae: Mae, reality: str, seed: int, seconds: float) -> 
 
 
 def main(argv: list[str]) -> int:
-    """Record, learn and test each individual, and print its errors."""
+    """Record each individual, learn from the recordings, and print the errors."""
     parser = Parser('moving', 'Learns emulated recordings with and without rests.')
     parser.add_robot(default='arm26')
     parser.add_reality()

@@ -341,7 +341,7 @@ def systems(
 
 
 def main(argv: list[str]) -> None:
-    """Measure every combination and print a table."""
+    """Measure every combination of robot, rate and set of nodes, and print a table."""
     parser = Parser('wire', (__doc__ or '').partition('\n')[0])
     robots = 'arm26,musashi_left_arm'
     parser.add_argument('--robots', type=names, default=robots, help='names or directories')

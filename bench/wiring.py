@@ -157,7 +157,7 @@ def _named(estimator: Estimator, text: str) -> set[int]:
 class Case(NamedTuple):
     """One restart of a driver, and what differs after it."""
 
-    what: str  # what changes in the driver: 'exchange', 'sign' or 'healthy'
+    what: str  # change in the driver: 'exchange', 'sign', or 'healthy' for none
     wiring: Wiring
     has_sensors: bool
 

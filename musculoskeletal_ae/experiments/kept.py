@@ -33,7 +33,7 @@ def write(file: Path, value: Any) -> None:
     """Write a value to a file, which is replaced as a whole.
 
     Raises:
-        TypeError: If a part of the value has another type than those that the module names.
+        TypeError: If a part of the value has a type that the module docstring does not list.
     """
     arrays = dict[str, Array]()
     document = json.dumps(_encoded(value, arrays))

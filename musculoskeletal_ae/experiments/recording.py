@@ -83,8 +83,7 @@ class ClosedLoop:
     ) -> None:
         """Connect an arm in its present posture.
 
-        `seed` determines the exploration, and `on_anomaly` what happens on an anomaly, as the
-        parameter of the estimator does.
+        `seed` determines the exploration. `on_anomaly` is the estimator's parameter of this name.
         """
         self.arm, self.core, self.stops = arm, Controller(arm.robot, settings, seed), 0
         self.estimator = Estimator(arm.robot, mae.preset)

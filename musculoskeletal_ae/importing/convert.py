@@ -48,7 +48,7 @@ class Imported(NamedTuple):
     """An imported robot, with notes on the import and a comparison with its source."""
 
     robot: Robot
-    #: what the import chose, dropped, held fixed, renamed or approximated
+    #: notes on everything that the import chose, dropped, held fixed, renamed or approximated
     notes: tuple[str, ...]
     #: comparison with the source's own engine; None if no engine computes the source's lengths
     comparison: Comparison | None

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Reduced limits for joints that the muscles can hold in only a part of the range.
 
-The muscles of such a joint pull it in one direction, and a spring pulls it in the other. If a
-tendon crosses the joint's axis within the range, beyond that angle its muscle pulls in the
-direction of the spring. The joint then snaps to its stop, and nothing can bring it back: without
-reduced limits, an emulated arm ends there in its first second.
+The muscles of such a joint pull it in one direction, and a spring pulls it in the other. If the
+joint turns so far that a tendon crosses its axis, the muscle pulls in the direction of the spring,
+too. The joint then snaps to its stop, and nothing can bring it back: without reduced limits, an
+emulated arm ends there in its first second.
 """
 
 from typing import NamedTuple

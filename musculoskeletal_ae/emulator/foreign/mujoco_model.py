@@ -36,7 +36,7 @@ POSTURES = 300  # fit the radii of heads and muscles in this many random posture
 # Couple joints with this constraint stiffness (solimp). MuJoCo's default disregards the ratio of a
 # coupling: a prismatic joint that follows a revolute one would lag by centimetres.
 STIFF = [0.9999, 0.9999, 0.001, 0.5, 2.0]
-SPRING = 'spring'  # first word of the names of springs that couple joints
+SPRING = 'spring'  # begin the names of springs that couple joints with this word
 #: replace the inverse mass by which MuJoCo scales the contacts of a body if it is below this share
 #: of the inverse mass at the body's shapes
 LEAST_WEIGHT_SHARE = 0.01
