@@ -30,9 +30,8 @@ def main(argv: list[str]) -> int:
     listed = benches()
     if not argv or argv[0] in ('-h', '--help'):
         print(
-            'Usage: python -m bench NAME [options]. Each bench has --help; bench/README.md says '
-            'what\n'
-            'passing means.\n'
+            'Usage: python -m bench NAME [options]. Each bench has --help;\n'
+            'bench/README.md states when a bench passes.\n'
         )
         print('\n'.join(f'{name:<20}{line}' for name, line in listed.items()))
         return 0

@@ -8,8 +8,8 @@ network. With the learned network, the bench measures:
 
 - estimate: mean ‖θ_est − θ‖ in further exploration, before and after learning,
 - control: mean ‖θ_target − θ‖ of `proposed` at random holdable postures, --held seconds after each
-  target (a motion of stiffness-controlled muscles that its tensions would not suffice for is
-  slowed, so that it can take up to 9 s),
+  target (a motion for which the tensions of stiffness-controlled muscles would not suffice is
+  slowed, and can take up to 9 s),
 - rupture: several muscles rupture in turn while the arm explores. The columns are the share of
   ruptures after which a muscle is isolated within 10 s, the share after which only the ruptured
   muscle is isolated, and the mean time from a rupture to the first isolation (10 s if there is
@@ -42,7 +42,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 #: explore and learn for EXPLORED, and then measure in a held-out motion of HELD_OUT [s]
 EXPLORED, HELD_OUT = 300.0, 60.0
-#: number of targets to which an arm moves, and default time for which it holds each [s]
+#: move to this many targets, and by default hold each for this time [s]
 TARGETS, HELD = 5, 4.0
 RUPTURES = 3  # rupture this many muscles, one after another
 MOVING = 4.0  # explore for this time before a rupture [s]
@@ -229,9 +229,9 @@ def main(argv: list[str]) -> int:
     parser.add_quick('a quarter of the time')
     add = parser.add_argument
     add('--realities', type=names, default=(KIN, FOREIGN), help='emulator models: kin, foreign')
-    add('--modules', type=names, default=tuple(KINDS), help=f'kinds: {", ".join(KINDS)}')
-    add('--seconds', type=positive, default=EXPLORED, help='time of exploration [s]')
-    add('--held', type=positive, default=HELD, help='time for each target [s]')
+    add('--modules', type=names, default=tuple(KINDS), help=f'modules: {", ".join(KINDS)}')
+    add('--seconds', type=positive, default=EXPLORED, help='duration of the exploration [s]')
+    add('--held', type=positive, default=HELD, help='hold each target this long [s]')
     parser.add_initial()
     parser.add_workers()
     options = parser.parse_args(argv)

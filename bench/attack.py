@@ -42,7 +42,7 @@ from musculoskeletal_ae.robot.robot import Robot
 if TYPE_CHECKING:
     from bench.attack_graph import Attack
 
-#: accept a delay of this size between computing and publishing a command on a loaded machine [s]
+#: accept a delay of up to this between computing and publishing a command on a loaded machine [s]
 JITTER = 0.03
 RELIEF = 0.3  # let paying out exceed the rate limit for this time after an excess tension [s]
 SILENT = 10.0  # report a node under attack that has not reported on /diagnostics for this time [s]
@@ -51,7 +51,7 @@ YOUNG = 300.0  # compare later memory of a node with that at this age [s]
 #: Report a tension that exceeds ABOVE times tension.limit for longer than MOMENT [s].
 ABOVE, MOMENT = 1.1, 0.5
 STILL = 0.002  # report a muscle of a stopped arm that is wound in by more than this [m]
-MOST_MEMORY = 500.0  # report a node that uses more memory at any time [MB]
+MOST_MEMORY = 500.0  # report a node that ever uses more memory than this [MB]
 
 
 class Size(NamedTuple):
@@ -246,7 +246,7 @@ def evaluate(attack: 'Attack') -> list[Row]:
         for begin, end, mode in stops:
             if (length := wound_in(at, value, begin + JITTER, end)) > STILL:
                 wound.append(f'{1e3 * length:.1f} mm in {mode}, from {begin:.2f} s')
-    # The driver obeys other nodes as well, so their tensions are not the controller's.
+    # Leave out tensions while other nodes command the driver, or while sensor data are wrong.
     excluded = [*attack.lying, *attack.foreign]
     true = [load for load in attack.loads if without(np.array([load[0]]), excluded)[0]]
     highest, when = max(((float(load.max()), at) for at, load in true), default=(0.0, 0.0))

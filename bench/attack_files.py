@@ -26,8 +26,9 @@ from robots import chain
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
-LONGEST = 5.0  # report a file whose reading takes more CPU time [s]
-MOST_MEMORY = 300  # report a file whose reading raises the peak memory of the process by more [MB]
+LONGEST = 5.0  # report a file whose reading takes more CPU time than this [s]
+#: report a file whose reading raises the peak memory of the process by more than this [MB]
+MOST_MEMORY = 300
 NASTY: tuple[object, ...] = (
     0.0, -1.0, 1e-300, 1e300, -1e300, float('nan'), float('inf'), 2**70, '', '\x1b[2J', [], {},
 )  # fmt: skip
@@ -39,8 +40,8 @@ class Attempt(NamedTuple):
 
     kind: str
     outcome: str
-    seconds: float  # CPU time of reading it [s]
-    memory: float  # memory that reading it added to the peak of the process [MB]
+    seconds: float  # CPU time of reading the file [s]
+    memory: float  # memory that reading the file added to the process's peak [MB]
 
     @property
     def broken(self) -> bool:

@@ -140,7 +140,7 @@ class Attack:
         self.processes: dict[str, Process] = {}
         self.publishers: dict[str, Any] = {}
         self.clients: dict[str, Any] = {}
-        #: digests of the hostile messages, by which they are told from genuine ones
+        #: digests by which hostile messages are told from genuine ones
         self.sent: set[int] = set()
         self.genuine: dict[str, Any] = {}  # last message that the system itself sent, by topic
         self.commands: list[Command] = []
@@ -406,7 +406,7 @@ class Attack:
     def topics(self) -> dict[str, str]:
         """Return the types of all subscribed topics, by name."""
         for name in NODES:
-            with suppress(NodeNameNonExistentError):  # just killed; its topics are known already
+            with suppress(NodeNameNonExistentError):  # a node just killed: its topics are known
                 pairs = self.node.get_subscriber_names_and_types_by_node(name, self.namespace)
                 self._topics |= {topic: kinds[0] for topic, kinds in pairs}
         return self._topics
@@ -476,7 +476,7 @@ class Attack:
         return checkpoint.to_bytes(replace(mae, decoder=layers))
 
     def request(self, service: str, kind: str) -> None:
-        """Request something illegal of a service of type `kind`; do not wait for the response."""
+        """Send an illegal request to a service of type `kind` without waiting for the response."""
         rng, name = self.rng, SERVICES[kind]
         request = name.Request()
         node = service.removeprefix(f'{self.namespace}/').split('/')[0]
@@ -614,7 +614,7 @@ def _nasty(kind: str, rng: random.Random) -> Any:
             bits = int(kind.removeprefix(prefix))
             low, high = -(2 ** (bits - 1)) * sign, 2 ** (bits - sign) - 1
             return rng.choice((0, 1, low, high, rng.randint(low, high)))
-    return None  # `kind` is a message type
+    return None  # `kind` is the type of a nested message, which `filled` fills
 
 
 def illegal_value(rng: random.Random) -> ParameterValue:

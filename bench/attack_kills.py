@@ -78,7 +78,7 @@ def live(robot: Robot, directory: Path, initial: Path, life: int) -> None:
 
 
 class Child:
-    """A process that runs a learner, and what it has reported so far."""
+    """A process that runs a learner, with its reports so far."""
 
     def __init__(self, robot: Path, directory: Path, initial: Path, life: int) -> None:
         """Start child number `life`, which continues from the state that `directory` keeps."""

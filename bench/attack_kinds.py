@@ -44,7 +44,7 @@ REPAIRS = {
     Step.CHECK_JOINT_SENSOR,
     Step.REPAIR_SENSOR,
 }
-OFFSET = 0.08  # absolute value of the false length offsets that are published [m]
+OFFSET = 0.08  # publish false length offsets of this absolute value [m]
 
 
 class Scene:
@@ -291,7 +291,7 @@ def isolate_in_turns(scene: Scene) -> None:
 
 
 def _denials(scene: Scene) -> list[Float64MultiArray]:
-    """Return body states by which there was no anomaly, or the anomaly has ended."""
+    """Return false body states: that there was no anomaly, and that the anomaly has ended."""
     return [_body(scene, anomaly=each) for each in (Anomaly.NONE, Anomaly.ENDED)]
 
 

@@ -11,11 +11,11 @@ many as the learner keeps, and DRAW the seed with which they are drawn.
                             standard deviation of 6 mm is added to each length. With `+blind`, the
                             learner has no joint sensors
 
-A line has the mean error ‖θ_est − θ‖ [rad] after the updates, the share of test errors in the 95 %
-ellipsoid, the error of the lengths of network and body [mm], the size of the remainder [mm] and its
-constants, the processor time of an update [s], and the errors of the regressions. With --body, only
-the body is fitted, and θ is estimated by least squares on it, with the covariance that the fit
-expects. This takes a quarter of the time. notes/real_bodies.md contains the figures;
+The line of a case has the mean error ‖θ_est − θ‖ [rad] after the updates, the share of test errors
+in the 95 % ellipsoid, the error of the lengths of network and body [mm], the size of the remainder
+[mm] and its constants, the processor time of an update [s], and the errors of the regressions. With
+--body, only the body is fitted, and θ is estimated by least squares on it, with the covariance that
+the fit expects. This takes a quarter of the time. notes/real_bodies.md contains the figures;
 `bench recordings` measures recorded robots.
 """
 
@@ -53,11 +53,11 @@ from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
 
-ROBOT = 'musashi_left_arm'  # robot that the emulated cases use
+ROBOT = 'musashi_left_arm'  # use this robot in the emulated cases
 #: let an emulated arm explore for EXPLORED, and test on a held-out motion of HELD_OUT [s]
 EXPLORED, HELD_OUT = 300.0, 60.0
 THINNED = 10  # use only every tenth message of the held-out motion for the test
-#: standard deviation of the coupling of joints that `+coupled` adds to each length [m]
+#: let `+coupled` add a coupling of the joints with this standard deviation to each length [m]
 COUPLING = 0.006
 MOST_FITTED = 150  # fit at most this many test rows by least squares, because each fit is slow
 #: constants of least squares: step of finite differences [rad], typical step as a share of the
@@ -184,7 +184,7 @@ def package(case: Case, updates: int | None, seed: int) -> str:
     by_network, by_body = (
         1e3 * np.sqrt(np.square(length - test.length).mean()) for length in (of_network, of_body)
     )
-    assert mae.covariance is not None  # the preset `default` computes it
+    assert mae.covariance is not None  # preset `default` has one
     inside = (ellipsoids(mae.covariance, error) <= 1.0).mean()
     constants = ' '.join(group.text() for group in body.remainder.groups)
     return (
@@ -260,7 +260,7 @@ def main(argv: list[str]) -> None:
     """Learn each case that the command line names, and print a line with its errors."""
     parser = Parser('bodies', (__doc__ or '').partition('\n')[0])
     parser.add_argument('cases', nargs='+', metavar='CASE', help='INDIVIDUAL[:COUNT[:DRAW]]')
-    help_cache = 'directory for first networks, and for samples of emulated arms'
+    help_cache = 'directory that keeps initial networks, and samples of emulated arms'
     parser.add_argument('--cache', type=Path, required=True, help=help_cache)
     text = 'number of updates; by default, as many as the network needs to converge'
     parser.add_argument('--updates', type=whole(1, 100), help=text)

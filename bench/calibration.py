@@ -44,7 +44,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-HELD_OUT_SEED = 9001  # random seed of the held-out motion, from which no experiment learns
+HELD_OUT_SEED = 9001  # record the held-out motion with this seed, from which no experiment learns
 EVERY = 10  # evaluate the length error only at every tenth message, to save time
 
 

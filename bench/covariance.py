@@ -52,8 +52,8 @@ from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 
 HELD_OUT = 40.0  # test on a held-out motion of this duration [s]
-STEPS = 400, 1200  # numbers of training steps of the successive updates
-#: function that returns the joint angles which the learner receives, by its source of θ
+STEPS = 400, 1200  # make one update with each of these numbers of training steps
+#: for each source of θ: the function that returns the joint angles for the learner
 VIEWS: dict[str, JointView] = {
     SENSOR: lambda _learner, _n, _true, read: read,
     NONE: lambda *_: None,
@@ -139,7 +139,7 @@ def measure(
     results = {}
     for source in VIEWS:
         mae = learned(robot, driver, exploring, seed, source)
-        assert mae.covariance is not None  # the preset `default` computes it
+        assert mae.covariance is not None  # preset `default` has one
         results[source] = honesty(scale * mae.covariance, errors(mae, held_out))
     return results
 
@@ -154,10 +154,10 @@ def main(argv: list[str]) -> None:
         '--realities', type=names, default=(KIN, FOREIGN), help='emulator models or MJCF files'
     )
     parser.add_argument(
-        '--exploration', choices=PRESETS, default='default', help='preset that explores'
+        '--exploration', choices=PRESETS, default='default', help='preset whose exploration is used'
     )
     parser.add_argument(
-        '--scale', type=number(0.01, 100.0), default=1.0, help='factor of each covariance'
+        '--scale', type=number(0.01, 100.0), default=1.0, help='multiply each covariance by this'
     )
     parser.add_initial()
     parser.add_workers()

@@ -46,7 +46,7 @@ START_PATIENCE = 1800  # wait at most this long for the first status line, insta
 COMMAND_PATIENCE = 900
 #: end a `ros2` command after this time [s]; if the system has ended, the command would never end
 ANSWER_PATIENCE = 300
-#: what `bringup.sh` installs into a clone; the other files that a page creates are removed
+#: keep these files that `bringup.sh` installs into a clone; remove all others that a page creates
 INSTALLED = ('/.venv', '/.cache', '/build', '/install', '/log', '__pycache__', '*.egg-info')
 NAME = 'musculoskeletal_ae'
 INSTALL, ROS2 = 'doc/howto/install.md', 'ros2'

@@ -18,7 +18,7 @@ themselves, for example after 0.2 s without messages), the number of messages th
 lost, and the longest delay of a message. It also prints the number of false contacts, and the
 largest evidence d for contact after the first MINUTE of detection; contact is reported above 10
 (`estimation/contact.py`). An individual's hour ends with its first finding, doubt or stop. The exit
-status is 1 if there was one.
+status is 1 if there was any.
 
 With --pushes N, the arm then continues to explore with the network that it has learned, and a
 torque acts on one joint at a time for at most a second. The torques are multiples of σ, the
@@ -47,8 +47,8 @@ from musculoskeletal_ae.robot.robot import Robot
 
 MINUTE = 60.0  # ignore the evidence for contact during this time after the first network [s]
 FACTORS = 5.0, 10.0, 15.0, 20.0, 40.0  # push joints with these multiples of σ
-#: leave a push out if the wrench on the hand that exerts it would have more than this share of the
-#: torque at other joints
+#: leave a push out if the wrench on the hand would exert more than this share of its torque at
+#: other joints
 INEXACT = 0.05
 
 
@@ -56,11 +56,11 @@ class Result(NamedTuple):
     """Results of one healthy arm: a false finding or stop, pauses, lost and late messages."""
 
     seconds: float  # simulated time [s]
-    problem: str  # the false finding or stop that ended it, or ''
+    problem: str  # the false finding or stop that ended the exploration, or ''
     pauses: int  # how often the arm paused
     lost: int  # number of muscle_states that the controller lost
     delay: float  # longest delay of muscle_states at the controller [s]
-    samples: int  # number of samples that the learner took
+    samples: int  # number of samples that the learner accepted
     contacts: int  # number of false contacts
     evidence: float  # largest d, the evidence for contact
 
@@ -130,7 +130,7 @@ class BusyLoop(Lab):
 
 
 class Pushes(NamedTuple):
-    """What was noticed when a torque acted on one joint of an exploring arm.
+    """Delays until contact was noticed while a torque acted on one joint of an exploring arm.
 
     Attributes:
         spread: Residual torque σ of each joint on the healthy moving arm [N·m], (D,).
@@ -142,7 +142,7 @@ class Pushes(NamedTuple):
     delays: Array
 
     def lines(self, robot: Robot) -> list[str]:
-        """Return the table."""
+        """Return the lines of the table: its head, and a line for each joint."""
         lines = [
             f'      {"joint":<16}{"σ":>6}   torque [N·m]: % in {SOON} s, % in {MOVED} s, median'
         ]
@@ -195,7 +195,7 @@ def _delay(loop: ContactLoop, joint: int, torque: float, rng: np.random.Generato
             if np.abs(jacobian.T @ wrench - torques).max() > INEXACT * abs(torque):
                 return float('nan')
             loop.arm.set_wrench(wrench)
-            # The first message was read before the push.
+            # The message with n = 0 was read before the push, so n is the delay in messages.
             if loop.contact(exploring=True).is_contact:
                 return n * SAMPLE_TIME
         return float('inf')
@@ -206,7 +206,7 @@ def _delay(loop: ContactLoop, joint: int, torque: float, rng: np.random.Generato
 def watch(
     robot: Robot, reality: str, seed: int, initial: Mae, load: float, seconds: float, pushes: int
 ) -> tuple[Result, Pushes | None]:
-    """Let an emulated arm explore for `seconds` [s], push it, and return what happened.
+    """Let an emulated arm explore for `seconds` [s], push it, and return the results.
 
     `reality` and `seed` select the arm; `load` is the number of processes that compete with it.
     """
@@ -236,7 +236,7 @@ def main(argv: list[str]) -> int:
         '--pushes',
         type=whole(0, 1000),
         default=0,
-        help='afterwards, push each joint this often with each of several torques',
+        help='afterwards, push each joint this many times with each of several torques',
     )
     parser.add_initial()
     parser.add_quick('a minute of each arm')

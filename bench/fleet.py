@@ -38,7 +38,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 BRINGUP = Path(__file__).resolve().parents[1] / 'bringup.sh'
 STARTING = 60.0  # wait for the first commands at most this long × (1 + number of arms) [s]
-LOOK = 0.1  # time between two checks of a condition [s]
+LOOK = 0.1  # check a condition at this interval [s]
 HEAD = (
     'arms  processes  threads  start [s]  start CPU [s]  join [s]  CPU [%]  median, p99 [ms]  '
     'late [%]  missed [%]  memory [MB]  load'
@@ -52,12 +52,12 @@ class Fleet(NamedTuple):
     processes: int
     threads: int
     started: int  # number of arms whose controllers send commands
-    start: float  # [s]
-    start_cpu: float  # [s]
-    join: float  # [s]
-    cpu: dict[str, float]  # of all arms, by executable [% of a core]
+    start: float  # time until every controller sent commands [s]
+    start_cpu: float  # processor time of all processes until then [s]
+    join: float  # time in which a new node received commands of all these arms [s]
+    cpu: dict[str, float]  # processor time of all arms, by executable [% of a core]
     losses: tuple[tuple[float, ...], float, float]  # latency [ms], late and missed [%]
-    memory: float  # [MB]
+    memory: float  # memory of all processes [MB]
     load: float
 
     def __str__(self) -> str:
@@ -80,7 +80,7 @@ def topic(arm: int, name: str) -> str:
 
 
 def wait(condition: Callable[[], bool], seconds: float) -> float:
-    """Wait until a condition holds, for at most some seconds; return how long it took [s]."""
+    """Wait until a condition holds, at most `seconds` [s]; return the time that this took [s]."""
     start = time.monotonic()
     while not condition() and time.monotonic() < start + seconds:
         time.sleep(LOOK)
@@ -91,7 +91,7 @@ def wait(condition: Callable[[], bool], seconds: float) -> float:
 def running(
     count: int, robot: str, network: Path, rate: float
 ) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Run some arms, each in a namespace; end them after the block."""
+    """Run `count` arms, each in a namespace of its own; end them after the block."""
     parameters = network.with_name('rate.yaml')
     parameters.write_text(f'/**: {{ros__parameters: {{rate: {rate}}}}}\n')
     files = ['--checkpoint', str(network), '--params-file', str(parameters)]
@@ -127,25 +127,25 @@ def used(runs: list[subprocess.Popen[bytes]]) -> dict[str, float]:
     times: dict[str, float] = defaultdict(float)
     for run in runs:
         for child in children(run.pid):
-            with suppress(FileNotFoundError):  # it has ended
+            with suppress(FileNotFoundError):  # the process has ended
                 words = Path(f'/proc/{child}/cmdline').read_text('utf-8').split('\0')
                 times[Path(words[1]).name] += cpu(child)  # the first word is the interpreter
     return times
 
 
 def resident(runs: list[subprocess.Popen[bytes]]) -> tuple[int, int, float]:
-    """Return the numbers of processes and threads, and the memory of all [MB]."""
+    """Return the numbers of processes and threads, and the memory of all processes [MB]."""
     threads, memory = [], []
     for run in runs:
         for pid in family(run.pid):
-            with suppress(FileNotFoundError, ProcessLookupError):  # it has ended
+            with suppress(FileNotFoundError, ProcessLookupError):  # the process has ended
                 memory.append(memory_share(pid))
                 threads.append(thread_count(pid))
     return len(threads), sum(threads), sum(memory)
 
 
 def measure(count: int, robot: str, network: Path, rate: float, seconds: float) -> Fleet:
-    """Start some arms, and measure them for some seconds.
+    """Start `count` arms, and measure them for `seconds` [s].
 
     Raises:
         MusculoskeletalError: If a bringup.sh ends, or if the first arm sends nothing.
@@ -176,7 +176,7 @@ def measure(count: int, robot: str, network: Path, rate: float, seconds: float) 
             losses = delays(states, commands, rate, passed)
             processes, threads, memory = resident(runs)
             if ended := [arm for arm, run in enumerate(runs, 1) if run.poll() is not None]:
-                raise MusculoskeletalError(f'arms {ended} have ended; see the logs of bringup.sh')
+                raise MusculoskeletalError(f'bringup.sh of arms {ended} has ended; see its logs')
     finally:
         listener.end()
     return Fleet(
@@ -188,7 +188,7 @@ def main(argv: list[str]) -> None:
     """Measure each number of arms, and print a table."""
     parser = Parser('fleet', (__doc__ or '').partition('\n')[0])
     parser.add_robot(default='arm26')
-    parser.add_argument('--arms', type=seeds, default='1,2,5,10', help='numbers of arms')
+    parser.add_argument('--arms', type=seeds, default='1,2,5,10', help='numbers of arms to measure')
     parser.add_argument(
         '--rate', type=number(1.0, 1000.0), default=20.0, help='message rate of each arm [Hz]'
     )

@@ -44,7 +44,7 @@ from musculoskeletal_ae.signals.friction import directions
 from musculoskeletal_ae.signals.limits import LIMITS as SIGNAL_LIMITS
 from musculoskeletal_ae.signals.limits import share_outside
 
-LOAD = 3.6  # mass of the payload that the arm carries every second minute [kg]
+LOAD = 3.6  # let the arm carry this payload every second minute [kg]
 MINUTE = 60.0  # add or remove the payload at this interval [s]
 
 MESSAGES = {

@@ -34,7 +34,7 @@ from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
-#: elements of a link that are left out, because they do not affect muscle lengths
+#: leave these elements of a link out, because they do not affect muscle lengths
 DRAWN = 'visual', 'collision'
 HEAD = (
     'model', 'joints', 'muscles', 'wrap', 'max error [mm]', 'median [mm]', 'moment arm [mm]',

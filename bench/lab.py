@@ -43,12 +43,12 @@ from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
-CORES = 2  # number of cores of the simulated computer
+CORES = 2  # simulate a computer with this many cores
 #: let a process wait for the processor for this mean time, for each process per core [s]
 WAIT = 0.0008
 STALL_EVERY = 10.0  # stall a process at this mean interval [s]
 STALL = 0.015  # let a stall take this mean time, for each process per core [s]
-HANDLING = 0.0005  # time in which a node handles a message [s]
+HANDLING = 0.0005  # let a node handle a message in this time [s]
 QUEUE = 10  # let at most this many messages wait in a subscription; drop older ones
 #: set the publisher's clock ahead of the steady clock by this time [s]; no node may depend on it
 AHEAD = 1.7e9
@@ -127,7 +127,7 @@ class Process:
 
 
 class Packet(NamedTuple):
-    """What the driver publishes in one period."""
+    """The readings that the driver publishes in one period."""
 
     muscles: MuscleReadings
     theta: Array | None  # joint angles [rad], (D,), with NaN for missing ones; None: no message
@@ -140,7 +140,7 @@ CommandFault = Callable[[float, Array], Array | None]
 
 
 class Wire:
-    """What lies between the arm and the nodes: sensors, cables and the driver.
+    """The wire between the arm and the nodes: sensors, cables and the driver.
 
     Faults are applied to readings in the order of `reading_faults`, and to commands in the order of
     `command_faults`.
@@ -185,7 +185,7 @@ class Lab:
         learner: The core of the learner.
         now: The steady clock [s].
         clock_shift: The ROS clock minus the steady clock [s].
-        before_step: Functions of this object that are called before each step.
+        before_step: Functions that are called before each step, with this laboratory as argument.
     """
 
     def __init__(self, arm: Arm, initial: Mae, seed: int, load: float = 0.0) -> None:
@@ -218,7 +218,7 @@ class Lab:
 
     @property
     def clock(self) -> float:
-        """The ROS clock [s], by which the learner and the messages' times are kept."""
+        """The ROS clock [s], which the learner and the time stamps of messages use."""
         return self.now + self.clock_shift
 
     def run(self, seconds: float) -> None:
@@ -287,7 +287,7 @@ class Lab:
             self.publish()
 
     def publish(self) -> None:
-        """Publish what has changed in the estimator to the other nodes."""
+        """Publish the changes in the estimator to the other nodes."""
         core = self.estimator
         if (trust := core.joint_trust) is not self._published_trust:
             self._published_trust = trust
@@ -300,7 +300,7 @@ class Lab:
             core.networks.follow(body, self.now)
 
     def _connect_networks(self) -> None:
-        """Tell the other nodes what the estimator decides on networks."""
+        """Let controller and learner hear the estimator's decisions on networks."""
         self.estimator.networks.accepted = self._accepted
         self.estimator.networks.rejected = self._rejected
 
@@ -319,7 +319,8 @@ class Lab:
     def _accepted(self, mae: Mae) -> None:
         self.controller.use(mae)
         self._to_learner.append(lambda: self.learner.note_accepted(mae))
-        if Evidence.NOT_CALIBRATED in self.estimator.trust.evidence:  # it waits for a network
+        # The lengths could not be calibrated without a network.
+        if Evidence.NOT_CALIBRATED in self.estimator.trust.evidence:
             self.estimator.calibrate_lengths()
 
     def _control(self, now: float) -> None:
@@ -377,7 +378,7 @@ class Lab:
         robot = self.arm.robot
         self._process_of(node).restart(self.now + RESTARTING)
         if node == ESTIMATOR:
-            left = self.estimator.body  # a real estimator saves it
+            left = self.estimator.body  # a real estimator saves its state
             self.estimator = Estimator(robot, first_generation=left.generation + 1)
             self.estimator.isolate(left.isolated)
             self._connect_networks()

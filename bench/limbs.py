@@ -29,7 +29,7 @@ BODIES: dict[str, tuple[int | str, ...]] = {
     '17x40': (4, 4, 'neck'),
     '39x74': (3, 3, 3, 3, 3, 'held'),
 }
-BELOW = 0.8  # distance between a pair of arms and the pair above [m]
+BELOW = 0.8  # place a pair of arms this far below the pair above [m]
 WRIST = """<r>
   <joint name="wrist_flexion" type="revolute"><parent link="forearm"/><child link="carpus"/>
     <origin xyz="0 0 -0.20"/><axis xyz="1 0 0"/>

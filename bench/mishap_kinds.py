@@ -3,9 +3,9 @@
 
 A mishap declares which identifiers state it truly, and which are true but secondary. Statements of
 `SELF` describe what a node itself does, and are never false. Every other warning or error while the
-mishap lasts counts as false, and so does a statement that names muscles and joints of which none is
-concerned. The words in `says` recognize a true statement by its text, for conditions whose
-identifier this file does not know.
+mishap lasts counts as false, and so does a statement that names only muscles and joints that are
+not concerned. For conditions whose identifier this file does not know, the regular expression
+`says` recognizes the text of a true statement.
 """
 
 from __future__ import annotations
@@ -76,9 +76,9 @@ SOFTWARE = frozenset({
     Step.CHANGE_TARGET,
 })  # fmt: skip
 
-SHOWN_ANGLE = 0.1  # a wrong joint angle can be noticed from this error on [rad]
-SHOWN_LENGTH = 0.02  # a wrong length can be noticed from this error on [m]
-SHOWN_TENSION = 20.0  # a wrong tension can be noticed from this error on [N]
+SHOWN_ANGLE = 0.1  # expect a wrong joint angle to be noticed from this error on [rad]
+SHOWN_LENGTH = 0.02  # expect a wrong length to be noticed from this error on [m]
+SHOWN_TENSION = 20.0  # expect a wrong tension to be noticed from this error on [N]
 
 
 def _at_once(_: Lab) -> bool:
@@ -91,11 +91,12 @@ class Case:
 
     Attributes:
         detail: The random size, muscle or joint of the mishap.
-        mend: What a person does who has understood the mishap.
+        mend: Mends the mishap, as a person does who has understood it.
         subjects: The muscles and joints that are concerned; () if the whole arm is.
-        is_visible: Whether the mishap can be seen in what the nodes receive; asked until it is.
+        is_visible: Returns whether the nodes can notice the mishap in what they receive; called
+            until it returns True.
         lasts: Time after which it ends by itself [s].
-        settled_by: Steps of which each mends the mishap, without `mend`.
+        settled_by: Steps of the nodes' advice each of which mends the mishap, without `mend`.
         found_at: Muscles and joints at which a person finds the fault, besides `subjects`.
     """
 
@@ -118,7 +119,7 @@ class Mishap:
         true: Identifiers that state it truly.
         says: Regular expression; a statement with such a text states the mishap truly.
         allowed: Identifiers that are true but secondary.
-        is_harmless: Whether nothing needs to be stated, because the arm can simply go on.
+        is_harmless: Whether the arm can simply go on. If so, nothing needs to be stated.
         holds: Whether the arm holds a posture when it begins; otherwise it explores.
         patience: Time for which an operator follows the advice [s].
     """
@@ -137,7 +138,7 @@ class Mishap:
 
 
 def on_muscles(change: Callable[[float, MuscleReadings], None]) -> ReadingFault:
-    """Return a fault that changes a copy of the readings of the muscle modules in place."""
+    """Return a fault that applies `change` to a copy of the readings of the muscle modules."""
 
     def fault(now: float, packet: Packet) -> list[Packet]:
         muscles = packet.muscles.copy()
@@ -148,7 +149,7 @@ def on_muscles(change: Callable[[float, MuscleReadings], None]) -> ReadingFault:
 
 
 def on_theta(change: Callable[[float, Array], None]) -> ReadingFault:
-    """Return a fault that changes a copy of the joint angles, (D,), in place."""
+    """Return a fault that applies `change` to a copy of the joint angles, (D,)."""
 
     def fault(now: float, packet: Packet) -> list[Packet]:
         if packet.theta is None:
@@ -161,12 +162,12 @@ def on_theta(change: Callable[[float, Array], None]) -> ReadingFault:
 
 
 def silent(start: float, seconds: float) -> ReadingFault:
-    """Return a fault by which the driver is silent for `seconds` after the time `start` [s]."""
+    """Return a fault in which the driver is silent for `seconds` after the time `start` [s]."""
     return lambda now, packet: [] if now < start + seconds else [packet]
 
 
 def deaf(start: float, seconds: float) -> CommandFault:
-    """Return a fault by which no command arrives for `seconds` after the time `start` [s]."""
+    """Return a fault in which no command arrives for `seconds` after the time `start` [s]."""
     return lambda now, value: None if now < start + seconds else value
 
 
@@ -197,10 +198,9 @@ def _loaded(lab: Lab, rng: Rng) -> int:
 
 
 def _is_demanded(muscle: int) -> Callable[[Lab], bool]:
-    """Return a function that says whether a module pulls otherwise than it should.
+    """Return a function that says whether the module of `muscle` does not pull as demanded.
 
-    The function is that for the module of `muscle`: its tension must deviate from the demanded one
-    by more than SHOWN_TENSION.
+    This is so if the tension deviates from the demanded one by more than SHOWN_TENSION.
     """
 
     def shown(lab: Lab) -> bool:
@@ -238,7 +238,7 @@ def rupture_at_rest(lab: Lab, rng: Rng) -> Case:
 
 
 def _slackening(largest: float, speed: float) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which a tendon becomes longer, up to `largest` [m], by `speed` [m/s]."""
+    """Return a mishap in which a tendon lengthens by about `largest` [m], at about `speed` m/s."""
 
     def begin(lab: Lab, rng: Rng) -> Case:
         _, name = _any(rng, lab.arm.robot.muscles)
@@ -299,7 +299,7 @@ def retied(lab: Lab, rng: Rng) -> Case:
 
 
 def module_fault(kind: str, low: float = 0.0, high: float = 0.0) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which one module has the emulator's fault `kind`.
+    """Return a mishap in which one module has the emulator's fault `kind`.
 
     The size of the fault is drawn between `low` and `high`, in the unit of the fault.
     """
@@ -314,7 +314,7 @@ def module_fault(kind: str, low: float = 0.0, high: float = 0.0) -> Callable[[La
 
 
 def hot_motor(lab: Lab, rng: Rng) -> Case:
-    """A module becomes at least 88 to 100 °C hot, whatever its muscle exerts."""
+    """A module has a temperature of at least 88 to 100 °C, whatever its muscle exerts."""
     _, name = _any(rng, lab.arm.robot.muscles)
     size = rng.uniform(88.0, 100.0)
     lab.arm.set_faults([f'overheat:{name}:{size:.0f}'])
@@ -327,7 +327,7 @@ LENGTH, TENSION = MuscleReadings.length, MuscleReadings.tension
 
 
 def frozen(quantity: Quantity) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which the length or the tension reading of a random muscle freezes.
+    """Return a mishap in which the length or the tension reading of a random muscle freezes.
 
     `quantity` says which of the two. The mishap has an effect once the true value differs clearly
     from the frozen one.
@@ -370,7 +370,7 @@ def changed(
     quantity: Quantity, change: Callable[[float, float], float], low: float, high: float, unit: str,
     is_signed: bool = True,
 ) -> Callable[[Lab, Rng], Case]:  # fmt: skip
-    """Return a mishap by which one reading of a muscle is changed by a random size.
+    """Return a mishap in which one reading of a muscle is changed by a random size.
 
     `quantity` is the quantity that is read. `change` gets the true value and the size,
     which is drawn between `low` and `high`, and is negative at random if `is_signed`.
@@ -397,7 +397,7 @@ def changed(
 
 
 def bias(value: float, size: float) -> float:
-    """Return a value to which `size` is added, at least 0 as the reading of a tension sensor."""
+    """Return `value` plus `size`, but at least 0, like the reading of a tension sensor."""
     return max(value + size, 0.0)
 
 
@@ -521,7 +521,7 @@ def joint_drifts(lab: Lab, rng: Rng) -> Case:
 
 
 def joint_fault(change: Callable[[float], float], what: str) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which a joint sensor reads the function `change` of its true angle.
+    """Return a mishap in which a joint sensor reads the function `change` of its true angle.
 
     `what` describes the mishap in the results.
     """
@@ -707,7 +707,7 @@ def half_rate(lab: Lab, _: Rng) -> Case:
 
 
 def pause(seconds: float) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which the driver is silent for a time [s], and then goes on."""
+    """Return a mishap in which the driver is silent for a time [s], and then goes on."""
 
     def begin(lab: Lab, _: Rng) -> Case:
         lab.wire.reading_faults.append(silent(lab.now, seconds))
@@ -768,7 +768,7 @@ def lost_module(lab: Lab, rng: Rng) -> Case:
 
 
 def mounted(least: float, most: float) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which the base is mounted at an angle to the vertical.
+    """Return a mishap in which the base is mounted at an angle to the vertical.
 
     The angle is drawn between `least` and `most` [rad].
     """
@@ -834,7 +834,7 @@ def pushed(lab: Lab, rng: Rng) -> Case:
 
 
 def more_friction(lab: Lab, _: Rng) -> Case:
-    """Dust doubles the friction of the tendons, or of the joints in the other emulator model."""
+    """Dust doubles the friction of the tendons (`kin`) or of the joints (`foreign`)."""
     lab.arm.set_friction(2.0)
     return Case('× 2', lambda lab: lab.arm.set_friction(1.0), lasts=30.0)
 
@@ -876,7 +876,7 @@ def needless_calibration(lab: Lab, _: Rng) -> Case:
 
 
 def restarts(node: str, settled_by: tuple[Step, ...] = ()) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which a node is killed and started again."""
+    """Return a mishap in which a node is killed and started again."""
 
     def begin(lab: Lab, _: Rng) -> Case:
         lab.restart(node)
@@ -890,7 +890,7 @@ def restarts(node: str, settled_by: tuple[Step, ...] = ()) -> Callable[[Lab, Rng
 
 
 def stalls(*nodes: str) -> Callable[[Lab, Rng], Case]:
-    """Return a mishap by which nodes do not run for some seconds."""
+    """Return a mishap in which nodes do not run for some seconds."""
 
     def begin(lab: Lab, rng: Rng) -> Case:
         seconds = rng.uniform(1.0, 4.0)

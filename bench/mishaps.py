@@ -69,10 +69,10 @@ from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.robot.robot import Robot
 
 LEARNING = 180.0  # let an individual explore and learn for this time before its mishaps [s]
-#: learn for this time with the individual of this seed, whose network serves as the wrong one [s]
+#: learn for this time [s] with the individual of this seed, whose network serves as a wrong one
 OTHER_LEARNING, OTHER_SEED = 90.0, 990
 LOOK = 0.1  # read the statements at this interval [s]
-GOAL = 5.0  # count a true statement as in time within this time after the first effect [s]
+GOAL = 5.0  # count a true statement as timely up to this time after the first effect [s]
 PATIENCE = 30.0  # let a person find an unstated fault this long after its first effect [s]
 LONGEST_WAIT = 75.0  # wait at most this long for the first effect and PATIENCE together [s]
 REACTION = 5.0  # let the operator react this long after a node has first advised a step [s]
@@ -144,7 +144,7 @@ class Course:
         self.started_at = lab.now  # zero of the times in the result [s]
         self.mended_at: float | None = None
         self.is_found_by_advice = False
-        self.false: dict[str, dict[str, Any]] = {}  # the first of each false statement
+        self.false: dict[str, dict[str, Any]] = {}  # first occurrence of each false statement
         #: false statements that came only after the fault was mended
         self.later: dict[str, str] = {}
         self.stated: dict[str, Any] = {}  # all different statements, with time and judgement
@@ -323,7 +323,7 @@ class Course:
             self.taken.append(step.identifier + (f' ({refused[:90]})' if refused else ''))
 
     def _wait_until_cool(self) -> None:
-        """Wait while a statement advises it; the patience does not count this."""
+        """Wait for motors to cool while a statement advises it; `_follow_advice` adds this time."""
         while self._cooled_for < COOLING:
             if not any(Step.WAIT_UNTIL_COOL in each.steps for each in self.present):
                 break
@@ -342,7 +342,7 @@ class Course:
         lab.publish()
 
     def _mend_named(self, by: list[Statement]) -> str:
-        """Mend what a true statement names; return what the person finds otherwise."""
+        """Mend what a true statement names; if none is true, return what the person finds."""
         if self.mended_at is not None:
             return ''
         for each in by:
@@ -357,11 +357,11 @@ class Course:
 def judge(statement: Statement, mishap: Mishap, case: Case) -> str:
     """Judge whether a statement is 'true', 'allowed' (true but secondary) or 'false'.
 
-    A true statement names a muscle or joint that is concerned, if the mishap concerns some.
+    If the mishap concerns certain muscles or joints, a true statement names one of them.
     """
     concerned, subjects = frozenset(case.subjects), statement.subjects
     names_it = not concerned or bool(subjects & concerned)
-    # Count a statement as being about something else if it only names other muscles or joints.
+    # A statement that only names other muscles or joints is about something else.
     is_about = names_it or not subjects
     is_said = bool(mishap.says) and re.search(mishap.says, statement.text, re.I) is not None
     is_true = statement.identifier in mishap.true or is_said
@@ -596,7 +596,7 @@ WHEN = 'before', 'after'
 
 
 def totals(of: Sequence[dict[str, Any]]) -> tuple[float, int, float]:
-    """Return the shares that were true in time and ended well, and the number of false statements.
+    """Return the shares of timely true statements and of good ends, and the false statements.
 
     Returns:
         Share of true statements within GOAL of the cases that need one [%], number of false

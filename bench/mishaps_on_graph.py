@@ -28,9 +28,9 @@ from bench.processes import end_processes
 
 WATCHED = 15.0  # watch the status line for this time while the mishap lasts [s]
 ERROR_TIME = 10.0  # measure the true error over this time [s]
-#: statements that blame the computer; count them as false unless other programs use it up
+#: count statements that blame the computer as false, unless other programs keep it busy
 OVERLOADED = 'overloaded|stop other programs'
-BUSY = 8  # number of programs that keep the computer busy
+BUSY = 8  # keep the computer busy with this many programs
 
 
 class GraphMishap(NamedTuple):
@@ -42,7 +42,7 @@ class GraphMishap(NamedTuple):
             of `Scene` has to end it.
         says: Regular expression of status lines that state the mishap truly.
         denies: Regular expression of false status lines, or ''.
-        moment: What the arm does before, 'holding' or 'exploring'.
+        moment: State of the arm before the mishap, 'holding' or 'exploring'.
     """
 
     name: str
@@ -53,7 +53,7 @@ class GraphMishap(NamedTuple):
 
 
 def killed(node: str) -> Callable[[Scene], None]:
-    """Return a mishap by which a node is killed."""
+    """Return a mishap in which a node is killed."""
 
     def begin(scene: Scene) -> None:
         scene.attack.watches_processes = False
@@ -63,12 +63,12 @@ def killed(node: str) -> Callable[[Scene], None]:
 
 
 def suspended(node: str) -> Callable[[Scene], None]:
-    """Return a mishap by which a node is suspended until somebody resumes or restarts it."""
+    """Return a mishap in which a node is suspended until somebody resumes or restarts it."""
     return lambda scene: scene.pause(node)
 
 
 def second(node: str) -> Callable[[Scene], Callable[[], object]]:
-    """Return a mishap by which a node runs a second time, under another name."""
+    """Return a mishap in which a node runs a second time, under another name."""
 
     def begin(scene: Scene) -> Callable[[], object]:
         scene.attack.start_second(node, f'other_{node}')
@@ -95,7 +95,7 @@ def zeros(scene: Scene) -> Callable[[], object]:
 
 
 def busy(scene: Scene, *rest: Callable[[Scene], Any]) -> Callable[[], object]:
-    """Let other programs use up the computer, and then let the mishaps `rest` happen."""
+    """Let other programs keep the computer busy, and then let the mishaps `rest` happen."""
     code = 'while True: pass'
     programs = [subprocess.Popen([sys.executable, '-c', code]) for _ in range(BUSY)]
     scene.attack.spin(5.0)
@@ -142,9 +142,9 @@ GRAPH_MISHAPS: tuple[GraphMishap, ...] = (
 
 
 def play(scene: Scene, mishap: GraphMishap, seed: int) -> dict[str, Any] | None:
-    """Play a mishap, and recover; return its result, or None if the arm is not well.
+    """Play a mishap, and recover; return its result, or None if the arm was not ready for it.
 
-    The names are those of the results of `bench mishaps`.
+    The result has the same keys as those of `bench mishaps`.
     """
     attack = scene.attack
     scene.what = mishap.name
@@ -223,7 +223,7 @@ def run(
     with Attack(folder, initial, seed) as attack:
         scene = Scene(attack)
         attack.wait(lambda: set(attack.levels) == set(NODES), 'every node goes on', 'all nodes')
-        attack.spin(30.0)  # the learner learns from the first postures
+        attack.spin(30.0)  # let the learner learn from the first postures
         for mishap in GRAPH_MISHAPS:
             if mishap.name in kinds:
                 result = play(scene, mishap, seed)

@@ -21,7 +21,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
-PERIOD = 0.01  # interval between two readings [s]
+PERIOD = 0.01  # record a reading at this interval [s]
 TENSIONS = 40.0, 120.0  # draw the tensions at the postures from this range [N]
 
 
@@ -36,7 +36,7 @@ def record(
         seed: Seed of the emulated individual.
         seconds: Duration of the recording [s].
         motion: Duration of each motion [s].
-        rest: Duration of the rest after it [s].
+        rest: Duration of the rest after each motion [s].
         order: Seed of the postures.
     """
     arm, rng = make_arm(robot, seed, reality), np.random.default_rng([order, 7])
@@ -78,7 +78,7 @@ def measure(robot: Robot, mae: Mae, reality: str, seed: int, seconds: float) -> 
 
 
 def main(argv: list[str]) -> int:
-    """Record, learn and test each individual, and print its errors."""
+    """Record each individual, learn from the recordings, and print the errors."""
     parser = Parser('moving', 'Learns emulated recordings with and without rests.')
     parser.add_robot(default='arm26')
     parser.add_reality()

@@ -68,7 +68,7 @@ EXPERIMENTS_HEAD = (
 )  # fmt: skip
 MOTIONS, DURATION, TRIES = 4, 2.0, 400
 MOMENTS = 25  # evaluate the torque of a motion at this many instants
-LEAST_TORQUE = 1e-6  # treat the muscles as too weak for a motion if more torque is missing [N·m]
+LEAST_TORQUE = 1e-6  # treat a motion as impossible if more torque than this is missing [N·m]
 HOLDING = 5.0  # let the arm hold each posture for this time [s]
 ARM_POSTURES = 300
 TRAINED = 'trained'  # name of the part of a run that contains the first networks

@@ -34,7 +34,7 @@ ARM = 'musashi_left_arm'
 LARGE = 'musashi_upper_body'
 RATES, SIZES = (100.0, 200.0, 500.0), ('arm26', ARM, LARGE)
 EXPLORING = 60.0  # explore for this time, to fill the sample store before an update is timed [s]
-#: rate of muscle_states for start-up, memory, late messages and profiles [Hz]
+#: publish muscle_states at this rate [Hz] to measure start-up, memory, late messages and profiles
 FLAME_RATE = 200.0
 STARTING = 60.0  # wait at most this long for the first command [s]
 SETTLING = 15.0  # let the nodes run for this time before memory or a profile is measured [s]
@@ -292,7 +292,7 @@ def main(argv: list[str]) -> None:
         help='duration of the test for late messages [s]',
     )
     parser.add_argument('--flames', action='store_true', help='draw flame graphs; requires py-spy')
-    parser.add_out('DIR', 'performance.md and flames/')
+    parser.add_out('DIR', 'folder for performance.md and flames/')
     args = parser.parse_args(argv)
     if args.flames and shutil.which('py-spy') is None:
         parser.error('--flames requires py-spy: pip install py-spy')

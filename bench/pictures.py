@@ -51,7 +51,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / 'test' / 'view'))
 from browser import Browser  # noqa: E402 - the tests' own browser
 
-SIZE = 1280, 720  # size of the browser's window in which the page is opened [pixels]
+SIZE = 1280, 720  # open the page in a browser window of this size [pixels]
 #: scale pictures of the page by this factor, and reduce them to this many colours
 SCALE, COLOURS = 0.75, 128
 SCALED = round(SCALE * SIZE[0]), round(SCALE * SIZE[1])
@@ -59,12 +59,12 @@ LEARNING = 60.0  # record the running system for this time before the rupture [s
 MOVING_ON = 25.0  # record the system for this time after the isolation [s]
 EVERY = 1.0  # take a picture at this interval while the arm learns [s]
 EVERY_LATER = 0.4  # take a picture at this interval around the rupture [s]
-FRAME = 110  # duration of a picture in the film [ms]
-LAST = 1500  # duration of the last picture in the film [ms]
+FRAME = 110  # show each picture of the film this long [ms]
+LAST = 1500  # show the last picture of the film this long [ms]
 SETTLE = 3.0  # wait this long after the first status, until the whole page is drawn [s]
 PATIENCE = 600.0  # wait at most this long for the start and for each event of the film [s]
 KINDS = ('film', 'simulation')
-LOAD = -50.0  # vertical force on the hand of the simulated arm [N], as in the paper's simulation
+LOAD = -50.0  # load the hand of the simulated arm with this vertical force [N], as the paper does
 
 
 def record(options: Namespace, folder: Path) -> tuple[list[Image.Image], dict[str, int]]:

@@ -19,15 +19,15 @@ from scipy.optimize import minimize
 from musculoskeletal_ae.arrays import Array
 
 PARTS = 5  # divide the samples into this many parts for cross-validation
-DEGREES = 1, 2, 3  # degrees among which cross-validation chooses the polynomial
+DEGREES = 1, 2, 3  # let cross-validation choose a polynomial of one of these degrees
 #: try these penalties of the squared coefficients, relative to N
 PENALTIES = 1e-8, 1e-6, 1e-4, 1e-3, 1e-2
-MOST_TERMS = 600  # fit no polynomial with more terms
-#: kernel widths among which cross-validation chooses, in units of √K
+MOST_TERMS = 600  # fit no polynomial with more terms than this
+#: let cross-validation choose one of these kernel widths, in units of √K
 WIDTHS = 0.5, 1.0, 2.0, 4.0, 8.0, 16.0
-#: penalties of the kernel ridge regression among which cross-validation chooses
+#: let cross-validation choose one of these penalties of the kernel ridge regression
 RIDGES = 1e-5, 1e-4, 1e-3, 1e-2, 0.1, 1.0
-JITTER = 1e-8  # variance that is added to the diagonal, to keep covariances positive definite
+JITTER = 1e-8  # add this variance to the diagonal, to keep covariances positive definite
 
 Predict = Callable[[Array], Array]
 

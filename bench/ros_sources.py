@@ -27,12 +27,12 @@ from musculoskeletal_ae.options import Parser
 
 ROOT = Path(__file__).resolve().parents[1]
 REQUIREMENTS = ROOT / '.ci' / 'requirements-ros.txt', ROOT / '.ci' / 'requirements-ros-build.txt'
-#: paths of the machine that built the wheels; the CMake files in the wheels contain them
+#: remove these paths of the machine that built the wheels from the CMake files in the wheels
 BUILD_PATHS = re.compile(r'/(?:opt/python|usr/lib64)/[^";]*')
 
 
 class Release(NamedTuple):
-    """Where a package is released, and the version that is built by default."""
+    """The release repository of a package, and the version that is built by default."""
 
     repository: str
     version: str
@@ -63,7 +63,7 @@ class Builder:
         """Run a command, after printing `title`; return its standard output.
 
         Raises:
-            MusculoskeletalError: If it fails. The end of its output has then been printed.
+            MusculoskeletalError: If the command fails. The end of its output has then been printed.
         """
         print(f'   {title}', flush=True)
         ended = subprocess.run(

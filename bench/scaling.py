@@ -190,7 +190,7 @@ def main(argv: list[str]) -> None:
     text = f'bodies to measure, of {", ".join((SMALLEST, *BODIES))}'
     parser.add_argument('--bodies', type=names, default=[SMALLEST, *BODIES], help=text)
     parser.add_minutes('duration of the exploration', 10.0)
-    parser.add_out('DIR', 'networks, rows and plot')
+    parser.add_out('DIR', 'folder of networks, rows and plot')
     args = parser.parse_args(argv)
     if unknown := set(args.bodies) - {SMALLEST, *BODIES}:
         parser.error(

@@ -50,7 +50,8 @@ TOLERATED = 1.2
 #: check the memory from this robot time on [s]; before, imports, the sample store and the reservoir
 #: of messages fill it
 FILLED = 7200.0
-#: report updates in the last quarter whose median time exceeds that of the first by this factor
+#: report slow updates if their median time in the last quarter exceeds this multiple of that in the
+#: first quarter
 SLOWER = 1.5
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Collects what the nodes state about the arm, as one list of values for benches.
+"""Collects the statements of all nodes about the arm in one list, for benches.
 
 The statements are the conditions of the cores, with the muscles and joints that each concerns.
 """
@@ -25,7 +25,7 @@ class Statement(NamedTuple):
         identifier: Identifier of the condition that is stated.
         level: 'ok', 'warn' or 'error'.
         text: The statement as users read it.
-        steps: What users are advised to do.
+        steps: The steps that users are advised to take.
         subjects: The muscles and joints that the statement names.
     """
 
@@ -40,14 +40,14 @@ class Statement(NamedTuple):
 def statements(
     estimator: Estimator, controller: Controller, learner: Learner, now: float
 ) -> list[Statement]:
-    """Return what the nodes state at the time `now` of the steady clock [s]."""
+    """Return the statements of the nodes at the time `now` of the steady clock [s]."""
     cores: dict[str, Any] = {
         'estimator': estimator,
         'controller': controller,
         'learner': learner,
     }
     robot = estimator.robot
-    body = {*robot.muscles, *robot.joints}  # subjects may also be topics and nodes
+    body = {*robot.muscles, *robot.joints}  # conditions also name topics and nodes
     return [
         Statement(
             owner,

@@ -49,8 +49,8 @@ from musculoskeletal_ae.simulation.simulation import Simulation
 #: time a batch of this many arms; end a round of calls after about this time [s]
 MANY, LONGEST = 4096, 0.05
 SIMULATED = 0.01  # simulate this much time in each timed call [s]
-ROLLED = 256  # number of arms in `mujoco.rollout`, whose time per arm does not depend on it
-#: rate [Hz] and number of the messages of which each is timed in the cores of the nodes
+ROLLED = 256  # simulate this many arms in `mujoco.rollout`; the time per arm does not depend on it
+#: send messages at this rate [Hz], and time the cores of the nodes on this many
 RATE, MESSAGES = 500.0, 2000
 
 

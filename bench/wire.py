@@ -294,7 +294,7 @@ def delays(
 
     Args:
         state_stamps: Times of the messages of muscle_states [ns].
-        command_stamps: Times of those of muscle_length_command [ns].
+        command_stamps: Times of the messages of muscle_length_command [ns].
         rate: Rate of the emulator [Hz].
         seconds: Time in which the messages were sent [s].
 
@@ -341,7 +341,7 @@ def systems(
 
 
 def main(argv: list[str]) -> None:
-    """Measure every combination and print a table."""
+    """Measure every combination of robot, rate and set of nodes, and print a table."""
     parser = Parser('wire', (__doc__ or '').partition('\n')[0])
     robots = 'arm26,musashi_left_arm'
     parser.add_argument('--robots', type=names, default=robots, help='names or directories')

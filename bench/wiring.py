@@ -7,7 +7,7 @@ An individual that has learned for two minutes explores. Its driver then restart
 second with two muscles exchanged, in readings and commands, or with the length and the command of
 one muscle reversed. The bench calls the services that the estimator advises, until it names a wrong
 wiring, or reports nothing more. For comparison, a healthy driver restarts without length offsets.
-It prints one line for each case:
+The bench prints one line for each case:
 
 - `named`: the muscles were named, and no others; `undetermined`: others were named, too;
   `refused`: offsets were refused without naming the muscles; `other`: another fault was reported;
@@ -48,7 +48,7 @@ MINUTES = 2.0  # let an individual learn from an exploration of this duration fi
 BEFORE = 10.0  # let the arm explore for this time before the driver restarts [s]
 RESTART = 0.5  # let the driver publish no messages for this time while it restarts [s]
 LONGEST = 180.0  # follow the advice of the estimator for at most this time [s]
-NOTHING = 60.0  # end the advice at an instant without a report, but not before this time [s]
+NOTHING = 60.0  # stop when nothing is reported, but not before this time [s]
 AFTER = 10.0  # let the arm explore for this time after the advice was followed [s]
 REFUSING = 15.0  # let a calibration go on for at most this time after it has enough data [s]
 OFFSET = 0.1  # let a driver that loses its offsets restart with offsets of up to this length [m]
@@ -155,9 +155,9 @@ def _named(estimator: Estimator, text: str) -> set[int]:
 
 
 class Case(NamedTuple):
-    """One restart of a driver, with what has changed in it."""
+    """One restart of a driver, and what differs after it."""
 
-    what: str  # what changes in the driver: 'exchange', 'sign' or 'healthy'
+    what: str  # change in the driver: 'exchange', 'sign', or 'healthy' for none
     wiring: Wiring
     has_sensors: bool
 

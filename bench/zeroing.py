@@ -47,7 +47,7 @@ HELD_OUT = 300.0  # measure errors on a held-out motion of this duration [s]
 AFTER = 30.0  # let the arm explore for this time after a calibration, and count false alarms [s]
 LONGEST = 120.0  # give a calibration up after this time [s]
 SETTLING = 20.0  # let the arm hang for this time after power-on, so that it is still [s]
-STATED = 0.0  # standard deviation of the error of a stated posture [rad], the same for each joint
+STATED = 0.0  # draw errors of a stated posture with this standard deviation [rad]
 #: for calibrations by joint sensors, without any, and in a stated posture: report one that takes
 #: longer than the first value [s], or that multiplies the error by more than the second
 GOALS = {'sensors': (30.0, 1.2), 'none': (60.0, 1.5), 'posture': (30.0, 1.5)}
@@ -79,7 +79,7 @@ class Loop:
             control.estimated(estimate.state.theta, now)
             if estimate.detected:
                 self.alarms += 1
-                with suppress(MusculoskeletalError):  # refused while the suspect does not fit
+                with suppress(MusculoskeletalError):  # refused while the suspect is implausible
                     estimator.reset()
             if (command := control.step(now)) is not None:
                 self.arm.command_length(command.value + zeros.offset)
@@ -144,7 +144,7 @@ def zeroed(robot: Robot, mae: Mae, seed: int, how: str, held_out: Any) -> dict[s
 
 
 def measure(robot: Robot, folder: Path, seed: int) -> dict[str, dict[str, Any]]:
-    """Measure how well one individual is zeroed, with and without joint sensors."""
+    """Calibrate the lengths of one individual in every way; return the results by the way."""
     learned = learned_arm(robot, seed, folder, MINUTES)
     held_out = record(EmulatedArm(robot, seed), learned.driver, HELD_OUT_STREAM, HELD_OUT)
     return {how: zeroed(robot, learned.mae, seed, how, held_out) for how in GOALS}

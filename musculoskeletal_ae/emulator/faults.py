@@ -19,14 +19,14 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, MuscleReadings
 
-SPEED_LIMIT = 0.25  # fastest speed of a muscle module's motor [m/s]; chosen by hand
+SPEED_LIMIT = 0.25  # wind no muscle module faster than this [m/s]; chosen by hand
 TURN = 6.2832  # reject a turn of the base by more than this [rad], one revolution
 SPIKE_SHARE = 0.05  # give one muscle a spike in this share of the readings
 BURST_TIME, BURST_PAUSE = 0.3, 3.0  # let bursts and the pauses before them last this on average [s]
 
 
 class FaultKind(NamedTuple):
-    """What a kind of fault does, and which sizes, muscles and quantities its line may state."""
+    """A kind of fault: its effect, and the sizes, muscles and quantities that a line may state."""
 
     meaning: str
     size: float = 0.0  # size of the fault if its line states none, in the unit `unit`
@@ -73,7 +73,7 @@ LEGAL = 'KIND[:QUANTITY][:MUSCLE or JOINT][:SIZE]; kinds: ' + ', '.join(KINDS)
 
 
 class ArmReadings(NamedTuple):
-    """What all sensors of an arm read at one moment."""
+    """Readings of all sensors of an arm at one moment."""
 
     theta: Array  # joint angles [rad], (D,)
     muscles: MuscleReadings
@@ -127,7 +127,7 @@ def read_fault(line: str, robot: Robot) -> EmulatedFault:
     if quantities and kind.size:
         size, largest, unit = (RATES if name == 'drift' else SIZES)[quantities[0]]
         unit, smallest = f'{unit} of {quantities[0]}', -largest
-    # The name of a muscle may be a number.
+    # The last word is the size, or the name of a muscle, which may be a number.
     if words and largest and ':'.join(words) not in robot.muscles:
         try:
             size = float(words[-1])
@@ -161,7 +161,7 @@ class Faults:
         self._reordered: ArmReadings | None = None  # readings that are sent after the next ones
         self._queue: list[tuple[float, ArmReadings]] = []
         self._time = 0.0  # time since the start [s]
-        self._begins: dict[tuple[object, ...], float] = {}  # begin of each drift [s], by its key
+        self._begins: dict[tuple[object, ...], float] = {}  # start of each drift [s], by its key
         #: time of the next change of each burst [s], and whether the burst is present, by its key
         self._bursts: dict[tuple[object, ...], tuple[float, bool]] = {}
         # Effects on the mechanics, each (M,): relative loss of motor speed, excess length of the
@@ -192,7 +192,7 @@ class Faults:
         self._bursts = {key: self._bursts.get(key, (self._time, True)) for key in bursts}
         if not self._of('reorder'):
             self._reordered = None
-        if self._delay() != delay:  # queued readings would arrive between newer ones
+        if self._delay() != delay:  # otherwise, queued readings would arrive out of order
             self._queue.clear()
         self.stuck[:] = self.slack[:] = self.zero[:] = 0.0
         self.hot[:], self.ceiling[:] = -np.inf, np.inf
@@ -239,7 +239,7 @@ class Faults:
         """Apply all sensor faults to readings, and return the result."""
         theta, muscles = readings.theta.copy(), readings.muscles.copy()
         muscles.tension = np.minimum(muscles.tension, self.ceiling)
-        # These arrays are views, which are changed in place.
+        # Most of these arrays are views of `muscles`, so the faults change its readings in place.
         values = {each.name: each.of(muscles) for each in QUANTITIES} | {'theta': theta}
         kinds = 'exchange', 'bias', 'drift', 'burst', 'spike', 'dead_sensor', 'nan_sensor', 'freeze'
         for fault in self._of(*kinds):
@@ -252,7 +252,7 @@ class Faults:
                 if fault.kind == 'bias':
                     value[which] += size
                 elif fault.kind == 'exchange':
-                    units = self._robot.units  # the sensors publish positions
+                    units = self._robot.units  # positions are what the sensors publish
                     value[which] = units.to_theta(units.to_position(value)[which[::-1]], which)
                 elif fault.kind == 'drift':
                     value[which] += size * (self._time - self._begins[fault.key])

@@ -32,7 +32,7 @@ from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
 STEP = 0.001  # duration of a simulation step [s]
-#: count an arm as diverged if a joint is faster than this [rad/s] or [m/s]; it then stands still
+#: count an arm as diverged, and stop simulating it, if a joint is faster than this [rad/s or m/s]
 FASTEST = 1000.0
 
 #: modes of a module: safe state, following a target length, following a target tension
@@ -41,12 +41,12 @@ SAFE, FOLLOW_LENGTH, FOLLOW_TENSION = 0, 1, 2
 # The following values are chosen by hand, because those of Musashi are not public.
 #: let a module in the safe state change its tension towards T_bias at this rate [N/s]
 RELEASE_RATE = 100.0
-MOTOR_GAIN = 0.004  # speed at which a module winds in for each newton of missing tension [m/s/N]
+MOTOR_GAIN = 0.004  # wind in at this speed for each newton of missing tension [m/s/N]
 #: Wind in a tendon without tension at this speed [m/s], and more slowly as the tension rises, down
 #: to 0 at half of T_bias. MOTOR_GAIN alone would be too slow for weak muscles: 2 mm/s with a T_bias
 #: of 0.5 N.
 TAKE_UP_SPEED = 0.03
-#: time constant with which a position-controlled module follows its target length [s]
+#: let a position-controlled module follow its target length with this time constant [s]
 POSITION_LAG = 0.02
 # Heat. Each motor is sized for its muscle: constant T_limit heats the average module to 85 °C at
 # the housing and 105 °C in the winding.
@@ -72,8 +72,8 @@ CURRENT_NOISE, CURRENT_RESOLUTION = 1.0, 2.0**-3
 #: draw errors of a motor current as a measure of tension: standard deviation of the scale's
 #: logarithm, standard deviation of the offset [N], and mean drive friction as a share of T_limit
 CURRENT_SCALE, CURRENT_ZERO, DRIVE_FRICTION = 0.15, 5.0, 0.1
-ACCELERATION_NOISE = 0.05  # standard deviation of the noise of each axis of an accelerometer [m/s²]
-#: standard deviations of the noise of a marker's position [m] and orientation [rad]
+ACCELERATION_NOISE = 0.05  # give accelerometer axes noise of this standard deviation [m/s²]
+#: give a marker's position [m] and orientation [rad] noise of these standard deviations
 MARKER_NOISE, MARKER_TURN_NOISE = 0.002, 0.01
 
 
@@ -363,7 +363,7 @@ class Arm(ABC):
 
     @property
     def has_diverged(self) -> bool:
-        """Whether a joint is so fast (FASTEST) that it cannot be simulated; `reset` ends this."""
+        """Whether a joint has become too fast to simulate (FASTEST); true until `reset`."""
         # The comparison is False if the speed is NaN.
         return not np.abs(self._rates[self._order]).max() <= FASTEST
 
@@ -396,7 +396,7 @@ class Arm(ABC):
 
     @property
     def safe(self) -> bool:
-        """Whether the modules ignore the last command, because it is too old (safe state)."""
+        """Whether the modules are in the safe state, because the last command is too old."""
         return self._kind == SAFE
 
     def command_length(self, length: Array) -> None:
@@ -435,7 +435,7 @@ class Arm(ABC):
     def set_friction(self, factor: float) -> None:
         """Set the friction of the tendons (`kin`) or of the joints (`foreign`).
 
-        `factor` is the multiple of the individual's own friction, and above 0.
+        `factor`, which is above 0, multiplies the individual's own friction.
         """
         friction = self._varying_friction
         friction *= factor / self._friction_factor
@@ -516,7 +516,7 @@ class Arm(ABC):
         """Read all sensors once, with noise, bias, resolution and faults."""
         theta, muscles = self._raw_readings()
         ruptured, rng = self._muscle.ruptured > 0.0, self._rng
-        # Let the sensor of a ruptured tendon read 0, and no tension sensor less than 0.
+        # The tension sensor of a ruptured muscle reads 0; no tension sensor reads less than 0.
         finest = TENSION_NOISE_SHARE * self.robot.description.tension.bias
         fineness = np.minimum(1.0, finest / TENSION_NOISE)
         noise, resolution = fineness * TENSION_NOISE, fineness * TENSION_RESOLUTION

@@ -47,12 +47,12 @@ def make_arm(
         return EmulatedArm(robot, seed, individual)
     file = None
     if reality != FOREIGN:
-        with suppress(RuntimeError, OSError):  # unknown home directory, name too long
+        with suppress(RuntimeError, OSError):  # home directory unknown, or name too long
             file = path if (path := Path(reality).expanduser()).is_file() else None
         if file is None:
             legal = f'{KIN}, {FOREIGN} or the model.xml that import_robot writes'
             raise MusculoskeletalError(f'reality {reality[:80]!r} is unknown; legal: {legal}')
-    # Imported here because `kin` does not need MuJoCo.
+    # Import MuJoCo only here, because `kin` does not need it.
     from musculoskeletal_ae.emulator.foreign.arm import ForeignArm
     from musculoskeletal_ae.emulator.foreign.effects import Effects
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which sensors an emulated arm has besides those of its muscle modules.
+"""Sensors of an emulated arm in addition to those of its muscle modules.
 
 A line describes a sensor: 'joints' (joint angles), 'marker[:RATE]' (pose of a marker at the hand,
 as a camera sees it) or 'imu:LINK' (an accelerometer on a link).
@@ -18,7 +18,7 @@ LEGAL = f'joints, marker[:RATE] (above 0 to {HIGHEST_RATE:g} Hz) and imu:LINK, e
 
 
 class Sensors(NamedTuple):
-    """The sensors that an emulated arm has besides those of its muscle modules."""
+    """The sensors that an emulated arm has in addition to those of its muscle modules."""
 
     joints: bool = False  # whether there are joint sensors
     marker_rate: float = 0.0  # rate of the marker's pose [Hz]; 0: there is no marker

@@ -77,9 +77,9 @@ class PolynomialFilter:
     name = 'polynomial mapping, EKF'
     DEGREE = 3
     MODEL_SAMPLES = 20_000
-    #: weight of the previous coefficients when new ones are fitted, as a number of samples
+    #: in a fit of new coefficients, let the previous ones weigh as much as this many samples
     PRIOR_ROWS = 20.0
-    #: factor that scales tensions [1/N], so that a_m is about as large as c_mk
+    #: scale tensions by this factor [1/N], so that a_m is about as large as c_mk
     TENSION_SCALE = 1.0 / 200.0
     #: standard deviation of a joint's random walk [rad/√s]; with 0.2 instead, the error differs by
     #: about 1 %

@@ -46,12 +46,12 @@ from musculoskeletal_ae.experiments.study import (
 )
 from musculoskeletal_ae.robot.robot import Robot
 
-#: angles of the shoulder over which muscle lengths are compared [rad], as in the paper's figure
+#: compare muscle lengths at these angles of the shoulder [rad], as in the paper's figure
 SWEEP = np.radians(np.linspace(-120.0, 30.0, 151))
-POINTS = 101  # number of points of a curve of length over tension
-COLUMNS = 5  # number of panels in a row of a plot
+POINTS = 101  # compute a curve of length over tension at this many points
+COLUMNS = 5  # put this many panels in a row of a plot
 WORN = 0.5  # multiply the stiffening rate of the worn series elastic element by this
-WORN_FRICTION = 0.4  # capstan exponent of the tendon with high friction (mean of others: 0.1)
+WORN_FRICTION = 0.4  # give the tendon with high friction this capstan exponent (others: 0.1)
 SMALL = 1e-9  # divide by at least this, to avoid a division by zero [m]
 
 

@@ -16,24 +16,24 @@ from musculoskeletal_ae.motion.explored_postures import TRIES, holdable_postures
 from musculoskeletal_ae.robot.robot import Robot
 
 CONTACT_STREAM = 7000
-#: numbers of postures in which the resting arm is pushed twice, of collisions, and of tests of
-#: method `float`
+#: push the resting arm twice in this many postures, make this many collisions, and test method
+#: `float` this many times
 POSTURES, COLLISIONS, FLOATS = 15, 20, 4
-#: try each collision at most this often; a try fails if the arm hardly moves, or if a contact is
-#: detected before the push
+#: try each collision at most this many times; a try fails if the arm hardly moves, or if a contact
+#: is detected before the push
 TRIES_PER_COLLISION = 20
-#: explore without contact for this time, shared by the individuals, and count detected contacts as
-#: false [s]
+#: let healthy arms explore without contact for this time [s], shared by the individuals; count
+#: every detected contact as false
 HEALTHY = 3600.0
-LEAST, MOST = 10.0, 50.0  # range of the forces with which the hand is pushed [N]
-LIGHT, FIRM = 15.0, 20.0  # range of the forces that guide the hand in method `float` [N]
-MOVE = 4.0  # duration of the motion to a posture before a push [s]
-PUSH = 1.5  # duration of a push against the resting arm [s]
+LEAST, MOST = 10.0, 50.0  # push the hand with forces in this range [N]
+LIGHT, FIRM = 15.0, 20.0  # guide the hand in method `float` with forces in this range [N]
+MOVE = 4.0  # move to a posture in this time before a push [s]
+PUSH = 1.5  # push the resting arm for this time [s]
 EVALUATED = 0.5  # average estimates over this time at the end of a push [s]
-APART = 3.0  # longest wait of the exploring arm before a collision [s]
+APART = 3.0  # let the arm explore for at most this time before a collision [s]
 WARM_UP = 5.0  # explore for this time before contacts of the healthy arm are counted [s]
-FLOATING = 30.0  # time for which the drift of the untouched arm is measured in method `float` [s]
-MOVED = 1.0  # duration of a push that collides with the moving arm, or that guides the hand [s]
+FLOATING = 30.0  # measure the drift of the untouched arm in method `float` over this time [s]
+MOVED = 1.0  # push the moving arm, or guide the hand, for this time [s]
 SOON = 0.1  # report the share of collisions that are detected within this time [s]
 INSIDE = 0.1  # keep random postures away from the joint limits by this fraction of the joint ranges
 
@@ -174,7 +174,7 @@ def _collisions(loop: ContactLoop, rng: np.random.Generator, count: int) -> Arra
         loop.push(force)
         detected = [each.is_contact for each in loop.contacts_during(MOVED, exploring=True)]
         loop.push(np.zeros(3))
-        # The first message was read before the push.
+        # The message with index 0 was read before the push, so an index is the delay in messages.
         delay = detected.index(True) * SAMPLE_TIME if any(detected) else MOVED
         collisions.append((float(np.linalg.norm(force)), delay))
     return np.array(collisions).reshape(-1, 2).T

@@ -54,7 +54,7 @@ METHODS = {
     f'second_{PAPER_PRESET}': '#99D8C7',
     f'proposed_{PAPER_PRESET}': '#CC79A7',
 }
-APPROACHES = 5  # number of targets θ_eval, and of starts from which each of them is approached
+APPROACHES = 5  # approach this many targets θ_eval, each of them from this many starts
 
 
 class Durations(NamedTuple):
@@ -111,7 +111,7 @@ def protocol(
                 preset = preset or 'default'
                 loop = ClosedLoop(arm, networks['default'])
                 loop.approach(start, durations.start)
-                if not loop.core.supervisor.is_running:  # start from where the controller stopped
+                if not loop.core.supervisor.is_running:  # stopped on the way: start from here
                     loop = ClosedLoop(arm, networks['default'])
                 loop.use(networks[preset])
                 settings = Settings(
@@ -140,7 +140,7 @@ def _bound(arm: Arm) -> float:
 def measure(study: Study, seed: int) -> Measured:
     """Measure the errors and tensions of every control method on one individual."""
     networks = {'default': study.network(seed), PAPER_PRESET: study.network(seed, PAPER_PRESET)}
-    # In a shortened run, the arm has not yet reached the start when an approach begins.
+    # A shortened run has too little time to reach the start, so an approach begins before that.
     count, durations = study.number(APPROACHES), Durations(*map(study.seconds, DURATIONS))
     ended = protocol(study.arm(seed), networks, seed, count, durations)
     errors = {name: np.linalg.norm(offset, axis=-1) for name, offset in ended.offset.items()}
@@ -175,15 +175,14 @@ def _causes(
 ) -> dict[str, float]:
     """Return measures that show why `proposed` needs more than the least tension.
 
-    `proposed` first plans the tensions that hold each target. It then moves the same body without
-    tendon friction to the target. The arm with friction needs still more tension, because of the
-    friction.
+    `proposed` first plans the tensions that hold each target. It then moves the same body, but
+    without tendon friction, to the target. Friction is why the arm itself needs still more tension.
 
     Returns:
-        planned_to_bound, the mean ratio of the planned ‖T‖ to the least ‖T‖ with which the true
-        body holds the target. It shows the error of the learned body. frictionless_to_bound, the
-        same ratio for ‖T‖ after the motion. It also includes that tensions are commanded as
-        lengths. frictionless_rad, the mean distance [rad] of the frictionless arm from the target.
+        Three means. planned_to_bound: ratio of the planned ‖T‖ to the least ‖T‖ with which the true
+        body holds the target, which shows the error of the learned body. frictionless_to_bound: the
+        same ratio for ‖T‖ after the motion, which also shows the effect of commanding tensions as
+        lengths. frictionless_rad: distance [rad] of the frictionless arm from the target.
     """
     robot, rows = frictionless.robot, []
     for theta in ended.target:

@@ -21,15 +21,15 @@ from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
 
-PAYLOAD = 3.6  # mass of the dumbbell in the paper (§IV-B) [kg]
+PAYLOAD = 3.6  # let the arm grasp this mass, that of the paper's dumbbell (§IV-B) [kg]
 GRASPING = 60.0  # grasp or release the payload at this interval [s]
 #: a muscle carries tension if T exceeds T_bias by this much [N], far beyond the sensor's noise
 CARRYING = 10.0
-#: time for each muscle [s]: wait until it carries tension, rupture, repair, recover
+#: give each muscle this time to wait until it carries tension, rupture, be repaired and recover [s]
 SLOT = 20.0
 LATEST_RUPTURE = 14.0  # rupture a muscle no later than this after the beginning of its slot [s]
 RUPTURE_TIME = 3.0  # repair a muscle this long after its rupture [s]
-SLACKENING = 0.1  # expect no tension from this time after a rupture on [s]
+SLACKENING = 0.1  # expect a ruptured muscle to be slack this long after its rupture [s]
 RECOVERY = 2.0  # let the arm swing back for this time after a repair [s]
 #: wait for a random time of up to this before a rupture [s], so that muscles rupture both in motion
 #: and at rest
@@ -93,7 +93,7 @@ class GraspAndRupture:
 
     @property
     def counted(self) -> list[int]:
-        """Those of `muscles` that carried tension when they ruptured, or all if none did."""
+        """The `muscles` that carried tension when they ruptured; all of them if none did."""
         return [m for m in self.muscles if self.carried[m]] or self.muscles
 
     def while_ruptured(self, muscle: int) -> slice:
@@ -144,7 +144,7 @@ def grasp_and_release(arm: Arm, time: float) -> None:
 
 
 class DetectorOutput(NamedTuple):
-    """What estimator and detector report for each of N messages."""
+    """Outputs of estimator and detector for each of N messages."""
 
     theta: Array  # estimated joint angles θ [rad], (N, D)
     anomaly: Array  # anomaly A [scaled units], (N,)
@@ -156,7 +156,7 @@ class DetectorOutput(NamedTuple):
 def run_detector(
     robot: Robot, mae: Mae, recording: Recording, sliding: Array | None = None
 ) -> DetectorOutput:
-    """Return what estimator and detector report for each message of a recording.
+    """Run estimator and detector on a recording; return their outputs for each message.
 
     Both run as in the estimator node, but they continue after an alarm.
 
@@ -289,7 +289,7 @@ def auroc(healthy: Array, faulty: Array) -> float:
 
     Equal scores count half. The result is 0.5 if either array is empty.
     """
-    from scipy.stats import mannwhitneyu  # the import takes 0.7 s
+    from scipy.stats import mannwhitneyu  # import only if needed: it takes 0.7 s
 
     pairs = len(healthy) * len(faulty)
     return float(mannwhitneyu(faulty, healthy).statistic / pairs) if pairs else 0.5

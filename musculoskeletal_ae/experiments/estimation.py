@@ -73,8 +73,8 @@ HEALTHY_TIME = 3600.0
 PLOT_START = 60.0  # begin plots this long before the grasp [s]
 PLOT_TAIL = 3.0  # end plots this long after the repair [s]
 OFF_TIME = 40.0  # let the arm move for this time before its muscles are switched off one by one [s]
-#: times of the pictures [s], at ends of the motion's cycles without and with the payload; a
-#: shortened run has pictures of those times that its shorter motion reaches
+#: draw pictures of these times [s], at ends of the motion's cycles without and with the payload; a
+#: shortened run draws only those that its motion reaches
 MOMENTS = {'after 10 s': 9.9, 'after 20 s': 19.9, 'payload grasped': 29.9, 'payload, 40 s': 39.9}
 OFF = 'switched_off'
 #: measures that are also reported for switched-off muscles

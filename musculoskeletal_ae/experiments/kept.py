@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of a run in files: values with arrays as npz, without pickle, which could contain code.
+"""Saves parts of a run in npz files without pickle, because a pickle can contain code.
 
 A value consists of None, numbers, texts, arrays, and of dictionaries, lists and named tuples of
 values. Every array is a member of the npz file. A further member, `document`, contains the rest of
@@ -33,7 +33,7 @@ def write(file: Path, value: Any) -> None:
     """Write a value to a file, which is replaced as a whole.
 
     Raises:
-        TypeError: If a part of the value has another type than those that the module names.
+        TypeError: If a part of the value has a type that the module docstring does not list.
     """
     arrays = dict[str, Array]()
     document = json.dumps(_encoded(value, arrays))
@@ -52,8 +52,8 @@ def read(file: Path) -> Any:
     try:
         with np.load(file, allow_pickle=False) as arrays:
             return _decoded(json.loads(str(arrays[DOCUMENT])), arrays)
-    # zipfile, numpy and json raise these for damaged files and for other files. A file that is no
-    # npz file is read as an array, which is no context manager.
+    # zipfile, numpy and json raise these errors for damaged files and for other files. From an npy
+    # file, numpy reads an array, which is no context manager.
     except (
         OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, BadZipFile,
     ) as error:  # fmt: skip

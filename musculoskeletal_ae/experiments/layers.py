@@ -40,8 +40,8 @@ from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.presets.paper import PaperPreset
 
-#: units of the encoder's hidden layers. The decoder has the same layers in reverse order, and the
-#: latent layer has D + M units.
+#: compare encoders with hidden layers of these numbers of units. The decoder has the same layers in
+#: reverse order, and the latent layer has D + M units.
 HIDDEN = {
     'as in the paper: 200, 30': (200, 30),
     'fewer layers: 200': (200,),
@@ -50,9 +50,9 @@ HIDDEN = {
     'fewer units: 50, 20': (50, 20),
     'fewer units: 20, 10': (20, 10),
 }
-TRAININGS = 3  # train each layout this often, with different random seeds
+TRAININGS = 3  # train each layout this many times, with different random seeds
 QUICK_STEPS = 100  # in a shortened run, end the initial training after this many steps
-ERRORS = 'before_rad', 'after_rad'  # numbers whose range over the trainings is reported
+ERRORS = 'before_rad', 'after_rad'  # report the range of these numbers over the trainings
 
 
 def measure(study: Study, seed: int) -> Measured:

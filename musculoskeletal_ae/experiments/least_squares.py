@@ -32,7 +32,7 @@ from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 ROUNDS = 30  # end the search after this many Gauss–Newton steps
 #: damp the Gauss–Newton steps so that a typical one has this size, as a share of the joint's range
 USUAL_STEP = 0.1
-EVERY = np.s_[::10]  # every tenth message of a recording, because least squares is slow
+EVERY = np.s_[::10]  # evaluate every tenth message only, because least squares is slow
 DIFFERENCE = 1e-4  # compute finite differences with this step [rad]
 
 

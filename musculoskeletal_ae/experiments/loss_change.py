@@ -39,8 +39,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-STEP = 0.02  # duration of a simulation step [s]
-FORCED = 30.0  # angle at which the shoulder is held in the phase `shoulder forced` [deg]
+STEP = 0.02  # simulate in steps of this duration [s]
+FORCED = 30.0  # hold the shoulder at this angle in the phase `shoulder forced` [deg]
 
 
 class Phase(NamedTuple):
@@ -161,7 +161,7 @@ def _run_arm(arm: Arm, command: Array) -> Motion:
 
 
 def _phases(numbers: dict[str, Any]) -> list[str]:
-    """Return the names of the phases, with the joints and angles in the numbers of a robot."""
+    """Return plot labels of the phases, with the joints and angles of the robot of `numbers`."""
     flexed_deg, forced_deg = np.degrees([numbers['flexed_rad'], numbers['forced_rad']])
     names = [phase.name for phase in PHASES]
     names[0] = f'{numbers["flexed_joint"]}\n{flexed_deg:.0f}°'
@@ -203,7 +203,7 @@ def loss_change(study: Study, rows: Rows) -> Plot:
         style = {'ha': 'center', 'va': 'bottom', 'fontsize': 7}
         for at, name in zip(0.5 * (edges[:-1] + edges[1:]), _phases(row.numbers), strict=True):
             both[0].text(at, 1.02, name, transform=both[0].get_xaxis_transform(), **style)
-    figure.suptitle(f'individual {seed}: the simulator after learning')
+    figure.suptitle(f'individual {seed}: response of the simulator after learning')
     return figure, (
         'The simulator after learning: first, forces act on the hand; then a joint is held at a '
         'given angle. Dashed: the emulated arm under the same forces (its joints cannot be held at '

@@ -66,10 +66,10 @@ from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-DURATIONS = (1.0, 2.0)  # durations of the motions between two postures [s]
-MOTIONS, CIRCLES = 6, 3  # number of motions of each duration, and number of circles of the hand
-STARTING = 3.0  # duration of the motion to the first posture [s]
-REST = 0.6  # duration of the rest after each motion [s]
+DURATIONS = (1.0, 2.0)  # move from one posture to the next in these times [s]
+MOTIONS, CIRCLES = 6, 3  # make this many motions of each duration, and of circles of the hand
+STARTING = 3.0  # move to the first posture in this time [s]
+REST = 0.6  # rest for this time after each motion [s]
 SETTLED = 0.5  # read the settled error this long after the end of a motion [s]
 OURS = 'trajectory'
 METHODS = {
@@ -81,12 +81,12 @@ METHODS = {
 }
 #: control methods of a shortened run; all but OURS are only measured in motions of DURATIONS[0]
 QUICK_METHODS = OURS, 'tension', 'second'
-RADIUS, SPEED = 0.05, 0.1  # radius of a circle [m], and speed of the hand along it [m/s]
+RADIUS, SPEED = 0.05, 0.1  # move the hand along circles of this radius [m] at this speed [m/s]
 EVERY = 2  # send a pose of the hand with every second message, which makes 50 poses a second
 NEAR = 0.002  # treat a pose as reachable if the hand comes this close to it [m]
 #: maps a time [s] to the desired pose of the hand
 Place = Callable[[float], pin.SE3]
-TARGETS = 20  # number of targets that `proposed` approaches
+TARGETS = 20  # let `proposed` approach this many targets
 ARRIVING = 8.0  # read the distance from a target after this time [s]
 SETTLING_TIME = 4.0  # wait at most this long for the arm to settle [s]
 WITHIN = 0.05  # count the arm as settled within this distance from the target [rad]
@@ -96,7 +96,7 @@ LAP = 2.0 * np.pi * RADIUS / SPEED  # duration of a circle [s]
 
 
 class TrackedMotion(NamedTuple):
-    """Desired and true postures of one motion and the rest after it, and the tensions.
+    """Postures and tensions during one motion and the rest after it.
 
     N messages cover the motion and the rest, and the first N' of them the motion itself.
     """
@@ -224,7 +224,7 @@ def bounds(arm: Arm, motion: Setpoint) -> Array:
     result = []
     for G, rigid, velocity in zip(jacobian, torque, motion.velocity):
         speed = G @ velocity
-        # A tendon that is pulled out drags its winch along.
+        # A tendon that is pulled out drags its winch along, which needs additional tension.
         with_drag = np.minimum(bias + np.maximum(speed, 0.0) / MOTOR_GAIN, limits.limit)
         cases = [(G, rigid, bias), (G, rigid, with_drag)]
         if isinstance(true, Individual):

@@ -63,8 +63,8 @@ from musculoskeletal_ae.signals.friction import FrictionDirection
 
 #: after each update, evaluate only every tenth message of the held-out motion, to save time
 CURVE_STRIDE = 10
-#: use the mean error over this first part of a run as the initial guess of b in the exponential fit
-#: [s]
+#: take the initial guess of b in the exponential fit from the mean error over this first part of a
+#: run [s]
 FIRST_ERRORS = 10.0
 PUBLISHED_MINUTES = 10.0
 PUBLISHED = (0.324, 0.154)  # errors that the paper fits at the start, and after ten minutes [rad]
@@ -136,7 +136,8 @@ def explore(loop: ClosedLoop, learner: Learner, duration: float) -> Iterator[tup
         if learner.mae is not accepted:
             loop.use(learner.mae)
             learner.note_accepted(loop.mae)
-            # The learner now keeps the network with the residual torque that the estimator added.
+            # `note_accepted` may have replaced the learner's network by a copy with the residual
+            # torque that the estimator added.
             accepted = learner.mae
         yield loop.explore()
 

@@ -83,8 +83,7 @@ class ClosedLoop:
     ) -> None:
         """Connect an arm in its present posture.
 
-        `seed` determines the exploration, and `on_anomaly` what happens on an anomaly, as the
-        parameter of the estimator does.
+        `seed` determines the exploration. `on_anomaly` is the estimator's parameter of this name.
         """
         self.arm, self.core, self.stops = arm, Controller(arm.robot, settings, seed), 0
         self.estimator = Estimator(arm.robot, mae.preset)
@@ -140,7 +139,7 @@ class ClosedLoop:
         core, estimator = self.core, self.estimator
         supervisor = core.supervisor
         if estimator.body.anomaly is Anomaly.FOUND:
-            with suppress(MusculoskeletalError):  # refused while the suspect does not fit
+            with suppress(MusculoskeletalError):  # refused while the suspect is implausible
                 estimator.reset()
         if not supervisor.is_running and core.reset(self.time) is None:
             self.stops += 1

@@ -45,7 +45,7 @@ from musculoskeletal_ae.robot.tension import holding_tension
 
 #: evaluate only every tenth message of the held-out motion, because it is estimated very often
 EVERY = 10
-TARGETS = 2  # number of targets that the arm approaches without each muscle
+TARGETS = 2  # let the arm approach this many targets without each muscle
 MOVING = 12.0  # let the arm explore for this time before a fault [s]
 #: wait at most this long after a fault for the end of the first verification [s]
 LATEST_VERDICT = 10
@@ -57,7 +57,7 @@ SETTLING = 4  # count the arm as arrived after this time at rest [s]
 STILL = 0.02  # count the arm as at rest if no joint moves more than this in a second [rad]
 HEALTHY_TIME = 18_000.0  # let healthy arms explore for this time, shared by the individuals [s]
 PUSH_EVERY = 10.0  # push the hand of a healthy arm at this interval [s]
-PUSH = (10.0, 30.0)  # range of the forces that push the hand of a healthy arm [N]
+PUSH = (10.0, 30.0)  # push the hand of a healthy arm with forces in this range [N]
 
 
 class IsolatingLoop(ClosedLoop):
@@ -132,7 +132,7 @@ def run_with_fault(
 
 
 class Reach(NamedTuple):
-    """Measures of which postures an arm can hold and approach without one of its muscles.
+    """Results on the postures that an arm can hold and approach without one of its muscles.
 
     Attributes:
         share: Share of the holdable postures of the true body that remain holdable.
@@ -169,7 +169,7 @@ def measure_reach(
     for theta in held[:targets]:
         try:
             loop.target(theta)
-            #: time at rest so far [s], and the posture one second ago
+            #: time at rest so far [s], and posture one second ago
             rest_time, before = 0, loop.arm.theta
             for _ in range(LONGEST_APPROACH):
                 if rest_time == SETTLING:

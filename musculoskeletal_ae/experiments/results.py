@@ -31,8 +31,8 @@ from musculoskeletal_ae.schema import Strict, convert
 #: result.json of every experiment that was run, by its name
 Results = Mapping[str, Mapping[str, Any]]
 
-#: quantities of which the sum over individuals is reported instead of the mean: numbers of events,
-#: and the durations that the individuals share
+#: report the sum of these over the individuals instead of the mean: numbers of events, and the
+#: durations that the individuals share
 ALARMS = ('false_contacts', 'false_alarms', 'false_alarms_beside_cuts')
 ISOLATIONS = ('wrong_isolations', 'acquittals')
 MOTIONS = ('approaches', 'missed', 'stuck')

@@ -59,7 +59,7 @@ ABLATED = {
 }
 #: keys of ABLATED whose effects a shortened run removes; a full run does this for every key in turn
 QUICK = ('friction',)
-ABLATION_INDIVIDUALS = 2  # number of individuals for which the ablation is measured
+ABLATION_INDIVIDUALS = 2  # measure the ablation for this many individuals
 #: label of a run with all effects and another exploration, which shows the difference between runs
 REPEATED = 'nothing: another run'
 OTHER_RUN = 1000  # add this to the seed of exploration and training of the repeated run
@@ -131,7 +131,7 @@ def _informed_oracle_error(arm: Any, recording: Recording) -> float:
         tension = np.maximum(part.tension - body.tension_bias, 0.0) / body.tension_gain
         length = part.length - body.length_bias
     else:
-        # Invert the sensor characteristics with tables.
+        # Find true tensions and lengths from the sensors' readings by tables.
         tensions = np.linspace(0.0, 2.0 * arm.robot.tension.max.max(), 2000)
         lengths = np.linspace(-1, 1, 20001)
         tension, length = np.empty_like(part.tension), np.empty_like(part.length)

@@ -62,15 +62,15 @@ class Part(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What the run learns when a part ends."""
+    """How a part ended: with an error or not, and how much processor time it took."""
 
     part: Part
-    failure: str = ''  # '' if the result is in the folder of the run
+    failure: str = ''  # error message; '' if the result is in the folder of the run
     seconds: float = 0.0  # processor time of the part [s]; 0 if it was not measured in this run
 
 
 def stages(study: Study, names: Sequence[str]) -> tuple[list[Part], ...]:
-    """Return the parts of a run, in stages: each needs results of the stages before it only."""
+    """Return the parts of a run, in stages: a part needs only results of earlier stages."""
     others = set(names) - {LEARNING}
     # Start the longest experiments first, so that none of them runs alone at the end.
     longest_first = sorted(others, key=lambda name: EXPERIMENTS[name].weight, reverse=True)
@@ -91,7 +91,7 @@ def run(
     Args:
         study: Options of the run.
         names: Names of the experiments.
-        workers: Where the parts run.
+        workers: The workers that measure the parts.
         report: Function that is called whenever a part has ended.
 
     Raises:

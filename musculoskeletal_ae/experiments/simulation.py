@@ -31,7 +31,7 @@ from musculoskeletal_ae.simulation.simulation import Simulation
 
 #: the errors in the paper before and after learning
 PUBLISHED = {'rad': (0.335, 0.162), 'n': (105.0, 92.2)}
-CYCLE = 10.0  # duration of a cycle of the exploration, which consists of three steps [s]
+CYCLE = 10.0  # one cycle of exploration, three steps, takes this time [s]
 MOMENTS = 5  # draw the arm at this many instants of the motion
 
 

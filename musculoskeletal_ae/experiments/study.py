@@ -27,7 +27,7 @@ from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot
 
-HELD_OUT = 300.0  # duration of the held-out motion [s]
+HELD_OUT = 300.0  # let the held-out motion last this long [s]
 #: in a shortened run, shorten a motion to this share of the whole one, and to at most this time [s]
 QUICK_SHARE, QUICK_LIMIT = 0.25, 10.0
 DIGITS = 6  # round results to this many significant digits; further digits are noise
@@ -61,7 +61,7 @@ class Study:
         return tuple(dict.fromkeys((PAPER_PRESET, self.preset)))
 
     def number(self, whole: int) -> int:
-        """Return how often to measure something: `whole` times, or once in a shortened run."""
+        """Return a number of measurements: `whole`, or 1 in a shortened run."""
         return 1 if self.quick else whole
 
     def seconds(self, whole: float) -> float:

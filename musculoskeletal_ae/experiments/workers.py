@@ -119,8 +119,8 @@ class _Processes(Workers):
         """Run a function with the arguments in `calls`, and yield results with the keys of `calls`.
 
         If one worker is killed, joblib ends all of them. The halves of the remaining calls then run
-        one after the other, until a call is alone. A lone call runs again if this `is_first`
-        attempt with it; after that, its result is a WorkerKilledError.
+        one after the other, until a call is alone. A lone call runs again if `is_first` says that
+        this was its first attempt alone; otherwise, its result is a WorkerKilledError.
         """
         missing = dict(calls)
         try:
@@ -149,7 +149,7 @@ class _Processes(Workers):
             batch_size=1,
             pre_dispatch='all',
         )
-        with interrupts_blocked():  # so that Ctrl-C reaches no worker that starts here
+        with interrupts_blocked():  # keep Ctrl-C from the workers that start here
             results = parallel(
                 delayed(_run_numbered)(index, function, call) for index, call in calls.items()
             )

@@ -41,8 +41,8 @@ from musculoskeletal_ae.robot.robot import Robot
 POSTURES = 1000  # compare the model and the network in this many postures
 #: multiply this damping by the `joint_gear` of a joint [N·m·s/rad]; chosen for a stable simulation
 DAMPING = 0.05
-THIN = 0.008  # radius of the capsules that represent bones [m]
-TIMESTEP = 0.002  # time step of the exported model [s]
+THIN = 0.008  # represent bones by capsules of this radius [m]
+TIMESTEP = 0.002  # let MuJoCo simulate the exported model with this time step [s]
 LEGEND = """\
 length      standard deviation of the difference of lengths
 moment arm  difference of dl/dq (norm over all joints, root mean square over the postures), and the
@@ -76,7 +76,7 @@ class ExportReport(NamedTuple):
     kept: dict[str, str]  # why a muscle keeps the points of the robot directory, by muscle
 
     def text(self, robot: Robot, offsets: Array) -> str:
-        """Return the report as text; `offsets` [m] (M,) lead from measured lengths to controls."""
+        """Return the report as text; `offsets` [m] (M,) convert measured lengths to controls."""
         counts = f'{robot.joint_count} joints, {robot.muscle_count} muscles, {POSTURES} postures'
         units = f'{"":<28}{"[mm]":>10}{"[mm]":>12}{"[mm]":>8}{"[mm]":>9}{"[m]":>11}'
         head = f'{"muscle":<28}{"length":>10}{"moment arm":>12}{"of":>8}{"spring":>9}{"offset":>11}'
@@ -156,7 +156,7 @@ def export_into(robot: Robot, mae: Mae, file: Path, out: Path, seed: int = 0) ->
         parts = *learned.before, *learned.after
         for name, l0, a0, l1, a1 in zip(robot.muscles, *(1e3 * part for part in parts)):
             lines.append(f'{name:<28}{f"{l0:.2f} → {l1:.2f}":>18}{f"{a0:.2f} → {a1:.2f}":>20}')
-        lines += ['', 'differences from the network, of the file → of the copy, as in export_mjcf']
+        lines += ['', 'differences from the network: file → copy; computed as in export_mjcf']
         lines += ['', kept_text(learned.kept), f'MJX {mjx}', '']
         (out / 'report.txt').write_text(text := '\n'.join(lines), encoding='utf-8')
     return text

@@ -56,7 +56,7 @@ class UserFile:
             self._read(self._included(file, match[1]))
 
     def _included(self, file: Path, name: str) -> Path:
-        """Return an included file, whose name is relative to the main file, or to the includer."""
+        """Return the path of an included file; `name` is relative to the main file or to `file`."""
         beside = (self.file.parent / name, file.parent / name)
         return next((path.resolve() for path in beside if path.is_file()), beside[0].resolve())
 
@@ -64,7 +64,7 @@ class UserFile:
         """Return the positions [m], by name, of the sites that an edit of the MJCF file can move.
 
         These are the sites of which the file states the position that they have in the compiled
-        model. Of a site in a `frame` or a replica, or of one that `fromto` places, the file states
+        model. For a site in a `frame` or a replica, or one that `fromto` places, the file states
         another position.
         """
         found = dict[str, list[Array]]()
@@ -160,7 +160,7 @@ class UserFile:
     def _placed_elsewhere(
         self, file: Path, copies: dict[Path, str], folders: dict[str, Path]
     ) -> str:
-        """Return a file's text for its copy, with other paths of included files and of assets."""
+        """Return the text of a file's copy, with adapted paths of included files and assets."""
         text = self.texts[file]
         plain, edits = _without_comments(text), list[tuple[int, int, str]]()
         for match in INCLUDE.finditer(plain):
@@ -172,6 +172,7 @@ class UserFile:
                     absolute = (self.file.parent / inside[2]).resolve()
                     edits.append((start, end, str(absolute)))
         # MuJoCo looks for an asset in the folder of assets, and then beside the including file.
+        # Only an asset of the second kind needs another path.
         for match in ASSET.finditer(plain):
             key = 'texturedir' if match[1] == 'texture' else 'meshdir'
             place = folders.get(key) or folders.get('assetdir') or self.file.parent

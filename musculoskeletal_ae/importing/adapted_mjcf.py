@@ -39,10 +39,10 @@ REFERENCES: dict[str, dict[str, tuple[str, ...]]] = {
         'bone': ('body',),
     },
 }
-#: elements and attributes that belong to the actuators and sensors of the user's model
+#: remove these elements and attributes, which belong to the user's actuators and sensors
 OF_ACTUATORS = 'actuator', 'sensor', 'keyframe', 'tuple', 'general'
 ACTUATION = 'actuatorfrclimited', 'actuatorfrcrange', 'actuatorgroupdisable', 'actuation'
-#: attributes of `size` that MuJoCo does not accept beside `memory`
+#: remove these attributes of `size` beside `memory`, because MuJoCo rejects both together
 OLDER_SIZES = 'njmax', 'nconmax', 'nstack'
 
 
@@ -172,7 +172,7 @@ class AdaptedModel:
             if name := item.get('geom'):
                 geom, element = model.geom(name), geoms[name]
                 sizes = 1 if geom.type[0] == mujoco.mjtGeom.mjGEOM_SPHERE else 2
-                element.attrib.pop('mesh', None)  # the fitted size follows
+                element.attrib.pop('mesh', None)  # replaced by the size of the fitted primitive
                 element.set('size', _text(geom.size[:sizes]))
                 element.set('pos', _text(geom.pos))
                 element.set('quat', _text(geom.quat))

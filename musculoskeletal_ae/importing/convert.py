@@ -48,9 +48,9 @@ class Imported(NamedTuple):
     """An imported robot, with notes on the import and a comparison with its source."""
 
     robot: Robot
-    #: what the import chose, dropped, held fixed, renamed or approximated
+    #: notes on everything that the import chose, dropped, held fixed, renamed or approximated
     notes: tuple[str, ...]
-    #: comparison with the source's own engine; None if this engine computes no lengths
+    #: comparison with the source's own engine; None if no engine computes the source's lengths
     comparison: Comparison | None
 
 
@@ -97,8 +97,8 @@ def import_robot(
     Args:
         file: Path of the file to import.
         out: A new or empty directory.
-        loaded: Function that gets the new robot before the comparison with the source, which takes
-            long.
+        loaded: Function that is called with the new robot before the slow comparison with the
+            source.
         chain: Options of `cut`.
 
     Raises:

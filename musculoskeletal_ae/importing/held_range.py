@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Smaller limits for joints that their muscles can hold in a part of the range only.
+"""Reduced limits for joints that the muscles can hold in only a part of the range.
 
-The muscles of such a joint pull it in one direction, against a spring. If a tendon passes over the
-axis of the joint inside its range, the muscle pulls the other way beyond it, like the spring. The
-joint then snaps to its stop, and nothing can bring it back: without smaller limits, an emulated arm
-ends there in its first second.
+The muscles of such a joint pull it in one direction, and a spring pulls it in the other. If the
+joint turns so far that a tendon crosses its axis, the muscle pulls in the direction of the spring,
+too. The joint then snaps to its stop, and nothing can bring it back: without reduced limits, an
+emulated arm ends there in its first second.
 """
 
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from musculoskeletal_ae.robot.tension import holding_tension
 POSTURES = 600  # check the muscles in this many random postures
 FIRST = 100  # reduce no range if none of this many postures can be held
 PARTS = 20  # divide the range of a joint into this many equal parts
-#: keep a part of the range if its share of held postures is at least this, relative to the best one
+#: keep a part of the range if its share of held postures is at least this share of the best part's
 KEPT_SHARE = 0.5
 
 
@@ -44,7 +44,8 @@ def held_ranges(robot: Robot) -> list[HeldRange]:
     if not any(_can_hold(robot, at) for at in theta[:FIRST]):
         return []
     check = measure(Setting.of(robot, theta))
-    # An unstable posture cannot be held either: near the axis, a tendon pulls itself past it.
+    # An unstable posture cannot be held either: near the joint's axis, a tendon pulls itself past
+    # it.
     held = check.held & (check.stiffness > 0.0)
     if not held.any():
         return []

@@ -44,11 +44,11 @@ from musculoskeletal_ae.robot.wrapping import RIM
 
 check_mujoco()
 
-#: attribute of a model with the number of elements, for each kind of named element
+#: for each kind of named element: the attribute of MjModel that counts the elements
 COUNTS = {
     'body': 'nbody', 'joint': 'njnt', 'tendon': 'ntendon', 'actuator': 'nu', 'equality': 'neq',
 }  # fmt: skip
-#: number of random postures in which the range of a tendon's length is measured
+#: determine the range of a tendon's length from this many random postures
 RANGE_POSTURES = 200
 LEAST_REACH = 1e-3  # ignore a far end that is closer than this to the origin of its body [m]
 #: ignore a larger force of an actuator [N]: MuJoCo computes it for muscles without an initial
@@ -191,7 +191,7 @@ class _Reader:
         self.polynomials: dict[int, tuple[int, Array]] = {}
         self.tendons: dict[str, int] = {}
         self.passive: dict[str, int] = {}
-        self.radius = model.geom_size[:, 0].copy()  # as in the file, before `tie_rims` changes it
+        self.radius = model.geom_size[:, 0].copy()  # radii of the file, before `tie_rims`
         self._tie_rims()
         self._bodies()
         self._points()
@@ -260,7 +260,7 @@ class _Reader:
         return fixed
 
     def _not_modelled(self) -> None:
-        """Note what the robot directory cannot represent; the emulated arm has most of it."""
+        """Note what the robot directory cannot represent; most of that is in the emulated arm."""
         m, only = self.model, 'only in model.xml'
         if forces := self._named('joint', m.jnt_actfrclimited):
             self.source.note('dropped', f"limits of the actuators' force: joint {forces}")

@@ -24,7 +24,8 @@ class Polynomial(NamedTuple):
 
     powers: Array  # powers of the joint positions in the R terms, (R, joints)
     coefficient: Array  # factor of each term [m/rad^p], (R,)
-    error: float  # root mean square error of the length in other postures [m]
+    #: root mean square error of the length [m] in postures that were not used for the fit
+    error: float
     degree: int
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reduces a body that was read from another format to a chain, writes it, and compares it."""
+"""Reduces an imported body to a chain, writes its directory, and compares it with the source."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -30,14 +30,14 @@ from musculoskeletal_ae.robot.kinematics import link_placement, reduced
 from musculoskeletal_ae.robot.robot import Robot
 
 KINDS = REVOLUTE + PRISMATIC
-POSTURES = 1000  # number of random postures in which lengths are compared with those of the source
-#: number of random postures in which moment arms are compared with those of the source
+POSTURES = 1000  # compare lengths with those of the source in this many random postures
+#: compare moment arms with those of the source in this many random postures
 ARM_POSTURES = 200
 #: search in this many postures for the joints that change the length of a passive tendon
 PROBES = 20
 MOVED = 1e-8  # count a joint as moving a tendon if it changes the length by at least this [m]
 WRONG_LENGTH = 5e-5  # report a passive tendon whose polynomial is wrong by at least this [m]
-TURN = 1e-5  # step of the numerical derivatives of the lengths, which give moment arms [rad]
+TURN = 1e-5  # compute moment arms as numerical derivatives of the lengths with this step [rad]
 SHORT_ARM = 1e-3  # do not compare the sign of a shorter moment arm [m]
 LISTED = 12  # name at most this many elements in a message, so that it stays readable
 # The largest tension that the source states for a muscle becomes its tension.limit.
@@ -51,8 +51,8 @@ RIGID_STIFFNESS = 1e5  # make no element stiffer than this at tension.max [N/m]
 #: let an element that stands for a rigid tendon stretch by this at tension.limit [m], which is
 #: negligible
 RIGID_ELONGATION = 5e-4
-EARTH = 9.81  # standard gravity of the earth, which replaces another gravity of the source [m/s²]
-#: give a joint without limits ± these, by whether it is prismatic: [rad] or [m]
+EARTH = 9.81  # replace another gravity of the source by that of the earth [m/s²]
+#: limit a joint without usable limits to ± this: a revolute joint [rad] and a prismatic one [m]
 UNLIMITED = {False: np.pi, True: 0.5}
 
 #: returns the absolute length of each muscle in N postures [m], (N,), from joint positions, (N,)
@@ -108,7 +108,8 @@ class Source:
     strength: dict[str, float] = field(default_factory=dict)  # largest tension [N], if known
     #: tension that the actuators of a muscle always exert [N]; 0 if missing
     least: dict[str, float] = field(default_factory=dict)
-    #: whether tendons do not stretch in the source; otherwise, nobody stated their elasticity
+    #: whether tendons cannot stretch in the source; if False, the source does not state their
+    #: elasticity
     is_rigid: bool = False
     springs: list[Spring] = field(default_factory=list)
     #: damping of the joints [N·m·s/rad], by joint
@@ -138,7 +139,8 @@ class Source:
     def rename(self, kind: str, original: str | None, fallback: str, taken: Iterable[str]) -> str:
         """Return a legal name that is not in `taken`, and add a note if it is not the original.
 
-        `fallback` is used without an original name. The note begins with `kind`, such as 'muscle'.
+        `fallback` is used if there is no original name. The note begins with `kind`, such as
+        'muscle'.
         """
         (name,) = distinct([safe_name(original, fallback)], taken)
         self.renamed(kind, original, name)
@@ -336,7 +338,7 @@ def names_of_all(kind: str, originals: Iterable[str]) -> list[str]:
     Elements without a name are numbered, such as 'joint_2'.
     """
     safe = (safe_name(name, f'{kind}_{i}') for i, name in enumerate(originals))
-    return distinct(safe, ['universe'])  # pinocchio's name of the world
+    return distinct(safe, ['universe'])  # reserved: pinocchio's name of the world
 
 
 def unique(
@@ -367,8 +369,8 @@ def cut(
     """Reduce the source in place to the links that descend from the base, and fix unwanted joints.
 
     All other links are removed, with their muscles. Joints that do not stay movable are held fixed,
-    with a note. Muscles that move no joint are removed as well. Without `joints`, this holds the
-    joints of a floating base, too.
+    with a note. Muscles that move no joint are removed as well. Unless `joints` names them, the
+    joints of a floating base are held fixed, too.
 
     Args:
         source: The source, which is changed in place.
@@ -378,8 +380,8 @@ def cut(
         muscles: Muscles that stay; by default all.
         without: Muscles to remove.
         base: The new root link; by default the present one.
-        end: The end effector, a link or a point; by default it is chosen, with a note, and holds
-            no joint fixed.
+        end: The end effector, a link or a point; by default it is chosen, with a note, and no joint
+            is held fixed because of it.
 
     Raises:
         SourceError: If a name is unknown or cannot be kept, or if no movable joint remains.
@@ -547,7 +549,8 @@ def write(source: Source, out: Path) -> None:
     document['end_effector'] = source.end_effector
     if source.couplings:
         document['couplings'] = [_coupling(s, c) for s, c in source.couplings.items()]
-    tendons = passive_tendons(source, joints)  # first, because they may add damping to joints
+    # Do this before `_joint_elasticity`, because passive tendons may add damping to joints.
+    tendons = passive_tendons(source, joints)
     if elasticity := _joint_elasticity(source, joints):
         document['joint_elasticity'] = elasticity
     if tendons:

@@ -33,7 +33,7 @@ class DefaultPreset:
     methods_without_tension: tuple[str, ...] = 'geometric', 'first', 'proposed'
 
     def initial_steps(self, robot: Robot) -> int:
-        """Return a number of mini-batches that grows with D + M of the largest block."""
+        """Return a number of mini-batches that grows with D + M of the network's largest block."""
         from musculoskeletal_ae.mae.default_training import default_steps, divided
 
         return default_steps(divided(robot)[0])
@@ -59,10 +59,7 @@ class DefaultPreset:
         return BodyUpdater(robot, mae, seed)
 
     def residual_detectors(self, robot: Robot) -> tuple[ResidualDistance, list[Detector]]:
-        """Return the detectors of large residuals, of slack tendons, and of modules that fail.
-
-        The last one detects modules that do not follow their commands.
-        """
+        """Return detectors of large residuals, slack tendons and modules not following commands."""
         from musculoskeletal_ae.estimation.detectors.module_following import (
             ModuleFollowing,
             PositionFollowing,

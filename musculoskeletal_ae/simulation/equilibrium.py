@@ -44,7 +44,7 @@ from musculoskeletal_ae.simulation.load import Load, LoadTree, hold
 #: value of l_target for muscles without a command [m]; MSC then holds T_bias, and modules that
 #: follow positions hold their length
 PAID_OUT = np.inf
-#: K_stiff that represents a position-controlled module [N/m]; 400 N move such a module by 1 mm
+#: represent a position-controlled module by this K_stiff [N/m]; 400 N move such a module by 1 mm
 RIGID = 4e5
 #: Multiply Σ_i |∂l_i/∂θ| by this to get B without the dampers [N·s/rad]. Motions then take as long
 #: as on the emulated arm; values from 8 to 20 do equally well.
@@ -129,7 +129,7 @@ def follow(
     """Follow a command: return the length [m] that a muscle module has reached on the way.
 
     Args:
-        command: Length commands l_target [m].
+        command: Length command l_target [m].
         followed: The length that the module had reached before this step [m].
         length: Muscle length [m].
         span: Distance of the command below `length` at which the tension reaches T_max [m].
@@ -137,7 +137,7 @@ def follow(
         most: Largest distance that the module winds in a step [m].
     """
     reached = followed + clip(command - followed, -most, most)
-    # Stop the module where the tension no longer changes; it would only lose time on the way back.
+    # Stop the module where the tension no longer changes: winding further would delay its way back.
     return clip(reached, length - span, length + max(loose, most))
 
 
@@ -465,7 +465,7 @@ class Slopes:
     """
 
     def __init__(self, robot: Robot) -> None:
-        """Draw postures over all joint ranges, to which `fit` fits; tensions are in mid-range."""
+        """Draw the postures, over all joint ranges, at which `fit` fits the cubics."""
         most = max(len(group.joints) for group in robot.groups)
         count = POSTURES_PER_COEFFICIENT * comb(most + 3, 3)
         self._postures = robot.random_postures(count, np.random.default_rng(0))

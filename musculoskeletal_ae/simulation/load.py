@@ -16,7 +16,8 @@ it carries:
     τ_k       = a_k · Σ (c_i − o_k) × f_i
     ∂τ_k/∂θ_j = a_j · Σ f_i × ((c_i − o_k) × a_k)        for j at or before k; symmetric
 
-The last axis of all arrays (…, N) is that of the arms, so that a core computes several at once.
+The last axis of all arrays (…, N) is that of the arms, so that a core computes several arms at
+once.
 """
 
 import math

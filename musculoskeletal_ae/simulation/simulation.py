@@ -28,11 +28,11 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState
 
-LONGEST_STEP = 0.01  # divide a longer time into several steps [s]
+LONGEST_STEP = 0.01  # divide a longer step into several [s]
 #: simulate this many arms in a call of the compiled code, so that their arrays fit into a core's
 #: cache
 CHUNK = 384
-#: duration of each step of `settle` [s]; its steps follow no motion, so they may be long
+#: let each step of `settle` last this long [s]; the steps follow no motion, so they may be long
 SETTLING_STEP = 0.1
 SETTLING_STEPS = 300  # end `settle` after this many steps, even if some arms have not settled
 #: count arms as settled if a step moves them by less than this [rad]; a change of tension by 1000 N

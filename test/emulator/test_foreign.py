@@ -320,11 +320,11 @@ PATH = '<site site="u1" />\n      <site site="l1" />'
     ('old', 'new', 'problem'),
     [
         ('name="swing"', 'name="swung"', "joint 'swing' is missing"),
-        ('<site name="f1"', '<joint name="more" /><site name="f1"', "joint 'more' is not one"),
+        ('<site name="f1"', '<joint name="more" /><site name="f1"', "joint 'more' is not a joint"),
         ('name="lift"', 'type="slide" name="lift"', "joint 'lift' has another type"),
         ('<motor name="front"', '<motor name="ahead"', "motor 'front' is missing"),
         ('name="hand of the emulator"', 'name="hand"', "body 'hand of the emulator' is missing"),
-        (PATH, f'<pulley divisor="4" />{PATH}', "'bend' is typically [0-9]+ mm longer"),
+        (PATH, f'<pulley divisor="4" />{PATH}', "'bend' typically differs by [0-9]+ mm"),
         ('<mujoco', '<mujoko', 'MuJoCo cannot load it'),
     ],
 )

@@ -29,15 +29,17 @@ from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
-#: update the bends of the tendons, and how far route points yield, only after this many steps
+#: update the bends of the tendons, and how far route points yield, once in this many steps
 GUIDES_EVERY = 5
 #: reject delays of sensors that exceed this many steps of 1 ms, which is the length of the history
 HISTORY = 64
 HOUR = 3600.0  # one hour in seconds
-BEDDING_TIME = 2.0 * HOUR  # time constant with which a new tendon lengthens under load [s]
+BEDDING_TIME = 2.0 * HOUR  # let a new tendon lengthen under load with this time constant [s]
 NUDGE = 1e-7  # change the joint angles by this if MuJoCo's wrapping returns NaN in a posture [rad]
-SLIP_TIME = 5.0 * HOUR  # mean time between two slips of a tendon on its spool [s]
-OTHER_ROUTE = 0.02  # refuse a file if the length of a muscle differs by more in most postures [m]
+SLIP_TIME = 5.0 * HOUR  # let a tendon slip on its spool at this mean interval [s]
+#: refuse a file if the length of a muscle differs from the robot's by more than this [m] in most
+#: postures
+OTHER_ROUTE = 0.02
 
 
 class ForeignBody:
@@ -154,10 +156,10 @@ def _imported_model(robot: Robot, file: Path, draw: Draw, deviates: bool) -> Any
     theta = robot.random_postures(100, np.random.default_rng(0))
     relative = given.absolute_lengths(theta) - given.length_at_zero
     off = np.abs(relative - robot.muscle_lengths(theta, np.zeros(robot.muscle_count)))
-    typical = np.median(off, axis=0)  # ignores the few postures in which a length jumps
+    typical = np.median(off, axis=0)  # the median ignores the few postures in which a length jumps
     for m in np.flatnonzero(typical > OTHER_ROUTE):
         name, millimetres = robot.muscles[m], 1e3 * typical[m]
-        problem = f'muscle {name!r} is typically {millimetres:.0f} mm longer or shorter there'
+        problem = f'the length of muscle {name!r} typically differs by {millimetres:.0f} mm'
         raise mujoco_model.other_robot(robot, file, problem)
     if deviates:
         _deviate(robot, model, given, draw)
@@ -169,7 +171,7 @@ def _deviate(robot: Robot, model: Any, given: ForeignBody, draw: Draw) -> None:
 
     If displaced attachment points make the length of a tendon jump, because the tendon slips over
     the end of an object, its points are redrawn. The number of draws is limited (MOST_DRAWS), so
-    some tendons may still jump. Tendons that jump in the body `given`, that of the file, are not
+    some tendons may still jump. Tendons that already jump in `given`, the body of the file, are not
     redrawn.
     """
     attachments = deviation.Attachments(robot, model, draw)
@@ -430,7 +432,7 @@ class ForeignArm(Arm):
         model, data = self._model, self._data
         mujoco.mj_step1(model, data)
         if not math.isfinite(data.ten_length.sum()):
-            # MuJoCo's wrapping can return NaN in the posture where a tendon touches an object.
+            # MuJoCo's wrapping can return NaN in the posture where a tendon just touches an object.
             data.qpos += NUDGE
             mujoco.mj_step1(model, data)
         self._steps += 1

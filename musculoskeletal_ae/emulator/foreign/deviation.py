@@ -28,13 +28,13 @@ from musculoskeletal_ae.emulator.foreign.effects import NONE, Draw, Effects
 from musculoskeletal_ae.emulator.foreign.mujoco_model import set_constants
 from musculoskeletal_ae.robot.robot import Robot
 
-#: standard deviation σ of the displacement of a point, relative to the typical moment arm
+#: displace points with this standard deviation σ, relative to the typical moment arm
 ATTACHMENT = 0.1
 FARTHEST = 0.005  # limit σ of the displacement of a point to this [m]
-#: standard deviation σ of the error of a tendon's length, relative to the typical moment arm
+#: draw errors of tendon lengths with this standard deviation σ, relative to the typical moment arm
 SLACK = 0.05
 LONGEST = 0.002  # limit σ of the error of a tendon's length to this [m]
-MASS = 0.1  # standard deviation σ of the logarithm of a body's mass, relative to the file
+MASS = 0.1  # multiply masses by random factors whose logarithm has this σ
 #: draw offsets of tension sensors with this σ, relative to T_bias: modules that keep a low tension
 #: have sensors that can measure it
 ZERO = 0.1
@@ -80,7 +80,7 @@ class Attachments:
         self._model, self._rest, self._rng = model, model.site_pos.copy(), draw.rng('attachment')
         sigma = np.minimum(ATTACHMENT * typical_arms(robot), FARTHEST)
         self._sites = [_sites(model, model.tendon(name).id) for name in robot.muscles]
-        #: σ of each site: the smallest of all muscles that pass it [m]
+        #: σ of each site [m]: the smallest σ of the muscles that pass through it
         self._sigma = np.zeros(model.nsite)
         for own, size in zip(self._sites, sigma.tolist()):
             is_new = self._sigma[own] == 0.0

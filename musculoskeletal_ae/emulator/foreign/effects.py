@@ -43,7 +43,8 @@ class Effects:
     hysteresis: float = 0.2  # width of the loop, relative to the elongation
     creep: float = 0.05  # creep per decade of time, relative to the elongation
     # Tendons
-    #: share of the stretch that is delayed, most of it by up to 40 min, all of it by up to 12 h
+    #: share of the stretch that builds up with a delay: most of it within 40 min, all of it within
+    #: 12 h
     recovery: float = 0.45
     bedding: float = 0.005  # lengthening of a tendon in its first hours [m]
     knot: float = 0.0034  # length by which a knot slips once, at a random time [m]

@@ -36,7 +36,7 @@ POSTURES = 300  # fit the radii of heads and muscles in this many random posture
 # Couple joints with this constraint stiffness (solimp). MuJoCo's default disregards the ratio of a
 # coupling: a prismatic joint that follows a revolute one would lag by centimetres.
 STIFF = [0.9999, 0.9999, 0.001, 0.5, 2.0]
-SPRING = 'spring'  # first word of the names of springs that couple joints
+SPRING = 'spring'  # begin the names of springs that couple joints with this word
 #: replace the inverse mass by which MuJoCo scales the contacts of a body if it is below this share
 #: of the inverse mass at the body's shapes
 LEAST_WEIGHT_SHARE = 0.01
@@ -46,7 +46,8 @@ Place = tuple[int, Array]  # a place on a link: its joint, and the position in i
 Obstacle = tuple[int, Array, Array]
 
 check_mujoco()
-mujoco.set_mju_user_warning(lambda _: None)  # the default writes a file to the current directory
+# Drop warnings; by default, MuJoCo writes them to a file in the current directory.
+mujoco.set_mju_user_warning(lambda _: None)
 
 
 def from_directory(robot: Robot, draw: Draw, again: Ints) -> Any:
@@ -86,8 +87,8 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
     limits = [*zip(units.to_position(robot.lower), units.to_position(robot.upper))]
     for i in range(1, model.njoints):
         at, inertia, name = model.jointPlacements[i], model.inertias[i], names[i]
-        # A joint that is hardly apart from its parent belongs to a joint module with several axes
-        # through one point. Its origin is not moved, so that these axes still meet.
+        # Do not move the origin of a joint that almost coincides with its parent: both belong to a
+        # joint module, whose axes meet in one point.
         is_apart = np.linalg.norm(at.translation) > 2.0 * LENGTH_SPREAD
         place = at.translation + LENGTH_SPREAD * off[i, 0] * is_apart
         placement = {'name': f'moved by {name}', 'pos': place, 'quat': _turn(at.rotation)}
@@ -310,8 +311,8 @@ def _obstacle(
 def _add_round(body: Any, name: str, place: Array, axis: Array | None, radius: float) -> None:
     """Add an object without collisions to a body, for tendons to wrap around.
 
-    In the frame of the body, it is a sphere around `place` [m], or a cylinder along `axis` if there
-    is one.
+    The object is a sphere around `place` [m] in the body's frame, or a cylinder along `axis` if one
+    is given.
     """
     kind, turn = mujoco.mjtGeom.mjGEOM_SPHERE, pin.Quaternion.Identity()
     if axis is not None:
@@ -358,7 +359,7 @@ def from_file(robot: Robot, file: Path) -> Any:
         if missing := [name for name in needed if name not in names]:
             raise other_robot(robot, file, f'{kind} {missing[0]!r} is missing')
         if kind == 'joint' and (more := [name for name in names if name not in [*needed]]):
-            raise other_robot(robot, file, f'joint {more[0]!r} is not one of the robot')
+            raise other_robot(robot, file, f'joint {more[0]!r} is not a joint of the robot')
     kinds = mujoco.mjtJoint
     for name, slides in zip(joints, robot.kinematics.tree.prismatic[1:], strict=True):
         if model.joint(name).type != (kinds.mjJNT_SLIDE if slides else kinds.mjJNT_HINGE):
@@ -380,7 +381,7 @@ def set_constants(model: Any) -> None:
     body has at its centre of mass at qpos0. Many files place the centre of mass of a finger's first
     link on the axes of its joints. If no joint before it can move, w is 0 there: the contact
     becomes rigid, and a slight touch accelerates the finger beyond all limits. For such a body, w
-    is therefore the mean over the centres of those of its shapes that can touch others.
+    is therefore averaged over the centres of its shapes that can touch other bodies.
     """
     data = mujoco.MjData(model)
     mujoco.mj_setConst(model, data)

@@ -229,7 +229,7 @@ GuideParts = namedtuple('GuideParts', 'guides tension bend')
 
 @njit(cache=True)
 def make_handle(parts: TendonParts | GuideParts) -> Handle:
-    """Make a handle, by which `tendons_step` or `guides_step` gets `parts`; arrays are shared."""
+    """Make the handle through which `tendons_step` or `guides_step` gets `parts`, uncopied."""
     return Handle(parts)
 
 
@@ -274,7 +274,7 @@ def tendons_step(arm: Handle, kind: int, absolute: Array, control: Array) -> Non
 
 @njit(cache=True)
 def guides_step(arm: Handle, duration: float) -> None:
-    """Compute the angles by which tendons bend at their guides, and how far these guides give way.
+    """Compute the angles by which tendons bend at their route points, and how far the points yield.
 
     Args:
         arm: Handle to the GuideParts, which are changed in place.
@@ -289,7 +289,7 @@ def guides_step(arm: Handle, duration: float) -> None:
         for p in range(first, last + 1):
             load[:] = 0.0
             both = True
-            for other in (max(p - 1, first), min(p + 1, last)):  # at an end, the point itself
+            for other in (max(p - 1, first), min(p + 1, last)):  # the point itself at an end
                 for r in range(3):
                     line[r] = guides.point[other, r] - guides.point[p, r]
                 size = math.sqrt(line[0] ** 2 + line[1] ** 2 + line[2] ** 2)

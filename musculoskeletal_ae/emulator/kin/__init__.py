@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The emulator model `kin`: the described body with other sizes, in own rigid-body dynamics.
+"""The emulator model `kin`: the described body with random deviations, and its dynamics.
 
-`arm.py` moves the arm and rubs its tendons, `individual.py` draws the sizes, and `wrapping.py`
-leads the tendons around bones.
+`arm.py` simulates the motion and the friction of the arm, `individual.py` draws the deviations, and
+`wrapping.py` leads the tendons around bones.
 """

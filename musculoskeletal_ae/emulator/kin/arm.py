@@ -98,7 +98,7 @@ def tension_from_elongation(elongation: float, force: float, rate: float, stretc
 
 @njit(cache=True)
 def make_handle(parts: Parts) -> Handle:
-    """Make a handle, by which `muscle_step` gets `parts`. The arrays are shared, not copied."""
+    """Make the handle through which `muscle_step` gets `parts`, without copying the arrays."""
     return Handle(parts)
 
 

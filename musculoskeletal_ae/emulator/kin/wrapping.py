@@ -51,7 +51,7 @@ class WrappedRoutes(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """Where `place` has put joints, route points and tendons, in the root link's frame."""
+    """Joints, route points and tendons in the root link's frame, as `place` computes them."""
 
     rotation: Array  # orientation of each joint, (J, 3, 3)
     translation: Array  # position of each joint [m], (J, 3)
