@@ -106,7 +106,7 @@ def motion_text(robot: Robot, recording: Pairs) -> str:
     least = preset_named('default').least_samples
     text = f'different resting postures to learn from: {rests}'
     if rests >= LEAST_RESTS:
-        return f'{text} (at least {least} are needed; the more, the smaller the error)'
+        return f'{text} (at least {least} are needed; more of them reduce the error)'
     moments = _postures(robot, recording, 'slow moments', from_motion=True)
     if moments >= max(least, rests + 1):
         return (
@@ -114,10 +114,10 @@ def motion_text(robot: Robot, recording: Pairs) -> str:
             f'{moments} slow moments of the motion instead'
         )
     if rests >= least:
-        return f'{text} (at least {least} are needed; the more, the smaller the error)'
+        return f'{text} (at least {least} are needed; more of them reduce the error)'
     return (
-        f'{text}; too little motion for `train --from-bag`, which needs at least {least}. Record '
-        'an arm that moves from posture to posture, as with controller/explore'
+        f'{text}; `train --from-bag` needs at least {least} of them, or as many slow moments of '
+        'the motion. Record an arm that moves from posture to posture, as with controller/explore'
     )
 
 
@@ -245,8 +245,8 @@ def _fit(bag: Bag, name: str, namespace: str | None) -> _Fit:
     pairs = streams.pairs()
     wiring = recorded_wiring(pairs, robot)
     if wiring.faulty:
-        what = 'in the order' if wiring.misplaced else 'of the signs'
-        faults = [f'muscles are not {what} of {name}: {wiring.text(robot.muscles)}']
+        what = 'order' if wiring.misplaced else 'signs'
+        faults = [f'the muscles do not have the {what} of {name}: {wiring.text(robot.muscles)}']
     else:
         faults = wrong_joint_sensors(robot, pairs)
     faults = rejected_faults + joint_faults + faults

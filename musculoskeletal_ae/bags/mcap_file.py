@@ -32,7 +32,8 @@ from musculoskeletal_ae.bags.storage import (
 )
 from musculoskeletal_ae.exceptions import BagError
 
-MAGIC = b'\x89MCAP0\r\n'  # recognise an mcap file by its first bytes, a complete one by its last
+#: recognise an mcap file by these bytes at its start, and a complete file also by those at its end
+MAGIC = b'\x89MCAP0\r\n'
 LARGEST_RECORD = 64 << 20  # refuse a larger record or decompressed chunk [bytes]
 #: Refuse a file that decompresses to more than MOST_EXPANDED bytes plus LARGEST_EXPANSION times its
 #: size. A malicious file of a few kB could otherwise take hours to read.
@@ -136,14 +137,14 @@ class McapFile:
         """Set `unfinished` to a text which says that the file ends within a record.
 
         Raises:
-            ValueError: If the file contains no complete record, or if it was closed properly, so
-                that the stated length of a record must be wrong.
+            ValueError: If the file contains no complete record, or if it was closed properly: the
+                stated length of a record must then be wrong.
         """
         if self._complete == 0:
             raise ValueError('it ends within its first record')
         with open_file(self.path) as file:
             file.seek(-len(MAGIC), 2)
-            if file.read() == MAGIC:  # complete, so a stated length is wrong
+            if file.read() == MAGIC:  # the file is not truncated, so a stated length is wrong
                 raise ValueError('a record reaches beyond the end of the file')
         self.unfinished = (
             f'{self.path.name} ends within a record at byte {self._size}; '

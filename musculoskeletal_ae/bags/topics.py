@@ -59,7 +59,7 @@ def interface_topics(
 
     Raises:
         BagError: If the namespace is ambiguous or not in the bag, if the topic of the motors is
-            missing, or if a topic has another type than the interface.
+            missing, or if a topic has another type than in the interface.
     """
     names = _relative_names(bag, namespace, motors)
     topics = topics_with(motors) | EARLIER
@@ -149,7 +149,7 @@ def namespaces(names: Iterable[str]) -> list[str]:
 
     The root namespace is ''. Recorded names can be ambiguous: `/sim/joint_states` is a topic of the
     interface in the root, but also `joint_states` in the namespace `/sim`. If all topics can belong
-    to one namespace, only this namespace is returned, and the shortest if there are several.
+    to one namespace, only this namespace is returned; of several such namespaces, the shortest is.
 
     Args:
         names: Recorded names of topics.

@@ -230,7 +230,7 @@ def test_the_check_of_a_bag_of_another_arm_fails(arm, tmp_path):
 def test_the_check_of_muscles_in_another_order_fails(robot, tmp_path):
     arm = Arm(robot, order=[*range(1, robot.muscle_count), 0])
     faults = check_bag(arm.write(tmp_path / 'bag'), 'arm26').faults
-    assert any('muscles are not in the order of arm26' in fault for fault in faults)
+    assert any('the muscles do not have the order of arm26' in fault for fault in faults)
 
 
 def test_the_check_of_a_damaged_bag_fails_and_names_the_place(arm, tmp_path):
