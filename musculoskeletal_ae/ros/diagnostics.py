@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishes a node's state on /diagnostics, with message rates and rejected messages; reads it."""
+"""Publishes and reads the states of nodes on /diagnostics, with message rates and rejections."""
 
 import secrets
 

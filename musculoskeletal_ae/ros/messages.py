@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # a slow import, which --help of the tools does not need
     from musculoskeletal_ae.robot.joint_units import JointUnits
     from musculoskeletal_ae.signals.motor_interface import MotorInterface
 
-# The three qualities of service (doc/reference/topics_and_services.md).
+# The three QoS profiles of the interface (doc/reference/topics_and_services.md).
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 SENSOR = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(

@@ -63,8 +63,8 @@ TURNS = 3  # conclude from this many decreases within LOOKS checks that two node
 #: [s]; the graph keeps a killed node for only 20 s
 LEASE = 30.0
 NAMING = 1.0  # wait at most this long until the graph knows the node of a publisher [s]
-#: report that there are more publishers than links once this has lasted for this time; a link
-#: without a message for this time has no sensor [s]
+#: treat a link without a message for this time [s] as a link without a sensor; report a topic with
+#: more publishers than links with sensors once it has had too many for the same time
 LINK_PATIENCE = 3.0
 #: name that the graph returns for a node of which it knows only a publisher
 UNNAMED = '_NODE_NAME_UNKNOWN_'
