@@ -63,7 +63,7 @@ class BringupStatusNode(Shell):
             lambda: nodes_in_graph(self),
             lambda: self.awake.at(time.monotonic()),
         )
-        #: last error, as text, and last A in a status line
+        #: last known error, as text, and last known A of the status lines
         self.last_known = ('', math.nan)
         self.started: float | None = None
         self.ended: float | None = None  # when the end of the recording was first reported [s]

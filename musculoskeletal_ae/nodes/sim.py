@@ -30,7 +30,7 @@ from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-MOST_RATE = 100.0  # beside a robot, simulate at most this often, because nothing is controlled [Hz]
+MOST_RATE = 100.0  # beside a robot, simulate at no higher rate [Hz], because nothing is controlled
 TEMPERATURE = 25.0  # report this temperature of all modules [°C]
 
 
@@ -111,7 +111,7 @@ class SimNode(ArmNode):
         self.ticked = self.get_clock().now()
 
     def conditions(self) -> Iterable[Condition]:
-        """Yield that there is no network yet."""
+        """Yield the conditions of every node, and one while there is no network."""
         yield from super().conditions()
         if self.arm is None:
             yield ConditionKind.NO_CHECKPOINT.condition(steps=[Step.PROVIDE_CHECKPOINT])

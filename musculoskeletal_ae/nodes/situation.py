@@ -2,7 +2,7 @@
 """Reads what the nodes of arms report on /diagnostics.
 
 The nodes decide what is true; this module collects, sorts and prints their conditions. It adds one
-fact that a node cannot report itself: that a node has ended, or does not report any more.
+fact that no node can report of itself: that the node has ended, or does not report any more.
 `Situation` has the reports of one arm, and `Arms` those of all arms in the ROS graph.
 """
 
@@ -32,7 +32,7 @@ NEEDED = 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim'
 OTHER = 'other_report'  # identifier of a report that lists no conditions
 SUMMARY = 'bringup_status'  # node that repeats the conditions of all others
 PAGE = 'page'  # value in the report of `view`: address of its page
-#: the addresses to which a list of arms may lead
+#: let a list of arms link only to pages with such an address
 ADDRESS = re.compile(r'https?://[^\s/]+')
 #: modes in which a running arm does not explore
 NOT_EXPLORING = {
@@ -64,7 +64,7 @@ def nodes_in_graph(node: RosNode) -> set[str]:
 
 
 class NodeReport(NamedTuple):
-    """What a node has last reported on /diagnostics."""
+    """The last report of a node on /diagnostics."""
 
     values: dict[str, str]  # values that the node has reported, by name
     conditions: tuple[Condition, ...]
@@ -154,7 +154,7 @@ class Situation:
     def conditions(self) -> list[Reported]:
         """Return all conditions in the order in which users read them.
 
-        Conditions of the same kind and with the same subjects, from several nodes, are one.
+        If several nodes report conditions of the same kind with the same subjects, they are merged.
         """
         merged = dict[tuple[str, tuple[str, ...]], Reported]()
         for name, condition in self._all():
@@ -253,7 +253,7 @@ class Situation:
 
     @property
     def doing(self) -> str:
-        """What the controller does, or why the arm stands still; '' without a controller."""
+        """Activity of the controller, or why the arm stands still; '' without a controller."""
         controller = self._reports.get('controller')
         return '' if controller is None else controller.message
 

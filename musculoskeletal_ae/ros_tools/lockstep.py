@@ -7,10 +7,10 @@ a processor for 0.1 s. The messages that remain would arrive in bunches, so that
 wrong.
 
 A replay in lockstep asks the nodes after every STEP of recorded time, and goes on only after all of
-them have answered. A node runs its callbacks one after another, so an answer shows that it has used
-the messages before. The question is the standard service `get_parameters` with an empty list of
-names, which every node of rclpy and rclcpp offers. Recorded time stands still while the replay
-waits: nodes that use /clock do not notice it.
+them have answered. A node runs its callbacks one after another, so its answer shows that it has
+used all messages that were sent before the question. The question is the standard service
+`get_parameters` with an empty list of names, which every node of rclpy and rclcpp offers. Recorded
+time stands still while the replay waits, so nodes that use /clock do not notice the wait.
 """
 
 import time

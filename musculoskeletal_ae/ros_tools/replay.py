@@ -76,8 +76,8 @@ WAIT = 2.0  # by default, wait at most this long for subscribers, and then play 
 SEND_WAIT = 10.0
 CLOCK_PERIOD = 0.005  # publish /clock at this interval of recorded time [s]
 SLOW = 0.5  # report playback as slow below this share of the wanted speed
-LOCKSTEP_LAG = 0.005  # in lockstep, catch up with at most this delay [s]
-#: publish /clock at intervals of at least this wall time [s], because nodes cannot use more of it
+LOCKSTEP_LAG = 0.005  # in lockstep, do not catch up after a longer delay than this [s]
+#: publish /clock at intervals of at least this wall time [s], because nodes cannot use a faster one
 SHORTEST_CLOCK_PERIOD = 0.001
 
 
@@ -198,7 +198,7 @@ class Replay(Node):
             longest = LOCKSTEP_LAG
             if self._lockstep.is_due(recorded):
                 self._lockstep.step(recorded, self._spinner)
-            #: publish /clock at once, so that the nodes know the time of this message
+            # Publish /clock at once, so that the nodes know the time of this message.
             self._next_tick = 0.0
         self._timeline.catch_up(recorded, time.monotonic(), longest)
 
@@ -265,7 +265,7 @@ class Replay(Node):
         report = Report(state, {'position': self._position(), 'state': state})
         if state == PAUSED:
             report = report.with_conditions([ConditionKind.REPLAY_STANDS.condition(PAUSED)])
-        # Only the lockstep keeps playback back for a long time.
+        # Only lockstep delays playback for long, so report slow playback only in lockstep.
         before, self._reported = self._reported, (now, self._done())
         speed = (self._reported[1] - before[1]) / max(now - before[0], 1e-3)
         is_slow = 0.0 < speed < SLOW * self._rate and before[0] > self._seek_time
@@ -392,8 +392,8 @@ def parse(arguments: list[str]) -> Namespace:
     check = 'check the contents without playing them (exit status 1: faults)'
     add('--check', action='store_true', help=check)
     robot = (
-        'a shipped robot or a directory: with --check, the robot that the bag must fit; without '
-        'it, its motors.yaml names further topics to play (doc/howto/ros2_control.md)'
+        'a shipped robot or a directory: with --check, the robot that the bag must fit; otherwise, '
+        'a robot whose motors.yaml names further topics to play (doc/howto/ros2_control.md)'
     )
     add('--robot', metavar='NAME|DIR', help=robot)
     topics = (

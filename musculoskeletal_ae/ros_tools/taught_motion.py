@@ -20,7 +20,7 @@ from musculoskeletal_ae.ros.diagnostics import LAST_REJECTED, PERIOD, rejected_c
 from musculoskeletal_ae.ros.messages import RELIABLE
 from musculoskeletal_ae.ros_tools.ros_tool import Spinner, start_ros
 
-#: wait at most this long for reliable readers to acknowledge the messages [s]
+#: wait at most this long for reliable subscribers to acknowledge the messages [s]
 ACKNOWLEDGE_TIME = 2.0
 TRAJECTORY = 'joint_trajectory'
 #: rate that /diagnostics states for a topic without a used message since the previous report
@@ -80,7 +80,7 @@ class _Answers:
                 self.reports.append(values_of(status))
 
     def begin(self) -> None:
-        """Discard the reports so far; from now on, only refusals that follow are counted."""
+        """Discard the reports so far; `refusal` then ignores the refusals that they counted."""
         self._refused_before = self._refused
         self.reports.clear()
 

@@ -39,7 +39,7 @@ def network_file(robot: str | Path, preset: str, quick: bool = False) -> Path:
     Args:
         robot: A shipped robot or a robot directory.
         preset: Name of the preset that trains the network.
-        quick: Whether it is trained with `train --quick`.
+        quick: Whether the network is trained with `train --quick`.
 
     Raises:
         MusculoskeletalError: If there is no such robot, or no place for a cache.
