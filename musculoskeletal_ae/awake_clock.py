@@ -16,7 +16,7 @@ therefore a question for the steady clock, not for this one.
 
 import math
 
-PAUSE = 0.3  # treat the time between two ticks that exceeds this as a pause of this process [s]
+PAUSE = 0.3  # treat the part of the time between two ticks that exceeds this as a pause [s]
 
 
 class AwakeClock:
@@ -29,7 +29,7 @@ class AwakeClock:
         """Count at most `longest` [s] of the time between two ticks.
 
         Args:
-            longest: Longer than the usual time between two ticks [s].
+            longest: Longest time that counts in full [s]; must exceed the usual time between ticks.
         """
         self._longest = longest
         self._ticked_at = math.inf  # steady time of the last tick [s]
