@@ -803,7 +803,7 @@ class Condition(NamedTuple):
         identifier: Identifier of its kind, for programs.
         level: How urgent it is.
         text: What has happened, for users; understandable without any other text.
-        steps: What ends it, in this order; () if it ends by itself.
+        steps: Steps that end it, in order; () if it ends by itself.
         subjects: Names of the muscles, joints, topics or nodes that it concerns.
     """
 

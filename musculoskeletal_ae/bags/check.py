@@ -27,7 +27,7 @@ from musculoskeletal_ae.robot.motors import NO_MOTORS, motor_topics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.wiring import Wiring, judge
 
-MOST_REJECTED = 0.1  # report a fault if a larger share of a topic's messages is rejected
+MOST_REJECTED = 0.1  # report a fault if more than this share of a topic's messages is rejected
 #: report no fault, however many messages are rejected for these reasons: lengths were being
 #: calibrated, or another program publishes its own joints on the topic
 USUAL_REJECTIONS = 'length offsets unknown', 'missing joint', 'missing motor'
@@ -100,7 +100,7 @@ def motion_text(robot: Robot, recording: Pairs) -> str:
     """Return a text that tells the user how many different postures can be learned.
 
     `train --from-bag` learns from resting postures or, if there are few, from slow moments of the
-    motion. If both are too few, the text also says what to record.
+    motion. If there are too few of both, the text also says what to record.
     """
     rests = _postures(robot, recording, 'resting postures')
     least = preset_named('default').least_samples
@@ -142,7 +142,7 @@ def recorded_wiring(pairs: Pairs, robot: Robot) -> Wiring:
 
 
 def _read_times(bag: Bag, progress: Callable[[float], None]) -> dict[str, array[int]]:
-    """Return the log times [ns] of each topic, after decoding all messages that can be used."""
+    """Decode all messages that can be used, and return the log times [ns] of each topic."""
     times = {name: array('q') for name in bag.topics}
     for message in bag.messages():
         times[message.topic].append(message.log_time)

@@ -75,7 +75,7 @@ class McapFile:
         self._chunks: list[_Span] = []
         self._size = path.stat().st_size
         self._expanded = 0  # bytes of decompressed chunks so far
-        self._complete = 0  # end of the last complete record [bytes]
+        self._complete = 0  # position at which the last complete record ends [bytes]
         self._newest: dict[str, int] = {}  # latest log time so far [ns], by topic
         with reading(path), open_file(path) as file:
             self._survey(_ExactStream(file))
@@ -206,7 +206,7 @@ class McapFile:
             raise BagError(self.path, problem, _JUMP)
         if self.end - time > LONGEST_PAUSE:
             problem = (
-                f'a message is {(self.end - time) / 1e9:.3g} s older than one before it; '
+                f'a message is {(self.end - time) / 1e9:.3g} s older than the newest before it; '
                 f'legal: at most {LONGEST_PAUSE / 1e9:g} s'
             )
             raise BagError(self.path, problem, CONVERT)

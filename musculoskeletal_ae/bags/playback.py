@@ -123,7 +123,7 @@ class Timeline:
     def hold(self, paused: bool, now: float) -> None:
         """Hold playback, or resume it if `paused` is False, when the steady clock reads `now` [s].
 
-        Neither changes the recorded time that has been reached.
+        Both leave the recorded time that has been reached unchanged.
         """
         self.jump(self.recorded(now), now)
         self.paused = paused

@@ -31,7 +31,7 @@ from musculoskeletal_ae.exceptions import BagError
 
 ROS1_MAGIC = b'#ROSBAG V'  # recognise a bag file of ROS 1, which is refused, by its first bytes
 MOST_HELD = 64 << 20  # hold messages of at most this total size in memory to sort them [bytes]
-_OVERHEAD = 100  # add this to the size of each message that is held in memory [bytes]
+_OVERHEAD = 100  # count this in addition to the data of each message that is held in memory [bytes]
 
 
 @dataclass

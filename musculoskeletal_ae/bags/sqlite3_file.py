@@ -142,7 +142,7 @@ def logs_of(path: Path) -> list[Path]:
 
 
 def _read_only(path: Path) -> closing[sqlite3.Connection]:
-    """Return a connection to a file that sqlite neither changes nor locks."""
+    """Return a connection through which sqlite neither changes nor locks a file."""
     address = f'{path.absolute().as_uri()}?mode=ro&immutable=1'
     return closing(sqlite3.connect(address, uri=True))
 

@@ -52,7 +52,7 @@ class Pairs(NamedTuple):
     isolated: Ints  # 1 for isolated muscles, 0 for others, -1 if not recorded, (P, M)
 
     def at(self, rows: Ints | Bools | slice) -> 'Pairs':
-        """Return the pairs in some rows, which indices, a mask or a slice selects."""
+        """Return the pairs in the rows that indices, a mask or a slice select."""
         time, theta, length, tension, isolated = self
         return Pairs(time[rows], theta[rows], length[rows], tension[rows], isolated[rows])
 
@@ -122,7 +122,7 @@ class _Stream:
     values: list[Array] = field(default_factory=list)
 
     def take(self, message: Any, arrival: Arrival) -> None:
-        """Convert a decoded message to values and append them; `arrival` is that of its sender."""
+        """Convert a decoded message to values and append them; `arrival` says when it arrived."""
         self.values.append(self.read(message, arrival))
         self.times.append(arrival.received_at)
 
@@ -152,7 +152,7 @@ class _ArmStreams:
         self._interface = MotorInterface(robot.description.motors, robot.tension_source)
         self._muscle_stream = MuscleStream(robot)
         self.had_offsets: list[bool] = []
-        #: lowest and highest recorded value of each tension, (M,) each, if they are not used
+        #: lowest and highest recorded tension of each muscle, (M,) each, if tensions are not used
         self._unused_tension = np.array([np.inf, -np.inf])[:, None] * np.ones(robot.muscle_count)
         muscles = robot.muscle_count
         self._bodies: list[BodyState] = []
@@ -215,9 +215,9 @@ class _ArmStreams:
 
     def _offset_rows(self, message: Any, _: Arrival) -> Array:
         muscles = self._robot.muscle_count
-        if len(message.data) == 2 * muscles:  # recorded with version 0.1.0: without trust
+        if len(message.data) == 2 * muscles:  # version 0.1.0 published no trust
             offsets = LengthOffsets(*read_array(message, 2, muscles))
-        else:  # with trust, and a generation
+        else:  # later versions published trust, and a generation
             offset, deviation, trust, _ = read_array(message, 4, muscles)
             offsets = LengthOffsets(offset, deviation, trust)
         return BodyState.of_rows(BodyState(offsets).rows).offsets.rows
@@ -227,7 +227,7 @@ class _ArmStreams:
         return np.isin(np.arange(self._robot.muscle_count), indices).astype(float)
 
     def isolated(self) -> Series:
-        """Return which muscles are isolated from when on: 1 for isolated muscles, else 0."""
+        """Return the isolated muscles in each message that states them, as 1, others as 0."""
         time, rows = self._body.series()
         return Series(time, rows[:, ISOLATED_ROW]) if len(time) else self._isolated.series()
 
@@ -342,9 +342,9 @@ def read_streams(
 def _labels(recorded: Mapping[str, str]) -> dict[str, str]:
     """Return, for each topic of the interface, the name by which reports refer to its messages.
 
-    This is the recorded name. One recorded topic may carry the angles of the joints as well as
-    those of the motors, and then stands for two topics of the interface. Its messages are then
-    counted twice, under two names of the form 'RECORDED NAME as INTERFACE NAME'.
+    Usually, this is the recorded name. However, one recorded topic may carry the angles of the
+    joints as well as those of the motors, and thus stand for two topics of the interface. Its
+    messages are then counted twice, under two names of the form 'RECORDED NAME as INTERFACE NAME'.
 
     Args:
         recorded: The recorded name of each topic of the interface.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of a recording with the best times that are known, for training and replay.
 
-A recorder on a busy computer is blocked for a moment, and then writes many messages late and in
+A recorder on a busy computer may be blocked for a moment, and then write many messages late and in
 bunches, with almost the same log time. The publish times are then more accurate, but the
 publisher's clock may differ from that of the recorder. With the delay d = log time − publish time
 of each message, the best time is
@@ -114,7 +114,7 @@ class TimedMessages:
         )
         waiting: list[tuple[int, int, BagMessage]] = []  # heap, ordered by best time
         for n, message in enumerate(self.bag.messages(topics, start, stop + longest)):
-            # Later messages of the bag have best times after this time.
+            # All later messages of the bag have best times after `log_time - longest`.
             while waiting and waiting[0][0] < message.log_time - longest:
                 yield heapq.heappop(waiting)[2]
             bunched = self._bunched.get(message.topic)

@@ -172,8 +172,8 @@ def interface_name(name: str) -> str:
 def _motor_topics(bag: Bag, motors: MotorTopics) -> dict[str, str]:
     """Return the name in motors.yaml of each recorded motor topic, by recorded name.
 
-    The file may use a relative name that the interface uses too, such as `joint_states`.
-    Such a topic counts as one of the interface and is left out.
+    The file may use a relative name that the interface uses too, such as `joint_states`. Such a
+    topic counts as one of the interface and is left out.
     """
     stated = [motors.states, motors.commands]
     return {
@@ -194,8 +194,8 @@ def _relative_names(
     """Return the name of each recorded topic relative to a namespace, by recorded name.
 
     Names outside the namespace stay absolute, and so do motor topics that motors.yaml states with
-    their absolute names. A topic of the interface that the namespace lacks may be taken from
-    an enclosing namespace.
+    their absolute names. A topic of the interface that the namespace lacks may be taken from an
+    enclosing namespace.
 
     Args:
         bag: The recording.

@@ -41,7 +41,7 @@ from musculoskeletal_ae.signals.muscle_readings import (
 )
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement
 
-#: report a fault if a larger share of the messages repeats the previous message exactly
+#: report a fault if more than this share of the messages repeats the previous message exactly
 MOST_REPEATED = 0.2
 #: treat sensors with at most this many different values as free of noise: repeated readings of an
 #: arm at rest are then no fault

@@ -39,7 +39,7 @@ LATEST = 0.1  # report a fault if a module takes longer to respond to a command 
 #: let a moving target advance for at most this time between two messages, so that it does not jump
 #: after a gap [s]
 LONGEST_ADVANCE = 0.05
-#: a change of T [N] or l [m] that exceeds the noise by this counts as a response to a command
+#: count a change of T [N] or l [m] that exceeds the noise by this as a response to a command
 RESPONSE = 4.0, 0.0006
 
 #: a part of a test that takes time; each of its steps takes one message

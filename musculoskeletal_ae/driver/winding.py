@@ -64,8 +64,8 @@ LENGTH_ERROR = 2.0e-4
 SLOPES = 0.7, 1.4
 #: to check the clip, demand this beyond tension.max [N]; accept this excess of T, relative to it
 CLIP = 20.0, 0.05
-#: If a muscle becomes taut at an l_target within this distance of −l [m], the sign of l or of the
-#: command is wrong.
+#: conclude that the sign of l or of the command is wrong if a muscle becomes taut at an l_target
+#: within this distance of −l [m]
 MIRROR_TOLERANCE = 0.008
 #: While the arm is held before the first test, demand at most HELD, and release all muscles above
 #: ALARM; both are fractions of the range from T_bias to the highest test tension. Healthy emulated
@@ -76,7 +76,7 @@ HELD, ALARM = 0.5, 0.9
 #: MEAN seconds
 OSCILLATES = 6
 #: start a release with l_target this far beyond l [m], and increase the distance at this speed
-#: [m/s]; it is small at first, because commands of wrong sign wind in
+#: [m/s]; the distance is small at first, because commands of wrong sign wind in
 PAY_OUT = 0.003, 0.3
 #: set every l_target this far beyond the largest l while searching for a wrong order [m]; no module
 #: then pulls, whichever command it follows
@@ -491,8 +491,8 @@ class Winding(MotionTest):
     def _judge_law(self, m: int, home: _Reading, last: _Reading, out: _Reading) -> None:
         """Judge whether the tension of muscle m obeys the control law of the modules.
 
-        `home` is the reading before it was wound in, `last` that at the highest demand, and `out`
-        that with l_target beyond l, which must demand T_bias only.
+        `home` is the reading before winding in, `last` that at the highest demand, and `out` that
+        with l_target beyond l, at which the law demands T_bias only.
         """
         failed = self.verdict.failed
         asked, got = last.demand[m] - home.demand[m], last.tension[m] - home.tension[m]

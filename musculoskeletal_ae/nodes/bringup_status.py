@@ -157,12 +157,12 @@ class BringupStatusNode(Shell):
         )
 
     def _why_no_estimate(self) -> str:
-        """Return the last rejected message of the estimator; without one, all problems."""
+        """Return the message that the estimator rejected last; if there is none, all problems."""
         rejected = self.situation.values('estimator').get(LAST_REJECTED, '')
         return f'rejected {rejected}' if rejected else self.situation.trouble()
 
     def _learned(self) -> str:
-        """Return from how many samples of a recording the learner has learned; '' without one.
+        """Return how many samples of a recording were learned, as a text; '' without a learner.
 
         If nodes may have missed messages, the text says so, with the remedy.
         """

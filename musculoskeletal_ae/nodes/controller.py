@@ -94,7 +94,7 @@ class ControllerNode(Shell):
             self.core.use, lambda reason: self.core.stop(ConditionKind.UNFIT_CHECKPOINT, reason)
         )
         # Settings of one request are applied together, because they may end a motion, which a
-        # rollback would not restore.
+        # return to the previous settings would not resume.
         for name in parameters_of(Settings):
             self.parameters.on_change(name, self.core.configure, lambda _: self._settings())
         self.needed.add('muscle_states', 'estimated_joint_states')

@@ -182,7 +182,7 @@ class EstimatorNode(Shell):
         if finding is None:
             return 'no anomaly was detected'
         muscle = self.robot.muscles[finding.muscle]
-        return f'cleared the anomaly of {muscle}; a fault that is still present is detected again'
+        return f'cleared the anomaly of {muscle}; a fault that persists will be detected again'
 
     # -- messages -------------------------------------------------------------------------------
 

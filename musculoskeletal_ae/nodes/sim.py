@@ -2,8 +2,8 @@
 """The node `sim`: simulates the learned body, driven by the same commands as the real arm.
 
 muscle_length_command, body_state → sim/joint_states, sim/muscle_states, sim/markers. With
-as_robot:=true the node replaces the robot, whose body is healthy, and publishes joint_states,
-muscle_states, robot_description, sim/markers.
+as_robot:=true the node replaces a healthy robot, and publishes joint_states, muscle_states,
+robot_description, sim/markers.
 The topic sim/external_wrench applies an external wrench, and sim/fixed_joint_states fixes joints. A
 command holds until the next command; before the first command, muscles are at T_bias. The node
 ignores muscle_tension_command, and its modules stay at 25 °C.

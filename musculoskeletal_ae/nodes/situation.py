@@ -24,8 +24,8 @@ from musculoskeletal_ae.remedy import Step, sentence
 from musculoskeletal_ae.report import with_load
 from musculoskeletal_ae.ros.diagnostics import IDENTITY, NODE_SILENCE, values_of
 
-#: forget other nodes than NEEDED without a report for this time [s]; it exceeds NODE_SILENCE,
-#: because nodes of other packages may report less often
+#: forget a node that is not in NEEDED after this time without a report [s]; the time exceeds
+#: NODE_SILENCE, because nodes of other packages may report less often
 FORGET_TIME = 5.0
 #: nodes that should not end, once they have reported
 NEEDED = 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim'
@@ -304,9 +304,9 @@ class Situation:
         return why if needed == '1' else f'{why}; learning begins with {needed} samples'
 
     def unexplored(self) -> str:
-        """Return that the arm does not explore although there is a learner, with its mode; or ''.
+        """Return a text if the arm does not explore although there is a learner, else ''.
 
-        The text is '' if a condition says the same.
+        The text states the mode. It is also '' if a condition already advises to explore.
         """
         mode = self.values('controller').get('mode')
         advised = {Step.EXPLORE, Step.EXPLORE_GENTLY}.intersection(self.steps())

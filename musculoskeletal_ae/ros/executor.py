@@ -229,8 +229,8 @@ class LeanExecutor(SingleThreadedExecutor):
 def make_executor(context: Context | None = None) -> Executor:
     """Return a `LeanExecutor` if it supports this rclpy, otherwise a `SingleThreadedExecutor`.
 
-    The environment can select either of them. If rclpy lacks a private name, `LeanExecutor` cannot
-    be selected either.
+    An environment variable can select one of the two. Even then, `LeanExecutor` is not returned if
+    rclpy lacks a private name that it needs.
 
     Raises:
         MusculoskeletalError: If the environment selects an unknown executor.

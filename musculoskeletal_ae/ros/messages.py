@@ -88,7 +88,7 @@ def add_joints(message: JointState, units: JointUnits, theta: Array) -> None:
 
 
 def is_heard(publisher: Publisher) -> bool:
-    """Return whether a publisher has a subscriber; otherwise, building a message is useless."""
+    """Return whether a publisher has a subscriber; without one, building a message is useless."""
     return publisher.get_subscription_count() > 0
 
 

@@ -26,7 +26,7 @@ from musculoskeletal_ae.ros_tools.ros_tool import Spinner
 
 STEP = 5_000_000  # ask the nodes after at most this recorded time [ns]
 MOST_MESSAGES = 8  # ask the nodes after at most this many messages; the queues of nodes hold 10
-#: wait at most this long for the first answer of all nodes, which have to start [s]
+#: wait at most this long until all nodes have started and answered [s]
 START_TIME = 300.0
 REPEAT_TIME = 2.0  # repeat an unanswered question after this time while nodes start [s]
 #: wait at most this long for an answer during playback [s]; a node that hangs has ended itself by

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tool `record`: writes the topics of this package to an mcap bag for `ros2 bag`."""
+"""The tool `record`: records the topics of this package to a bag that `ros2 bag` can read."""
 
 import math
 import sys
@@ -35,7 +35,7 @@ from musculoskeletal_ae.ros_tools.ros_tool import (
     start_ros,
 )
 
-#: write to disk at this interval [s]; a killed recorder loses the messages since the last writing
+#: write to disk at this interval [s]; a killed recorder loses the messages since the last write
 FLUSH_PERIOD = 0.5
 #: QoS whose queue holds at least a second of the fastest topic, in case the disk is busy
 LIVE = QoSProfile(depth=1000)

@@ -13,7 +13,7 @@ from musculoskeletal_ae.ros.diagnostics import LAST_REJECTED, rejected_counts, v
 
 
 class Rejections:
-    """Warns once for each node, topic and reason when a node rejects more and more messages."""
+    """Warns once for each node, topic and reason when a node rejects messages during the replay."""
 
     def __init__(self, topics: Iterable[str], bag: str, warn: Callable[[str], object]) -> None:
         """Prepare to watch which nodes reject messages of some topics.

@@ -23,7 +23,7 @@ from musculoskeletal_ae.ros_tools.ros_tool import Spinner, start_ros
 #: wait at most this long for reliable subscribers to acknowledge the messages [s]
 ACKNOWLEDGE_TIME = 2.0
 TRAJECTORY = 'joint_trajectory'
-#: rate that /diagnostics states for a topic without a used message since the previous report
+#: rate that /diagnostics states if no message of a topic was used since the previous report
 NO_RATE = '0.0 Hz'
 FIRST_REPORT_TIME = 2.0 * PERIOD  # wait at most this long for a first report of the subscribers [s]
 REPORT_TIME = 5.0 * PERIOD  # wait at most this long for two reports after sending a trajectory [s]

@@ -86,7 +86,7 @@ def read_csv(
 
 
 def looks_like_a_sequence(table: Table) -> bool:
-    """Return whether the postures of successive rows are near to each other, as in a motion."""
+    """Return whether the postures of successive rows are close to each other, as in a motion."""
     theta = table.rows.theta
     if not table.at_rest or len(theta) < 20:
         return False

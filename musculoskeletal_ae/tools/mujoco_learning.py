@@ -41,7 +41,7 @@ from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.model_training import train_on_model
 
-HELD_OUT = 60.0  # measure the error in a motion of this duration [s] that is not learned from
+HELD_OUT = 60.0  # measure the error on a held-out motion of this duration [s]
 #: options of `train --mujoco` that are passed on to `import_robot`
 CHAIN = 'joints', 'muscles', 'without', 'base', 'end'
 

@@ -27,7 +27,7 @@ CODE = (
     'robot',
     'mae',
     'presets',
-    'paper',  # has the initial training of §III-B
+    'paper',  # contains the initial training (§III-B of the paper)
     'tools/model_training.py',
 )
 ROBOT_FILES = 'robot.urdf', 'muscles.yaml'

@@ -168,7 +168,7 @@ def _csv_sources(robot: Robot, args: Namespace) -> list[TableSource]:
                 _warn([f'{path}: {count} rows were left out: {reason}'])
             if looks_like_a_sequence(table):
                 text = (
-                    'each row is used as a resting posture, but successive rows are near to each '
+                    'each row is used as a resting posture, but successive rows are close to each '
                     'other. If they are readings of a moving arm, name the column of their times '
                     'with --columns time=HEADER, or add --rate HZ'
                 )
@@ -184,8 +184,8 @@ def _csv_sources(robot: Robot, args: Namespace) -> list[TableSource]:
             sources.append(TableSource(f'{path}, {len(held_out)} rows', held_out, True))
     if len({source.table.at_rest for source in sources}) > 1:
         raise TableError(
-            'some files have times and others do not; learn from them separately, with '
-            '--checkpoint from the second time on'
+            'some files have times and others do not; learn from each kind in a run of its own, '
+            'and pass the network of the first run to the second with --checkpoint'
         )
     zeros = _zeros(robot, sources, args.estimate_zeros)
     shifted = [source._replace(table=source.table.without_zeros(zeros)) for source in sources]
@@ -425,8 +425,8 @@ def _warn(warnings: list[str]) -> None:
 def repetition(robot: Robot, theta: Array, learned: Array) -> str:
     """Return a warning if a held-out recording repeats the postures that were learned, or ''.
 
-    Its error is then no measure of the error in new postures. Postures of a single joint are not
-    judged, because they lie close together.
+    The error on such a recording is no measure of the error in new postures. Postures of a single
+    joint are not judged, because they lie close together.
 
     Args:
         robot: The geometric model.
