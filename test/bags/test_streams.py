@@ -219,7 +219,7 @@ def test_the_check_counts_the_resting_postures_that_can_be_learned_from(robot, p
     length = robot.muscle_lengths(theta, tension)
     text = motion_text(robot, Pairs(time, theta, length, tension, np.full(tension.shape, -1)))
     assert f'resting postures to learn from: {postures}' in text
-    assert ('too little motion' in text) == (postures == 1)
+    assert ('needs at least' in text) == (postures == 1)
 
 
 def test_the_check_of_a_bag_of_another_arm_fails(arm, tmp_path):
