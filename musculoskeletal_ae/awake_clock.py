@@ -3,20 +3,21 @@
 
 A process pauses while it is suspended, or while a busy computer gives it no time. Messages that
 arrive during a pause wait unread, so their absence proves nothing about their sender. Whether a
-sender is silent is therefore decided by the age of its messages on an `AwakeClock` (`arrival`).
+sender is silent is therefore decided by the age of its messages on an `AwakeClock`
+(`messages/arrival.py`).
 
 Each node has one such clock. It ticks ten times a second (`nodes/shell.py`), and in each step of
 the controller; that of `view` ticks in its loop, and that of `check_driver` every 0.02 s. Of the
 time between two ticks, at most `longest` counts. In a process that is always late, the clock
 advances by only `longest` for each tick. The process still notices a silent sender, but later.
 
-The arm moves on during a pause of this process. How far it can have moved since the last message is
-therefore a question for the steady clock, not for this one.
+The arm moves on during a pause of this process. How far it can have moved since the last message
+therefore depends on the time of the steady clock, not on the time of this clock.
 """
 
 import math
 
-PAUSE = 0.3  # treat the time between two ticks that exceeds this as a pause of this process [s]
+PAUSE = 0.3  # treat the part of the time between two ticks that exceeds this as a pause [s]
 
 
 class AwakeClock:
@@ -29,7 +30,7 @@ class AwakeClock:
         """Count at most `longest` [s] of the time between two ticks.
 
         Args:
-            longest: Longer than the usual time between two ticks [s].
+            longest: Longest time that counts in full [s]; must exceed the usual time between ticks.
         """
         self._longest = longest
         self._ticked_at = math.inf  # steady time of the last tick [s]

@@ -3,8 +3,8 @@
 
 A *condition* is a fact that a user should know: a fault, a stop, or something that a node waits
 for. The node that owns a fact reports it as long as it is true, and no other node infers it. A node
-reports all conditions that are present; none hides another. They travel on /diagnostics as the
-value `conditions` (`to_json`), and readers sort and print them.
+reports all conditions that are present; none hides another. Conditions travel on /diagnostics as
+the value `conditions` (`to_json`), and readers sort and print them.
 
 `ConditionKind` declares every kind with its text, its remedy and its consequence. The reference
 pages on stops and on diagnostics are generated from this table.
@@ -52,11 +52,11 @@ class Clears(Enum):
 class Stop(NamedTuple):
     """Consequence of a stop cause: what the controller does, and how the stop ends."""
 
-    #: whether the cause is a single event, which is over at once; otherwise it lasts until it
-    #: clears
     action: Action
     clears: Clears
-    is_event: bool = False  # whether the cause is a single event; otherwise it lasts or clears
+    #: whether the cause is a single event, which is over at once; otherwise it lasts until it
+    #: clears
+    is_event: bool = False
 
     def __str__(self) -> str:
         return f'{self.action.name.lower().replace("_", " ")}; ends {self.clears.value}'
@@ -81,7 +81,7 @@ class FindingReaction(Enum):
 
 
 class Revokes(Enum):
-    """Which length offsets become unreliable because of a finding."""
+    """The length offsets that become unreliable because of a finding."""
 
     ONE = 'that of the muscle, unless it is isolated'
     ALL = 'all'
@@ -131,13 +131,13 @@ class ConditionKind(Enum):
 
     @property
     def action(self) -> Action:
-        """What the controller does with the commands because of this stop cause."""
+        """Action of the controller while this stop cause is present."""
         assert self.stop is not None, self
         return self.stop.action
 
     @property
     def clears(self) -> Clears:
-        """How the stop that this cause has begun may end."""
+        """The ways in which a stop of this cause may end."""
         assert self.stop is not None, self
         return self.stop.clears
 
@@ -253,9 +253,9 @@ class ConditionKind(Enum):
         'module_not_following',
         'estimator',
         'error',
-        'the tension of a module stays away from the one that its command demands (its length, if '
-        'it follows positions), and its winch does not correct that: its motor is jammed or weak, '
-        'a reading is wrong, or commands do not arrive',
+        'the tension of a module (the length, if it follows positions) stays away from the value '
+        'that its command demands, and its winch does not correct the difference: its motor is '
+        'jammed or weak, a reading is wrong, or commands do not arrive',
         'a module does not follow its commands',
         REPAIR,
         reaction=FindingReaction.ISOLATE,
@@ -397,7 +397,7 @@ class ConditionKind(Enum):
         'estimator',
         'warn',
         'the constants of the thermal model of a cool module have changed',
-        'a cool module heats or cools otherwise than before',
+        'a cool module heats up or cools down at another rate than before',
         (Step.CHECK_MODULE,),
     )
 
@@ -433,7 +433,7 @@ class ConditionKind(Enum):
         'length_calibration_stuck',
         'estimator',
         'warn',
-        'a length calibration has enough data, but no offsets that it may believe',
+        'a length calibration has enough data, but its offsets are not reliable',
         'the length calibration does not end',
         (Step.CHECK_SENSOR, Step.CALIBRATE_LENGTHS),
     )
@@ -452,7 +452,7 @@ class ConditionKind(Enum):
         'estimator',
         'warn',
         'the tensions of an arm that has learned show another direction of gravity than robot.urdf',
-        'gravity, as the tensions show it, is not as in robot.urdf',
+        'the tensions show another direction of gravity than robot.urdf',
         (Step.CORRECT_MOUNTING, Step.RESET_ESTIMATOR),
     )
     UNSUITABLE_NETWORK = Declaration(
@@ -763,7 +763,7 @@ class ConditionKind(Enum):
         'replay_slow',
         'replay',
         'warn',
-        'playback waits for nodes and runs at less than 90 % of the wanted speed',
+        'playback waits for nodes and runs at less than half of the wanted speed',
         'the recording is played slowly',
     )
 
@@ -803,7 +803,7 @@ class Condition(NamedTuple):
         identifier: Identifier of its kind, for programs.
         level: How urgent it is.
         text: What has happened, for users; understandable without any other text.
-        steps: What ends it, in this order; () if it ends by itself.
+        steps: Steps that end it, in order; () if it ends by itself.
         subjects: Names of the muscles, joints, topics or nodes that it concerns.
     """
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read files that a user names, write files atomically, and lock directories.
 
-A file of a user is read only if it is a regular file up to a size limit. The argument
-`refuse(file, problem)` of the functions that read them returns the exception to raise.
+A file of a user is read only if it is a regular file up to a size limit. The functions that read
+such files have an argument `refuse(file, problem)`, which returns the exception to raise.
 """
 
 import csv

@@ -40,8 +40,8 @@ Samples without shared unknowns. `minimise_each` solves, for every sample n alon
 
     min over θ_n of  ‖r(θ_n)‖²   with  θ_low ≤ θ_n ≤ θ_high
 
-Each sample has its own damping, and stops alone. r contains the roots of weights, and the prior as
-further rows. An unknown at its bound is held if the step would move it beyond.
+Each sample has its own damping, and stops on its own. r contains the roots of weights, and the
+prior as further rows. An unknown at its bound is held if the step would move it beyond.
 
 Two problems of this package have their own solver. The steps of `simulation/equilibrium.py` are
 compiled, because a simulation takes thousands of them. Each step of `motion/methods.py` is a
@@ -190,14 +190,13 @@ class Eliminated:
         samples, mixed, common = equations
         eye = np.eye(samples.shape[-1])
         damped = samples + np.asarray(sample_damping)[..., None] * eye
-        # L is the inverse of the Cholesky factor of A, so that A⁻¹ = Lᵀ L. Products with L are
-        # cheaper than triangular solves.
-        #: L, the inverse of the Cholesky factor of A
+        #: L, the inverse of the Cholesky factor of A, so that A⁻¹ = Lᵀ L. Products with L are
+        #: cheaper than triangular solves.
         self._inverse = np.linalg.inv(np.linalg.cholesky(damped))
         self._reduced = self._inverse @ mixed  # the product L B
         tall = self._reduced.reshape(-1, len(common))
         diagonal = np.broadcast_to(common_damping, len(common))
-        # numpy alone: nodes that estimate would wait 0.3 s for the import of scipy.linalg.
+        # Use numpy only, because nodes would wait 0.3 s for the import of scipy.linalg.
         self._complement = common + np.diag(diagonal) - tall.T @ tall
         self.root: Array = np.linalg.cholesky(self._complement).T.astype(float, copy=False)
 
@@ -355,10 +354,10 @@ def minimise_each(
         usual: e_θ, 1 over the square of a typical step, (D,).
         rounds: Largest number of steps.
         bounds: θ_low and θ_high, (D,) each; None without bounds.
-        least_damping: Smallest λ. With a large one, residuals that hardly depend on an unknown do
-            not move it far.
-        enough: The first step that is predicted to lower ‖r‖² by less than this value is the last
-            one of a sample. It is not checked.
+        least_damping: Smallest λ. With a large value, residuals that hardly depend on an unknown do
+            not move this unknown far.
+        enough: A sample ends with the first step that is predicted to lower ‖r‖² by less than this
+            value. This last step is taken without checking that it lowers ‖r‖².
 
     Returns:
         θ, (..., D).

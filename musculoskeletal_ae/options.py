@@ -25,7 +25,8 @@ from musculoskeletal_ae.robot.directories import shipped_robots
 
 DEFAULT_ROBOT = 'musashi_left_arm'  # robot that a command uses without --robot
 DEFAULT_SEED = 0  # random seed that a command uses without --seed
-#: exit status after the reader of the output has closed it, as of other tools: 128 + SIGPIPE
+#: exit status after the reader of the output has closed it, the same as for other tools: 128 +
+#: SIGPIPE
 CLOSED = 141
 PICTURES = ('.png', '.svg', '.pdf', '.jpg')
 T = TypeVar('T')
@@ -163,8 +164,8 @@ class Parser(argparse.ArgumentParser):
     ) -> None:
         """Add `--out`, a file or directory; it is required unless it has a default or is optional.
 
-        `metavar` and `text` appear in its help. `read` converts and checks the argument. An
-        optional one is None if it is not given.
+        `metavar` and `text` appear in its help. `read` converts and checks the argument. If
+        `is_optional`, the value is None unless the user states it.
         """
         required = default is None and not is_optional
         self.add_argument(
@@ -208,7 +209,8 @@ def exit_status(
 
     A tool does its work whatever happens to its output (`output.py`). If the reader of stdout has
     closed it, as `head` does, print nothing and return CLOSED; if stdout could not be written for
-    another reason, print one line and return 1. A status other than 0 of the work comes first.
+    another reason, print one line and return 1. If the work returns another status than 0, that
+    status is returned.
     """
     refused: tuple[type[Exception], ...] = (MusculoskeletalError, OSError, *also)
     before = _versions(out)

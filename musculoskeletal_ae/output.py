@@ -2,9 +2,9 @@
 """Standard output and standard error that never raise an error.
 
 The reader of a pipe may have closed it (`| head`), the disk may be full, the terminal may be gone,
-and a process may have been started without any of them. None of this may keep a node or a tool from
-its work: text that cannot be written is discarded. A tool reports the loss by its exit status
-(`options.exit_status`).
+or the process may have been started without standard streams. None of this may keep a node or a
+tool from its work: text that cannot be written is discarded. A tool reports the loss by its exit
+status (`options.exit_status`).
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def secure_output() -> None:
     """Secure stdout and stderr, so that writing to them never raises an error.
 
     Characters that the encoding of the terminal lacks are shown as "?". A descriptor that was
-    closed when the process started leads to /dev/null from now on, because the next file that is
-    opened would otherwise get its number, and then also the text.
+    closed when the process started leads to /dev/null from now on. Otherwise, the next file that is
+    opened would get the number of this descriptor, and the output would be written into that file.
     """
     for number in _DESCRIPTORS:
         try:
@@ -64,7 +64,7 @@ def secure_output() -> None:
 def _secured(stream: TextIO | None, number: int) -> TextIO:
     """Return a stream that replaces `stream`, which Python has opened for descriptor `number`."""
     if stream is not None and not isinstance(stream, io.TextIOWrapper):
-        return stream  # not Python's own one
+        return stream  # other code has replaced the stream that Python opened
     if stream is not None:
         stream.flush()
     file: io.RawIOBase = _Output(number, 'w', closefd=False)

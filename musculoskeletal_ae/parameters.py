@@ -166,7 +166,7 @@ def parameters_of(settings: type) -> dict[str, Parameter]:
 ROBOT = Parameter(DEFAULT_ROBOT, 'a shipped robot, or a directory with robot.urdf and muscles.yaml')
 RATE = Parameter(100.0, 'rate of the muscle modules', 'Hz', (1.0, 1000.0))
 CHECKPOINT = Parameter(
-    '', 'file of a trained network (empty: wait for one on the topic)', settable=True
+    '', 'file of a trained network (empty: wait until a network is published)', settable=True
 )
 PRESET = Parameter(
     DEFAULT,

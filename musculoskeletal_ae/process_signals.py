@@ -23,7 +23,7 @@ GRACE = 2
 
 
 class Reaction(Enum):
-    """What a process does when it receives a stop signal (SIGINT or SIGTERM)."""
+    """Reaction of a process to a stop signal (SIGINT or SIGTERM)."""
 
     #: End the process at once. Used during imports, because extension modules turn a
     #: KeyboardInterrupt during their initialisation into other errors.

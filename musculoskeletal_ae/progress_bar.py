@@ -66,7 +66,7 @@ class ProgressBar:
         self._done = 0.0
         self._first: tuple[float, float] | None = None  # time [s] and sum after the first part
         self._last = 0.0  # time at which the last part was done [s]
-        # sums of durations [s] and parts since the first part, in which old ones count less
+        # sums of durations [s] and parts since the first part, in which older parts count less
         self._recent_time = self._recent_parts = 0.0
         self._shown = time.perf_counter()  # time at which the last text was printed [s]
 
@@ -86,7 +86,7 @@ class ProgressBar:
             self._print(f'{self._title}{more}')
 
     def add(self, part: float = 1.0) -> None:
-        """Count a part as done, and show the progress if it is time to."""
+        """Count a part as done, and show the progress if the last output is old enough."""
         now = time.perf_counter()
         self._done = min(self._done + part, self._total)
         if self._first is None:

@@ -28,7 +28,7 @@ class Step(Enum):
     REPAIR_MUSCLE = 'repair_muscle', 'repair tendon, winch or sensor of the named muscle'
     REPAIR_EMULATED_FAULT = (
         'repair_emulated_fault',
-        "set faults of hardware_emulator to [''], or press Repair on the page for a tendon",
+        "set faults of hardware_emulator to ['']; a tendon can also be repaired on the page",
     )
     FREE_ARM = 'free_arm', 'remove what pulls at the arm'
     CHECK_SENSOR = (
@@ -88,7 +88,7 @@ class Step(Enum):
     )
     WAIT_UNTIL_COOL = (
         'wait_until_cool',
-        'let the arm rest or pull less until the motors have cooled, when this condition ends',
+        'let the arm rest or pull less until the motors have cooled and this condition ends',
     )
     REPORT_LOG = 'report_log', 'keep the log of the node, and report the error'
     FREE_DISK = 'free_disk', 'make the state directory writable, with free space'

@@ -70,7 +70,7 @@ class RememberedText:
         return True
 
     def keep(self) -> None:
-        """Keep the text of the file, because it is right again; this ends a problem."""
+        """Keep the text of the file, because it is right again; clear `problem`."""
         self.problem = ''
 
     def delete(self) -> None:

@@ -39,9 +39,9 @@ class Report(NamedTuple):
 
     @property
     def message(self) -> str:
-        """What the component does, and all conditions that are not only for information.
+        """Activity of the component, and the texts of all warnings and errors.
 
-        If there is neither, the message consists of the conditions for information.
+        If there is neither, the message consists of the remaining conditions, of level 'ok'.
         """
         texts = [each.text for each in ordered(self.conditions) if each.level != 'ok']
         shown = filter(None, [self.doing, *texts])
@@ -70,8 +70,8 @@ def is_overloaded() -> bool:
 def overload_note() -> str:
     """Return that this computer is overloaded, with its load; '' if it is not overloaded.
 
-    Add the note to the text of a fault that an overload may contribute to. It is not the cause: a
-    node may have ended on a busy computer, too.
+    Add the note to the text of a fault to which an overload may have contributed. The overload need
+    not be the cause: a node may also have ended for another reason.
     """
     return f'this computer is overloaded (load {load_text()})' if is_overloaded() else ''
 

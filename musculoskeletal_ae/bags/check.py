@@ -27,7 +27,7 @@ from musculoskeletal_ae.robot.motors import NO_MOTORS, motor_topics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.wiring import Wiring, judge
 
-MOST_REJECTED = 0.1  # report a fault if a larger share of a topic's messages is rejected
+MOST_REJECTED = 0.1  # report a fault if more than this share of a topic's messages is rejected
 #: report no fault, however many messages are rejected for these reasons: lengths were being
 #: calibrated, or another program publishes its own joints on the topic
 USUAL_REJECTIONS = 'length offsets unknown', 'missing joint', 'missing motor'
@@ -100,13 +100,13 @@ def motion_text(robot: Robot, recording: Pairs) -> str:
     """Return a text that tells the user how many different postures can be learned.
 
     `train --from-bag` learns from resting postures or, if there are few, from slow moments of the
-    motion. If both are too few, the text also says what to record.
+    motion. If there are too few of both, the text also says what to record.
     """
     rests = _postures(robot, recording, 'resting postures')
     least = preset_named('default').least_samples
     text = f'different resting postures to learn from: {rests}'
     if rests >= LEAST_RESTS:
-        return f'{text} (at least {least} are needed; the more, the smaller the error)'
+        return f'{text} (at least {least} are needed; more of them reduce the error)'
     moments = _postures(robot, recording, 'slow moments', from_motion=True)
     if moments >= max(least, rests + 1):
         return (
@@ -114,10 +114,10 @@ def motion_text(robot: Robot, recording: Pairs) -> str:
             f'{moments} slow moments of the motion instead'
         )
     if rests >= least:
-        return f'{text} (at least {least} are needed; the more, the smaller the error)'
+        return f'{text} (at least {least} are needed; more of them reduce the error)'
     return (
-        f'{text}; too little motion for `train --from-bag`, which needs at least {least}. Record '
-        'an arm that moves from posture to posture, as with controller/explore'
+        f'{text}; `train --from-bag` needs at least {least} of them, or as many slow moments of '
+        'the motion. Record an arm that moves from posture to posture, as with controller/explore'
     )
 
 
@@ -142,7 +142,7 @@ def recorded_wiring(pairs: Pairs, robot: Robot) -> Wiring:
 
 
 def _read_times(bag: Bag, progress: Callable[[float], None]) -> dict[str, array[int]]:
-    """Return the log times [ns] of each topic, after decoding all messages that can be used."""
+    """Decode all messages that can be used, and return the log times [ns] of each topic."""
     times = {name: array('q') for name in bag.topics}
     for message in bag.messages():
         times[message.topic].append(message.log_time)
@@ -245,8 +245,8 @@ def _fit(bag: Bag, name: str, namespace: str | None) -> _Fit:
     pairs = streams.pairs()
     wiring = recorded_wiring(pairs, robot)
     if wiring.faulty:
-        what = 'in the order' if wiring.misplaced else 'of the signs'
-        faults = [f'muscles are not {what} of {name}: {wiring.text(robot.muscles)}']
+        what = 'order' if wiring.misplaced else 'signs'
+        faults = [f'the muscles do not have the {what} of {name}: {wiring.text(robot.muscles)}']
     else:
         faults = wrong_joint_sensors(robot, pairs)
     faults = rejected_faults + joint_faults + faults

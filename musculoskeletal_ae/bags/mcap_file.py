@@ -32,7 +32,8 @@ from musculoskeletal_ae.bags.storage import (
 )
 from musculoskeletal_ae.exceptions import BagError
 
-MAGIC = b'\x89MCAP0\r\n'  # recognise an mcap file by its first bytes, a complete one by its last
+#: recognise an mcap file by these bytes at its start, and a complete file also by those at its end
+MAGIC = b'\x89MCAP0\r\n'
 LARGEST_RECORD = 64 << 20  # refuse a larger record or decompressed chunk [bytes]
 #: Refuse a file that decompresses to more than MOST_EXPANDED bytes plus LARGEST_EXPANSION times its
 #: size. A malicious file of a few kB could otherwise take hours to read.
@@ -74,7 +75,7 @@ class McapFile:
         self._chunks: list[_Span] = []
         self._size = path.stat().st_size
         self._expanded = 0  # bytes of decompressed chunks so far
-        self._complete = 0  # end of the last complete record [bytes]
+        self._complete = 0  # position at which the last complete record ends [bytes]
         self._newest: dict[str, int] = {}  # latest log time so far [ns], by topic
         with reading(path), open_file(path) as file:
             self._survey(_ExactStream(file))
@@ -136,14 +137,14 @@ class McapFile:
         """Set `unfinished` to a text which says that the file ends within a record.
 
         Raises:
-            ValueError: If the file contains no complete record, or if it was closed properly, so
-                that the stated length of a record must be wrong.
+            ValueError: If the file contains no complete record, or if it was closed properly: the
+                stated length of a record must then be wrong.
         """
         if self._complete == 0:
             raise ValueError('it ends within its first record')
         with open_file(self.path) as file:
             file.seek(-len(MAGIC), 2)
-            if file.read() == MAGIC:  # complete, so a stated length is wrong
+            if file.read() == MAGIC:  # the file is not truncated, so a stated length is wrong
                 raise ValueError('a record reaches beyond the end of the file')
         self.unfinished = (
             f'{self.path.name} ends within a record at byte {self._size}; '
@@ -205,7 +206,7 @@ class McapFile:
             raise BagError(self.path, problem, _JUMP)
         if self.end - time > LONGEST_PAUSE:
             problem = (
-                f'a message is {(self.end - time) / 1e9:.3g} s older than one before it; '
+                f'a message is {(self.end - time) / 1e9:.3g} s older than the newest before it; '
                 f'legal: at most {LONGEST_PAUSE / 1e9:g} s'
             )
             raise BagError(self.path, problem, CONVERT)

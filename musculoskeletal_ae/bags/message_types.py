@@ -12,8 +12,8 @@ from typing import Any
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 TYPESTORE = get_typestore(Stores.ROS2_JAZZY)  # decode all messages with these types
-# Refuse messages with a longer sequence: no sequence in the messages of this package is nearly as
-# long. The size of a message is a further limit.
+# Refuse messages with a longer sequence than this: no sequence in the messages of this package is
+# nearly as long. Sequences that are longer than the rest of their message are refused anyway.
 TYPESTORE.max_sequence_length = 1 << 26
 
 CDR = 'cdr'  # the message encoding of ROS 2
@@ -56,7 +56,7 @@ def decode(data: bytes, type_name: str) -> Any:
 
 
 def mismatch(type_name: str, encoding: str, text: bytes, recorded_hash: str) -> str:
-    """Return the mismatch by which messages of a recorded type cannot be decoded; '' if they can.
+    """Return why the messages of a recorded type cannot be decoded; '' if they can.
 
     A recorder may store the RIHS01 hash and the definition of a type. Each of them that is stored
     must agree with the type of this name in ROS 2 Jazzy. Only definitions in .msg format are

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes metadata.yaml of a rosbag2 directory in version 9, and reads the names of its files.
+"""Writes metadata.yaml of a rosbag2 directory in version 9, and reads from it the storage files.
 
 The recorder writes metadata.yaml when recording starts and replaces it when recording ends. Readers
 of a bag take times and counts from the storage files instead.
@@ -29,7 +29,7 @@ FILE = 'metadata.yaml'  # name of the file in a bag directory
 VERSION = 9  # write the format of metadata.yaml that ROS 2 Jazzy writes
 SUFFIXES = ('.mcap', '.db3')  # read files with these suffixes if metadata.yaml cannot be used
 
-_NO_TIME = (1 << 63) - 1  # write this start of a bag without messages, as rosbag2 does [ns]
+_NO_TIME = (1 << 63) - 1  # write this start time [ns] for a bag without messages, as rosbag2 does
 _FOREVER = QosTime(9223372036, 854775807)  # QoS duration of a deadline that never passes
 
 

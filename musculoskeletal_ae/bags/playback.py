@@ -28,13 +28,13 @@ from musculoskeletal_ae.messages.arrival import SILENCE
 from musculoskeletal_ae.messages.message_reading import MOST_ENTRIES, target_values
 
 LONGEST_LAG = 1.0  # after an interruption longer than this [s], do not catch up
-#: when a pause of the recording is skipped, continue at this recorded time before the next message
-#: [ns]
+#: after skipping a pause of the recording, continue this long before the next message, in recorded
+#: time [ns]
 SKIP_LEAD = 500_000_000
 
 TAUGHT_TOPIC = 'estimated_joint_states'  # read a demonstrated motion from this topic
 #: Smooth a demonstrated motion by Gaussian weights of this standard deviation [s]. They keep the
-#: motion of a hand, which takes longer, and remove noise, which varies faster.
+#: motion of a hand, which takes longer than this, and remove noise, which varies faster.
 SMOOTHING = 0.15
 SPACING = 0.1  # place the points of the trajectory at this interval [s]
 LEAD_TIME = 3.0  # let the arm reach the first posture of the motion in this time [s]
@@ -123,7 +123,7 @@ class Timeline:
     def hold(self, paused: bool, now: float) -> None:
         """Hold playback, or resume it if `paused` is False, when the steady clock reads `now` [s].
 
-        Neither changes the recorded time that has been reached.
+        Both leave the recorded time that has been reached unchanged.
         """
         self.jump(self.recorded(now), now)
         self.paused = paused

@@ -30,8 +30,8 @@ from musculoskeletal_ae.bags.storage import (
 from musculoskeletal_ae.exceptions import BagError
 
 ROS1_MAGIC = b'#ROSBAG V'  # recognise a bag file of ROS 1, which is refused, by its first bytes
-MOST_HELD = 64 << 20  # hold messages of at most this size in memory to sort them [bytes]
-_OVERHEAD = 100  # add this to the size of each message that is held in memory [bytes]
+MOST_HELD = 64 << 20  # hold messages of at most this total size in memory to sort them [bytes]
+_OVERHEAD = 100  # count this in addition to the data of each message that is held in memory [bytes]
 
 
 @dataclass
@@ -45,7 +45,7 @@ class Bag:
 
     @classmethod
     def open(cls, path: str | Path) -> Bag:
-        """Open a recording, after reading and checking it as a whole.
+        """Open a recording: read and check all of it.
 
         If the recorder was killed, the recording is read up to its last complete record, and
         `unfinished` says why the rest is missing.
@@ -143,7 +143,7 @@ def _in_order(messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
         newest = max(newest, message.log_time)
         heapq.heappush(waiting, (message.log_time, number, message))
         held += len(message.data) + _OVERHEAD
-        # A single message may be larger than MOST_HELD, so that none is left.
+        # A single message may be larger than MOST_HELD; this loop then empties `waiting`.
         while waiting and (waiting[0][0] < newest - LONGEST_PAUSE or held > MOST_HELD):
             _, _, earliest = heapq.heappop(waiting)
             held -= len(earliest.data) + _OVERHEAD

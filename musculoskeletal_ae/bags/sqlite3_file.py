@@ -95,7 +95,7 @@ class Sqlite3File:
                 shutil.copyfile(file, Path(self._copy.name) / file.name)
         except OSError as error:
             size = sum(file.stat().st_size for file in (self.path, *logs)) / 1e6
-            problem = f'cannot be copied to {gettempdir()}, to apply {logs[0].name}'
+            problem = f'cannot be copied to {gettempdir()} in order to apply {logs[0].name}'
             remedy = f'set TMPDIR to a folder with {size:.0f} MB of free space'
             raise BagError(self.path, f'{problem}: {error.strerror}', remedy) from error
         self._read = Path(self._copy.name) / self.path.name
@@ -124,7 +124,7 @@ class Sqlite3File:
 
 
 def is_damaged(path: Path) -> bool:
-    """Return whether a file begins as a sqlite3 file, but cannot be read as a whole."""
+    """Return whether a file begins like a sqlite3 file, but cannot be read as a whole."""
     with open_file(path) as stream:
         if stream.read(len(MAGIC)) != MAGIC:
             return False
@@ -142,7 +142,7 @@ def logs_of(path: Path) -> list[Path]:
 
 
 def _read_only(path: Path) -> closing[sqlite3.Connection]:
-    """Return a connection to a file that sqlite neither changes nor locks."""
+    """Return a connection through which sqlite neither changes nor locks a file."""
     address = f'{path.absolute().as_uri()}?mode=ro&immutable=1'
     return closing(sqlite3.connect(address, uri=True))
 
@@ -151,9 +151,9 @@ def salvage(path: Path, target: Path) -> int:
     """Salvage a damaged file: copy all rows that sqlite can read to a new file.
 
     Rows are read in the order of their ids. After a row that cannot be read, the next readable id
-    is searched with steps that double, and then by bisection, because a damaged page contains
-    successive ids. A row whose values have another type is left out. Damage within the data of a
-    message cannot be noticed, because the format has no checksums.
+    is found with steps that double, and then by bisection, because a damaged page contains
+    successive ids. Rows whose values are not of the types of a message are left out. Damage within
+    the data of a message cannot be noticed, because the format has no checksums.
 
     Args:
         path: The damaged file, which stays as it is.
@@ -208,7 +208,7 @@ def _next_readable(connection: sqlite3.Connection, place: int) -> int | None:
 
 
 def _is_readable(connection: sqlite3.Connection, place: int) -> bool:
-    """Return whether the first row from an id on can be read; False if there is none."""
+    """Return whether the first row with this or a larger id can be read; False without a row."""
     try:
         return connection.execute(f'{_ROWS} LIMIT 1', (place,)).fetchone() is not None
     except sqlite3.DatabaseError:

@@ -136,7 +136,7 @@ def absolute(name: str) -> str:
 
 
 def topic_problem(topic: BagTopic, recorded_hash: str) -> str:
-    """Return the problem why messages of a topic cannot be used, for users; '' if they can.
+    """Return why the messages of a topic cannot be used, as a text for users; '' if they can.
 
     The text continues a sentence that begins with the topic.
     """

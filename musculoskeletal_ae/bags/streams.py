@@ -46,13 +46,13 @@ class Pairs(NamedTuple):
     """P pairs, each of a muscle message and of the joint angles at the same time."""
 
     time: Array  # time since the bag's start [s], (P,)
-    theta: Array  # joint angles [rad], (P, D); NaN for joints without a sensor or a right reading
+    theta: Array  # joint angles [rad], (P, D); NaN for joints without a usable reading
     length: Array  # muscle lengths [m], (P, M)
     tension: Array  # tensions [N], (P, M)
     isolated: Ints  # 1 for isolated muscles, 0 for others, -1 if not recorded, (P, M)
 
     def at(self, rows: Ints | Bools | slice) -> 'Pairs':
-        """Return the pairs in some rows, which indices, a mask or a slice selects."""
+        """Return the pairs in the rows that indices, a mask or a slice select."""
         time, theta, length, tension, isolated = self
         return Pairs(time[rows], theta[rows], length[rows], tension[rows], isolated[rows])
 
@@ -62,7 +62,7 @@ class Streams(NamedTuple):
 
     joints: Series  # usable joint angles [rad], (N, D); NaN where a joint has no usable reading
     muscle_times: Array  # times of the readings of muscle modules since the bag's start [s], (N,)
-    muscles: MuscleReadings  # these N readings; lengths without offset, plausible temperatures
+    muscles: MuscleReadings  # the N readings, with corrected lengths and plausible temperatures
     length_commands: Series  # target lengths of the muscle modules [m], (N, M)
     tension_commands: Series  # target tensions of the muscle modules [N], (N, M)
     isolated: Series  # 1 for isolated muscles, else 0, (N, M)
@@ -78,8 +78,8 @@ class Streams(NamedTuple):
         """Pair each muscle message with the joint angles at the same time.
 
         Online learning on the robot pairs messages in the same way (`signals/pairing.py`). Muscle
-        messages without matching joint angles are left out, but not those beside a false reading,
-        because their lengths and tensions are right.
+        messages without matching joint angles are left out, unless false joint angles were
+        recorded at the same time: the lengths and tensions are then right nevertheless.
         """
         time = self.muscle_times
         period = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
@@ -122,7 +122,7 @@ class _Stream:
     values: list[Array] = field(default_factory=list)
 
     def take(self, message: Any, arrival: Arrival) -> None:
-        """Convert a decoded message to values and append them; `arrival` is that of its sender."""
+        """Convert a decoded message to values and append them; `arrival` says when it arrived."""
         self.values.append(self.read(message, arrival))
         self.times.append(arrival.received_at)
 
@@ -152,7 +152,7 @@ class _ArmStreams:
         self._interface = MotorInterface(robot.description.motors, robot.tension_source)
         self._muscle_stream = MuscleStream(robot)
         self.had_offsets: list[bool] = []
-        #: lowest and highest recorded value of each tension, (M,) each, if they are not used
+        #: lowest and highest recorded tension of each muscle, (M,) each, if tensions are not used
         self._unused_tension = np.array([np.inf, -np.inf])[:, None] * np.ones(robot.muscle_count)
         muscles = robot.muscle_count
         self._bodies: list[BodyState] = []
@@ -215,9 +215,9 @@ class _ArmStreams:
 
     def _offset_rows(self, message: Any, _: Arrival) -> Array:
         muscles = self._robot.muscle_count
-        if len(message.data) == 2 * muscles:  # recorded with version 0.1.0: without trust
+        if len(message.data) == 2 * muscles:  # version 0.1.0 published no trust
             offsets = LengthOffsets(*read_array(message, 2, muscles))
-        else:  # with trust, and a generation
+        else:  # later versions published trust, and a generation
             offset, deviation, trust, _ = read_array(message, 4, muscles)
             offsets = LengthOffsets(offset, deviation, trust)
         return BodyState.of_rows(BodyState(offsets).rows).offsets.rows
@@ -227,15 +227,15 @@ class _ArmStreams:
         return np.isin(np.arange(self._robot.muscle_count), indices).astype(float)
 
     def isolated(self) -> Series:
-        """Return which muscles are isolated from when on: 1 for isolated muscles, else 0."""
+        """Return the isolated muscles in each message that states them, as 1, others as 0."""
         time, rows = self._body.series()
         return Series(time, rows[:, ISOLATED_ROW]) if len(time) else self._isolated.series()
 
     def _body_at(self, time: float, before: BodyState) -> BodyState:
         """Return the body state at a time [s] of the recording; `before` if nothing has changed.
 
-        Before the first message, its isolated muscles hold, and its offsets if they are known: it
-        was published before the bag began, but the recorder received it a little late.
+        The first message also applies to the time before it, except for unknown offsets: it was
+        published before the bag began, but the recorder received it a little late.
         """
         if not self._bodies:
             return self._earlier_body_at(time, before)
@@ -287,8 +287,8 @@ def read_streams(
 
     Muscle states pass through the same `MuscleStream` as on a robot, which rejects and counts
     implausible messages. Each length is corrected by the length offsets of the newest body state
-    (topic `body_state`). If the offsets of the first one are known, they also correct earlier
-    lengths. Muscle states that were received while offsets were unknown are rejected.
+    (topic `body_state`). If the offsets of the first body state are known, they also correct
+    earlier lengths. Muscle states that were received while offsets were unknown are rejected.
 
     False readings of joint sensors are left out (`signals/joint_series.py`).
 
@@ -299,7 +299,7 @@ def read_streams(
         bag: The recording.
         robot: The robot, whose joints and muscles the messages must have.
         namespace: The namespace of the arm; required only if the bag has several.
-        progress: Called after each message with its share of all messages, which add up to 1.
+        progress: Called after each message with its share of all messages; all shares add up to 1.
         stop: Latest log time [ns] of the messages to read.
 
     Raises:
@@ -342,9 +342,9 @@ def read_streams(
 def _labels(recorded: Mapping[str, str]) -> dict[str, str]:
     """Return, for each topic of the interface, the name by which reports refer to its messages.
 
-    This is the recorded name. One recorded topic may carry the angles of the joints as well as
-    those of the motors, and then stands for two topics of the interface. Its messages are then
-    counted twice, under two names of the form 'RECORDED NAME as INTERFACE NAME'.
+    Usually, this is the recorded name. However, one recorded topic may carry the angles of the
+    joints as well as those of the motors, and thus stand for two topics of the interface. Its
+    messages are then counted twice, under two names of the form 'RECORDED NAME as INTERFACE NAME'.
 
     Args:
         recorded: The recorded name of each topic of the interface.
@@ -385,7 +385,8 @@ def _deliver(
         messages.messages(early, stop=stop), messages.messages(takers.keys() - early, stop=stop)
     ):
         decoded = bag.decode(message)
-        # Publishers of different joints on one topic may have different clocks.
+        # Publishers of different joints on one topic may have different clocks: keep one Arrival
+        # for each of them.
         arrival = arrivals[(message.topic, *getattr(decoded, 'name', ()))]
         is_new = arrival.receive((message.log_time - bag.start) / 1e9, message.publish_time)
         for label, take in takers[message.topic].items():

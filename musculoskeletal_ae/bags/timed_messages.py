@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Messages of a recording with the best times that are known, for training and replay.
 
-A recorder on a busy computer is blocked for a moment, and then writes many messages late and in
+A recorder on a busy computer may be blocked for a moment, and then write many messages late and in
 bunches, with almost the same log time. The publish times are then more accurate, but the
 publisher's clock may differ from that of the recorder. With the delay d = log time − publish time
 of each message, the best time is
@@ -10,7 +10,7 @@ of each message, the best time is
 
 The minimum is over all messages of the topic. Topics without bunches keep their log times, because
 publish times have errors of their own: the clock of another computer drifts, and the clock of a
-recorder with `use_sim_time` passes at another rate.
+recorder with `use_sim_time` runs at another rate.
 
 Log times may also jump forward, because the recorder was paused, or because its clock was set.
 Jumps of more than `LONGEST_PAUSE` count as pauses. Backward jumps are refused when a bag is opened.
@@ -34,7 +34,7 @@ from musculoskeletal_ae.report import duration
 # only if all of the following conditions hold.
 FEW = 20  # the topic has at least this many messages
 BUNCHED = 50_000_000  # its delays (log time minus publish time) differ by more than this [ns]
-MANY = 0.1  # more than this share of its messages was written together with the one before
+MANY = 0.1  # more than this share of its messages was written together with the message before
 
 
 class Pause(NamedTuple):
@@ -104,8 +104,8 @@ class TimedMessages:
 
         Args:
             topics: Recorded names of the topics to read.
-            start: Earliest time [ns]. The start of the bag includes messages that were published
-                before, but recorded late.
+            start: Earliest time [ns]. If it is the start of the bag, messages that were published
+                earlier, but recorded late, are included.
             stop: Latest time [ns].
         """
         start = start if start > self.bag.start else 0
@@ -114,7 +114,7 @@ class TimedMessages:
         )
         waiting: list[tuple[int, int, BagMessage]] = []  # heap, ordered by best time
         for n, message in enumerate(self.bag.messages(topics, start, stop + longest)):
-            # Later messages of the bag have best times after this time.
+            # All later messages of the bag have best times after `log_time - longest`.
             while waiting and waiting[0][0] < message.log_time - longest:
                 yield heapq.heappop(waiting)[2]
             bunched = self._bunched.get(message.topic)

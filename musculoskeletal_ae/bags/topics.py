@@ -59,7 +59,7 @@ def interface_topics(
 
     Raises:
         BagError: If the namespace is ambiguous or not in the bag, if the topic of the motors is
-            missing, or if a topic has another type than the interface.
+            missing, or if a topic has another type than in the interface.
     """
     names = _relative_names(bag, namespace, motors)
     topics = topics_with(motors) | EARLIER
@@ -149,7 +149,7 @@ def namespaces(names: Iterable[str]) -> list[str]:
 
     The root namespace is ''. Recorded names can be ambiguous: `/sim/joint_states` is a topic of the
     interface in the root, but also `joint_states` in the namespace `/sim`. If all topics can belong
-    to one namespace, only this namespace is returned, and the shortest if there are several.
+    to one namespace, only this namespace is returned; of several such namespaces, the shortest is.
 
     Args:
         names: Recorded names of topics.
@@ -172,8 +172,8 @@ def interface_name(name: str) -> str:
 def _motor_topics(bag: Bag, motors: MotorTopics) -> dict[str, str]:
     """Return the name in motors.yaml of each recorded motor topic, by recorded name.
 
-    The file may use a relative name that the interface uses too, such as `joint_states`.
-    Such a topic counts as one of the interface and is left out.
+    The file may use a relative name that the interface uses too, such as `joint_states`. Such a
+    topic counts as one of the interface and is left out.
     """
     stated = [motors.states, motors.commands]
     return {
@@ -194,8 +194,8 @@ def _relative_names(
     """Return the name of each recorded topic relative to a namespace, by recorded name.
 
     Names outside the namespace stay absolute, and so do motor topics that motors.yaml states with
-    their absolute names. A topic of the interface that the namespace lacks may be taken from
-    an enclosing namespace.
+    their absolute names. A topic of the interface that the namespace lacks may be taken from an
+    enclosing namespace.
 
     Args:
         bag: The recording.

@@ -18,7 +18,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import EMPTY, BagTopic
 from musculoskeletal_ae.exceptions import BagError
 
-#: compression of the chunks of an mcap file, by the value of an option
+#: compression of the chunks of an mcap file, by the value of the option --compression
 COMPRESSIONS = {'none': CompressionType.NONE, 'zstd': CompressionType.ZSTD}
 _LARGEST_CHUNK = 1 << 20  # write a chunk to the file once it has reached this size [bytes]
 
@@ -167,7 +167,7 @@ class BagWriter:
 
 
 class Recovered(NamedTuple):
-    """What the recovery of a damaged or unfinished recording has saved, and what it has not."""
+    """Result of a recovery: the number of saved messages, and what could not be saved."""
 
     message_count: int  # number of messages in the new bag
     left_out: list[str]  # topics that were left out because their messages are not in CDR
@@ -195,9 +195,9 @@ def recover(path: Path, target: Path, compression: str = 'zstd') -> Recovered:
 
 
 def _open_damaged(path: Path, folder: Path) -> tuple[Bag, list[str]]:
-    """Open a recording; return it with the names of its files that are damaged.
+    """Open a recording; return it, and the names of its damaged files.
 
-    Of a damaged sqlite3 file, a copy of its readable rows in `folder` is read instead.
+    Instead of a damaged sqlite3 file, a copy of its readable rows in `folder` is read.
     """
     try:
         return Bag.open(path), []

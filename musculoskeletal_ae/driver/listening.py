@@ -41,7 +41,7 @@ from musculoskeletal_ae.signals.muscle_readings import (
 )
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement
 
-#: report a fault if a larger share of the messages repeats the previous message exactly
+#: report a fault if more than this share of the messages repeats the previous message exactly
 MOST_REPEATED = 0.2
 #: treat sensors with at most this many different values as free of noise: repeated readings of an
 #: arm at rest are then no fault
@@ -50,8 +50,8 @@ TEMPERATURES = -20.0, 130.0  # treat temperatures outside this range as impossib
 #: let l exceed its range by this distance, with and without length calibration [m]
 BEYOND = 0.1, 1.0
 BEYOND_JOINT = 0.3  # report a fault if θ exceeds the joint limits by more than this [rad]
-#: compare the excess of θ over its limits that this share of the messages does not exceed with
-#: BEYOND_JOINT
+#: compare BEYOND_JOINT with this quantile of the excess of θ over its limits, because a single
+#: reading may be an outlier
 BEYOND_SHARE = 0.95
 #: report a fault if |T − T_bias| exceeds the smaller of these while nothing is commanded, [N] and
 #: relative to T_bias; they cover errors of the sensor and of its zero
@@ -59,20 +59,20 @@ RESTING_TENSION, RESTING_SHARE = 15.0, 0.5
 PULLS = 0.3, 3.0  # reinterpret units or rows only if T / T_bias at rest is then in this range
 #: reinterpret units or rows only if temperatures at rest are then in this range [°C]
 USUAL = 10.0, 60.0
-#: T is in another unit if all muscles, converted from that unit to N, are within this fraction of
-#: T_bias
+#: conclude that T is in another unit if all tensions, converted from that unit to N, differ from
+#: T_bias by less than this fraction
 UNIT_TOLERANCE = 0.3
 #: units in which a driver may publish tensions by mistake, each in newtons
 TENSION_UNITS = {'kgf': 9.80665, 'lbf': 4.44822, 'kN': 1000.0}
-#: doubt the unit of a higher temperature of modules without commands [°C]; modules above 13 °C
-#: exceed this value if their temperature is published in °F
+#: doubt the unit if a module without commands reports a higher temperature than this [°C]; modules
+#: above 13 °C exceed this value if their temperature is published in °F
 HOTTEST_AT_REST = 55.0
 # Lengths of healthy arms differ from the model. For the emulated individuals 0–9 of arm26 and
 # musashi_left_arm (notes/removed_benches.md), lengths change by 0.31 to 1.55 times the model's
 # changes, and `model_errors.LARGEST` bounds the difference.
 #: report a fault if the change of l, divided by the modelled change, is outside this range
 SLOPES = 0.2, 2.2
-#: a column of an arm at rest is misplaced only if another muscle fits it better by this factor
+#: count a column of an arm at rest as misplaced only if another muscle fits better by this factor
 BETTER_AT_REST = 2.5
 MOVED = 0.04  # check sign and slope of l only if its range is larger than this [m]
 #: blame the joint sensors if correcting their angles leaves at most this fraction of the misfit;
@@ -95,7 +95,7 @@ MOTOR_NOTE = (
 
 
 class Listening:
-    """Collects messages of a driver and checks them. Times are of one steady clock [s]."""
+    """Collects messages of a driver and checks them. All times come from one steady clock [s]."""
 
     def __init__(
         self,
@@ -128,7 +128,7 @@ class Listening:
         #: readings of each message of muscle_states, and how many messages of joint_states arrived
         #: before it
         self._read: list[tuple[MuscleReadings, int]] = []
-        #: times [s] of the joint messages, which are those of the muscles before them, and θ (D,)
+        #: for each message of joint_states: time [s] of the muscle message before it, and θ (D,)
         self._angles_read: list[tuple[float, Array]] = []
         self._now = 0.0  # time of the newest message of the muscles [s]
         #: errors of the rejected messages, by topic and reason
@@ -234,7 +234,7 @@ class Listening:
     def _angles_at_readings(self, verdict: Verdict) -> Array:
         """Return θ [rad] at each message of the muscles, (N, D), with NaN where it is unknown.
 
-        False angles are left out, and recorded.
+        False angles are left out, and the verdict reports them.
 
         Args:
             verdict: Receives the results.
@@ -611,7 +611,7 @@ class Listening:
             follows = other == m or all_turned
             if not moved.any():
                 follows |= inverse[m] < fit[m, other] or own[m] <= BETTER_AT_REST * fit[m, other]
-                # Two muscles that are exchanged both misfit; if one misfits, its zero is wrong.
+                # If two muscles are exchanged, both misfit; if only one misfits, its zero is wrong.
                 follows |= not self._zeroed or min(own[m], own[other]) <= model_errors.LARGEST
             if not follows:
                 verdict.failed('place', m, other=robot.muscles[other], doubt=doubt)
@@ -635,7 +635,7 @@ class Listening:
                 predicted = f'the route predicts {model[0, m]:+.3f} m'
                 verdict.failed('sign', m, detail=f'{measured}, {predicted}{doubt}')
             else:
-                # Only lengths that a hand has changed distinguish this from a wrong sign or order.
+                # Unless a hand changes the length, a wrong sign or order looks like a wrong zero.
                 is_movable = robot.actuation.choose(not self._stated, False)
                 what = 'zero at rest' if is_movable and not moved[m] else 'zero'
                 verdict.failed(what, m, off=1e3 * off)
@@ -648,9 +648,9 @@ def _interpretations(
     """Yield interpretations of a message's values, from the literal one to the least likely.
 
     Each interpretation is a tuple: the name of the driver fault that would explain it ('' for
-    none), the values for the texts about this fault, and the readings that the driver
-    should have published. If no interpretation gives possible values, the
-    last one is the literal one again, so that the values are reported as they were published.
+    none), the values for the texts about this fault, and the readings that the driver should have
+    published. The last interpretation is the literal one again: if none gives possible values, they
+    are reported as they were published.
 
     Args:
         published: The published values.

@@ -22,14 +22,15 @@ from musculoskeletal_ae.signals.joint_sensors import corrected, judge, sign_note
 from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.signals.wiring import WiringJudgement
 
-#: time for paying out a released muscle, and for settling after a target has moved back [s]
+#: pay a released muscle out for this time, and let a muscle settle for this time after its target
+#: has moved back [s]
 RELEASE = 0.6
-MEAN = 0.3  # average the readings of the last part of a wait, of this duration [s]
+MEAN = 0.3  # average the readings over this time at the end of a wait [s]
 #: let the arm come to rest for this time after a motion, before its readings are judged [s]
 SETTLE = 1.5
 HOLD = 0.5  # judge the response to a command after holding it for this time [s]
-SPEED = 0.01  # let the target length of the tested muscle move inwards at this speed [m/s]
-RELEASE_SPEED = 0.03  # let the target length of the tested muscle move back at this speed [m/s]
+SPEED = 0.01  # move the target length of the tested muscle inwards at this speed [m/s]
+RELEASE_SPEED = 0.03  # move the target length of the tested muscle back at this speed [m/s]
 ABOVE_BIAS = 40.0  # without --tension, test muscles up to this tension above T_bias [N]
 #: release a muscle whose tension exceeds the highest or the demanded tension by this [N]
 RUN_AWAY_TENSION = 60.0
@@ -38,7 +39,7 @@ LATEST = 0.1  # report a fault if a module takes longer to respond to a command 
 #: let a moving target advance for at most this time between two messages, so that it does not jump
 #: after a gap [s]
 LONGEST_ADVANCE = 0.05
-#: a change of T [N] or l [m] that exceeds the noise by this counts as a response to a command
+#: count a change of T [N] or l [m] that exceeds the noise by this as a response to a command
 RESPONSE = 4.0, 0.0006
 
 #: a part of a test that takes time; each of its steps takes one message
@@ -80,7 +81,7 @@ class MotionTest(ABC):
         #: index of the muscle that is being tested; None while the arm is held
         self._tested: int | None = None
         self.done = False
-        #: whether each muscle has been tested in this run, and no fault was found, (M,)
+        #: whether each muscle has been tested in this run without a fault, (M,)
         self._is_verified: Bools = np.zeros(robot.muscle_count, dtype=bool)
         self._now = 0.0
         #: times [s] and readings of the messages of the last MEAN seconds
@@ -156,7 +157,7 @@ class MotionTest(ABC):
         """
 
     def _explain(self) -> Generator[None, None, dict[int, int]]:
-        """Return which muscles commands wind in instead, after a muscle ran away; {} if unknown."""
+        """Return, after a muscle ran away, which muscle each command winds in; {} if unknown."""
         yield from ()
         return {}
 
@@ -246,8 +247,8 @@ class MotionTest(ABC):
         if judgement.faults:
             if order.is_faulty:
                 verdict.notes.append(
-                    f'the lengths look the same if {self._moves_like(order)}: check the order of '
-                    'these muscles, too'
+                    f'the lengths could also mean that {self._moves_like(order)}: check the order '
+                    'of these muscles, too'
                 )
             return
         verdict.passed_some('order', [m for m in self._muscles if m in order.right])

@@ -55,7 +55,7 @@ def wrong_side(
         segments: Number of the segment to which each message belongs, (N,).
         winds: The column that responded to each command, by muscle.
         joint_faults: Faults that would explain the lengths if the readings are right. Exchanged
-            readings must explain them better.
+            readings must explain the lengths better.
 
     Returns:
         The exchanged side, or None if the joint angles do not tell it.

@@ -2,12 +2,12 @@
 """Measure the rate at which a driver publishes.
 
 Source time and sequence number of the messages give the rate of publication. Without them, the rate
-of reception is used instead. It may be lower, because a busy computer may delay or lose messages,
-or block this process. The `AwakeClock` of this process shows whether it was blocked.
+of reception is used, which may be lower: a busy computer may delay or lose messages, or block this
+process. The `AwakeClock` of this process shows whether it was blocked.
 
 A driver must keep at least the expected rate. If it does not, but this computer is overloaded, the
-rate is not judged, because the driver may run here. The motion test then remains possible, within
-LEAST_RATE and INTERRUPTION.
+rate is not judged, because the driver may run here. The motion test then remains possible if the
+rate is at least LEAST_RATE and no gap is longer than INTERRUPTION.
 """
 
 from typing import NamedTuple

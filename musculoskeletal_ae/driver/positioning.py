@@ -40,8 +40,8 @@ OUTWARDS = 0.005  # pay a muscle out by this after winding it in, to check the o
 FOLLOWS = 0.0015  # accept a module at rest whose l differs from l_target by at most this [m]
 #: report a fault if the change of l, divided by that of l_target, is outside this range
 SHARES = 0.7, 1.4
-#: permit T to rise by this while the arm is held, even where T exceeds the highest test tension at
-#: rest [N]
+#: while the arm is held, permit T to rise by this [N], even if T then exceeds the highest test
+#: tension
 RISE = 20.0
 #: release a muscle, and end the test, if its l is further away from l_target than this [m]
 RUN_AWAY = 0.03
@@ -129,7 +129,7 @@ class Positioning(MotionTest):
         return self._winds
 
     def _exchanged(self, length: Array) -> dict[int, int]:
-        """Return which modules the commands move instead while the arm is held; {} if unknown.
+        """Return, while the arm is held, which module each command moves; {} if unknown.
 
         Every target is the l that a module had published. Modules that follow the commands of other
         muscles move to the l of these muscles. While they still move, only two modules that move

@@ -121,7 +121,7 @@ class Verdict:
         self._excused.setdefault(check, []).append(observation)
 
     def advise(self, checks: tuple[Check, ...], remedy: str) -> None:
-        """Record how to make checks; the report names the muscles that still lack one of them."""
+        """Record how to make checks possible; the report names the muscles that still lack one."""
         self._remedies.append((checks, remedy))
 
     def forbid_motion(self, reason: str) -> None:
@@ -225,8 +225,8 @@ class Verdict:
                 'reason alone: end other programs and repeat the check'
             )
         remarks += [f'note: {note}' for note in self.notes]
-        # Where the motion of the arm showed a fault, the other checks of l are open because of the
-        # fault, and the remedy would not make them.
+        # If order, unit or sign of a muscle is wrong, its other checks are open for this reason,
+        # and the remedy would not help.
         columns = [CHECKS.index(check) for check in ('order', 'unit', 'sign')]
         has_fault: Bools = (self._state[:, columns] == WRONG).any(axis=1)
         has_fault |= any(fault.is_of_joints for fault in self.faults)

@@ -51,10 +51,10 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
-#: demand at least this above T_bias, because noise hides the response to less [N]
+#: demand at least this much above T_bias [N], because noise hides the response to smaller demands
 LEAST_ABOVE_BIAS = 20.0
 FURTHEST = 0.025  # wind a muscle in by at most this [m]
-SLACK = 0.01  # after winding in, set l_target this far beyond l, so that the law demands T_bias [m]
+SLACK = 0.01  # after winding in, set l_target this far beyond l [m], so that the law demands T_bias
 RUN_AWAY = 0.05  # release all muscles, and end the test, if one shortens by more than this [m]
 #: accept an error of T up to the larger of these: [N], and relative to the demand
 TENSION_TOLERANCE, TENSION_SHARE = 10.0, 0.1
@@ -64,26 +64,27 @@ LENGTH_ERROR = 2.0e-4
 SLOPES = 0.7, 1.4
 #: to check the clip, demand this beyond tension.max [N]; accept this excess of T, relative to it
 CLIP = 20.0, 0.05
-#: If a muscle becomes taut at an l_target within this distance of −l [m], the sign of l or of the
-#: command is wrong.
+#: conclude that the sign of l or of the command is wrong if a muscle becomes taut at an l_target
+#: within this distance of −l [m]
 MIRROR_TOLERANCE = 0.008
 #: While the arm is held before the first test, demand at most HELD, and release all muscles above
 #: ALARM; both are fractions of the range from T_bias to the highest test tension. Healthy emulated
-#: arms that still swing reach 0.81. If K is large, T is noisy, and ALARM is raised by the excess.
+#: arms that still swing reach 0.81. If K is large, T is noisy, and the limit of ALARM is raised by
+#: twice the excess of the tolerance of T over TENSION_TOLERANCE.
 HELD, ALARM = 0.5, 0.9
 #: treat T as oscillating, and release all muscles, if it crosses its mean more often than this in
 #: MEAN seconds
 OSCILLATES = 6
 #: start a release with l_target this far beyond l [m], and increase the distance at this speed
-#: [m/s]; it is small at first, because commands of wrong sign wind in
+#: [m/s]; the distance is small at first, because commands of wrong sign wind in
 PAY_OUT = 0.003, 0.3
-#: set every l_target this far beyond the largest l while a wrong order is searched [m]; no module
+#: set every l_target this far beyond the largest l while searching for a wrong order [m]; no module
 #: then pulls, whichever command it follows
 CLEAR = 0.005
-#: let the demand rise by at most this share of the range from T_bias to ALARM within
-#: LONGEST_ADVANCE while a wrong order is searched
+#: while searching for a wrong order, let the demand rise by at most this share of the range from
+#: T_bias to ALARM within LONGEST_ADVANCE
 SEARCH_SHARE = 0.5
-CONFIRMATIONS = 3  # count a rise of tension as a response only in this many successive messages
+CONFIRMATIONS = 3  # count a rise of tension as a response if this many messages in a row show it
 MOST_BEYOND = 0.3  # demand at most this much beyond tension.max, relative to tension.max
 
 
@@ -152,7 +153,7 @@ class Winding(MotionTest):
         #: highest tension [N] (M,) that is demanded in the present test
         self._most: Array = self._highest.copy()
         self._sent: Array = self._target.copy()  # the last command [m] (M,)
-        #: whether each muscle is searched for its response, which may be anywhere (M,)
+        #: whether the target of each muscle moves without limit, to search for a response, (M,)
         self._is_searched: Bools = np.zeros(robot.muscle_count, dtype=bool)
         #: standard deviation of T while the arm is held [N] (M,)
         self._swing: Array = np.zeros(robot.muscle_count)
@@ -252,8 +253,8 @@ class Winding(MotionTest):
     def _misplaced(self) -> list[int]:
         """Return the muscles that pull more than demanded, if a wrong order explains all of them.
 
-        Each of them must then follow the command of another muscle, which demands the excess, and
-        no two of them the same one. If every muscle pulls, the order is therefore not wrong.
+        Each of them must then follow the command of another muscle that demands the excess, and no
+        two of them the same command. If every muscle pulls, the order is therefore not wrong.
         """
         length, tension = self._newest.length, self._newest.tension
         demand = self._demanded(length)
@@ -272,7 +273,7 @@ class Winding(MotionTest):
         return np.flatnonzero(pulls).tolist()
 
     def _obeys_another(self, m: int, held: _Reading) -> bool:
-        """Return whether the tension of muscle m at rest is what another command demands of it."""
+        """Return whether another muscle's command would demand the tension of muscle m at rest."""
         stretched = np.maximum(0.0, held.length[m] - self._sent)
         demands = self._bias[m] + self._robot.stiffness[m] * stretched
         fits = np.abs(demands - held.tension[m]) < 2.0 * np.maximum(
@@ -406,7 +407,7 @@ class Winding(MotionTest):
     def _wind(
         self, m: int, level: float, home: float, latency: list[float]
     ) -> Generator[None, None, _Reading]:
-        """Wind a muscle in until it should have a tension, and return the reading that results.
+        """Wind a muscle in until the law demands a given tension, and return the last reading.
 
         If the arm yields, so that the muscle shortens, l_target moves further inwards, until the
         demand or the distance FURTHEST is reached.
@@ -490,8 +491,8 @@ class Winding(MotionTest):
     def _judge_law(self, m: int, home: _Reading, last: _Reading, out: _Reading) -> None:
         """Judge whether the tension of muscle m obeys the control law of the modules.
 
-        `home` is the reading before it was wound in, `last` that at the highest demand, and `out`
-        that with l_target beyond l, which must demand T_bias only.
+        `home` is the reading before winding in, `last` that at the highest demand, and `out` that
+        with l_target beyond l, at which the law demands T_bias only.
         """
         failed = self.verdict.failed
         asked, got = last.demand[m] - home.demand[m], last.tension[m] - home.tension[m]
@@ -511,7 +512,8 @@ class Winding(MotionTest):
     def _may_be_misplaced(self, m: int, home: _Reading, last: _Reading) -> bool:
         """Return whether another muscle seems to have followed the command of muscle m.
 
-        It was then wound in further than muscle m, and its tension rose more than demanded of it.
+        That muscle was then wound in further than muscle m, and its tension rose by more than the
+        law demanded of it.
         """
         pulled, wound = last.tension - home.tension, home.length - last.length
         excess = pulled - (last.demand - home.demand)
@@ -542,8 +544,9 @@ class Winding(MotionTest):
         is not read any more.
 
         Returns:
-            The target and the length at that time [m], or None without a response. The rise of T
-            that was noticed is subtracted, so that their difference is that of the zeros.
+            The target and the length at that time [m], or None without a response. The target is
+            corrected for the rise of T that was needed to notice the response, so that target and
+            length differ by the difference of their zeros.
         """
         home_length, far = (
             home.length[m],

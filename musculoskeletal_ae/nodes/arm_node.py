@@ -112,8 +112,8 @@ class Frames:
 class ArmNode(Shell):
     """Base class of nodes that replace a real arm: they obey commands and publish the arm's state.
 
-    All other nodes ignore a topic that several nodes publish. These nodes obey such commands, as
-    real muscle modules would.
+    All other nodes reject the messages of a topic that several nodes publish. These nodes obey
+    commands even then, as real muscle modules would.
     """
 
     accepted_from_all = COMMANDS

@@ -63,7 +63,7 @@ class BringupStatusNode(Shell):
             lambda: nodes_in_graph(self),
             lambda: self.awake.at(time.monotonic()),
         )
-        #: last error, as text, and last A in a status line
+        #: last known error, as text, and last known A of the status lines
         self.last_known = ('', math.nan)
         self.started: float | None = None
         self.ended: float | None = None  # when the end of the recording was first reported [s]
@@ -157,12 +157,12 @@ class BringupStatusNode(Shell):
         )
 
     def _why_no_estimate(self) -> str:
-        """Return the last rejected message of the estimator; without one, all problems."""
+        """Return the message that the estimator rejected last; if there is none, all problems."""
         rejected = self.situation.values('estimator').get(LAST_REJECTED, '')
         return f'rejected {rejected}' if rejected else self.situation.trouble()
 
     def _learned(self) -> str:
-        """Return from how many samples of a recording the learner has learned; '' without one.
+        """Return how many samples of a recording were learned, as a text; '' without a learner.
 
         If nodes may have missed messages, the text says so, with the remedy.
         """

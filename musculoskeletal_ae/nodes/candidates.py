@@ -46,7 +46,7 @@ class Candidates:
 
         Args:
             node: The estimator.
-            networks: Decides which network its core uses.
+            networks: Decides which network the estimator uses.
         """
         self._node, self._networks = node, networks
         networks.rejected = self._reject

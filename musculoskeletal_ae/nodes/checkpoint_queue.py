@@ -24,7 +24,7 @@ LARGEST = 64 << 20  # refuse a larger checkpoint [bytes]; a typical one has half
 class CheckpointQueue:
     """Processes one checkpoint after the other, in small steps.
 
-    Of the checkpoints that arrive meanwhile, only the newest one is processed.
+    Of the checkpoints that arrive while one is processed, only the newest is processed next.
     """
 
     def __init__(

@@ -94,7 +94,7 @@ class ControllerNode(Shell):
             self.core.use, lambda reason: self.core.stop(ConditionKind.UNFIT_CHECKPOINT, reason)
         )
         # Settings of one request are applied together, because they may end a motion, which a
-        # rollback would not restore.
+        # return to the previous settings would not resume.
         for name in parameters_of(Settings):
             self.parameters.on_change(name, self.core.configure, lambda _: self._settings())
         self.needed.add('muscle_states', 'estimated_joint_states')
@@ -118,8 +118,8 @@ class ControllerNode(Shell):
         serve(self, SetBool, 'controller/explore', self._explore)
         serve(self, Trigger, 'controller/stop', self._stop)
         serve(self, Trigger, 'controller/reset', self._reset)
-        # Each step resets this timer. It is therefore called only while no estimates arrive, to
-        # check the ages of messages and to publish commands.
+        # Each step resets this timer. The timer therefore makes a step only while no estimates
+        # arrive, to check the ages of messages and to publish commands.
         self.overdue = self.create_timer(OVERDUE / self.rate, self._step, clock=STEADY)
         if self.parameter('explore') and (reason := self.core.explore_at_start()):
             self.get_logger().warning(f'not exploring: {reason}')
@@ -277,9 +277,9 @@ class ControllerNode(Shell):
             is_anomaly = present.kind is ConditionKind.ANOMALY
             if is_anomaly and self.core.stopping.suspect is not None:
                 raise MusculoskeletalError(
-                    f'refused: {present.text}; the muscle is being verified; wait until this has '
-                    f'ended, within {LONGEST:g} s; the arm then moves on by itself, unless another '
-                    'stop cause needs a reset'
+                    f'refused: {present.text}; the muscle is being verified; wait until the '
+                    f'verification has ended, within {LONGEST:g} s; the arm then moves on by '
+                    'itself, unless another stop cause needs a reset'
                 )
             first = [step for step in present.steps if step is not Step.RESET_CONTROLLER]
             remedy = 'see the remedy of the estimator' if is_anomaly else sentence(first)
@@ -333,7 +333,7 @@ class ControllerNode(Shell):
             self.recording.save(supervisor.condition.text, self.parameter('stop_recordings'))
 
     def conditions(self) -> Iterable[Condition]:
-        """Yield the conditions of the core, and that a stop cannot be kept."""
+        """Yield the conditions of the core, and one if a latched stop could not be saved."""
         yield from super().conditions()
         if problem := self.memory.problem:
             yield ConditionKind.STOP_NOT_KEPT.condition(problem)

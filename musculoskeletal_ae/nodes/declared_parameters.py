@@ -165,7 +165,8 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {  # all parameters of all nodes, 
         ),
         'end_with_replay': Parameter(
             False,
-            'exit when the recording that `replay` plays ends; without any estimate, as an error',
+            'exit when the recording that `replay` plays ends, with an error if it led to no '
+            'estimate',
         ),
     },
 }
@@ -196,8 +197,8 @@ def check_names(names: Iterable[str], node: str = '') -> None:
         node: Node or executable to which the parameters are passed; '' for all nodes, as in a file.
 
     Raises:
-        MusculoskeletalError: If no node has a parameter of some name. Also if exactly one node has
-            it, and this node is not the one to which it is passed.
+        MusculoskeletalError: If no node has a parameter of some name, or if the only node that has
+            the parameter is another one than `node`.
     """
     own = COMBINED.get(node, (node,) if node else ())
     every = [*OF_RCLPY, *(name for table in PARAMETERS.values() for name in table)]

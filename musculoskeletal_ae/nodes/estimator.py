@@ -182,7 +182,7 @@ class EstimatorNode(Shell):
         if finding is None:
             return 'no anomaly was detected'
         muscle = self.robot.muscles[finding.muscle]
-        return f'cleared the anomaly of {muscle}; a fault that is still present is detected again'
+        return f'cleared the anomaly of {muscle}; a fault that persists will be detected again'
 
     # -- messages -------------------------------------------------------------------------------
 
@@ -269,7 +269,7 @@ class EstimatorNode(Shell):
             self._report()  # at once, because the report names the suspect
 
     def conditions(self) -> Iterable[Condition]:
-        """Yield the conditions of the core, and that the body state cannot be saved."""
+        """Yield the conditions of the core, and one if the body state could not be saved."""
         yield from super().conditions()
         if problem := self.memory.problem:
             yield ConditionKind.OFFSETS_NOT_SAVED.condition(problem)

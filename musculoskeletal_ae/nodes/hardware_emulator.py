@@ -139,9 +139,8 @@ class HardwareEmulatorNode(ArmNode):
 
     def status(self) -> Report:
         """Return what the emulated arm does, with its values."""
-        hottest = np.fmax.reduce(
-            self.reading.muscles.temperature
-        )  # NaN only if all temperatures are NaN
+        # The result is NaN only if all temperatures are NaN.
+        hottest = np.fmax.reduce(self.reading.muscles.temperature)
         values = {'hottest module': f'{hottest:.1f} °C', 'real-time factor': f'{self.pace:.2f}'}
         is_obeying = not (self.arm.has_diverged or self.arm.safe)
         return Report('following commands' if is_obeying else '', values)

@@ -48,7 +48,7 @@ class LearnerNode(Shell):
     def __init__(self, **options: Any) -> None:
         super().__init__('learner', **options)
         value = self.parameter
-        self.taken_at = -math.inf  # time of the last message that was learned [s]
+        self.taken_at = -math.inf  # time of the last muscle message that the core received [s]
         self.core = Learner(
             self.robot,
             preset=value('preset'),

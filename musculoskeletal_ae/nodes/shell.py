@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base class of the nodes of an arm: parameters, checkpoints, subscriptions, diagnostics.
 
-Tools that are nodes, such as `replay` and `view`, do not use it.
+The nodes of tools, such as `replay` and `view`, do not derive from it.
 """
 
 from __future__ import annotations
@@ -368,7 +368,8 @@ class Shell(Node):
     ) -> CheckpointQueue:
         """Return a queue that processes the checkpoints of a topic in small steps.
 
-        `handle` yields after each step. `unfit` is called with the reason if one is refused.
+        `handle` yields after each step. `unfit` is called with the reason if a checkpoint is
+        unusable.
         """
         return CheckpointQueue(self, self._reception, topic, handle, unfit)
 
@@ -520,7 +521,7 @@ class Shell(Node):
         self.listen(kind, STATES, take, SENSOR)
 
     def follow_body(self, changed: Callable[[], object]) -> None:
-        """Update `body` with each body state of the estimator, and call `changed` then.
+        """Update `body` with each new body state of the estimator, then call `changed`.
 
         A body state may be received several times, because the topic is latched. It is used once.
         """
@@ -534,7 +535,7 @@ class Shell(Node):
         self.follow_muscles('body_state', take, ROWS, LATCHED)
 
     def follow_joint_trust(self, follow: Callable[[JointTrust], object]) -> None:
-        """Call `follow` with the estimator's trust in the joint sensors, in times of `now`."""
+        """Call `follow` with the estimator's trust in the joint sensors, by the clock of `now`."""
 
         def take(message: Float64MultiArray) -> None:
             rows = read_array(message, JointTrust.ROWS, self.robot.joint_count, 'joint')

@@ -2,8 +2,8 @@
 """The node `sim`: simulates the learned body, driven by the same commands as the real arm.
 
 muscle_length_command, body_state → sim/joint_states, sim/muscle_states, sim/markers. With
-as_robot:=true the node replaces the robot, whose body is healthy, and publishes joint_states,
-muscle_states, robot_description, sim/markers.
+as_robot:=true the node replaces a healthy robot, and publishes joint_states, muscle_states,
+robot_description, sim/markers.
 The topic sim/external_wrench applies an external wrench, and sim/fixed_joint_states fixes joints. A
 command holds until the next command; before the first command, muscles are at T_bias. The node
 ignores muscle_tension_command, and its modules stay at 25 °C.
@@ -30,7 +30,7 @@ from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
 from musculoskeletal_ae.simulation.simulation import Simulation
 
-MOST_RATE = 100.0  # beside a robot, simulate at most this often, because nothing is controlled [Hz]
+MOST_RATE = 100.0  # beside a robot, simulate at no higher rate [Hz], because nothing is controlled
 TEMPERATURE = 25.0  # report this temperature of all modules [°C]
 
 
@@ -111,7 +111,7 @@ class SimNode(ArmNode):
         self.ticked = self.get_clock().now()
 
     def conditions(self) -> Iterable[Condition]:
-        """Yield that there is no network yet."""
+        """Yield the conditions of every node, and one while there is no network."""
         yield from super().conditions()
         if self.arm is None:
             yield ConditionKind.NO_CHECKPOINT.condition(steps=[Step.PROVIDE_CHECKPOINT])

@@ -2,7 +2,7 @@
 """Reads what the nodes of arms report on /diagnostics.
 
 The nodes decide what is true; this module collects, sorts and prints their conditions. It adds one
-fact that a node cannot report itself: that a node has ended, or does not report any more.
+fact that no node can report of itself: that the node has ended, or does not report any more.
 `Situation` has the reports of one arm, and `Arms` those of all arms in the ROS graph.
 """
 
@@ -24,15 +24,15 @@ from musculoskeletal_ae.remedy import Step, sentence
 from musculoskeletal_ae.report import with_load
 from musculoskeletal_ae.ros.diagnostics import IDENTITY, NODE_SILENCE, values_of
 
-#: forget other nodes than NEEDED without a report for this time [s]; it exceeds NODE_SILENCE,
-#: because nodes of other packages may report less often
+#: forget a node that is not in NEEDED after this time without a report [s]; the time exceeds
+#: NODE_SILENCE, because nodes of other packages may report less often
 FORGET_TIME = 5.0
 #: nodes that should not end, once they have reported
 NEEDED = 'controller', 'estimator', 'hardware_emulator', 'learner', 'sim'
 OTHER = 'other_report'  # identifier of a report that lists no conditions
 SUMMARY = 'bringup_status'  # node that repeats the conditions of all others
 PAGE = 'page'  # value in the report of `view`: address of its page
-#: the addresses to which a list of arms may lead
+#: let a list of arms link only to pages with such an address
 ADDRESS = re.compile(r'https?://[^\s/]+')
 #: modes in which a running arm does not explore
 NOT_EXPLORING = {
@@ -64,7 +64,7 @@ def nodes_in_graph(node: RosNode) -> set[str]:
 
 
 class NodeReport(NamedTuple):
-    """What a node has last reported on /diagnostics."""
+    """The last report of a node on /diagnostics."""
 
     values: dict[str, str]  # values that the node has reported, by name
     conditions: tuple[Condition, ...]
@@ -154,7 +154,7 @@ class Situation:
     def conditions(self) -> list[Reported]:
         """Return all conditions in the order in which users read them.
 
-        Conditions of the same kind and with the same subjects, from several nodes, are one.
+        If several nodes report conditions of the same kind with the same subjects, they are merged.
         """
         merged = dict[tuple[str, tuple[str, ...]], Reported]()
         for name, condition in self._all():
@@ -253,7 +253,7 @@ class Situation:
 
     @property
     def doing(self) -> str:
-        """What the controller does, or why the arm stands still; '' without a controller."""
+        """Activity of the controller, or why the arm stands still; '' without a controller."""
         controller = self._reports.get('controller')
         return '' if controller is None else controller.message
 
@@ -304,9 +304,9 @@ class Situation:
         return why if needed == '1' else f'{why}; learning begins with {needed} samples'
 
     def unexplored(self) -> str:
-        """Return that the arm does not explore although there is a learner, with its mode; or ''.
+        """Return a text if the arm does not explore although there is a learner, else ''.
 
-        The text is '' if a condition says the same.
+        The text states the mode. It is also '' if a condition already advises to explore.
         """
         mode = self.values('controller').get('mode')
         advised = {Step.EXPLORE, Step.EXPLORE_GENTLY}.intersection(self.steps())

@@ -24,7 +24,7 @@ from musculoskeletal_ae.bags.writer import BagWriter
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 SECONDS = 10.0  # let a recording begin this long before the stop [s]
-MOST = 50_000  # of the time before a stop, keep only the newest messages, at most this many
+MOST = 50_000  # keep at most this many messages, the newest ones
 MOST_BYTES = 32 << 20  # keep messages of at most this total size [bytes]
 LARGEST_MESSAGE = 4 << 20  # leave out a larger message [bytes]; a typical network has half a MB
 FILE = 'cause.txt'  # file in the bag's directory with the cause of the stop; written last
@@ -58,7 +58,7 @@ class StopRecording:
         self._directory = directory or Path(get_logging_directory())
         self._recent: deque[Heard] = deque()
         self._recent_size = 0  # size of the recent messages [bytes]
-        #: newest message of each latched topic that is too old for `_recent`
+        #: for each latched topic, the newest message that is no longer in `_recent`
         self._latched: dict[str, Heard] = {}
         self._writing: threading.Thread | None = None
         self.left_out = 0  # number of messages that were too large

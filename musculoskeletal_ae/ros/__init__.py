@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Code that every node and tool of ROS may use: running, parameters, diagnostics, publishers."""
+"""Code that nodes and ROS tools share: running, parameters, diagnostics, publishers."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishes a node's state on /diagnostics, with message rates and rejected messages; reads it."""
+"""Publishes and reads the states of nodes on /diagnostics, with message rates and rejections."""
 
 import secrets
 
@@ -14,8 +14,8 @@ from musculoskeletal_ae.remedy import sentence
 from musculoskeletal_ae.report import Report
 
 MANY_REPORTS = QoSProfile(depth=50)  # QoS of /diagnostics, on which all nodes of the graph report
-IDENTITY = 'identity'  # value that is in the reports of this package's nodes only
-LAST_REJECTED = 'last rejected'  # value that names the topic and the fault of that message
+IDENTITY = 'identity'  # name of a value that only the reports of this package's nodes contain
+LAST_REJECTED = 'last rejected'  # name of the value with topic and fault of that message
 REJECTED = 'rejected '  # value `rejected TOPIC: REASON`: the number of messages rejected so far
 PERIOD = 1.0  # publish a report of each node at this interval [s]
 NODE_SILENCE = 2.0  # treat a node as ended or hanging if it has not reported for this time [s]

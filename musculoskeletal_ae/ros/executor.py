@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The executor that runs the callbacks of nodes and tools, and other names private to rclpy.
+"""The executor of nodes and tools, and everything else that needs private names of rclpy.
 
 rclpy's `SingleThreadedExecutor` rebuilds its wait set, in Python, for every message, and runs each
 callback as a task. At 200 Hz this takes half of a node's CPU time. `LeanExecutor` keeps the wait
 set until entities are created or destroyed, and calls callbacks directly. `LeanExecutor` uses
 private names of rclpy. It therefore runs only with versions of rclpy that it was tested with, and
 only if all of these names exist. Otherwise `SingleThreadedExecutor` runs, and the log says so.
-rclpy's `EventsExecutor` cannot replace it: up to rclpy 7.1.7 it runs no callbacks. In 7.1.11 it
-passes a message and its information as one tuple to callbacks that take both.
+rclpy's `EventsExecutor` cannot replace `LeanExecutor`: up to rclpy 7.1.7 it runs no callbacks. In
+7.1.11 it passes a message and its information as one tuple to callbacks that take both.
 
 The environment variable MUSCULOSKELETAL_AE_EXECUTOR overrides the choice: lean or single.
 
@@ -125,7 +125,7 @@ class LeanExecutor(SingleThreadedExecutor):
     def spin(self) -> None:
         """Run callbacks until shutdown.
 
-        Some versions of rclpy would not call this class's `spin_once` for this.
+        In some versions of rclpy, the inherited `spin` would not call this class's `spin_once`.
         """
         while self.context.ok() and not self._is_shutdown:
             self.spin_once()
@@ -229,8 +229,8 @@ class LeanExecutor(SingleThreadedExecutor):
 def make_executor(context: Context | None = None) -> Executor:
     """Return a `LeanExecutor` if it supports this rclpy, otherwise a `SingleThreadedExecutor`.
 
-    The environment can select either of them. If rclpy lacks a private name, `LeanExecutor` cannot
-    be selected either.
+    An environment variable can select one of the two. Even then, `LeanExecutor` is not returned if
+    rclpy lacks a private name that it needs.
 
     Raises:
         MusculoskeletalError: If the environment selects an unknown executor.

@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # a slow import, which --help of the tools does not need
     from musculoskeletal_ae.robot.joint_units import JointUnits
     from musculoskeletal_ae.signals.motor_interface import MotorInterface
 
-# The three qualities of service (doc/reference/topics_and_services.md).
+# The three QoS profiles of the interface (doc/reference/topics_and_services.md).
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 SENSOR = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED = QoSProfile(
@@ -88,7 +88,7 @@ def add_joints(message: JointState, units: JointUnits, theta: Array) -> None:
 
 
 def is_heard(publisher: Publisher) -> bool:
-    """Return whether a publisher has a subscriber; otherwise, building a message is useless."""
+    """Return whether a publisher has a subscriber; without one, building a message is useless."""
     return publisher.get_subscription_count() > 0
 
 

@@ -15,8 +15,8 @@ from musculoskeletal_ae.messages.reception import Reception
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import with_load
 
-#: topics that are published continually, so that silence is an error, in the order of the data
-#: flow, and the remedy for silence
+#: topics whose silence is an error, because they are published continually, each with the remedy;
+#: in the order of the data flow
 STREAMS = {'muscle_states': Step.CHECK_DRIVER, 'estimated_joint_states': Step.CHECK_ESTIMATOR}
 REPLAY = 'replay'  # name of the node that plays a recording
 SLOW = 0.4  # warn of a topic whose rate is below this fraction of the expected rate
@@ -69,8 +69,8 @@ class NeededTopics:
     def conditions(self) -> Iterator[Condition]:
         """Yield which topics are silent, missing or slow.
 
-        Without the messages at the beginning of the data flow, there are none after it. Only the
-        first silent topic therefore has a remedy.
+        A silent topic also silences the topics after it in the data flow. Only the first silent
+        topic therefore has a remedy.
         """
         has_remedy = False
         for topic in sorted(self._topics, key=[*STREAMS, *self._topics].index):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS arguments on the command line: the names of parameters in them, and rclpy's errors."""
+"""ROS arguments on the command line: which parameters they set, and rclpy's errors about them."""
 
 import os
 from itertools import pairwise
@@ -13,8 +13,8 @@ NO_REASON = 'error not set'  # text of an rcl error whose reason rcl does not st
 NO_LOG_FOLDER = 'log directory'
 #: exceptions of rclpy for an argument that cannot be parsed
 ARGUMENT_ERRORS = UnknownROSArgsError, RCLInvalidROSArgsError
-#: exceptions of rclpy for a wrong ROS argument: also a parameter value of the wrong type or out of
-#: range
+#: exceptions of rclpy for a wrong ROS argument, including a parameter value of the wrong type or
+#: out of range
 PARAMETER_ERRORS = (
     InvalidParameterTypeException,
     InvalidParameterValueException,

@@ -28,7 +28,7 @@ from musculoskeletal_ae.ros.hang_detection import ProgressWatch
 from musculoskeletal_ae.ros.ros_arguments import PARAMETER_ERRORS, parameters_given, reason
 
 STOP_CHECK_PERIOD = 0.1  # check for a stop signal at this interval [s]
-NICENESS = 5  # niceness of a node that is not time-critical, so that commands have priority
+NICENESS = 5  # run nodes that are not time-critical with this niceness: commands have priority
 
 
 def run(name: str) -> int:

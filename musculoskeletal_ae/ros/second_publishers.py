@@ -4,7 +4,7 @@
 A message does not name its sender, so this module looks at the ROS graph. While several nodes
 publish a topic of `AUTHORS`, the nodes that use the topic reject its messages and report an ERROR,
 and the controller stops. Afterwards nodes resubscribe to latched topics to receive the value again.
-Only a node that replaces a real arm obeys the commands of several publishers (`arm.Arm`).
+Only a node that replaces a real arm obeys the commands of several publishers (`ArmNode`).
 
 Two publishers with the same node name do not prove that two nodes run. A killed node stays in the
 graph for up to 20 s beside its successor, but sends no more messages. Any of these signs proves
@@ -14,7 +14,7 @@ that a second node runs:
 - A report on /diagnostics under our own name with another identity, after our first report. The
   identity is a random number of the reporting node. A node reads reports only while the graph has
   two nodes of its name.
-- Two publishers that have both been in the graph for longer than it keeps a killed publisher.
+- Two publishers that have both been in the graph for longer than the graph keeps a killed one.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ TURNS = 3  # conclude from this many decreases within LOOKS checks that two node
 #: [s]; the graph keeps a killed node for only 20 s
 LEASE = 30.0
 NAMING = 1.0  # wait at most this long until the graph knows the node of a publisher [s]
-#: report that there are more publishers than links once this has lasted for this time; a link
-#: without a message for this time has no sensor [s]
+#: treat a link without messages for this time [s] as a link without a sensor; report that there are
+#: more publishers than sensors once this has lasted for the same time
 LINK_PATIENCE = 3.0
 #: name that the graph returns for a node of which it knows only a publisher
 UNNAMED = '_NODE_NAME_UNKNOWN_'
@@ -205,7 +205,7 @@ class LinkSensors:
 
 
 def full_name(namespace: str, name: str) -> str:
-    """Return the full name of a node of the graph, or NAMELESS while the graph has no name."""
+    """Return the full name of a node, or NAMELESS while the graph does not know its name."""
     return NAMELESS if name == UNNAMED else f'{namespace.rstrip("/")}/{name}'
 
 

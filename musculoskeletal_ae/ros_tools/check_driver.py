@@ -97,7 +97,7 @@ class CheckDriver:
         return ', '.join(sorted(kinds - {self.motors.state_type}))
 
     def _listen_for(self, duration: float) -> None:
-        """Receive messages for `duration` [s], and say from time to time how long it will last."""
+        """Receive messages for `duration` [s]; print the remaining time now and then."""
         left = duration
         while left > COUNTDOWN:
             self.spin_until(lambda: False, COUNTDOWN)
@@ -303,7 +303,7 @@ def _parse(arguments: list[str]) -> Namespace:
         'at no more than the test tension (--tension), then wind in each muscle slightly, one at '
         'a time. If a muscle pulls more than demanded, it is released, and the test ends',
     )
-    text = 'with --move: wind only these muscles in; all muscles hold the arm before'
+    text = 'with --move: wind in only these muscles; before that, all muscles hold the arm'
     add('--muscles', type=names, metavar='NAME,…', help=text)
     text = (
         'with --move: test tension, to which muscles are wound in [N] (default: T_bias + 40 N, or '

@@ -7,10 +7,10 @@ a processor for 0.1 s. The messages that remain would arrive in bunches, so that
 wrong.
 
 A replay in lockstep asks the nodes after every STEP of recorded time, and goes on only after all of
-them have answered. A node runs its callbacks one after another, so an answer shows that it has used
-the messages before. The question is the standard service `get_parameters` with an empty list of
-names, which every node of rclpy and rclcpp offers. Recorded time stands still while the replay
-waits: nodes that use /clock do not notice it.
+them have answered. A node runs its callbacks one after another, so its answer shows that it has
+used all messages that were sent before the question. The question is the standard service
+`get_parameters` with an empty list of names, which every node of rclpy and rclcpp offers. Recorded
+time stands still while the replay waits, so nodes that use /clock do not notice the wait.
 """
 
 import time
@@ -26,7 +26,7 @@ from musculoskeletal_ae.ros_tools.ros_tool import Spinner
 
 STEP = 5_000_000  # ask the nodes after at most this recorded time [ns]
 MOST_MESSAGES = 8  # ask the nodes after at most this many messages; the queues of nodes hold 10
-#: wait at most this long for the first answer of all nodes, which have to start [s]
+#: wait at most this long until all nodes have started and answered [s]
 START_TIME = 300.0
 REPEAT_TIME = 2.0  # repeat an unanswered question after this time while nodes start [s]
 #: wait at most this long for an answer during playback [s]; a node that hangs has ended itself by

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tool `record`: writes the topics of this package to an mcap bag for `ros2 bag`."""
+"""The tool `record`: records the topics of this package to a bag that `ros2 bag` can read."""
 
 import math
 import sys
@@ -35,12 +35,12 @@ from musculoskeletal_ae.ros_tools.ros_tool import (
     start_ros,
 )
 
-#: write to disk at this interval [s]; a killed recorder loses the messages since the last writing
+#: write to disk at this interval [s]; a killed recorder loses the messages since the last write
 FLUSH_PERIOD = 0.5
 #: QoS whose queue holds at least a second of the fastest topic, in case the disk is busy
 LIVE = QoSProfile(depth=1000)
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-DRAIN_TIME = 0.5  # after Ctrl-C, record messages that have already arrived for this time [s]
+DRAIN_TIME = 0.5  # after Ctrl-C, spend at most this time on messages that have already arrived [s]
 #: wait this long for publishers to be discovered before a recording is announced [s]
 DISCOVERY_TIME = 0.5
 CONNECTION_TIME = 2.0  # wait at most this long for connections to the discovered publishers [s]
@@ -87,8 +87,8 @@ class Record(Node):
     def _look_after(self) -> None:
         """Write received messages to disk, count lost messages, and repair subscriptions.
 
-        If a publisher offers a weaker QoS than the subscription requests, the subscription receives
-        none of its messages. It is then replaced by a subscription with the weaker QoS.
+        If a publisher offers a weaker QoS than a subscription requests, the subscription receives
+        none of its messages. Such a subscription is replaced by one with the weaker QoS.
         """
         self.writer.flush()
         self.count_losses()
@@ -231,7 +231,7 @@ def parse(arguments: list[str]) -> Namespace:
     add('directory', nargs='?', type=Path, metavar='DIR', help=directory_help)
     add('-o', '--out', type=Path, metavar='DIR', help='another way to state DIR')
     add('--topics', type=names, metavar='LIST', help='topics, separated by commas (default: all)')
-    text = 'robot whose motors.yaml names topics of motors (doc/howto/ros2_control.md)'
+    text = 'robot whose motors.yaml names further topics to record (doc/howto/ros2_control.md)'
     add('--robot', metavar='NAME|DIR', help=text)
     add('--duration', type=positive, metavar='S', help='stop after this time [s]')
     compression_help = 'compression of the chunks of the mcap file'

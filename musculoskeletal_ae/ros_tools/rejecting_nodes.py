@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tells a replay which of its messages nodes reject, such as nodes of another robot.
+"""Warns of nodes that reject the messages of a replay, such as nodes of another robot.
 
-A message does not tell its publisher what becomes of it, but nodes count the messages that they
-reject in their reports on /diagnostics.
+A publisher does not learn from ROS whether its messages are used. However, nodes report on
+/diagnostics how many messages they have rejected.
 """
 
 from collections.abc import Callable, Iterable
@@ -13,7 +13,7 @@ from musculoskeletal_ae.ros.diagnostics import LAST_REJECTED, rejected_counts, v
 
 
 class Rejections:
-    """Warns once for each node, topic and reason when a node rejects more and more messages."""
+    """Warns once for each node, topic and reason when a node rejects messages during the replay."""
 
     def __init__(self, topics: Iterable[str], bag: str, warn: Callable[[str], object]) -> None:
         """Prepare to watch which nodes reject messages of some topics.
@@ -57,5 +57,5 @@ class Rejections:
         self._warn(
             f'{node} (robot {robot}) rejects messages of this recording: {detail}; start the nodes '
             f'for the robot that was recorded; `replay {self._bag} --check --robot {robot}` tells '
-            f'whether it is {robot}'
+            f'whether that robot is {robot}'
         )

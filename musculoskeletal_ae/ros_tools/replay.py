@@ -65,8 +65,8 @@ from musculoskeletal_ae.signals.motor_interface import STATES
 
 #: depth of the publishers' queues; a subscriber that is one second late still gets every message
 DEPTH = 1000
-SERVICE_PERIOD = 0.02  # let a request of a service wait at most this long [s]
-LONGEST_SLEEP = 0.002  # sleep at most this long; run callbacks of services during a longer wait [s]
+SERVICE_PERIOD = 0.02  # let a service request wait at most this long [s]
+LONGEST_SLEEP = 0.002  # sleep at most this long [s]; run service callbacks during a longer wait
 #: wait this long after the discovery of a subscriber, until it can receive messages [s]
 SETTLE_TIME = 0.3
 #: with --loop, let this recorded time pass between the last message and the first one [ns]
@@ -76,8 +76,8 @@ WAIT = 2.0  # by default, wait at most this long for subscribers, and then play 
 SEND_WAIT = 10.0
 CLOCK_PERIOD = 0.005  # publish /clock at this interval of recorded time [s]
 SLOW = 0.5  # report playback as slow below this share of the wanted speed
-LOCKSTEP_LAG = 0.005  # in lockstep, catch up with at most this delay [s]
-#: publish /clock at intervals of at least this wall time [s], because nodes cannot use more of it
+LOCKSTEP_LAG = 0.005  # in lockstep, do not catch up after a longer delay than this [s]
+#: publish /clock at intervals of at least this wall time [s]; nodes cannot use a faster clock
 SHORTEST_CLOCK_PERIOD = 0.001
 
 
@@ -134,7 +134,7 @@ class Replay(Node):
         topics = [publisher.topic_name for publisher in self._publisher.values()]
         if options.motors.states:  # nodes count messages of motors as muscle_states
             topics.append(self.resolve_topic_name(STATES))
-        if DIAGNOSTICS not in topics:  # otherwise the reports may be recorded ones
+        if DIAGNOSTICS not in topics:  # otherwise, a report may come from the recording
             rejections = Rejections(topics, str(options.bag), _warn)
             self.create_subscription(DiagnosticArray, DIAGNOSTICS, rejections.take, MANY_REPORTS)
         if options.paused:
@@ -198,7 +198,7 @@ class Replay(Node):
             longest = LOCKSTEP_LAG
             if self._lockstep.is_due(recorded):
                 self._lockstep.step(recorded, self._spinner)
-            #: publish /clock at once, so that the nodes know the time of this message
+            # Publish /clock at once, so that the nodes know the time of this message.
             self._next_tick = 0.0
         self._timeline.catch_up(recorded, time.monotonic(), longest)
 
@@ -265,7 +265,7 @@ class Replay(Node):
         report = Report(state, {'position': self._position(), 'state': state})
         if state == PAUSED:
             report = report.with_conditions([ConditionKind.REPLAY_STANDS.condition(PAUSED)])
-        # Only the lockstep keeps playback back for a long time.
+        # Only lockstep delays playback for long, so report slow playback only in lockstep.
         before, self._reported = self._reported, (now, self._done())
         speed = (self._reported[1] - before[1]) / max(now - before[0], 1e-3)
         is_slow = 0.0 < speed < SLOW * self._rate and before[0] > self._seek_time
@@ -335,7 +335,7 @@ def _await_subscribers(spinner: Spinner, publishers: list[Publisher], longest: f
 
 
 def _warn_of_pauses(messages: TimedMessages, played: tuple[int, int]) -> None:
-    """Warn of the pauses for which playback will wait, in the part to play [ns]."""
+    """Warn of pauses between the recorded times `played` [ns], in which playback will wait."""
     pauses = [each for each in messages.pauses if each.end > played[0] and each.begin < played[1]]
     if not pauses:
         return
@@ -383,17 +383,17 @@ def parse(arguments: list[str]) -> Namespace:
         'replay',
         'Publishes the messages of a recorded bag on their topics, at the recorded intervals. '
         + ROS_HELP,
-        'While it plays, the services replay/pause, replay/resume and replay/step '
+        'During playback, the services replay/pause, replay/resume and replay/step '
         '(std_srvs/Trigger) pause it, resume it, and play the messages of the next recorded time. '
-        'Set its parameter `position` [s] to seek.',
+        'Set the parameter `position` [s] of the node to seek.',
     )
     add = parser.add_argument
     add('bag', type=Path, metavar='BAG', help='a bag directory, or one mcap or sqlite3 file')
     check = 'check the contents without playing them (exit status 1: faults)'
     add('--check', action='store_true', help=check)
     robot = (
-        'a shipped robot or a directory: with --check, the robot that the bag must fit; without '
-        'it, its motors.yaml names further topics to play (doc/howto/ros2_control.md)'
+        'a shipped robot or a directory: with --check, the robot that the bag must fit; otherwise, '
+        'a robot whose motors.yaml names further topics to play (doc/howto/ros2_control.md)'
     )
     add('--robot', metavar='NAME|DIR', help=robot)
     topics = (

@@ -20,10 +20,10 @@ from musculoskeletal_ae.ros.diagnostics import LAST_REJECTED, PERIOD, rejected_c
 from musculoskeletal_ae.ros.messages import RELIABLE
 from musculoskeletal_ae.ros_tools.ros_tool import Spinner, start_ros
 
-#: wait at most this long for reliable readers to acknowledge the messages [s]
+#: wait at most this long for reliable subscribers to acknowledge the messages [s]
 ACKNOWLEDGE_TIME = 2.0
 TRAJECTORY = 'joint_trajectory'
-#: rate that /diagnostics states for a topic without a used message since the previous report
+#: rate that /diagnostics states if no message of a topic was used since the previous report
 NO_RATE = '0.0 Hz'
 FIRST_REPORT_TIME = 2.0 * PERIOD  # wait at most this long for a first report of the subscribers [s]
 REPORT_TIME = 5.0 * PERIOD  # wait at most this long for two reports after sending a trajectory [s]
@@ -80,7 +80,7 @@ class _Answers:
                 self.reports.append(values_of(status))
 
     def begin(self) -> None:
-        """Discard the reports so far; from now on, only refusals that follow are counted."""
+        """Discard the reports so far; `refusal` then ignores the refusals that they counted."""
         self._refused_before = self._refused
         self.reports.clear()
 

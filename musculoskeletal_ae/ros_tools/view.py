@@ -345,7 +345,7 @@ class View(Node):
         """Return the names of the muscles that the emulator ruptures."""
         lines = [line.partition(':') for line in self.faults]
         names = [name for kind, _, name in lines if kind == RUPTURE]
-        return names if all(names) else [*self.robot.muscles]  # no name stands for all muscles
+        return names if all(names) else [*self.robot.muscles]  # '' stands for all muscles
 
     def _ask(
         self,

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readings of an arm as tables: arrays, and CSV files."""
+"""Readings of an arm as tables, from arrays or CSV files."""

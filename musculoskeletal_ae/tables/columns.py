@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds out which joint or muscle each column of a table belongs to, and its unit.
+"""Finds the joint or muscle to which each column of a table belongs, and the column's unit.
 
     header = [WORD] NAME [WORD] [unit], as in `elbow`, `elbow angle (deg)`, `length_biceps_mm`
 
@@ -77,8 +77,9 @@ def find_columns(
     Args:
         robot: The robot.
         headers: Header of each column.
-        chosen: The header of a column by what it contains: the name of a joint, `length:MUSCLE`,
-            `tension:MUSCLE` or `time`. '' states that a joint was not measured.
+        chosen: Headers of columns by their contents, which are the name of a joint,
+            `length:MUSCLE`, `tension:MUSCLE` or `time`. The header '' states that a joint was not
+            measured.
         units: Unit of each kind of quantity, by the values of `Kind`; a number is the size of the
             unit in SI units. By default, the unit is that of the header, or an SI unit.
 
@@ -141,7 +142,7 @@ def _plain(text: str) -> str:
 
 
 def _names(robot: Robot) -> dict[str, Key]:
-    """Return the quantity that each header stands for, by its text as `_plain` returns it."""
+    """Return the quantity that each header stands for, by the header as `_plain` simplifies it."""
     names = {word: Key(Kind.TIME, 0) for word in TIME_HEADERS}
     for kind, words in ((Kind.LENGTH, LENGTH_WORDS), (Kind.TENSION, TENSION_WORDS)):
         for i, name in enumerate(map(_plain, robot.muscles)):
@@ -231,8 +232,8 @@ def _check_units(columns: Sequence[Column]) -> None:
         if stated and silent:
             raise TableError(
                 f'the column {silent[0].header!r} states no unit, but {stated[0].header!r} does; '
-                f'state it for all of this kind with --units {kind.value}={stated[0].unit}, or in '
-                'the header'
+                f'state one unit for all of them with --units {kind.value}={stated[0].unit}, or '
+                'write the unit in each header'
             )
 
 

@@ -30,7 +30,7 @@ DELIMITERS = ';', '\t', ',', ' '
 NOTHING = '', 'nan', 'na', 'n/a', 'null', 'none', '-'
 MOST_SHOWN = 40  # show at most this many characters of a cell in an error
 #: conclude that rows are a sequence, as in a motion, if successive postures differ by less than
-#: this share of the difference of randomly ordered ones
+#: this share of the difference between postures in random order
 SEQUENCE_SHARE = 0.1
 
 
@@ -49,9 +49,9 @@ def read_csv(
     Args:
         file: The file.
         robot: The robot whose readings the file contains.
-        columns: The header of a column by what it contains, if the header does not say so itself:
-            the name of a joint, `length:MUSCLE`, `tension:MUSCLE` or `time`. The value '' states
-            that a joint was not measured.
+        columns: Headers of columns by their contents, required where a header does not state its
+            contents: the name of a joint, `length:MUSCLE`, `tension:MUSCLE` or `time`. The header
+            '' states that a joint was not measured.
         units: Unit of each kind of quantity: angle, travel, length, tension or time. A number is
             the size of the unit in SI units, such as -0.01 for a spool of 1 cm that winds in.
         rate: Rows per second [Hz], if the file has no times.
@@ -86,7 +86,7 @@ def read_csv(
 
 
 def looks_like_a_sequence(table: Table) -> bool:
-    """Return whether the postures of successive rows are near to each other, as in a motion."""
+    """Return whether the postures of successive rows are close to each other, as in a motion."""
     theta = table.rows.theta
     if not table.at_rest or len(theta) < 20:
         return False

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Readings of an arm in rows, from which it is learned, whatever file they came from.
+"""Readings of an arm in rows, from which its network is trained, whatever file they came from.
 
-The rows are either successive readings, with their times, or resting postures, one in each row. Of
-successive readings, the learner finds the rests itself, as on a running arm. Rows of a recording
+The rows are either successive readings, with their times, or resting postures, one in each row. In
+successive readings, the learner itself finds the rests, as on a running arm. Rows of a recording
 that do not directly follow each other are in different segments (`Table.segments`).
 """
 
@@ -19,12 +19,12 @@ from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 
-#: `Table.split` divides a table into BLOCKS parts of equally many successive rows, and holds the
-#: blocks HELD_OUT out. Single rows between learned ones would be no test, because successive rows
-#: resemble each other.
+#: `Table.split` divides a table into BLOCKS parts of equally many successive rows, and holds out
+#: the parts with the numbers HELD_OUT. Single rows between learned ones would be no test, because
+#: successive rows resemble each other.
 BLOCKS, HELD_OUT = 10, (2, 7)
-#: leave readings of a motion that are closer than this to a learned reading out of the held-out
-#: part [s], so that no rest is in both parts
+#: exclude a reading of a motion from the held-out part if a learned reading is closer to it than
+#: this [s], so that no rest is in both parts
 MARGIN = 1.0
 
 

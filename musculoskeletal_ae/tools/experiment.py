@@ -43,7 +43,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('--keep', type=Path, metavar='DIR', help=text)
     text = 'also write the results table between the markers of this page'
     parser.add_argument('--readme', type=Path, metavar='FILE', help=text)
-    text = 'also write the page FILE.md that shows the paper beside ours, and its pictures'
+    text = "also write the page FILE.md that shows the paper's results beside ours, with pictures"
     parser.add_argument('--page', type=Path, metavar='FILE.md', help=text)
     args = parser.parse_args(argv)
     if args.scheduler and not args.keep:

@@ -16,12 +16,12 @@ def main(argv: list[str] | None = None) -> int:
         'are those of the robot; route points, series elastic elements and friction are learned. '
         'A report compares lengths and moment arms with those of the network, and the torques of '
         'weight and springs with those of the robot. With --into, a copy of your MJCF file gets '
-        'the learned attachment points instead, and everything else in it stays.',
+        'the learned attachment points instead, and everything else in it stays as it is.',
     )
     parser.add_argument('checkpoint', type=Path, metavar='CHECKPOINT', help='.safetensors file')
     parser.add_robot(default=None)
     parser.add_out('DIR', 'new or empty directory, for model.xml and report.txt')
-    text = 'MJCF file of the robot; the command writes a copy of it with the learned via points'
+    text = 'MJCF file of the robot; a copy of it with the learned attachment points is written'
     parser.add_argument('--into', type=Path, metavar='FILE', help=text)
     args = parser.parse_args(argv)
     return exit_status(lambda: _run(args), out=args.out)

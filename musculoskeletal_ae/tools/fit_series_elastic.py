@@ -28,7 +28,8 @@ LEAST_FORCE, MOST_FORCE = 1e-3, 1e3  # keep `force` in this range, relative to t
 ROUNDS = 200  # end the fit after this many Gauss–Newton steps
 #: end the fit if a step lowers the sum of squares by less than this, relative to the noise
 ENOUGH = 1e-9
-LEAST_ELONGATION = -0.002  # reject a smaller elongation [m]; noise can make it slightly negative
+#: reject a smaller elongation than this [m]; noise can make an elongation slightly negative
+LEAST_ELONGATION = -0.002
 #: reject a longer muscle on a testbed [m]; larger numbers are probably in another unit
 LONGEST = 10.0
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`train --mujoco`: imports a MuJoCo model, and learns an emulated arm of it, without ROS.
+"""`train --mujoco`: imports a MuJoCo model, and learns from an emulated arm of it, without ROS.
 
 The emulated arm is an individual that deviates from the file (`emulator/foreign/deviation.py`). It
 explores in closed loop, as fast as the computer can.
@@ -41,13 +41,13 @@ from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.model_training import train_on_model
 
-HELD_OUT = 60.0  # measure the error in a motion of this duration, from which nothing is learned [s]
+HELD_OUT = 60.0  # measure the error on a held-out motion of this duration [s]
 #: options of `train --mujoco` that are passed on to `import_robot`
 CHAIN = 'joints', 'muscles', 'without', 'base', 'end'
 
 
 class Learned(NamedTuple):
-    """What an emulated arm has learned."""
+    """Result of `learn`: the network, its errors, and the course of the exploration."""
 
     mae: Mae  # the learned network
     before: float  # error of the initial network on the held-out motion [rad]

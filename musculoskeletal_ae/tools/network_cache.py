@@ -27,7 +27,7 @@ CODE = (
     'robot',
     'mae',
     'presets',
-    'paper',  # has the initial training of §III-B
+    'paper',  # contains the initial training (§III-B of the paper)
     'tools/model_training.py',
 )
 ROBOT_FILES = 'robot.urdf', 'muscles.yaml'
@@ -39,7 +39,7 @@ def network_file(robot: str | Path, preset: str, quick: bool = False) -> Path:
     Args:
         robot: A shipped robot or a robot directory.
         preset: Name of the preset that trains the network.
-        quick: Whether it is trained with `train --quick`.
+        quick: Whether the network is trained with `train --quick`.
 
     Raises:
         MusculoskeletalError: If there is no such robot, or no place for a cache.

@@ -20,7 +20,7 @@ from musculoskeletal_ae.robot.directories import shipped_robots
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
 
-#: read this much time of a recording first [ns], which reveals most wrong robots quickly
+#: first read this much time of a recording [ns], which reveals most wrong robots quickly
 BEGINNING = 2_000_000_000
 
 
@@ -36,9 +36,9 @@ def misfit(bag: Bag, name: str, namespace: str | None = None) -> str:
         MusculoskeletalError: If the robot or the recording is unusable.
     """
     robot = Robot.load(name)
-    # Raise errors that do not depend on the robot first.
+    # First raise errors that do not depend on the robot.
     interface_topics(bag, namespace, robot.description.motor_topics)
-    # The first messages may be bad ones, so read the whole recording before refusing it.
+    # The first messages may be faulty, so read the whole recording before refusing it.
     for stop in bag.start + BEGINNING, LATEST:
         problem = _problem(bag, robot, namespace, stop)
         if not problem:

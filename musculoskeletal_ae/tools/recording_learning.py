@@ -56,10 +56,10 @@ from musculoskeletal_ae.tools.network_cache import network_file
 
 LEAST_OFFSET = 0.002  # do not report a smaller joint-sensor offset [rad]
 #: Warn that a held-out recording repeats what was learned if more than REPEATED_SHARE of its
-#: postures are closer than REPEATED [rad] to a learned one. Between two explorations of a neck of
-#: two joints with the same seed, 70 % of the postures were; with different seeds, 2 %.
+#: postures are closer than REPEATED [rad] to a learned one. In two explorations of a neck of two
+#: joints, this holds for 70 % of the postures with the same seed, and for 2 % with different seeds.
 REPEATED, REPEATED_SHARE = 0.03, 0.25
-#: refuse a table whose length zeros are larger, unless --estimate-zeros is given [m]; on five
+#: refuse a table with a larger length zero than this [m], unless --estimate-zeros is given; on five
 #: emulated arms, lengths differ from the geometric model by up to 15 mm
 LARGEST_ZERO = 0.03
 #: refuse a table if more than this share of the values of a joint or muscle is impossible
@@ -91,7 +91,7 @@ def train(args: Namespace) -> None:
     mae = _initial_network(robot, args)
     CheckpointValidator(robot).check(mae)
     learner = Learner(robot, mae, args.preset, args.seed, from_motion=from_motion)
-    # A recording that does not say which muscles were isolated belongs to the arm of this network.
+    # Where a recording does not say which muscles were isolated, assume those of this network.
     learner.use_body(learner.body.with_isolated(mae.isolated))
     before = [table_errors(mae, source.table) for source in sources]
     try:
@@ -154,7 +154,7 @@ def _bag_sources(robot: Robot, args: Namespace) -> list[TableSource]:
 
 
 def _csv_sources(robot: Robot, args: Namespace) -> list[TableSource]:
-    """Read the CSV files, hold a part of them out, and bring their lengths to the zeros of θ = 0.
+    """Read the CSV files, hold out a part of them, and subtract the zeros of their lengths.
 
     Raises:
         TableError: If a file is unusable, or if the files or their values do not fit together.
@@ -168,7 +168,7 @@ def _csv_sources(robot: Robot, args: Namespace) -> list[TableSource]:
                 _warn([f'{path}: {count} rows were left out: {reason}'])
             if looks_like_a_sequence(table):
                 text = (
-                    'each row is used as a resting posture, but successive rows are near to each '
+                    'each row is used as a resting posture, but successive rows are close to each '
                     'other. If they are readings of a moving arm, name the column of their times '
                     'with --columns time=HEADER, or add --rate HZ'
                 )
@@ -184,8 +184,8 @@ def _csv_sources(robot: Robot, args: Namespace) -> list[TableSource]:
             sources.append(TableSource(f'{path}, {len(held_out)} rows', held_out, True))
     if len({source.table.at_rest for source in sources}) > 1:
         raise TableError(
-            'some files have times and others do not; learn from them separately, with '
-            '--checkpoint from the second time on'
+            'some files have times and others do not; learn from each kind in a run of its own, '
+            'and pass the network of the first run to the second with --checkpoint'
         )
     zeros = _zeros(robot, sources, args.estimate_zeros)
     shifted = [source._replace(table=source.table.without_zeros(zeros)) for source in sources]
@@ -202,10 +202,10 @@ def _table_text(table: Table, columns: tuple[Column, ...]) -> str:
 
 
 def _zeros(robot: Robot, sources: list[TableSource], estimate: bool) -> Array:
-    """Return the length zeros [m] (M,) of the tables that are learned, or 0.
+    """Return the length zeros [m] (M,), estimated from the learned tables if `estimate`, else 0.
 
     Raises:
-        TableError: If the lengths have other zeros and shall not be estimated.
+        TableError: If a length has a large zero, but zeros are not to be estimated.
     """
     learned = [source.table.rows for source in sources if not source.is_held_out]
     joined = Table.of_pairs(Pairs(*map(np.concatenate, zip(*learned, strict=True))))
@@ -221,8 +221,8 @@ def _zeros(robot: Robot, sources: list[TableSource], estimate: bool) -> Array:
             raise TableError(
                 f'the lengths of {robot.muscles[worst]} differ by {1e3 * zeros[worst]:.0f} mm from '
                 'those of the model at the same joint positions (median); legal: up to '
-                f'{1e3 * LARGEST_ZERO:.0f} mm. Lengths are relative to those at θ = 0, and grow '
-                'with the muscle. If their zeros are unknown, add --estimate-zeros; '
+                f'{1e3 * LARGEST_ZERO:.0f} mm. Lengths must be relative to those at θ = 0, and '
+                'grow as the muscle gets longer. If their zeros are unknown, add --estimate-zeros; '
                 'if they are in another unit, or motor angles, add --units length=UNIT'
             )
     return np.zeros(robot.muscle_count)
@@ -272,8 +272,9 @@ def _warnings(robot: Robot, sources: list[TableSource], is_csv: bool) -> Iterato
 def _initial_network(robot: Robot, args: Namespace) -> Mae:
     """Return the network to start from.
 
-    This is the network of `--checkpoint`. Without this option, it is the one that `bringup.sh`
-    starts from too. It comes from the cache of initial networks, and is trained if it is not there.
+    This is the network of `--checkpoint`. Without this option, it is the initial network that
+    `bringup.sh` also uses: from the cache, or trained and cached if it is missing there. With
+    another seed or with `--quick`, a network is trained and not cached.
     """
     if args.checkpoint:
         return checkpoint.load(args.checkpoint, robot)
@@ -424,8 +425,8 @@ def _warn(warnings: list[str]) -> None:
 def repetition(robot: Robot, theta: Array, learned: Array) -> str:
     """Return a warning if a held-out recording repeats the postures that were learned, or ''.
 
-    Its error is then no measure of the error in new postures. Postures of a single joint are not
-    judged, because they lie close together.
+    The error on such a recording is no measure of the error in new postures. Postures of a single
+    joint are not judged, because they lie close together.
 
     Args:
         robot: The geometric model.

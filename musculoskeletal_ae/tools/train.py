@@ -55,13 +55,16 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument(
         '--units', nargs='+', type=_entry, default=[], metavar='KIND=UNIT', help=text
     )
-    text = 'with --from-csv: rows per second; without it and a column of times, each row is a rest'
+    text = (
+        'with --from-csv: rows per second; without --rate and without a column of times, each row '
+        'is a resting posture'
+    )
     parser.add_argument('--rate', type=positive, metavar='HZ', help=text)
     text = 'with --from-csv: estimate the zero of each length from the joint positions'
     parser.add_argument('--estimate-zeros', action='store_true', help=text)
     text = (
         'with --from-bag or --from-csv: network to start from (default: the initial network of '
-        'bringup.sh from its cache, or train it)'
+        'bringup.sh, which is trained unless its cache has it)'
     )
     parser.add_argument('--checkpoint', type=Path, metavar='FILE', help=text)
     text = 'with --from-bag: namespace of the arm if the bags have several'
@@ -88,7 +91,9 @@ def main(argv: list[str] | None = None) -> int:
     work = 'recording_learning' if read_files else 'model_training'
     if args.mujoco:
         if read_files or args.plot:
-            parser.error('--mujoco learns an emulated arm; remove --from-bag, --from-csv, --plot')
+            parser.error(
+                '--mujoco learns from an emulated arm; remove --from-bag, --from-csv and --plot'
+            )
         work = 'mujoco_learning'
     elif any(getattr(args, name) for name in ('joints', 'muscles', 'without', 'base', 'end')):
         parser.error('--joints, --muscles, --without, --base and --end need --mujoco')

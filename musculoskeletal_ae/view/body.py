@@ -23,10 +23,10 @@ from musculoskeletal_ae.robot import drawing
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.routes import ARC
 
-LARGEST_MESH = 50_000_000  # draw no mesh whose file is larger [bytes]
+LARGEST_MESH = 50_000_000  # draw no mesh whose file is larger than this [bytes]
 FORMATS = ('.stl', '.obj', '.ply', '.glb')
-#: find the space in which the arm moves from this many postures with arbitrary joint angles, and
-#: from as many with all joints at their limits
+#: to find the space in which the arm moves, place it in this many postures with arbitrary joint
+#: angles, and in as many with all joints at their limits
 POSTURES = 50
 #: draw each straight piece of a muscle as this many tubes; only dashed muscles have gaps between
 #: them

@@ -85,7 +85,7 @@ class Controls:
         self._sliders: dict[Key, Any] = {}  # handles of all sliders
         self._settled: dict[Key, float] = {}  # last value that the arm had, or that was sent
         self._entered: dict[Key, float] = {}  # last value that the arm had, or that was entered
-        #: posture [rad] (D,) near which the estimate has been, and since when [s]
+        #: posture [rad] (D,) near which the estimate has stayed, and since when [s]
         self._rest = np.full(robot.joint_count, np.nan), 0.0
         self._is_pushing = False
         #: controls of each node, which are shown while the node runs

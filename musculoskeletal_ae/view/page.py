@@ -24,7 +24,7 @@ from musculoskeletal_ae.view.readings import HTML, History, ReadingsPanel
 from musculoskeletal_ae.view.scene import RIGHT_PANEL, Scene
 from musculoskeletal_ae.view.visits import checked_visits
 
-#: show one panel in a window narrower than this, because two would hide the arm [pixels]
+#: show one panel in a window narrower than this [pixels], because two would hide the arm
 NARROW = 900
 HOT = 80.0  # temperature at the right end of a muscle's temperature bar [°C]
 

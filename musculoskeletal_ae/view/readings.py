@@ -20,7 +20,7 @@ ARMS = {'measured': (176, 180, 186), 'estimated': (0, 158, 115), 'simulated': (1
 ENVIRONMENT = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
 #: the macros of the template, which write the HTML of the panel
 HTML: Any = ENVIRONMENT.get_template('page.html.jinja').module
-DURATION = 60.0  # show the curves of the last part of a run, of this duration [s]
+DURATION = 60.0  # let the curves show this much time before now [s]
 GREEN, BLUE = {'stroke': '#009e73', 'width': 2}, {'stroke': '#0072b2', 'width': 2}
 DASHED = {'stroke': '#c80082', 'width': 2, 'dash': [6, 4]}
 HEIGHT = 84  # height of a plot of the curves [pixels]
