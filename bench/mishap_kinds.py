@@ -197,7 +197,7 @@ def _loaded(lab: Lab, rng: Rng) -> int:
     return int(rng.choice(loaded)) if len(loaded) else int((pull - bias).argmax())
 
 
-def _is_demanded(muscle: int) -> Callable[[Lab], bool]:
+def _pulls_otherwise(muscle: int) -> Callable[[Lab], bool]:
     """Return a function that says whether the module of `muscle` does not pull as demanded.
 
     This is so if the tension deviates from the demanded one by more than SHOWN_TENSION.
@@ -233,7 +233,7 @@ def rupture_at_rest(lab: Lab, rng: Rng) -> Case:
     name = lab.arm.robot.muscles[muscle]
     lab.arm.set_ruptured([name])
     return Case(
-        name, lambda lab: lab.arm.set_ruptured([]), (name,), is_visible=_is_demanded(muscle)
+        name, lambda lab: lab.arm.set_ruptured([]), (name,), is_visible=_pulls_otherwise(muscle)
     )
 
 
@@ -308,7 +308,7 @@ def module_fault(kind: str, low: float = 0.0, high: float = 0.0) -> Callable[[La
         muscle, name = _any(rng, lab.arm.robot.muscles)
         size = f':{rng.uniform(low, high):.3f}' if high else ''
         lab.arm.set_faults([f'{kind}:{name}{size}'])
-        return Case(f'{name}{size}', _clear, (name,), is_visible=_is_demanded(muscle))
+        return Case(f'{name}{size}', _clear, (name,), is_visible=_pulls_otherwise(muscle))
 
     return begin
 
@@ -761,7 +761,7 @@ def lost_module(lab: Lab, rng: Rng) -> Case:
         return value
 
     lab.wire.command_faults.append(keep)
-    return Case(name, _clear, (name,), is_visible=_is_demanded(muscle))
+    return Case(name, _clear, (name,), is_visible=_pulls_otherwise(muscle))
 
 
 # -- arm and people --------------------------------------------------------------------------------

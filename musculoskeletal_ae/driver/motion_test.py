@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.driver.order import JOINTS_BETTER, judge_order, wrong_side
+from musculoskeletal_ae.driver.order import EXCHANGE_BETTER, judge_order, wrong_side
 from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.report import is_overloaded
 from musculoskeletal_ae.signals.joint_sensors import corrected, judge, sign_notes
@@ -236,7 +236,7 @@ class MotionTest(ABC):
         of_joints = judge_order(robot, meant, length, tension, tested)
         # A fault of the joint sensors is preferred, because it can look like exchanged antagonists.
         if order.is_faulty and (
-            not judgement.faults or order.misfit < JOINTS_BETTER * of_joints.misfit
+            not judgement.faults or order.misfit < EXCHANGE_BETTER * of_joints.misfit
         ):
             # Modules that do not obey the law move in ways that look like another order.
             if 'law' not in verdict.wrong:

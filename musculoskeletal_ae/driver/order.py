@@ -18,7 +18,7 @@ from musculoskeletal_ae.signals.wiring import BETTER, WiringJudgement, judge, sq
 
 #: Blame exchanged muscles instead of joint sensors if the exchange reduces the misfit to less than
 #: this fraction.
-JOINTS_BETTER = 0.8
+EXCHANGE_BETTER = 0.8
 
 
 def judge_order(
@@ -77,4 +77,4 @@ def wrong_side(
     if BETTER * of_readings > of_commands:
         return None
     of_joints = misfit(corrected(theta, joint_faults, robot.units), own)
-    return 'readings' if of_readings < JOINTS_BETTER * of_joints else None
+    return 'readings' if of_readings < EXCHANGE_BETTER * of_joints else None

@@ -58,8 +58,6 @@ from musculoskeletal_ae.signals.muscle_readings import MuscleReadings, read_musc
 
 #: QoS of topics of which only the newest message counts
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-#: QoS of /diagnostics, on which all nodes of the graph report
-MANY = QoSProfile(depth=50, reliability=ReliabilityPolicy.RELIABLE)
 PERIOD = 1.0 / 30.0  # draw a picture at this interval [s]
 TEXT_PERIOD = 0.25  # update texts and curves at this interval [s]
 GRAPH_PERIOD = 1.0  # look for running nodes and other arms at this interval [s]
@@ -165,7 +163,7 @@ class View(Node):
             ('anomaly', Float64, 'anomaly', NEWEST, lambda m: m.data),
             ('body', Float64MultiArray, 'body_state', LATCHED, body),
             ('mode', String, 'controller_mode', LATCHED, lambda m: m.data),
-            ('', DiagnosticArray, '/diagnostics', MANY, self.arms.diagnosed),
+            ('', DiagnosticArray, '/diagnostics', diagnostics.MANY_REPORTS, self.arms.diagnosed),
         ]  # fmt: skip
 
         def note(what: str, topic: str, read: Callable[[Any], Any], message: Any) -> None:
