@@ -9,10 +9,10 @@
                          └───────── isolated muscles, anomaly ──────────────────────────┘
 
 The body state consists of the length offsets, the isolated muscles and the anomaly. Only the
-estimator creates a new one, when one of these changes; its node publishes it. `length_trust.py`
-decides which length offsets are known, on the evidence of the other parts. During a length
-calibration, only the detectors that do not need lengths report findings. `suspects.py` describes
-the sequence from a rupture to resuming.
+estimator creates a new body state, whenever one of these three changes, and its node publishes it.
+`length_trust.py` decides which length offsets are known, on the evidence of the other parts. During
+a length calibration, only the detectors that do not need lengths report findings. `suspects.py`
+describes the sequence from a rupture to resuming.
 """
 
 import math
@@ -86,7 +86,7 @@ class Output(NamedTuple):
 class Estimator:
     """Estimates the joint angles from each message, and monitors the health of the body.
 
-    `time` is a time of the messages' clock [s], `now` a time of a steady clock [s].
+    In all methods, `time` comes from the messages' clock [s], and `now` from a steady clock [s].
 
     Attributes:
         robot: The nominal body, with all muscles.
@@ -123,8 +123,8 @@ class Estimator:
         Args:
             robot: The nominal body.
             preset: Name of the preset that provides the detectors.
-            first_generation: Generation of the first body state; larger than those of all body
-                states before a restart.
+            first_generation: Generation of the first body state; it must be larger than those of
+                all body states before a restart.
         """
         self.robot = robot
         self.trust = LengthTrust(robot.muscle_count)
@@ -145,8 +145,8 @@ class Estimator:
         self.measured: Array | None = None
         self.stepped_at = -math.inf
         self.load: Contact | None = None
-        #: time since the health of the body was checked: by reception, of which each message counts
-        #: at most LONGEST_STEP, and by publication [s]
+        #: times since the health of the body was last checked [s]: between receptions, of which
+        #: each message adds at most LONGEST_STEP, and between publications
         self._unchecked = self._unchecked_sent = 0.0
         self._commands = ModuleCommands()
         self._rejected = Persistence()  # why messages are rejected
@@ -182,7 +182,7 @@ class Estimator:
     def advice(self) -> str:
         """Advice on how to end the anomaly, as a text for users; '' without an anomaly."""
         if self.suspects.verification is not None:
-            return f'wait until the muscle has been verified, within {LONGEST:g} s'
+            return f'wait for the verification of the muscle, which ends within {LONGEST:g} s'
         return sentence(self.remedy)
 
     # -- settings and services ------------------------------------------------------------------
@@ -389,18 +389,18 @@ class Estimator:
         return posture_of_marker(self.robot, pose, start)
 
     def report(self, now: float) -> Report:
-        """Report the status for /diagnostics; `now` is a time of the steady clock [s]."""
+        """Report the status for /diagnostics; `now` is a time on the steady clock [s]."""
         return estimator_status.report(self, now)
 
     def conditions(self, now: float) -> tuple[Condition, ...]:
         """Return the conditions of readings, body and network that users should know.
 
-        `now` is a time of the steady clock [s].
+        `now` is a time on the steady clock [s].
         """
         return estimator_status.conditions(self, now)
 
     def rejected_because(self, now: float) -> str:
-        """Return why all muscle states of the last 0.1 s or longer were rejected; '' otherwise."""
+        """Return why all muscle states have been rejected for longer than 0.1 s; '' otherwise."""
         return self._rejected.lasting(now)
 
     def _use_sample(self, sample: MuscleSample, now: float) -> Output | None:
@@ -529,9 +529,9 @@ class Estimator:
             self.stream.use_body(self.body)
 
     def _measured_theta(self, readings: Array) -> Array | None:
-        """Return the readings [rad], (D,), as the measured posture, or None.
+        """Return the readings [rad], (D,), if they show the posture of all joints, else None.
 
-        It is None unless every joint has a fresh reading of a sensor that is trusted.
+        Every joint must have a fresh reading from a trusted sensor.
         """
         is_known = not self.joint_trust.unused and np.isfinite(readings).all()
         return readings if is_known else None
@@ -599,8 +599,8 @@ class Estimator:
     def _handle(self, finding: Finding | None, now: float) -> bool:
         """Latch a finding and isolate its muscle, as its kind and the settings require.
 
-        A finding that makes one length unreliable also revokes its offset, one that makes several
-        lengths unreliable revokes all offsets.
+        A finding that makes a single length unreliable also revokes the offset of this length. A
+        finding that makes several lengths unreliable revokes all offsets.
 
         Returns:
             Whether this finding has just been latched; False if `finding` is None, or if an earlier

@@ -24,7 +24,7 @@ from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
 
 class HealthMonitor:
-    """Checks messages with all detectors, and returns the finding of the first that has one.
+    """Checks messages with all detectors, and returns the first finding.
 
     Attributes:
         residual: The detector that compares the network's residual with its healthy spread; it also

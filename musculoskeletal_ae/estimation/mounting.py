@@ -10,13 +10,14 @@ the vector of gravity, so the balance of the joints in several postures shows it
 
 Y(θ) u is the torque that holds the weight of the arm where gravity is u, Y_hand that of a mass of
 1 kg in the hand, g the gravity of `robot.urdf`, and τ_ext the external torque that the contact
-estimator computes with g (`estimation/contact.py`). u are directions on a sphere, and m masses of a
-payload. A payload is thus no evidence: it acts in the direction of gravity. S is the negative
-logarithm of a Student likelihood, because friction and pushes cause large residuals now and then.
+estimator computes with g (`estimation/contact.py`). u runs over directions on a sphere, and m over
+masses of a payload. Because the best m is chosen for each u, a payload does not look like another
+direction of gravity. S is the negative logarithm of a Student likelihood, because friction and
+pushes cause large residuals now and then.
 
-S is summed over the newest n postures, and the evidence is the largest one of all n. A base that is
-turned while the arm works is thus found as soon as one that was wrong from the beginning. Earlier
-postures are discarded once the newest ones show the direction of `robot.urdf`.
+S is summed over the newest n postures, for each n, and the largest evidence of all n counts. A base
+that is turned while the arm works is thus detected as soon as a base that was wrong from the
+beginning. Earlier postures are discarded once the newest ones show the direction of `robot.urdf`.
 
 A posture is used only if it differs from the last one that was used. An arm that stands still, with
 the same friction all the time, therefore adds no evidence. At the stop of a joint, the muscles need

@@ -78,8 +78,8 @@ JAM_EXCESS = 20.0
 #: conclude that a slack tendon is ruptured if its stretch exceeds the stretch at T_bias by this
 #: factor: a healthy tendon would have tension
 STRETCHED = 1.5
-#: with a position-controlled module, wait no longer than this for a tendon that is wound in to have
-#: tension [s]
+#: wait at most this long until the tendon of a position-controlled module, while it is wound in,
+#: has tension [s]
 LONGEST_WINDING = 2.5
 BEHIND = 0.005  # judge whether a module follows once its position command has decreased by this [m]
 STANDS = 0.0005  # treat a winch as standing still if the length changes by less than this [m]
@@ -181,7 +181,7 @@ class PositionLaw(ModuleLaw):
         super().__init__(bias, math.inf)
         self._elongation = elongation
         self._reference = 0.0  # x_0 − L_e(T_0) [m]
-        #: stretch of a healthy tendon with tension [m]
+        #: a healthy tendon has tension if its stretch exceeds this [m]
         self.stretched = STRETCHED * elongation(bias)
 
     def stretch(self, row: _Moment) -> float:
@@ -227,7 +227,7 @@ class Verification:
         self._time = 0.0
         self._highest_command = -math.inf
         self._before = bias, bias  # T and T_ref before the suspect was wound in [N]
-        self._rows: list[_Moment] = []  # while the suspect was wound in
+        self._rows: list[_Moment] = []  # moments of winding in the suspect
         self._watched = 0.0  # duration of winding in so far [s]
 
     def step(

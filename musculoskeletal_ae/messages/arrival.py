@@ -91,7 +91,7 @@ def nanoseconds(stamp: Any) -> int:
 
 
 class Arrival:
-    """The arrival of the messages of one topic. `now` is a time of a steady clock [s].
+    """The arrival of the messages of one topic. `now` is a time on a steady clock [s].
 
     Attributes:
         received_at: Time of reception of the newest message [s].

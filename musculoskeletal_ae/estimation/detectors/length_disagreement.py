@@ -209,13 +209,14 @@ class LengthDisagreement(Detector):
         """Return the change of each length difference since the arm was healthy, with its limits.
 
         For a muscle without enough healthy messages, such as one that was isolated for a minute,
-        the healthy difference is assumed to be 0, and the limits are wider.
+        the healthy difference is assumed to be 0, with limits for this case (GAP_YOUNG,
+        GAP_LEARNED).
 
         Args:
             gap: Measured minus computed lengths [m], (M,).
 
         Returns:
-            The difference of each length [m], (M,), and the limits of these differences.
+            The change of each difference [m], (M,), and the limits of these changes.
         """
         assert self._mae is not None
         is_learned = self._mae.is_calibrated
@@ -247,7 +248,7 @@ class LengthDisagreement(Detector):
             'length differs from that at the measured posture by '
             f'{largest.text(change, self._used, muscle)}'
         )
-        by_muscle = np.delete(change, muscle)  # what stays unexplained if this length is wrong
+        by_muscle = np.delete(change, muscle)  # what remains unexplained if this length is wrong
         limit = min(UNEXPLAINED * np.linalg.norm(change), np.linalg.norm(by_muscle))
         if np.linalg.norm(unexplained) <= limit:
             return None  # false joint sensors explain it; `joint_sensor_check.py` judges them

@@ -22,7 +22,7 @@ anomaly equally well. If tendons are slack, only they can be suspect.
 
 Slack. While a slack tendon is being wound in, its measured length is longer than the reconstructed
 length, and messages are no evidence. The measured length of a ruptured tendon is shorter than the
-restored length, so its messages are evidence.
+reconstructed length, so its messages are evidence.
 """
 
 import math
@@ -79,8 +79,8 @@ class ResidualDistance(Detector):
 
         Args:
             robot: The nominal body.
-            slack: The detector that knows which slack tendons are being wound in. Messages from
-                this time are ignored. With None, no message is ignored.
+            slack: The detector that knows which slack tendons are being wound in; meanwhile,
+                messages are ignored. With None, no message is ignored.
         """
         self._robot = self._complete_robot = robot
         self._slack = slack
@@ -222,7 +222,7 @@ class ResidualDistance(Detector):
         """Return the indices of the suspect muscles among the candidates, the most suspect first.
 
         Without the first muscle, the residual of the other muscles is most likely on a healthy arm.
-        Muscles follow without which it is nearly as likely.
+        The further muscles are those without which it is nearly as likely.
 
         Args:
             bone_tension: Bone-side tensions [N], (M,).

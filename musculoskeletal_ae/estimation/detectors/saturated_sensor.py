@@ -16,9 +16,9 @@ muscles are skipped, such as those of a simulator without noise at rest. Values 
 checked, because an ideal module may hold exactly T_bias.
 
 Such a muscle is no longer safe: while its command demands more than T_sat, the module winds in
-without seeing the tension grow, and neither the limiter nor the watchdog sees it. Emulated arms of
-which all sensors saturated at 120 to 150 N reached 350 to 420 N, with a limit of 200 N. A sensor
-that saturates above T_limit is no fault, because the limiter keeps the readings below.
+although its reading does not rise, and neither the limiter nor the watchdog notices. Emulated arms
+whose sensors all saturated at 120 to 150 N reached 350 to 420 N, although T_limit was 200 N. A
+sensor that saturates above T_limit is no fault, because the limiter keeps the readings below.
 """
 
 import numpy as np
@@ -31,7 +31,7 @@ from musculoskeletal_ae.robot.robot import Robot
 #: report a module that winds in if its tension reading has stayed the same for this long [s], and
 #: the module has wound in by WOUND meanwhile
 WINDING_TIME = 0.5
-WOUND = 0.005  # see WINDING_TIME [m]
+WOUND = 0.005  # length that the module must have wound in for such a report [m]
 #: record that a reading has been clipped at a value (a visit) once it has stayed exactly there for
 #: this long [s]
 LASTING = 0.15
@@ -58,8 +58,8 @@ class SaturatedSensor(Detector):
         self._robot, count = robot, robot.muscle_count
         self._limit = robot.description.tension.limit
         self._bias = robot.description.tension.bias
-        self._highest: Array = np.zeros(count)  # highest reading of two successive ones [N]
-        #: share of the lower readings that differed from the previous one
+        self._highest: Array = np.zeros(count)  # highest value of two successive readings [N]
+        #: share of the readings below the highest ones that differed from the reading before, (M,)
         self._varying: Array = np.zeros(count)
         self.reset()
 
@@ -73,7 +73,7 @@ class SaturatedSensor(Detector):
         self._value: Array = np.full(count, np.nan)  # value at which the reading was clipped [N]
         self._visits: Ints = np.zeros(count, dtype=np.int64)
         self._has_visits = False  # whether the reading of any muscle has been clipped
-        self._has_left = np.ones(count, dtype=bool)  # whether readings have fallen since then
+        self._has_left = np.ones(count, dtype=bool)  # whether readings have been lower since then
 
     def step(self, observation: Observation) -> Finding | None:
         """Report a muscle whose tension reading is clipped, or return None.

@@ -67,7 +67,7 @@ class SlackTendon(Detector):
         self._slack_time: Array = np.zeros(muscle_count)  # time without tension [s]
         #: time without tension and without winding in [s]
         self._idle_time: Array = np.zeros(muscle_count)
-        self._taut_excess: Array = np.zeros(muscle_count)  # `excess` when the tension was lost [m]
+        self._taut_excess: Array = np.zeros(muscle_count)  # `excess` as slack began [m]
         self._wound_length: Array = np.zeros(muscle_count)  # l when it was last wound in [m]
         self.is_winding_in: Bools = np.zeros(muscle_count, dtype=bool)
 
@@ -98,7 +98,7 @@ class SlackTendon(Detector):
             self.is_winding_in[:] = False
             return None
         begins = is_slack & (self._slack_time == 0.0)
-        # The estimated posture explains a part of the length; remove it.
+        # Subtract the part of the length that the estimated posture explains.
         excess = length - self._robot.routes.relative_lengths(theta) if is_slack.any() else length
         self._taut_excess = np.where(begins, excess, self._taut_excess)
         self._slack_time = np.where(is_slack, self._slack_time + dt, 0.0)

@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decides whether a finding is explained by a driver that has restarted or has another wiring.
+"""Decides whether a restart of the driver, or a wrong wiring, explains a finding.
 
 If a driver restarts with two muscles exchanged, in readings and commands, their lengths jump or no
 longer fit the rest of the arm. The same applies if it reverses the sign of a length. Detectors then
 report lost length offsets or a damaged muscle, and the advice that follows would be wrong. Two
 observations reveal what the driver has done:
 
-Silence. A driver that restarts is silent for a moment. The arm moves little meanwhile, so that
-putting the columns back makes their lengths continue those before the silence. If no other order
-and no sign does this for several lengths, and the readings do not fit the learned body, then these
-lengths have lost their offsets.
+Silence. A driver that restarts is silent for a moment, in which the arm moves little. Putting
+exchanged columns back therefore makes their lengths continue those before the silence. If neither
+an exchange nor a reversed sign explains why several lengths have changed, and the readings do not
+fit the learned body, then these lengths have lost their offsets.
 
 Anomaly score. If muscles are exchanged, putting the two columns back restores the usual anomaly
-score A in all recent messages (`signals/wiring.py`). A network that has learned the arm is exact
-enough for this. With any other network, the length calibration judges the order, because the arm
-moves meanwhile. Shortly after a silence, wrong signs are judged in this way as well: a length near
-0 changes by little when its sign is reversed. Without a silence, no driver has restarted, and a
-length offset that has been lost could look like a wrong sign.
+score A in all recent messages (`signals/wiring.py`). Only a network that has learned the arm is
+exact enough for this. With any other network, the length calibration judges the order, because the
+arm moves during the calibration. Shortly after a silence, wrong signs are judged by the anomaly
+score as well, because a length near 0 hardly changes when its sign is reversed. Without a silence,
+signs are not judged: no driver has restarted, and a lost length offset could look like a wrong
+sign.
 """
 
 import math
@@ -138,12 +139,12 @@ class ExchangeCheck:
             return finding
         if not observation.lengths_known:
             return finding
-        judgement, reason = None, 'the lengths then continue those before a pause'
+        judgement, reason = None, 'if corrected, the lengths continue those before a pause'
         if self._may_have_restarted:
             judgement = self._judge_silence()
         is_explained = judgement is not None and judgement.is_faulty
         if not is_explained and finding.kind in EXPLAINED:
-            judgement, reason = self._judge(observation), 'the lengths then fit the arm again'
+            judgement, reason = self._judge(observation), 'if corrected, the lengths fit the arm'
         if judgement is None or not judgement.is_faulty:
             is_vague = finding.kind is ConditionKind.RESIDUAL_DISTANCE
             return (self._jumped_in_silence() if is_vague else None) or finding

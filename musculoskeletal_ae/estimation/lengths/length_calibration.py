@@ -11,7 +11,8 @@ is therefore judged (`signals/wiring.py`), and a wrong one is refused with the n
 A standing arm does not show the wiring.
 
 If an arm stands still, some offsets explain its readings even if it does not stand in the stated
-posture. They are known only if the joint sensors, if there are any, measure that posture.
+posture. On an arm with joint sensors, the offsets are therefore accepted only if the sensors
+measure that posture.
 """
 
 from __future__ import annotations
@@ -50,15 +51,15 @@ LARGEST_RESIDUAL = 0.02
 LARGEST_COST = 0.75
 #: advise these steps if the order or the sign of the readings is wrong
 CORRECT_DRIVER = Step.CORRECT_WIRING, Step.CALIBRATE_LENGTHS
-#: advise this if a calibration in gentle motion fails: it needs an accurate network, which one that
-#: has not learned the arm may not be
+#: advise this if a calibration in gentle motion fails; a network that has not learned the arm may
+#: not be accurate enough for it
 OTHER_WAY = (
     'provide joint sensors; or set zero_posture, hold the arm there, and call estimator/zero'
 )
 #: treat this many successive moments (means over 0.25 s) as one independent measurement, when the
 #: standard deviation of an offset is computed
 CORRELATED = 10.0
-#: during the calibration, use a newer estimate of the offsets only if one of them differs by more
+#: during the calibration, use a newer estimate of the offsets only if an offset differs by more
 #: than this from the one in use [m]
 SHIFTED = 0.02
 #: Reject a stated posture if a joint sensor differs by more than this [rad]. A larger difference is
@@ -113,7 +114,7 @@ class LengthCalibration:
         self._best: Fit | None = None
         self._has_angles = False  # whether joint angles are measured most of the time
         self._problem = ''  # why the last fit is not reliable, or the stated posture is wrong
-        self._estimate: LengthOffsets | None = None  # the newest one, which may be unreliable
+        self._estimate: LengthOffsets | None = None  # newest estimate, which may be unreliable
         self._used: Array | None = None  # offsets in use [m], (M,); None before the first estimate
         #: θ measured last while the arm stands [rad], (D,) each
         self._measured: deque[Array] = deque(maxlen=MOST)

@@ -200,7 +200,7 @@ class PostureCheck:
         share = rng.uniform(size=(count, robot.muscle_count))
         tension = robot.tension.bias + share * (robot.tension.limit - robot.tension.bias)
         if has_followers(robot):
-            # The tensions determine θ by ② where the robot can rest, and not elsewhere.
+            # With ②, tensions and lengths determine θ only where the robot can rest.
             rests = equilibrium_states(robot, len(theta[::2]), rng, SEARCHED)
             if rests is not None:
                 theta[::2], tension[::2] = rests
