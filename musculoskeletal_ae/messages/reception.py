@@ -11,7 +11,7 @@ from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.messages.arrival import Arrival
 
-LONGEST_TEXT = 500
+LONGEST_TEXT = 500  # cut the text of a refusal or rejection after this many characters
 SHOWN = 10.0  # report a refusal or an internal error for this time after it happened [s]
 
 

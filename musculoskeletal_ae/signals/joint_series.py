@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finds false readings of joint sensors in a finished series, such as a recording.
 
-A node judges each reading by the earlier ones (`joint_stream.py`). Afterwards, more is known. A
-constant that interrupts other readings again and again is false: a program that publishes zeros
-beside the driver, or a driver that publishes 0 for a failed read. The constant is recognised by
-the jumps with which it begins and ends,
+A node judges each reading by the earlier ones (`joint_stream.py`). In a finished series, the later
+readings help as well. A constant that interrupts other readings again and again is false: it comes
+from a program that publishes zeros beside the driver, or from a driver that publishes 0 for a
+failed read. Such a constant is recognised by the jumps with which it begins and ends,
 
     |θ_n − θ_n−1| > step + speed · dt
 
-with the step and speed of `joint_stream.py`, or by readings that are the same before and after it
-and further than the step from it. All readings with the value of a false constant are left out,
-even where the arm happens to be close to it. The remaining readings pass through a `JointStream`.
+with the step and speed of `joint_stream.py`, or by readings that are nearly the same before and
+after it, and differ from it by more than the step. All readings with the value of a false constant
+are left out, even where the arm happens to be close to it. The remaining readings pass through a
+`JointStream`.
 
-Encoders count whole turns, or wrap around at 0 or π. Whole turns are therefore subtracted from
-readings that are then within the joint limits and continuous.
+Encoders may count whole turns, or wrap around at 0 or π. Whole turns are therefore subtracted from
+readings if the remaining angles are continuous and within the joint limits.
 
-If a sensor has impossible readings again and again even then, none of its readings during that time
-is usable, as on a running arm (`estimation/joint_sensor_check.py`).
+If a sensor still has impossible readings again and again, none of its readings during that time is
+usable, as on a running arm (`estimation/joint_sensor_check.py`).
 """
 
 from collections import defaultdict

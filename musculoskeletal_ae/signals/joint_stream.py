@@ -15,9 +15,9 @@ The level of a sensor changes if the sensor slips on its axis. The new level is 
 readings have followed each other plausibly for `LIMITS.settled`. This file cannot say which level
 is right: the estimator compares both with the muscle lengths (`estimation/joint_sensor_check.py`).
 
-As with `MuscleStream`, each node that reads the messages drops single readings by its own stream.
-What a lasting fault of a sensor means for others is decided by the estimator alone, which publishes
-it as the trust in this sensor (`joint_trust.py`).
+Each node that reads the messages drops single readings with its own stream, as with `MuscleStream`.
+Only the estimator decides whether a sensor with a lasting fault is trusted, and publishes this
+trust for the other nodes (`joint_trust.py`).
 """
 
 import math
@@ -34,7 +34,8 @@ from musculoskeletal_ae.signals.limits import LIMITS
 #: accept a change of at most this plus SPEED · dt between two readings of a joint sensor [rad]; it
 #: is far beyond the noise, resolution and backlash of sensors
 STEP = 0.1
-#: expect no joint to move faster [rad/s]; emulated arms reach 5.4 rad/s when a tendon slips
+#: expect no joint to move faster than this [rad/s]; emulated arms reach 5.4 rad/s when a tendon
+#: slips
 SPEED = 10.0
 #: report a series of impossible readings that has lasted for this time [s]; a burst of glitches is
 #: shorter, even together with the time after which new readings are accepted (`LIMITS.settled`)
@@ -73,7 +74,7 @@ class ImpossibleSeries(NamedTuple):
     total: int
 
     def is_present(self, now: float) -> bool:
-        """Return whether readings still arrive at the time `now` [s]."""
+        """Return whether the series still continues at the time `now` [s]."""
         return now - self.until <= ENDED
 
     def is_lasting(self, now: float) -> bool:

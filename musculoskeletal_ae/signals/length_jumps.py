@@ -11,9 +11,9 @@ receives every message and decides:
     waiting ── the lengths have returned ───────────────────► no jump
     waiting ── no length has jumped for `LIMITS.settled` ───► no jump: the new level is accepted
 
-A failed read may be so close to the lengths before it that only the way back is a jump. Changes of
-more than half the legal one are therefore counted as well, if they come shortly before a jump or
-while its new level is not accepted yet.
+A failed read may yield a length so close to the one before it that only the return to the true
+length is a jump. Changes of more than half the legal change are therefore counted as well, if they
+come shortly before a jump, or while the new level after a jump is not accepted yet.
 
 The muscles whose new level is accepted are displaced until the next length calibration, unless a
 rupture explains the jump (`PresumedRupture`).
@@ -39,7 +39,7 @@ LARGE = 0.5
 
 @dataclass(frozen=True)
 class Change:
-    """Sum of those changes of lengths, in one or several messages, that exceed half the legal one.
+    """Sum of the changes of lengths that exceed half the legal change, over one or more messages.
 
     The sum over several messages shows whether a length is still at another level. The length
     itself does not show this: a module whose length jumped winds in or pays out, which can bring
@@ -89,7 +89,7 @@ class Change:
 
 
 class PresumedRupture:
-    """Recognizes jumps of a length that a ruptured tendon may have caused.
+    """Recognises jumps of a length that a ruptured tendon may have caused.
 
     A motor winds in a ruptured tendon quickly. If messages are late or lost meanwhile, the length
     of this tendon appears to jump. A rupture is presumed if exactly one tendon is slack and has
@@ -223,7 +223,8 @@ class LengthJumps:
         show how far the arm has moved until the next message.
 
         Args:
-            length: Lengths as measured [m], (M,). One that is not finite is taken as unchanged.
+            length: Lengths as measured [m], (M,). A length that is not finite is taken as
+                unchanged.
             used: Which muscles to check, (M,).
             now: Time of reception by a steady clock [s].
             delay: How late the message is (`Arrival.delay`) [s].
@@ -287,7 +288,7 @@ class LengthJumps:
 
         Args:
             body: The body state.
-            is_calibrated: Whether new length offsets have been calibrated. Then `displaced` is
+            is_calibrated: Whether new length offsets have been calibrated. If so, `displaced` is
                 emptied, and no rupture is presumed any more.
         """
         if is_calibrated:

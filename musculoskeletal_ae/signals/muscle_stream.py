@@ -142,7 +142,7 @@ class MuscleStream:
         self.use_transmission(Transmission(np.zeros(robot.muscle_count)))
         self._levels = LevelCheck(robot)
         self._temperatures = TemperatureCheck(robot.muscle_count)
-        #: readings of the last messages that were accepted, and of all last messages
+        #: readings of the last accepted messages, and of the last messages, accepted or not
         self._accepted: deque[MuscleReadings] = deque(maxlen=window)
         self._received: deque[MuscleReadings] = deque(maxlen=window)
         self._implausible = Persistence()
