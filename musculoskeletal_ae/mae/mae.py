@@ -82,8 +82,9 @@ class BlockDiagonal:
                 already has this order.
             out: Indices that bring the outputs of the blocks, one block after another, into the
                 order of the result; None if the result has the order of the blocks.
-            starts: If given, sum the outputs, once they are in the order `out`, from each of these
-                places to the next. The transposed weight of blocks that share inputs needs it.
+            starts: If given, bring the outputs into the order `out`, and sum them from each of
+                these places to the next. The transposed weight of blocks that share inputs needs
+                this.
         """
         ends = np.cumsum([0, *map(len, blocks)]).tolist()
         self._blocks = [*zip(map(slice, ends, ends[1:]), blocks)]
@@ -611,7 +612,7 @@ class Mae:
     def _read_joints(self) -> list[tuple[int, ...]]:
         """The joints that each block reads, those of its base first.
 
-        A base has no other base, so a joint has the same place in each of these lists.
+        A base has no base itself, so a joint has the same place in each of these lists.
         """
         return [
             union([self.groups[r] for r in reversed(read)]).joints

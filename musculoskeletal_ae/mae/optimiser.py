@@ -30,7 +30,8 @@ POLYNOMIALS = (
 # Use an eigendecomposition for matrices whose smaller side is longer than this. At 413 × 827, as in
 # a hand of 23 joints, it takes half the time of the polynomials; at 163 × 327, as long as they do.
 LARGE = 256
-#: raise eigenvalues to at least this multiple of the largest; float32 does not resolve smaller ones
+#: raise eigenvalues to at least this multiple of the largest one, because float32 does not resolve
+#: smaller eigenvalues
 LEAST_EIGENVALUE = 1e-7
 #: train the weight matrices by Muon with this multiple of the step size of Adam for the biases
 MATRIX_RATIO = 12.5

@@ -36,7 +36,7 @@ def residuals(
     """Return the residuals e in scaled units, (..., 2M), which are 0 for isolated muscles.
 
     Args:
-        restored: States that the network restored from the measured T and l.
+        restored: States that the network reconstructed from the measured T and l.
         tension: Measured T [N], (..., M).
         length: Measured l [m], (..., M).
         isolated: Indices of isolated muscles.

@@ -45,8 +45,8 @@ SHARE = 0.7
 AHEAD = 0.04
 #: correct this fraction of the tension error by one length command to a position-controlled module
 ADMITTANCE = 0.5
-#: let a position-controlled module wind in again at this speed beyond a length at which its tension
-#: exceeded T_limit [m/s]
+#: after the tension of a position-controlled module exceeded T_limit, let its shortest permitted
+#: length command decrease at this speed [m/s]
 RECOVERY = 0.01
 DEPTH = 0.015  # wind a suspect muscle under stiffness control in by at most this [m]
 
@@ -316,7 +316,7 @@ class StiffnessControl(Actuation):
         return demand
 
     def tension_per_length(self, tension: Array) -> Array:  # noqa: ARG002
-        """Return the gain K of each module [N/m], (M,), which does not depend on the tension."""
+        """Return the control stiffness K_stiff of each module [N/m], (M,), at any tension."""
         return self._stiffness
 
     def length_for(self, length: Array, tension: Array, wanted: Array) -> Array:  # noqa: ARG002

@@ -48,8 +48,8 @@ Fail = Callable[[str], RobotDescriptionError]
 #: URDF's types of joints that are neither revolute nor prismatic, by degrees of freedom
 OTHER_JOINTS = {1: 'continuous', 3: 'planar', 6: 'floating'}
 
-#: refuse a stiffness matrix with a lower eigenvalue, relative to the largest one; rounding may make
-#: an eigenvalue slightly negative
+#: refuse a stiffness matrix with an eigenvalue below this multiple of the largest one; rounding may
+#: make an eigenvalue slightly negative
 LEAST_EIGENVALUE = -1e-9
 
 #: T_bias, T_limit and T_max of a muscle whose entry states none [N]
@@ -105,7 +105,7 @@ def written(item: RoutePoint | Wrap) -> dict[str, Any]:
     return entry
 
 
-#: route of a tendon: points that are connected by straight lines, or around the wrap between them
+#: route of a tendon: points, connected by straight lines or around the wrap between two points
 Route = tuple[RoutePoint | Wrap, ...]
 
 

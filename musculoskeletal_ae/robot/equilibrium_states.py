@@ -2,8 +2,9 @@
 """Random equilibria of robots whose joints follow springs and too few muscles.
 
 An underactuated hand has fewer muscles than joints: springs return its fingers, and one tendon may
-bend several joints. The lengths of its muscles do not determine its posture. At rest, however, it
-follows from lengths and tensions, because weight and springs balance the tensions:
+bend several joints. The lengths of its muscles do not determine its posture. At rest, however, the
+posture follows from lengths and tensions, because weight g, springs K θ − b and passive tendons h
+balance the tensions:
 
     g(θ) + K θ − b + h(θ) + G(θ)ᵀ T = 0
 
@@ -16,7 +17,8 @@ constant tensions, or wind like springs of stiffness k between T_bias and T_limi
     T = T_0 + k (l(θ) − l(θ_0))
 
 With constant tensions, an arm settles only where it is stable without the modules, and often at its
-stops. Winding modules also hold it where a tendon would pull itself past an axis.
+stops. Winding modules also hold an arm in postures in which a tendon would pull itself past an
+axis.
 """
 
 from typing import NamedTuple
@@ -32,15 +34,17 @@ REUSED = 5  # compute the stiffness that tensions cause in every fifth of these 
 LARGEST_STEP = 0.2  # turn a joint by at most this in one of these steps [rad]
 #: let the stiffness that determines a step be at least this share of the largest one
 LEAST_STIFFNESS = 0.002
-#: use equilibria in which no joint lacks a larger share of the muscles' typical torque
+#: accept an equilibrium if the unbalanced torque of each joint is at most this share of the typical
+#: torque of the muscles at this joint
 BALANCED = 0.01
-#: let this torque of a joint be at least this share of the largest one
+#: treat the typical torque at a joint as at least this share of the largest typical torque at any
+#: joint
 LEAST_TORQUE = 1e-3
 SEARCHED = 200  # search equilibria from this many random postures
-#: wind by this share of the tension near a found equilibrium (standard deviation); θ follows
+#: vary the tensions of a found equilibrium by this share (standard deviation) to get another one
 VARIATION = 0.1
-#: scatter the torques by this share of the muscles' torques (standard deviation), for joint
-#: friction
+#: vary the torques by this share of the muscles' torques (standard deviation), as joint friction
+#: does
 SCATTER = 0.03
 SMALL = 1e-9  # divide torques by at least this [N·m]
 

@@ -22,9 +22,10 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.gauss_newton import minimise_each
 from musculoskeletal_ae.robot.robot import Robot
 
-#: by default, expect a typical camera to measure a marker with σ_p [m] and σ_R [rad], (6,)
+#: by default, expect these standard deviations σ_p [m] and σ_R [rad] of a marker's pose, as of a
+#: typical camera, (6,)
 SPREADS = np.repeat([0.002, 0.01], 3)
-#: the same with so large a σ_R that any orientation is accepted
+#: the same, but with σ_R so large that any orientation is accepted
 POSITION_ONLY = np.repeat([0.002, 100.0], 3)
 ROUNDS = 30  # end the search after this many steps
 #: damp each step by this prior standard deviation, so that joints that the pose does not determine

@@ -59,7 +59,7 @@ class JointElasticity:
 
     @cached_property
     def typical_stiffness(self) -> Array:
-        """Stiffness of each joint [N·m/rad], (D,), with the passive tendons as at their centre."""
+        """Stiffness of each joint [N·m/rad], (D,), with that of passive tendons at their centre."""
         stiffness: Array = np.diag(self.stiffness) + self.tendons.typical_stiffness
         return stiffness
 

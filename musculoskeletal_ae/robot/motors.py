@@ -38,7 +38,7 @@ class MotorTopics(NamedTuple):
     """Topics of a ros2_control robot. The defaults stand for a robot that has none of them."""
 
     states: str = ''  # topic of the JointState messages that contain the motors
-    commands: str = ''  # positions that the motors should reach; '' to command no motor
+    commands: str = ''  # topic of the commanded positions; '' to command no motor
 
 
 NO_MOTORS = MotorTopics()  # topics of a robot that publishes muscle_states
@@ -57,7 +57,7 @@ class Constants(Strict, frozen=True):
     effort_zero: Number | UnsetType = UNSET  # effort of the motor at which T is 0
 
     def __post_init__(self) -> None:
-        """Check the values that may have either sign, but not every size."""
+        """Check that the direction is 1 or −1, and that the tension per effort is not 0."""
         if self.direction not in (UNSET, 1.0, -1.0):
             raise ValueError(f'direction: expected 1 or -1, got {self.direction:g}')
         if self.tension_per_effort == 0.0:

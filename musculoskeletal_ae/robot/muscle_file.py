@@ -27,8 +27,8 @@ from musculoskeletal_ae.robot.joint_tree import MOST_TERMS
 from musculoskeletal_ae.schema import Strict
 
 STIFFNESS, POSITION = 'stiffness', 'position'  # values of `actuation`
-MOST_POWER = 12  # refuse a larger power of an angle in the length of a passive tendon
-SHORTEST_AXIS = 1e-6  # refuse a shorter vector as an axis, because it defines no direction
+MOST_POWER = 12  # refuse a higher power than this in the length of a passive tendon
+SHORTEST_AXIS = 1e-6  # refuse an axis shorter than this, because it defines no direction
 
 
 class ElasticEntry(Strict, frozen=True):

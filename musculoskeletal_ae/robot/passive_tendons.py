@@ -83,7 +83,7 @@ class PassiveTendons:
         theta = np.asarray(theta, dtype=float)
         rows = np.ascontiguousarray(theta.reshape(-1, theta.shape[-1]))
         torque, gradient = np.zeros(rows.shape), np.zeros((*rows.shape, rows.shape[1]))
-        # numba is a slow import, which help texts do not need
+        # Imported here, because help texts should not wait for the slow import of numba.
         from musculoskeletal_ae.robot.passive_torque import hold_postures
 
         hold_postures(self.arrays, rows, torque, gradient)
@@ -93,7 +93,8 @@ class PassiveTendons:
         """Return tendons that deviate like the springs of their joints.
 
         Args:
-            factor: Factor of the stiffness at each joint, (D,); the mean over its joints counts.
+            factor: Factor of the stiffness at each joint, (D,); a tendon uses the mean over its
+                joints.
             shift: Displacement of the postures with the same lengths [rad], (D,).
         """
         spanned, law = self.spanned, self.arrays.law.copy()

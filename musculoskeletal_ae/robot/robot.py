@@ -200,10 +200,10 @@ class Robot:
         return relative - self.series_elastic.elongation(absolute, tension)
 
     def joint_load(self, torque: Array, jacobian: Array) -> Array:
-        """Return an upper limit of the load of each joint in N postures [N·m], (D,).
+        """Return an upper bound of the load of each joint in N postures [N·m], (D,).
 
         The load of a joint is the magnitude of its holding torque, plus the magnitudes of the
-        torques that the muscles exert on it at T_bias. The limit is the sum of the largest values
+        torques that the muscles exert on it at T_bias. The bound is the sum of the largest values
         that these two parts have in any posture.
 
         Args:

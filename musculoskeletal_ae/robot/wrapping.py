@@ -381,7 +381,8 @@ def arc_points(
     axis, centre = rotation[j] @ objects.axis[s], translation[j] + rotation[j] @ objects.centre[s]
     across = np.eye(3) - np.outer(axis, axis)
     ahead, speed = across @ leave, float(np.linalg.norm(across @ leave))
-    # The straight parts end where they are nearest to the axis, or to the centre of a sphere.
+    # The straight parts end where they are nearest to the axis of a cylinder, or the centre of a
+    # sphere.
     first, last = ((centre - start) @ ahead / speed**2, (centre - end) @ across @ arrive / speed**2)
     turn = np.linspace(0.0, max(length - first - last, 0.0) * speed / radius, most)[:, None]
     begin = start + first * leave - centre
