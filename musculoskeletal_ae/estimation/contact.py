@@ -36,9 +36,9 @@ from musculoskeletal_ae.robot.robot import Robot
 #: filter joint angles and torques with this bandwidth ω [1/s] and a damping ratio of 0.5; critical
 #: damping would make the filter a third slower
 BANDWIDTH = 25.0
-LARGEST_USUAL = 20.0  # F₀: expect no larger force at the hand in normal use [N]
-#: regularise the estimated force F with ‖F‖²/F₀² [1/N²], so that components stay small that produce
-#: no joint torque
+LARGEST_USUAL = 20.0  # F₀: expect no larger force than this at the hand in normal use [N]
+#: regularise the estimated force F with ‖F‖²/F₀² [1/N²], so that components that produce no joint
+#: torque stay small
 REGULARISATION = np.eye(3) / LARGEST_USUAL**2
 #: assume that a joint may rest against its stop within this distance from its limit [rad], which is
 #: roughly the error of an estimated angle

@@ -135,7 +135,7 @@ class JointSensorCheck:
         theta, tension, length = map(np.array, zip(*readings))
         estimate = mae.estimate(tension, np.nan_to_num(length)).theta
         used = ~np.isin(np.arange(length.shape[1]), mae.isolated)
-        # Messages in which a muscle was isolated that is used now cannot be compared.
+        # Messages in which a muscle that is used now was isolated cannot be compared.
         is_complete = np.isfinite(length[:, used]).all(axis=1)
         deviation = np.where(is_complete[:, None], theta - estimate, np.nan)
         residual = np.where(is_complete[:, None] & used, length, np.nan)
@@ -206,7 +206,7 @@ class JointSensorCheck:
         if self._mae is None or self._since < SPACING - 1e-9 or np.isnan(theta).all():
             return
         has_moved = (np.abs(estimate - self._counted_at) > MOVED).any()
-        # Also while the arm stands still, look for readings that are far from the estimate.
+        # Look for readings that are far from the estimate even while the arm stands still.
         usual = 0.0 if self._usual is None else self._usual.deviation
         is_far = np.abs(theta - estimate - usual) > GROSS
         if not (has_moved or (is_far & ~self.trust.is_doubted).any()):
@@ -256,7 +256,7 @@ class JointSensorCheck:
         count = np.isfinite(deviation).sum(axis=0)
         is_known = count >= ENOUGH
         middle = np.where(is_known, _median(deviation), 0.0)
-        newest = deviation[-ENOUGH:]  # of the earlier messages
+        newest = deviation[-ENOUGH:]  # the newest of the earlier messages
         messages = islice(self._messages, len(earlier) - len(newest), len(earlier))
         arrived = np.array([message.deviation for message in messages]).reshape(newest.shape)
         arrived = np.where(np.isnan(newest), np.nan, arrived)

@@ -76,10 +76,10 @@ SHARE = 0.35
 #: demanded tension T_ref by more than this [N]
 JAM_EXCESS = 20.0
 #: conclude that a slack tendon is ruptured if its stretch exceeds the stretch at T_bias by this
-#: factor: a healthy tendon would have tension
+#: factor, because a healthy tendon would then have tension
 STRETCHED = 1.5
-#: wait at most this long until the tendon of a position-controlled module, while it is wound in,
-#: has tension [s]
+#: wait at most this long for tension in the tendon of a position-controlled module that winds in
+#: [s]
 LONGEST_WINDING = 2.5
 BEHIND = 0.005  # judge whether a module follows once its position command has decreased by this [m]
 STANDS = 0.0005  # treat a winch as standing still if the length changes by less than this [m]
@@ -227,7 +227,7 @@ class Verification:
         self._time = 0.0
         self._highest_command = -math.inf
         self._before = bias, bias  # T and T_ref before the suspect was wound in [N]
-        self._rows: list[_Moment] = []  # moments of winding in the suspect
+        self._rows: list[_Moment] = []  # readings while the suspect was wound in
         self._watched = 0.0  # duration of winding in so far [s]
 
     def step(

@@ -82,7 +82,7 @@ class Metadata(Strict, frozen=True):
     preset: str
     version: Count
     training: Annotated[str, Meta(max_length=10_000)]
-    anomaly_calibrated: bool | None  # None if there are no anomaly statistics
+    anomaly_calibrated: bool | None  # None without anomaly statistics
     anomaly_samples: Count
     anomaly_thresholds: Annotated[dict[str, Threshold], Meta(max_length=1000)]
     anomaly_postures: Annotated[int, Meta(ge=0, le=10_000)]
@@ -146,7 +146,7 @@ class Metadata(Strict, frozen=True):
             depth = len(sizes) // 2
             for i, (into, out) in enumerate(pairwise(sizes)):
                 stack = 'encoder' if i < depth else 'decoder'
-                if i == depth:  # the decoder also reads the part of z of its base
+                if i == depth:  # the decoder also reads its base's part of z
                     into = len(latents[g])
                 layer = g * depth + i % depth
                 shapes[f'{stack}.{layer}.weight'] = out, into

@@ -13,7 +13,7 @@ from musculoskeletal_ae.mae.training import Progress, TrainedNetwork, rest_state
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
-#: compute the residuals' first mean and covariance from this many states that were not trained on
+#: compute the first mean and covariance of the residuals from this many held-out states
 HELD_OUT_STATES = 5000
 
 

@@ -311,8 +311,8 @@ class Mae:
     elasticity: JointElasticity | None = None  # springs of the joints; None if not learned
     #: groups of joints and muscles, each with a block of the network; () for one block
     groups: tuple[Group, ...] = ()
-    #: index of the block whose inputs and part of z each block uses as well, such as that of the
-    #: wrist for a finger; its own index if it uses no other; () if none does
+    #: for each block, the index of its base, whose inputs and part of z it uses as well, as a
+    #: finger uses those of the wrist; its own index without a base; () if no block has a base
     bases: tuple[int, ...] = ()
     isolated: tuple[int, ...] = ()  # indices of isolated muscles in T and l
     _enter: dict[Mask, Stack] = field(init=False, repr=False)

@@ -20,8 +20,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, State
 
 #: Assume at least this standard deviation of a residual in scaled units: 0.02 N or 0.01 mm, which
-#: no sensor resolves. It keeps the covariance invertible if a network reconstructs some combination
-#: of its inputs perfectly.
+#: no sensor resolves. This floor keeps the covariance invertible if a network reconstructs some
+#: combination of its inputs perfectly.
 FLOOR = 1e-4
 #: give the residuals of an ignored muscle this standard deviation in scaled units, which is 2000 N
 #: or 1 m, so that they do not matter

@@ -125,7 +125,7 @@ class TrainedNetwork(NamedTuple):
 
 # -- errors ------------------------------------------------------------------------------------
 
-#: report the errors of each output in this unit, with this factor from SI units
+#: name of each output, unit in which its errors are reported, and factor from SI units to this unit
 OUTPUTS = (('theta', 'rad', 1.0), ('tension', 'N', 1.0), ('length', 'mm', 1e3))
 
 

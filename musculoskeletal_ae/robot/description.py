@@ -91,7 +91,7 @@ class Wrap(NamedTuple):
     #: point on the side where the tendon passes [m]; a point inside the object makes it a ring
     side: Array | None
     side_link: str | None = None  # link in whose frame `side` is; None for `link`
-    swivels: bool = False  # whether it is a pulley that swivels about `axis`
+    swivels: bool = False  # whether the object is a pulley that swivels about `axis`
 
 
 def written(item: RoutePoint | Wrap) -> dict[str, Any]:

@@ -28,7 +28,7 @@ class Line(NamedTuple):
     points: Array  # corners of the polyline [m], (N, 3)
     width: float  # width of the line [m]
     colour: tuple[float, ...]  # red, green, blue in [0, 1]
-    name: str = ''  # name of the muscle; only the first branch of its tendon has one
+    name: str = ''  # name of the muscle; '' except for the first branch of its tendon
 
 
 def tension_share(robot: Robot, tension: Array) -> Array:

@@ -30,7 +30,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 
 STEPS = 30  # move towards an equilibrium in at most this many steps
-REUSED = 5  # compute the stiffness that tensions cause in every fifth of these steps
+REUSED = 5  # compute the stiffness due to tensions only in every fifth of these steps
 LARGEST_STEP = 0.2  # turn a joint by at most this in one of these steps [rad]
 #: let the stiffness that determines a step be at least this share of the largest one
 LEAST_STIFFNESS = 0.002
@@ -91,7 +91,7 @@ def equilibrium_states(
     Returns:
         The equilibria; None if none was found.
     """
-    # Most arms have no followers, so nodes that solve no other quadratic programme need no solver.
+    # Imported here, because most arms have no followers, and their nodes then load no solver.
     from musculoskeletal_ae.robot.tension import least_tension
 
     theta, limits = robot.random_postures(searched, rng), robot.tension

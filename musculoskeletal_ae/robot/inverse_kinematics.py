@@ -25,7 +25,7 @@ from musculoskeletal_ae.robot.robot import Robot
 #: by default, expect these standard deviations σ_p [m] and σ_R [rad] of a marker's pose, as of a
 #: typical camera, (6,)
 SPREADS = np.repeat([0.002, 0.01], 3)
-#: the same, but with σ_R so large that any orientation is accepted
+#: like SPREADS, but with σ_R so large that any orientation is accepted
 POSITION_ONLY = np.repeat([0.002, 100.0], 3)
 ROUNDS = 30  # end the search after this many steps
 #: damp each step by this prior standard deviation, so that joints that the pose does not determine
@@ -39,7 +39,7 @@ class Posture(NamedTuple):
 
     theta: Array  # joint angles θ of the solution [rad], (D,)
     distance: float  # distance of the end effector from the pose [m]
-    angle: float  # angle between its orientation and that of the pose [rad]
+    angle: float  # angle between the orientations of end effector and pose [rad]
     #: θ, with NaN for joints that do not move the end effector and therefore remain unknown, (D,)
     observed_theta: Array
 

@@ -42,7 +42,7 @@ from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics
 
 TINY = 1e-12  # divide by at least this, and count a smaller distance as zero
-#: count a point as outside if it is less than this beneath the surface, relative to the radius
+#: count a point as outside if it lies beneath the surface by less than this share of the radius
 RIM = 1e-6
 Vector = tuple[float, float, float] | Array
 

@@ -57,11 +57,11 @@ FAR = 2.5
 SLOPE = 1e-4  # compute the numerical derivatives of the filter with this step
 #: compare later thermal constants with those that were learned after this time [s]
 LEARNED = 1200.0
-#: use learned thermal constants as this reference only if the standard deviation of their
-#: logarithms is below this
+#: compare later thermal constants with learned ones only if the standard deviation of the
+#: logarithms of the learned ones is below this
 KNOWN = 0.2
 REST_STEP = 30.0  # search for the end of a rest in steps of this time [s]
-LONGEST_REST = 3600.0  # end the search at this time [s], and report 'more than 60 min'
+LONGEST_REST = 3600.0  # search up to this rest [s]; report a longer one as 'more than 60 min'
 CHANGED = 1.5  # report a module once a thermal constant differs from its reference by this factor
 
 

@@ -269,7 +269,7 @@ def _interrupting(which: Ints, readings: Array, largest: Array) -> list[int]:
     sure = np.bincount(constants[is_sure], minlength=count)
     repeated = np.bincount(which, minlength=count)
     same = np.bincount(which[1:][np.diff(which) == 0], minlength=count)
-    is_noisy = same.sum() - same < NOISY * (len(which) - repeated)  # if the constant is left out
+    is_noisy = same.sum() - same < NOISY * (len(which) - repeated)  # without the constant
     is_held = is_noisy & (same >= LEAST_REPEATED - 1)
     is_false = repeated >= LEAST_REPEATED
     is_false &= interruptions >= np.maximum(INTERRUPTING * appearances, 1)

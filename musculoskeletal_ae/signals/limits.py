@@ -26,7 +26,8 @@ class Limits(NamedTuple):
     Nodes and tools that process muscle states or estimates all use these limits.
     """
 
-    #: reject a measured angle that exceeds the joint's range by more than this fraction of it
+    #: reject a measured angle that exceeds the joint's range by more than this fraction of the
+    #: range
     joint_outside: float = 0.1
     #: treat an estimate as implausible if an angle exceeds the joint's range by more than this
     #: fraction of the range

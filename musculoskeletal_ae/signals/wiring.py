@@ -45,7 +45,7 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 #: factor. Conclude that the order of two columns is right if exchanging them multiplies their
 #: misfit by at least this factor.
 BETTER = 1.4
-#: assume a wrong order or sign if correcting it divides the cost of all readings by this factor
+#: assume a wrong order or sign if correcting it divides the cost of all readings by at least this
 COST_BETTER = 1.1
 #: add noise of this standard deviation to every misfit [m]; an arm that hardly moves then shows
 #: neither a fault nor that the wiring is right

@@ -89,13 +89,14 @@ class Largest(NamedTuple):
 #: with a network whose detector is not calibrated, tolerate this change Δ of the difference between
 #: measured and computed lengths
 CHANGE_YOUNG = Largest(0.06, 0.028)
-#: with such a network, tolerate this difference g itself while the usual one is not known
+#: with such a network, tolerate this difference g between measured and computed lengths while the
+#: usual difference is not known
 GAP_YOUNG = Largest(0.08, 0.045)
 #: with a network whose detector is calibrated, tolerate this change Δ of the difference between
 #: measured and computed lengths
 CHANGE_LEARNED = Largest(0.035, 0.016)
-#: with a network whose detector is calibrated, tolerate this difference g itself while the usual
-#: one is not known
+#: with a network whose detector is calibrated, tolerate this difference g between measured and
+#: computed lengths while the usual difference is not known
 GAP_LEARNED = Largest(0.035, 0.016)
 #: Store a healthy message at this interval [s]. The stored messages show the usual difference
 #: between measured and computed lengths.

@@ -45,8 +45,8 @@ from musculoskeletal_ae.signals.limits import slack_tension
 FAULTY = 1.0  # report a module once the evidence against it amounts to this time [s]
 #: smooth differences from the command, and winding speeds, with this time constant [s]
 SMOOTHING = 0.1
-#: reduce the evidence while the winch turns at more than this share of its largest speed, if that
-#: is known: it can hardly correct faster
+#: reduce the evidence while the winch turns at more than this share of its largest speed, if this
+#: speed is known: the winch can hardly correct faster
 FULL_SPEED = 0.5
 #: expect a healthy module to wind at least this fast [m/s] while |T − T_ref| is T_limit
 CORRECTING = 0.2
@@ -65,8 +65,8 @@ BEHIND = 0.005  # tolerate this distance of a position-controlled module from it
 CLEARLY_BEHIND = 0.005
 #: expect a healthy position-controlled module to lag behind its command by at most this time [s]
 LAG = 0.6
-#: reduce the evidence against a position-controlled module above this share of T_max, because it
-#: cannot pull harder
+#: reduce the evidence against a position-controlled module while its tension exceeds this share of
+#: T_max, because the motor cannot pull harder
 FULL = 0.9
 
 

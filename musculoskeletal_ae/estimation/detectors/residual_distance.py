@@ -47,8 +47,8 @@ NORM = 'norm'  # name under which a checkpoint stores the threshold of the anoma
 #: most this multiple of d without the suspect
 EQUALLY_LIKELY = 1.5
 IN_A_ROW = 5  # report the suspect after this many consecutive messages above the threshold
-#: raise the threshold if the posture is further than this from the nearest calibrated one [joint
-#: ranges], because the network is less accurate there
+#: raise the threshold if the posture is further than this [joint ranges] from the nearest
+#: calibrated posture, because the network is less accurate there
 NEAR = 0.25
 WIDEST = 3.0  # multiply the threshold by at most this factor, so that ruptures are still detected
 

@@ -37,7 +37,7 @@ WOUND = 0.005  # length that the module must have wound in for such a report [m]
 LASTING = 0.15
 VISITS = 2  # report a muscle once its reading has been clipped this often at the same value
 SAME = 2e-3  # treat two tension readings as the same value if they differ by less than this share
-#: record that a reading has been clipped again only after it has been lower by this share
+#: record that a reading has been clipped again only after it has fallen by this share in between
 BELOW = 0.1
 #: forget a value, because the sensor does not saturate there, once the reading has been higher for
 #: this long [s]; a spike is shorter
@@ -69,11 +69,11 @@ class SaturatedSensor(Detector):
         self._before: Array = np.full(count, np.nan)  # reading of the previous message [N]
         self._unchanged: Array = np.zeros(count)  # time without a change of the reading [s]
         self._length: Array = np.zeros(count)  # l when the reading changed last [m]
-        self._beyond: Array = np.zeros(count)  # time for which the reading has been higher [s]
+        self._beyond: Array = np.zeros(count)  # time for which it has exceeded `_value` [s]
         self._value: Array = np.full(count, np.nan)  # value at which the reading was clipped [N]
         self._visits: Ints = np.zeros(count, dtype=np.int64)
         self._has_visits = False  # whether the reading of any muscle has been clipped
-        self._has_left = np.ones(count, dtype=bool)  # whether readings have been lower since then
+        self._has_left = np.ones(count, dtype=bool)  # whether it has been clearly below `_value`
 
     def step(self, observation: Observation) -> Finding | None:
         """Report a muscle whose tension reading is clipped, or return None.

@@ -37,15 +37,15 @@ from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement, decide, single_faults
 
 SPACING = 0.25  # store at most one message in this time [s]
-#: take the median anomaly score A of at most this many stored messages as the usual one
+#: take the median anomaly score A of at most this many stored messages as the usual score
 USUAL_COUNT = 120
 ENOUGH = 20  # judge no finding before this many messages have been stored
 RECENT = 20  # judge a finding by this many of the newest messages
 #: judge a finding only by recent messages whose anomaly score A exceeds this multiple of the usual
-#: one, because the others are from before the fault
+#: score, because the others are from before the fault
 ANOMALOUS = 2.0
 #: assume an exchange only if the anomaly score, with the columns put back, is below this multiple
-#: of the usual one
+#: of the usual score
 USUAL = 1.5
 #: Assume an exchange only if putting the columns back divides the anomaly score by at least this
 #: factor. On messages of two learned arms, USUAL and BETTER together blamed an exchange for 3 of
@@ -53,8 +53,8 @@ USUAL = 1.5
 BETTER = 3.0
 #: assume that the driver may have restarted after a pause of all messages of this length [s]
 SILENT = 0.3
-#: for this time after such a pause, compare the lengths before and after it to explain a finding
-#: [s]
+#: for this time after a pause of all messages [s], compare the lengths before and after the pause
+#: to explain a finding
 RESTARTED = 5.0
 #: suspect that a column belongs to another muscle, or has lost its offset, if its length has
 #: changed by more than this during the pause [m]
@@ -92,8 +92,8 @@ class ExchangeCheck:
         self._since = 0.0  # time since a message was last kept [s]
         #: time [s] and lengths as read [m], (M,), of the newest message, accepted or not
         self._newest: tuple[float, Array] | None = None
-        #: time of the first message after the last silence [s], and the lengths as read before and
-        #: in it [m], (M,) each
+        #: time of the first message after the last silence [s], and the lengths as read before the
+        #: silence and in this message [m], (M,) each
         self._silence: tuple[float, Array, Array] | None = None
 
     def use(self, mae: Mae) -> None:

@@ -36,7 +36,7 @@ from musculoskeletal_ae.signals.wiring import WiringJudgement, judge
 ENOUGH_WITH_ANGLES = 20.0  # with joint sensors, require gentle motion for this long [s]
 ENOUGH = 38.0  # without joint sensors, require gentle motion for this long [s]
 STANDING = 1.0  # require the arm to stand still in a posture stated by the user for this long [s]
-#: begin the first fit after this time, and fits of an arm that stands at this interval [s]
+#: begin the first fit after this time [s], and all fits of a standing arm at this interval
 FIRST_FIT = 0.5
 FIT_INTERVAL = 2.0  # begin later fits of a moving arm at this interval [s]
 #: Do one piece of a fit, which takes 1 to 2 ms, for every PIECE_TIME [s] since the last message.
@@ -44,10 +44,11 @@ FIT_INTERVAL = 2.0  # begin later fits of a moving arm at this interval [s]
 #: with messages at 50 to 200 Hz.
 PIECE_TIME = 0.005
 MOST_PIECES = 4  # do at most this many pieces of a fit at one message, so that none is delayed
-#: reject a fit with a larger median residual of a length [m]; correct offsets leave 0.0003 m
+#: reject a fit if the median residual of a length is larger than this [m]; correct offsets leave
+#: 0.0003 m
 LARGEST_RESIDUAL = 0.02
-#: reject a fit with a larger cost per residual: correct offsets cost 0.2 to 0.5, offsets of a wrong
-#: posture 1.1, and pure noise 0.95
+#: reject a fit with a larger cost per residual than this: correct offsets cost 0.2 to 0.5, offsets
+#: of a wrong posture 1.1, and pure noise 0.95
 LARGEST_COST = 0.75
 #: advise these steps if the order or the sign of the readings is wrong
 CORRECT_DRIVER = Step.CORRECT_WIRING, Step.CALIBRATE_LENGTHS
@@ -202,7 +203,7 @@ class LengthCalibration:
             return None
         if self.is_done:
             return Evidence.CALIBRATED
-        # Use the first estimate, and any other only after a substantial change.
+        # Use the first estimate, and a later estimate only after a substantial change.
         if self._used is None or np.abs(offsets.offset - self._used).max() > SHIFTED:
             self._used = offsets.offset
             return Evidence.CALIBRATING

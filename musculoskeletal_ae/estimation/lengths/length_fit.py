@@ -106,7 +106,8 @@ class LengthFit:
         few = moments.rows(_few(moments))
         guesses = yield from self._guesses(moments, few)
         likeliest = yield from self._best(guesses, few, FIRST_ROUNDS)
-        # Let all moments decide between the new start and the earlier fit: a few may mislead.
+        # Let all moments decide between the new start and the earlier fit: a few moments may
+        # mislead.
         candidates = [likeliest.constants]
         if before is not None:
             candidates.append(before.constants)

@@ -51,7 +51,7 @@ JOINT_FRICTION = 0.03
 
 #: after a reversal, let the friction of a joint change its sign over this motion [rad]
 STICKING = 0.003
-#: relate joint friction to a torque of at least this share of that of the muscles at T_bias: a
+#: relate joint friction to at least this share of the torque of the muscles at T_bias, because a
 #: joint with a vertical axis carries no weight
 LEAST_WEIGHT = 0.1
 
@@ -141,7 +141,7 @@ class LengthModel:
         unbalanced, jacobian = self.torque(theta, pull)
         torque = unbalanced + joint_friction * turning
         # A stop can carry any torque, so the residual of a joint at its stop means nothing. It is
-        # replaced by a typical one, so that the fit neither seeks nor avoids stops.
+        # replaced by a typical residual, so that the fit neither seeks nor avoids stops.
         low, high = self.robot.lower + AT_STOP, self.robot.upper - AT_STOP
         is_free = (low < theta) & (theta < high)
         torque = np.where(is_free, torque, TORQUE_NOISE)

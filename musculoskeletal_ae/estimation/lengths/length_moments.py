@@ -20,7 +20,7 @@ WINDOW = 0.25  # average readings over this time; the mean is called a moment [s
 #: conclude that the arm has moved since the last moment if a length has changed by more than this
 #: [m]
 MOVED = 0.002
-#: skip moments in which a muscle is faster, because inertial forces matter then [m/s]
+#: skip moments in which a muscle is faster than this [m/s], because inertial forces matter then
 FASTEST = 0.05
 MOST = 240  # keep at most this many of the newest moments, which bounds the time of a fit
 
