@@ -63,7 +63,7 @@ JOINTS_AGE = 0.05
 
 
 class Output(NamedTuple):
-    """What the estimator has computed from one message.
+    """Results of the estimator for one message.
 
     Attributes:
         sample: The checked readings of the message.
@@ -110,8 +110,8 @@ class Estimator:
         joint_stream: Judges single readings of the joint sensors.
         joint_check: Decides which joint sensors are trusted.
         measured: Joint angles from joint sensors [rad], (D,), at the last message with an estimate;
-            None unless all joint sensors are trusted and reported a usable value within the 0.05 s
-            before it.
+            None unless all joint sensors are trusted and reported a usable value within 0.05 s
+            before that message.
         load: The newest external load; None as in `Output`.
         stepped_at: Time on the steady clock at which the last message was accepted while there was
             a network [s].
@@ -237,7 +237,7 @@ class Estimator:
         """Consider the length offsets unknown until the next length calibration.
 
         Args:
-            evidence: Why they are unknown.
+            evidence: Why the offsets are unknown.
             offset: Offsets that are used meanwhile [m], (M,); 0 by default.
         """
         unknown = LengthOffsets.unknown(self.robot.muscle_count)
@@ -248,7 +248,7 @@ class Estimator:
         """Start a length calibration, during which the arm stands in a posture or moves gently.
 
         Args:
-            posture: Positions of the joints at which the arm stands [rad or m], (D,); () if it
+            posture: Positions of the joints at which the arm stands [rad or m], (D,); () if the arm
                 moves gently.
 
         Raises:
@@ -274,7 +274,7 @@ class Estimator:
         """Record joint angles θ [rad], (D,), that joint sensors measured at `now` [s].
 
         θ is NaN for joints that the message does not contain. A joint that had readings before is
-        reported as missing once it has had none for a second.
+        reported as missing once it has had no reading for a second.
         """
         usable = self.joint_stream.take(now, theta)
         impossible = self.joint_stream.impossible(now)
@@ -284,7 +284,7 @@ class Estimator:
 
     @property
     def joint_trust(self) -> JointTrust:
-        """Which joint sensors are trusted; times are those of the steady clock."""
+        """The trust in each joint sensor, with times on the steady clock."""
         return self.joint_check.trust
 
     def confirm_joint_sensors(self) -> tuple[int, ...]:
@@ -309,9 +309,9 @@ class Estimator:
         verification = self.suspects.verification
         if verification is not None and verification.muscle in restored:
             raise MusculoskeletalError(
-                f'{self.robot.muscles[verification.muscle]} is being verified, which ends by '
-                f'itself within {LONGEST:g} s; wait until then, and call estimator/restore again '
-                'if the muscle is still isolated'
+                f'{self.robot.muscles[verification.muscle]} is being verified; this ends by itself '
+                f'within {LONGEST:g} s; wait until then, and call estimator/restore again if the '
+                'muscle is still isolated'
             )
         if problems := list(filter(None, map(self._repair_problem, restored))):
             again = 'then call estimator/restore again'

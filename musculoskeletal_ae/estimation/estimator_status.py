@@ -71,7 +71,7 @@ def _finding(core: Estimator) -> Iterator[Condition]:
     names = [core.robot.muscles[muscle] for muscle in finding.muscles]
     detail = f'{", ".join(names)}: {finding.evidence}'
     if core.suspects.verification is not None:
-        detail += f' (it is being verified, which ends by itself within {LONGEST:g} s)'
+        detail += f' (the muscle is being verified; this ends by itself within {LONGEST:g} s)'
     yield finding.kind.condition(detail, names, level='error', steps=core.remedy)
 
 
@@ -134,7 +134,7 @@ def _doubted_joints(core: Estimator) -> Iterator[Condition]:
 
 
 def _unreadable_joints(core: Estimator, now: float) -> Iterator[Condition]:
-    """Yield conditions on joints with lasting impossible readings, and on joints without any."""
+    """Yield conditions on joints with lasting impossible readings, or without any readings."""
     if series := core.joint_stream.impossible(now):
         names = [core.robot.joints[j] for j in series]
         impossible = sum(each.impossible for each in series.values())

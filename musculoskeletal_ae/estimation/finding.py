@@ -40,7 +40,7 @@ class Finding:
     others: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse a kind that neither stops the arm nor isolates a muscle, as findings do."""
+        """Refuse a kind that is no finding: it neither stops the arm nor isolates a muscle."""
         if self.kind.reaction is None:
             raise ValueError(
                 f'{self.kind.identifier} has no reaction that stops the arm or isolates a muscle; '
@@ -64,7 +64,7 @@ class Observation:
 
     Attributes:
         sample: The checked readings.
-        estimate: What the network estimates from these readings.
+        estimate: The network's estimate for these readings.
         demand: Tensions that the newest command demands of the muscle modules [N], (M,); None
             without a command, and for position-controlled modules.
         dt: Time since the previous message [s]; the caller limits it after a pause.

@@ -3,7 +3,7 @@
 
 The readings are mainly compared with the muscle lengths:
 
-    x_j = (θ_j − θ̂_j) − median of the same in earlier messages
+    x_j = (θ_j − θ̂_j) − median of θ_j − θ̂_j in earlier messages
 
 θ_j is the reading of joint sensor j, and θ̂_j the network's estimate from tensions and lengths,
 which no joint sensor enters. A false sensor therefore changes its own x_j only. This also holds if
@@ -156,7 +156,7 @@ class JointSensorCheck:
     def confirm(self) -> tuple[int, ...]:
         """Confirm all doubted sensors, because a user says that they are right.
 
-        Earlier readings, which contradict them, are discarded.
+        Earlier readings of these sensors, which contradict the present ones, are discarded.
 
         Returns:
             Indices of the joints whose sensors were in doubt.

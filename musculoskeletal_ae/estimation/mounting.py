@@ -80,8 +80,8 @@ class Tilt(NamedTuple):
         """Direction of gravity that the tensions show, as a text for users."""
         x, y, z = self.direction
         return (
-            f'the tensions show that gravity acts along ({x:.1f}, {y:.1f}, {z:.1f}) of the root '
-            f'link, about {self.angle:.0f}° away from the direction in robot.urdf'
+            f'the tensions show that gravity acts along ({x:.1f}, {y:.1f}, {z:.1f}) in the '
+            f'axes of the root link, about {self.angle:.0f}° away from the direction in robot.urdf'
         )
 
 

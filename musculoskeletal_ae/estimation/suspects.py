@@ -150,8 +150,8 @@ class SuspectHandling:
     def explains(self, finding: Finding) -> bool:
         """Return whether the repair of a muscle explains a new finding of a wrong length.
 
-        It does if the latched finding names the same muscle and asks for its repair: a repaired
-        muscle may have another length offset.
+        The repair explains it if the latched finding names the same muscle and asks for a repair,
+        because a repaired muscle may have another length offset.
         """
         suspected = self.finding
         if suspected is None or suspected.kind.steps != REPAIR:

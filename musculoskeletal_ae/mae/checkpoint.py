@@ -115,7 +115,7 @@ class Metadata(Strict, frozen=True):
         bases, count = self.bases_by_group(), len(self.groups)
         are_bases = len(bases) == count and max(bases) < count
         if not are_bases or any(bases[base] != base for base in bases):
-            expected = f'for each of {count} groups the index of its base, which is its own base'
+            expected = f'for each of {count} groups the index of its base, and for a base its own'
             raise ValueError(f'bases {self.bases}; legal: {expected}')
         # Encoder and decoder have equally many hidden layers; the latent layer is between them.
         depth, rest = divmod(len(self.layer_sizes), len(self.groups))

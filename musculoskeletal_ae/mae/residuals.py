@@ -105,7 +105,7 @@ class AnomalyStatistics:
 
 @dataclass(frozen=True, eq=False)
 class TouchStatistics:
-    """Statistics that distinguish contact from friction (`estimation/contact.py`)."""
+    """Tendon friction and residual torque, by which contact is detected."""
 
     friction: Array  # tendon friction μ of each muscle, (M,): T = T_end e^{±μ}
     #: root mean square of the estimated τ_ext of the healthy moving arm [N·m], (D,); positive

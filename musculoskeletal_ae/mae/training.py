@@ -142,7 +142,7 @@ class PairError(NamedTuple):
 def pair_errors(mae: Mae, states: State) -> list[PairError]:
     """Return the mean errors over N states, for all nine pairs of mask and output.
 
-    The states are true; the network reconstructs each from the two quantities that a mask selects.
+    The network reconstructs each of the true `states` from the two quantities that a mask selects.
     """
     result = []
     for mask in Mask:

@@ -186,7 +186,7 @@ def read_names(message: Any) -> list[str]:
 def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str, Array]:
     """Return the link that carries an IMU, and the acceleration [m/s²], (3,), of an Imu message.
 
-    The frame of the message names the link, after `prefix`.
+    The frame of the message is the name of the link, which may follow `prefix`.
     """
     link, vector = message.header.frame_id.removeprefix(prefix), message.linear_acceleration
     if link not in links:

@@ -92,7 +92,7 @@ class Reception:
     def reject(self, source: str, reason: str, detail: str) -> bool:
         """Count a rejected message or request; return whether it is the first for this reason.
 
-        `source` names the topic or service, and `detail` describes this case in the message.
+        `source` names the topic or service, and `detail` describes this case for users.
         """
         self.last_rejected = f'{source}: {detail}'[:LONGEST_TEXT]
         self.rejected[f'{source}: {reason}'] += 1

@@ -225,7 +225,7 @@ class Actuation(ABC):
 
     @abstractmethod
     def usable_lead(self, lead: Array | float) -> Array | float:
-        """Return how much further than `depth` a command may run ahead of a lagging module [m].
+        """Return by how much a command to a lagging module may exceed `depth` [m].
 
         Args:
             lead: Lag of each module behind its command while it winds in [m], scalar or (M,).
@@ -359,7 +359,7 @@ class StiffnessControl(Actuation):
         return tension
 
     def depth(self, tension: Array, rate: Array, limit: Array) -> Array:  # noqa: ARG002
-        """Return how far [m] a command that demands the tensions `limit` lies below l, (M,)."""
+        """Return by how much [m] a command is shorter than l if it demands `limit`, (M,)."""
         return self.largest_depth(limit)
 
     def largest_depth(self, limit: Array) -> Array:

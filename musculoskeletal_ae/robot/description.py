@@ -65,7 +65,7 @@ NO_TENSION = (
 )
 BY_CURRENT = (
     'tensions are computed from motor currents; scale, offset and drive friction are learned, and '
-    'the tension limits are wrong by as much as these constants until then'
+    'until then their errors make the tension limits equally wrong'
 )
 
 
@@ -169,7 +169,7 @@ class RobotDescription:
 
     @property
     def held_joints(self) -> tuple[str, ...]:
-        """Movable joints of the URDF that are held fixed, as they are neither in θ nor coupled."""
+        """Movable joints of the URDF that are held fixed: they are neither in θ nor coupled."""
         known = {*self.couplings, *self.joints}
         return tuple(name for name in self.model.names[1:] if name not in known)
 

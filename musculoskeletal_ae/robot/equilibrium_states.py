@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random equilibria of robots whose joints follow springs and too few muscles.
+"""Random equilibria of robots with springs at the joints and fewer muscles than joints.
 
 An underactuated hand has fewer muscles than joints: springs return its fingers, and one tendon may
 bend several joints. The lengths of its muscles do not determine its posture. At rest, however, the
@@ -50,7 +50,7 @@ SMALL = 1e-9  # divide torques by at least this [N·m]
 
 
 class Equilibrium(NamedTuple):
-    """N equilibria."""
+    """N equilibria, and how tensions and postures change near them."""
 
     theta: Array  # θ [rad], (N, D)
     tension: Array  # T [N], (N, M)
@@ -60,10 +60,9 @@ class Equilibrium(NamedTuple):
 
 
 def has_followers(robot: Robot) -> bool:
-    """Return whether springs and too few muscles move some group of joints.
+    """Return whether a group of joints has fewer muscles than joints, and a spring at one of them.
 
-    The group has fewer muscles than joints, and a spring at one of them. Without measured tensions,
-    no equilibrium can be told from another, so the result is false.
+    Without measured tensions, no equilibrium can be told from another, so the result is false.
     """
     if not robot.tension_source.is_known:
         return False

@@ -35,7 +35,7 @@ Radius = Annotated[float, Meta(ge=1e-4, le=10.0)]
 
 
 class MotorTopics(NamedTuple):
-    """Topics of a ros2_control robot. The defaults stand for a robot that has none of them."""
+    """Topics of a ros2_control robot. The defaults stand for a robot without motor topics."""
 
     states: str = ''  # topic of the JointState messages that contain the motors
     commands: str = ''  # topic of the commanded positions; '' to command no motor
@@ -92,7 +92,7 @@ class MotorFile(Constants, frozen=True, kw_only=True):
         super().__post_init__()
         for key, name in (('state_topic', self.state_topic), ('command_topic', self.command_topic)):
             if name is not None and not TOPIC_NAME.fullmatch(name):
-                legal = 'words of letters, digits and _ that are joined by /, as in joint_states'
+                legal = 'words of letters, digits and _, joined by /, as in arm/joint_states'
                 raise ValueError(f'{key}: {name!r} is no name of a topic; legal: {legal}')
 
 
@@ -112,7 +112,7 @@ class Motors:
 
 
 def motor_topics(robot: str | Path) -> MotorTopics:
-    """Return the topics of the motors of a robot: a shipped name, or a directory.
+    """Return the motor topics of a robot, which is a shipped name or a directory.
 
     Raises:
         RobotDescriptionError: If the robot is unknown, or its motors.yaml is invalid.

@@ -97,7 +97,7 @@ class RouteEntry(Strict, frozen=True):
         axis = np.array(self.axis)
         length = float(np.linalg.norm(axis))
         if length < SHORTEST_AXIS:
-            legal = f'a vector of at least the length {SHORTEST_AXIS:g}'
+            legal = f'a vector with a length of at least {SHORTEST_AXIS:g}'
             raise ValueError(f'axis: expected {legal}, got {list(self.axis)}')
         if self.wrap == 'pulley' and self.side is not None:
             raise ValueError(
@@ -107,7 +107,7 @@ class RouteEntry(Strict, frozen=True):
             out = np.array(self.side) - np.array(self.xyz)
             beside = np.linalg.norm(np.cross(axis / length, out))
             if beside < 1e-9 and np.linalg.norm(out) >= self.radius:
-                raise ValueError('side: expected a point beside the axis, got one on it')
+                raise ValueError('side: expected a point beside the axis, got a point on the axis')
 
 
 class MuscleEntry(Strict, frozen=True):
@@ -187,7 +187,7 @@ class PassiveTendonEntry(Strict, frozen=True):
     ]
 
     def __post_init__(self) -> None:
-        """Check that the parts of the entry have the same number of joints."""
+        """Check that all parts have the same number of joints, and check `slack` and the powers."""
         count = len(self.joints)
         if len(self.centre) != count:
             raise ValueError(f'centre: expected {count} numbers, got {len(self.centre)}')

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @njit(cache=True)
 def monomial(passive: Passive, term: int, theta: Array, a: int, b: int) -> float:
-    """Return a term of a length at θ (D,), differentiated by θ_a and θ_b; −1 stands for neither."""
+    """Return a term of a length at θ (D,), differentiated by θ_a and θ_b unless these are −1."""
     value = passive.coefficient[term]
     for j in range(len(theta)):
         power, order = passive.power[term, j], int(j == a) + int(j == b)

@@ -108,8 +108,8 @@ class Robot:
     def elongation(self, tension: Array) -> Array:
         """Return the elongation of series elastic elements and tendons [m], (M,).
 
-        The stretch of the tendons is that of their lengths at θ = 0. `tension` are the tensions
-        [N], (M,).
+        The stretch of the tendons is computed for their lengths at θ = 0. `tension` are the
+        tensions [N], (M,).
         """
         return self.series_elastic.elongation(self.routes.length_at_zero, tension)
 
@@ -152,7 +152,7 @@ class Robot:
         return changed
 
     def with_moved_points(self, shifts: Iterable[Array]) -> Robot:
-        """Return a copy whose route points are moved, as `with_routes` does.
+        """Return a copy whose route points are moved; see `with_routes`.
 
         Args:
             shifts: Displacement of each point in the frame of its link [m], (3,), muscle by muscle.

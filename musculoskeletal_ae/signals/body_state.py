@@ -83,7 +83,7 @@ class LengthOffsets:
 
     @classmethod
     def unknown(cls, muscle_count: int) -> LengthOffsets:
-        """Return unknown offsets, which nothing has determined; they are 0 until then."""
+        """Return unknown offsets: they are 0 until something determines them."""
         return cls(np.zeros(muscle_count), np.full(muscle_count, UNKNOWN))
 
     def __eq__(self, other: object) -> bool:
@@ -230,7 +230,7 @@ def _check(rows: Array) -> None:
         legal = (
             f'offset within ±{MOST_OFFSET:g} m; standard deviation >= 0; trust {values(Trust)}; '
             f'isolated 0 or 1; anomaly {values(Anomaly)}, other than 0 for at most one muscle, and '
-            f'{Anomaly.VERIFYING:d} only for an isolated one; generation a whole number >= 0, the '
-            'same for all muscles'
+            f'{Anomaly.VERIFYING:d} only for an isolated muscle; generation a whole number >= 0, '
+            'the same for all muscles'
         )
         raise MessageError('impossible body state', f'expected {legal}, got {rows.tolist()}')

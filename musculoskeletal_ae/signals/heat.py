@@ -66,7 +66,7 @@ CHANGED = 1.5  # report a module once a thermal constant differs from its refere
 
 
 def flow(state: Array, square: Array, dt: float) -> Array:
-    """Return the state to which the thermal model flows in a time dt of constant tension.
+    """Return the state of the thermal model after a time dt of constant tension.
 
     Args:
         state: The state at the beginning, (6, ...): temperature of the winding minus that of the

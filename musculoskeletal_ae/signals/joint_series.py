@@ -76,7 +76,7 @@ class JointSeries(NamedTuple):
             not usable.
         share: Share of the messages with at least one false reading, in [0, 1].
         text: Description of the false readings for users; '' if there are none.
-        remedy: What to do about them, for users.
+        remedy: What users should do about the false readings.
     """
 
     theta: Array
@@ -183,8 +183,8 @@ def _subtract_turns(robot: Robot, time: Array, theta: Array) -> list[tuple[int, 
 def _drop_constants(robot: Robot, time: Array, theta: Array) -> list[tuple[int, str]]:
     """Replace constants that interrupt other readings by NaN.
 
-    A program that publishes beside the driver shows as a constant posture, a failing sensor as a
-    constant reading of one joint.
+    A program that publishes beside the driver appears as a constant posture, and a failing sensor
+    as a constant reading of one joint.
 
     Args:
         robot: The robot.
@@ -281,7 +281,7 @@ def _text(is_affected: Bools, found: list[tuple[int, str]], consequence: str) ->
     """Return a text on false readings.
 
     Args:
-        is_affected: Which messages have them, (N,).
+        is_affected: Which messages have false readings, (N,).
         found: The number of readings of each kind, with a text about it.
         consequence: What is done with the readings.
     """

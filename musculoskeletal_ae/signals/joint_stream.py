@@ -4,10 +4,10 @@
     |θ_j − θ_j,accepted| ≤ step + speed · dt
 
 A reading is usable if it is a number within the joint limits (plus `LIMITS.joint_outside`) and
-satisfies this equation. θ_j,accepted is the last usable reading of joint j, and dt is the time
+satisfies this inequality. θ_j,accepted is the last usable reading of joint j, and dt is the time
 since its previous reading, limited to `LIMITS.longest_step`. Single impossible readings, such as 0
 or −π, and bursts of them are therefore not usable. Each joint is judged by itself, so that a bad
-sensor does not affect the readings of the others. However, if at least half of the joints in a
+sensor does not affect the readings of the others. However, if at least half of the readings in a
 message are impossible, no reading in it is usable: the message then describes another posture, for
 example that of another program.
 
@@ -78,7 +78,7 @@ class ImpossibleSeries(NamedTuple):
         return now - self.until <= ENDED
 
     def is_lasting(self, now: float) -> bool:
-        """Return whether the series is present, and more than a burst or a slip of the sensor."""
+        """Return whether the series is present, and longer than a burst or a slip of the sensor."""
         return self.is_present(now) and self.until - self.since > LASTING
 
 

@@ -157,7 +157,8 @@ class LengthJumps:
             calibration; these lengths are not reliable.
         newest: Indices of the muscles whose new level was accepted with the last message.
         count: Number of jumps whose new level was accepted, since the start.
-        is_unseen: Whether the last of them was during a pause of the messages (`Change.is_unseen`).
+        is_unseen: Whether the last of these jumps was during a pause of the messages
+            (`Change.is_unseen`).
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -255,7 +256,7 @@ class LengthJumps:
         return True
 
     def _note(self, large: Change) -> None:
-        """Note a large change: add it to the present jump, or begin one if it is too large."""
+        """Note a large change: add it to the present jump, or begin a jump if it is too large."""
         if self._jump is not None:
             self._jump += large
             return

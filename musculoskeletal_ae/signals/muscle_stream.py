@@ -125,7 +125,7 @@ class MuscleStream:
 
     Attributes:
         body: Length offsets and isolated muscles.
-        jumps: The jumps of lengths, and the muscles that are displaced since then.
+        jumps: The jumps of lengths, and the muscles that they have displaced.
     """
 
     def __init__(self, robot: Robot, body: BodyState | None = None, window: int = 1) -> None:
@@ -195,7 +195,7 @@ class MuscleStream:
     def take(
         self, message: Any, time: float, now: float | None = None, delay: float = 0.0
     ) -> MuscleSample:
-        """Check and convert a message, or readings that arrived otherwise.
+        """Check and convert a message, or readings from another source.
 
         Args:
             message: The message of `muscle_states`, or `MuscleReadings`.

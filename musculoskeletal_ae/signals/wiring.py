@@ -172,7 +172,7 @@ def decide(
 
     Args:
         wiring: The wiring that is assumed as long as no other one is clearly better.
-        cost: Its cost.
+        cost: Cost of `wiring`.
         others: Other wirings with their costs.
         better: Factor by which the cost of a better wiring must be lower.
     """

@@ -213,7 +213,7 @@ MUSCLES = {
         (of_wrap('axis', [0.0, 1.0, 0.0]), of_wrap('wrap', 'sphere')),
     ),
     'axis without direction': Row(
-        (wrap(axis=[0.0, 1e-7, 0.0]),), r'expected a vector of at least the length ([\d.e-]+)',
+        (wrap(axis=[0.0, 1e-7, 0.0]),), r'expected a vector with a length of at least ([\d.e-]+)',
         (of_wrap('axis', lambda match: [0.0, float(match[1]), 0.0]),),
     ),
     'side on the axis': Row(

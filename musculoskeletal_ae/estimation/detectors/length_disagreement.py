@@ -52,7 +52,7 @@ class Largest(NamedTuple):
     all: Array | float  # largest root mean square of the differences of all muscles in use [m]
 
     def excess(self, change: Array, used: Bools) -> float:
-        """Return the ratio of length differences to these limits; above 1, they are too large.
+        """Return the ratio of length differences to these limits; legal: at most 1.
 
         Args:
             change: Difference of each length [m], (M,).
@@ -246,7 +246,7 @@ class LengthDisagreement(Detector):
         shift = np.linalg.lstsq(jacobian, -change, rcond=None)[0]
         unexplained = change + jacobian @ shift
         evidence = (
-            'length differs from that at the measured posture by '
+            'length differs from the length expected in the measured posture by '
             f'{largest.text(change, self._used, muscle)}'
         )
         by_muscle = np.delete(change, muscle)  # what remains unexplained if this length is wrong

@@ -184,6 +184,7 @@ class PositionFollowing(ModuleFollowing):
         assert observation.command is not None
         away = 1e3 * (observation.sample.length[muscle] - observation.command[muscle])
         return (
-            f'its length differs by {away:.0f} mm from its command, and does not approach it: its '
-            'motor is jammed or weak, its length reading is wrong, or it gets no commands'
+            f'its length differs by {away:.0f} mm from the commanded length, and does not approach '
+            'this length: its motor is jammed or weak, its length reading is wrong, or it gets no '
+            'commands'
         )

@@ -68,7 +68,7 @@ class ResidualDistance(Detector):
     Attributes:
         symbol: Symbol of the statistic in messages to users, such as 'd'.
         threshold_name: Name under which the checkpoint stores the threshold of the statistic.
-        threshold: Threshold of the statistic; ∞ if the checkpoint has no calibrated one.
+        threshold: Threshold of the statistic; ∞ if it has not been calibrated.
         reading: Distance and most suspect muscle of the last message; None before the first.
     """
 

@@ -3,12 +3,12 @@
 
     T_read = min(T + noise, T_sat),   T_sat < T_limit
 
-The readings of a working sensor contain noise, also where a motor can pull no harder. Readings that
+The readings of a working sensor contain noise, even where a motor can pull no harder. Readings that
 stay exactly the same, although this sensor's readings usually vary, are therefore clipped: by the
 sensor, its amplifier or the driver. A muscle is reported in two cases:
 
 - Its readings have been clipped twice at the same value, were lower in between, and have not been
-  higher. A frozen sensor is not lower in between (`frozen_sensor.py`).
+  higher. Readings of a frozen sensor are not lower in between (`frozen_sensor.py`).
 - Its reading stays the same although its module winds in. The sensor may then also be frozen.
 
 A sensor is not checked if its readings often repeat. Messages that repeat the readings of most
@@ -78,7 +78,7 @@ class SaturatedSensor(Detector):
     def step(self, observation: Observation) -> Finding | None:
         """Report a muscle whose tension reading is clipped, or return None.
 
-        It must have been clipped twice at the same value, or while its module winds in.
+        The reading must have been clipped twice at the same value, or while the module winds in.
         """
         sample, dt, value = observation.sample, observation.dt, self._value
         reading = sample.newest.tension

@@ -139,12 +139,13 @@ class ExchangeCheck:
             return finding
         if not observation.lengths_known:
             return finding
-        judgement, reason = None, 'if corrected, the lengths continue those before a pause'
+        judgement, reason = None, 'if this is corrected, the lengths continue those before a pause'
         if self._may_have_restarted:
             judgement = self._judge_silence()
         is_explained = judgement is not None and judgement.is_faulty
         if not is_explained and finding.kind in EXPLAINED:
-            judgement, reason = self._judge(observation), 'if corrected, the lengths fit the arm'
+            judgement = self._judge(observation)
+            reason = 'if this is corrected, the lengths fit the arm'
         if judgement is None or not judgement.is_faulty:
             is_vague = finding.kind is ConditionKind.RESIDUAL_DISTANCE
             return (self._jumped_in_silence() if is_vague else None) or finding
@@ -164,7 +165,7 @@ class ExchangeCheck:
 
         The result is None if fewer than two lengths have changed. A driver that counts lengths from
         0 again changes all of them. An arm that has moved in the pause changes them as well, but
-        that leads to no finding that could be explained here.
+        its readings fit the learned body and cause no finding.
         """
         if not self._may_have_restarted or self._silence is None or self._mae is None:
             return None

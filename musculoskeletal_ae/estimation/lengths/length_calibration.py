@@ -7,8 +7,8 @@ decides when to fit and whether the result is reliable.
 
 Offsets cannot correct readings in a wrong order, or lengths with a wrong sign. Such readings would
 often lead to plausible but false offsets. Before offsets of a moving arm are accepted, the wiring
-is therefore judged (`signals/wiring.py`), and a wrong one is refused with the names of the muscles.
-A standing arm does not show the wiring.
+is therefore judged (`signals/wiring.py`), and a wrong wiring is refused with the names of the
+muscles. A standing arm does not show the wiring.
 
 If an arm stands still, some offsets explain its readings even if it does not stand in the stated
 posture. On an arm with joint sensors, the offsets are therefore accepted only if the sensors
@@ -78,9 +78,9 @@ class LengthCalibration:
 
     Attributes:
         posture: Positions of the joints at which the arm stands, as the user has stated them [rad
-            or m], (D,); () if it moves gently.
+            or m], (D,); () if the arm moves gently.
         wiring: Whether muscles are exchanged or lengths have a wrong sign, according to the newest
-            fit; None before that has been judged.
+            fit; None before the wiring has been judged.
     """
 
     def __init__(self, robot: Robot, mae: Mae | None, posture: tuple[float, ...] = ()) -> None:
@@ -135,7 +135,7 @@ class LengthCalibration:
     def offsets(self) -> LengthOffsets | None:
         """The newest estimate of the offsets; None before the first.
 
-        While the arm stands in a stated posture, there is none until the offsets are known.
+        While the arm stands in a stated posture, there is no estimate until the offsets are known.
         """
         return None if self.is_standing and not self.is_done else self._estimate
 
@@ -309,7 +309,7 @@ class LengthCalibration:
         # At a high cost, the fit may have found wrong postures that are similar to the true ones.
         if not cost <= LARGEST_COST:
             problem = 'no offsets explain the lengths and tensions'
-            excess = f'the cost is {cost:.2f}; legal: at most {LARGEST_COST:g}'
+            excess = f'the cost of the fit is {cost:.2f}; legal: at most {LARGEST_COST:g}'
             return f'{problem}: {excess}; {OTHER_WAY}'
         return ''
 

@@ -7,8 +7,8 @@ Three quantities are compared:
     lengths   the muscle lengths that the network computes at the same posture
     shape     the change of these lengths from posture to posture, on fixed random states
 
-If joint sensors measured the postures, they are the reference. The limit of the median error of
-each joint or muscle is then ANGLE_WORSE times the error of the network in use, but at least
+If joint sensors measured the postures, the sensors are the reference. The limit of the median error
+of each joint or muscle is then ANGLE_WORSE times the error of the network in use, but at least
 ANGLE_FLOOR or LENGTH_FLOOR. The shape is compared only if the candidate's mean error of length is
 larger than that of the network in use.
 

@@ -66,7 +66,7 @@ class CheckpointValidator:
         is_anomaly: Whether an anomaly is present.
         postures: The check on the geometric model.
         unsuitable_because: Why the network in use, which a user has chosen, fits this arm worse
-            than the one before; '' if it does not.
+            than the network before it; '' if it fits as well.
         accepted: Called with each network that is used from now on.
         rejected: Called with each network that is rejected, at once or after an anomaly, and with
             the reason.
@@ -166,7 +166,7 @@ class CheckpointValidator:
             return None
         self.unsuitable_because = ''
         self.accepted(self._use(proven))
-        self.rejected(doubtful, 'an anomaly was detected soon after it was accepted')
+        self.rejected(doubtful, 'an anomaly was detected soon after this network was accepted')
         return proven
 
     def _accept(self, mae: Mae, now: float, unsuitable_because: str = '') -> None:
