@@ -518,7 +518,7 @@ MOTORS = {
     ),
     'name of a topic': Row(
         (motors(state_topic='motor states'),),
-        'legal: words of letters, digits and _ that are joined by /, as in (joint_states)',
+        'legal: words of letters, digits and _, joined by /, as in (arm/joint_states)',
         (Members(lambda name: motors(state_topic=name)), motors(state_topic='a_1/b2')),
     ),
     'unknown key': Row(
