@@ -91,7 +91,7 @@ class Actuation(ABC):
         return np.maximum(self._whole.bias, DESIRED_SHARE * self._whole.limit)
 
     def known_tension(self, measured: Array) -> Array:
-        """Return measured tensions [N], (..., M), or the assumed ones if none are measured."""
+        """Return measured tensions [N], (..., M), or assumed tensions if none are measured."""
         if self.knows_tension:
             return measured
         return np.full_like(measured, self.assumed_tension)

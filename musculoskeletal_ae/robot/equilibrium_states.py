@@ -52,11 +52,11 @@ SMALL = 1e-9  # divide torques by at least this [N·m]
 class Equilibrium(NamedTuple):
     """N equilibria, and how tensions and postures change near them."""
 
-    theta: Array  # θ [rad], (N, D)
-    tension: Array  # T [N], (N, M)
-    jacobian: Array  # G [m/rad], (N, M, D)
-    stiffness: Array  # k of each muscle [N/m]; 0 where the tension is constant, (N, M)
-    by_torque: Array  # ∂θ/∂τ [rad/(N·m)]; 0 at a stop, (N, D, D)
+    theta: Array  # joint angles θ [rad], (N, D)
+    tension: Array  # tensions T [N], (N, M)
+    jacobian: Array  # muscle Jacobian G [m/rad], (N, M, D)
+    stiffness: Array  # stiffness k of each muscle [N/m]; 0 at constant tension, (N, M)
+    by_torque: Array  # change of θ per torque, ∂θ/∂τ [rad/(N·m)]; 0 at a stop, (N, D, D)
 
 
 def has_followers(robot: Robot) -> bool:
@@ -160,20 +160,20 @@ def settled_states(
 class _Law(NamedTuple):
     """How the tensions of N states depend on the lengths."""
 
-    tension: Array  # T_0 [N], (N, M)
-    length: Array  # l(θ_0) [m], (N, M)
-    stiffness: Array  # k [N/m], (N, M)
+    tension: Array  # tensions T_0 at the start [N], (N, M)
+    length: Array  # lengths l(θ_0) at the start [m], (N, M)
+    stiffness: Array  # stiffness k of each muscle [N/m], (N, M)
 
 
 class _Linearised(NamedTuple):
     """Equations linearised at N postures, from which the next step is computed."""
 
-    tension: Array  # T [N], (N, M)
-    jacobian: Array  # G [m/rad], (N, M, D)
-    stiffness: Array  # ∂T/∂l [N/m], (N, M)
-    bend: Array  # Σ T ∂²l/∂θ² [N·m/rad], (N, D, D)
-    by_torque: Array  # ∂θ/∂τ [rad/(N·m)]; 0 at a stop, (N, D, D)
-    is_stable: Bools  # (N,)
+    tension: Array  # tensions T [N], (N, M)
+    jacobian: Array  # muscle Jacobian G [m/rad], (N, M, D)
+    stiffness: Array  # derivative ∂T/∂l [N/m], (N, M)
+    bend: Array  # stiffness due to tensions, Σ T ∂²l/∂θ² [N·m/rad], (N, D, D)
+    by_torque: Array  # change of θ per torque, ∂θ/∂τ [rad/(N·m)]; 0 at a stop, (N, D, D)
+    is_stable: Bools  # whether each posture is stable, (N,)
 
 
 def _linearised(

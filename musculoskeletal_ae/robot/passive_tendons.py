@@ -32,7 +32,7 @@ class Passive(NamedTuple):
     power: Ints  # powers p of all R terms, (R, D)
     coefficient: Array  # factor c of each term [m/rad^p], (R,)
     first: Ints  # index of the first term of each tendon, then R, (T+1,)
-    law: Array  # k [N/m], x_low and x_high [m] of each tendon, (T, 3)
+    law: Array  # spring constant k [N/m], x_low and x_high [m] of each tendon, (T, 3)
 
 
 @dataclass(frozen=True, eq=False)

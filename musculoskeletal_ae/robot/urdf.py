@@ -152,7 +152,7 @@ def _preprocessor_parts(root: ET.Element) -> Iterator[tuple[str, str]]:
 
 
 def _limit_mimics(parts: list[ET.Element]) -> bool:
-    """Turn continuous joints with <mimic> into limited revolute ones; return whether there are any.
+    """Turn continuous joints with <mimic> into limited revolute joints; return whether any exist.
 
     Pinocchio represents a continuous joint by two coordinates, which cannot follow the single
     coordinate of the mimicked joint. A revolute joint must have limits. It gets limits so wide that

@@ -57,8 +57,8 @@ FAR = 2.5
 SLOPE = 1e-4  # compute the numerical derivatives of the filter with this step
 #: compare later thermal constants with those that were learned after this time [s]
 LEARNED = 1200.0
-#: compare later thermal constants with learned ones only if the standard deviation of the
-#: logarithms of the learned ones is below this
+#: use learned thermal constants as the reference for later ones only if their logarithms have a
+#: smaller standard deviation than this
 KNOWN = 0.2
 REST_STEP = 30.0  # search for the end of a rest in steps of this time [s]
 LONGEST_REST = 3600.0  # search up to this rest [s]; report a longer one as 'more than 60 min'

@@ -44,7 +44,7 @@ LEAST_REPEATED = 3  # examine a repeated value only if it occurs at least this o
 #: Treat a value that appears in one uninterrupted run as false in three cases: the readings before
 #: and after the run differ by less than the share RETURNING of the jumps at its ends; at least
 #: FOREIGN_SHARE of the joints jump at once; or the run lasts although at most the share NOISY of
-#: the other readings repeat the one before. Otherwise, a sensor may have slipped.
+#: the other readings repeat the reading before. Otherwise, a sensor may have slipped.
 RETURNING, NOISY = 0.5, 0.1
 #: Assume that the unit, sign or zero of a joint is wrong, and drop no single reading, if more than
 #: this share of its readings is far outside its limits, or if it crosses the limits without a jump

@@ -65,7 +65,7 @@ class ImpossibleSeries(NamedTuple):
         since: Time of its first impossible reading [s].
         until: Time of its newest impossible reading [s].
         impossible: Number of impossible readings in the series.
-        total: Number of all readings in the series, possible ones included.
+        total: Number of all readings in the series, including possible readings.
     """
 
     since: float
@@ -86,7 +86,7 @@ _NONE = ImpossibleSeries(-math.inf, -math.inf, 0, 0)  # stands for no series so 
 
 
 class JointChannel:
-    """Judges the readings of one joint sensor, and records series of impossible ones.
+    """Judges the readings of one joint sensor, and records series of impossible readings.
 
     Attributes:
         series: The newest series of impossible readings.

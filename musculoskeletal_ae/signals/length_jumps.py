@@ -72,7 +72,7 @@ class Change:
         return self.pause > LIMITS.pause
 
     def __add__(self, later: Change) -> Change:
-        """Return these changes and later ones together."""
+        """Return the sum of these changes and later changes."""
         return Change(
             self.change + later.change,
             np.maximum(self.allowed, later.allowed),

@@ -128,7 +128,7 @@ class LengthDisagreement(Detector):
         #: for muscles that were isolated
         self._healthy: deque[tuple[Array, Array, Array]] = deque(maxlen=HEALTHY_COUNT)
         self._usual: Array = np.zeros(robot.muscle_count)  # g_usual [m], (M,); 0 if unknown
-        #: for which muscles g_usual is known, (M,)
+        #: for which muscles the usual difference g_usual is known, (M,)
         self._has_usual: Bools = np.zeros(robot.muscle_count, dtype=bool)
         self._healthy_time = 0.0  # time since a message was last added to `_healthy` [s]
         self.reset()
@@ -141,7 +141,7 @@ class LengthDisagreement(Detector):
         self._compute_usual()
 
     def reset(self) -> None:
-        """Reset the detector: discard the messages of the last second, keep the healthy ones."""
+        """Reset the detector: discard messages of the last second, keep healthy messages."""
         self._recent: deque[Array] = deque(maxlen=COUNT)
         self._since, self._unmeasured, self._beyond = 0.0, 0.0, 0.0
         self.gap = None

@@ -85,9 +85,9 @@ class ModuleFollowing(Detector):
         """Reset the detector: discard all evidence."""
         count = self._complete_robot.muscle_count
         self._evidence: Array = np.zeros(count)  # time of evidence [s]
-        self._length: Array | None = None  # l in the previous message [m]
+        self._length: Array | None = None  # length in the previous message [m]
         self._difference: Array | None = None  # smoothed difference from the command [N or m]
-        self._speed: Array = np.zeros(count)  # smoothed dl/dt [m/s]
+        self._speed: Array = np.zeros(count)  # smoothed rate of the length [m/s]
 
     def step(self, observation: Observation) -> Finding | None:
         """Report the module with the most evidence against it; None if that is less than 1 s."""

@@ -68,7 +68,7 @@ class SaturatedSensor(Detector):
         count = self._robot.muscle_count
         self._before: Array = np.full(count, np.nan)  # reading of the previous message [N]
         self._unchanged: Array = np.zeros(count)  # time without a change of the reading [s]
-        self._length: Array = np.zeros(count)  # l when the reading changed last [m]
+        self._length: Array = np.zeros(count)  # length when the reading changed last [m]
         self._beyond: Array = np.zeros(count)  # time for which it has exceeded `_value` [s]
         self._value: Array = np.full(count, np.nan)  # value at which the reading was clipped [N]
         self._visits: Ints = np.zeros(count, dtype=np.int64)

@@ -86,7 +86,7 @@ class ExchangeCheck:
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._mae: Mae | None = None
-        #: T_end and l as read of recent messages
+        #: bone-side tensions, and lengths as read, of recent messages
         self._messages: deque[tuple[Array, Array]] = deque(maxlen=USUAL_COUNT)
         self._offset: Array = np.zeros(robot.muscle_count)  # length offsets of these messages [m]
         self._since = 0.0  # time since a message was last kept [s]

@@ -67,11 +67,12 @@ class MomentCollector:
         self._used, self._posture = used, posture
         self._no_angles = np.full(joint_count, np.nan)
         self._direction = FrictionDirection()
-        self._window: list[tuple[Array, ...]] = []  # T, l, s and raw l of each message
+        #: tension, length, sliding direction and raw length of each message
+        self._window: list[tuple[Array, ...]] = []
         self._angles: list[Array] = []  # measured θ in the same window
         self._span = 0.0  # duration of the present window so far [s]
         self._moments: list[tuple[Array, ...]] = []
-        self._last_length: Array = np.zeros(len(used))  # l from which motion is measured [m]
+        self._last_length: Array = np.zeros(len(used))  # length from which motion counts [m]
         self.time = 0.0
         self.has_moved_away = False
 
