@@ -2,9 +2,9 @@
 """Verifies whether a suspect muscle is faulty, by its response to being wound in slightly.
 
 The arm has stopped, and the estimate does not use the suspect. The controller lowers the length
-command l_target of the suspect by a few millimetres. The tension T of the suspect is compared with
-the tension T_ref that muscle stiffness control demands, and its length l with the length l' that is
-estimated from the other muscles:
+command l_target of the suspect by a few millimetres. The length l of the suspect is compared with
+the length l' that is estimated from the other muscles. Its tension T is compared with the tension
+T_ref that muscle stiffness control demands:
 
     T_ref = T_bias + K (l − l_target)
 

@@ -198,7 +198,7 @@ def loss(network: Network, samples: Tensor) -> Tensor:
     values = torch.cat([rows.repeat(3, 1), twins])  # (4N, D+2M)
     error = network.decoder(network.encode(values, mask))
     error = error - (values - network.mean) / network.std
-    # The difference between the errors of l of a sample and of its twin, divided by the distance of
+    # A sample and its twin have different errors of l. Their difference, divided by the distance of
     # the two, is the error of ∂l/∂θ in the direction from one to the other.
     between = (error[-count:] - error[:count])[:, -muscles:] / TWIN_DISTANCE
     slope = (between.square().sum(dim=1) + TINY).sqrt().mean()

@@ -4,8 +4,9 @@
     θ = IK(P_marker, θ_initial = θ_est):  min_θ ‖p(θ) − p‖²/σ_p² + ‖log(R(θ)ᵀ R)‖²/σ_R²
 
 (paper, §II-A) within the joint limits. p and R are the measured position and orientation of the end
-effector, p(θ) and R(θ) those at the joint angles θ, and σ_p and σ_R the standard deviations of the
-measurement. The sum is minimised by damped Gauss–Newton (`gauss_newton`) with pinocchio's Jacobian.
+effector, with the standard deviations σ_p and σ_R. p(θ) and R(θ) are its position and orientation
+at the joint angles θ. The sum is minimised by damped Gauss–Newton (`gauss_newton`) with pinocchio's
+Jacobian.
 
 Near a singular posture the pose determines some joints poorly, and camera noise would move them
 arbitrarily. Every step is therefore damped, and the search ends with the step that reduces the sum

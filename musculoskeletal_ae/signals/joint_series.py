@@ -46,9 +46,9 @@ LEAST_REPEATED = 3  # examine a repeated value only if it occurs at least this o
 #: FOREIGN_SHARE of the joints jump at once; or the run lasts although at most the share NOISY of
 #: the other readings repeat the reading before. Otherwise, a sensor may have slipped.
 RETURNING, NOISY = 0.5, 0.1
-#: Assume that the unit, sign or zero of a joint is wrong, and drop no single reading, if more than
-#: this share of its readings is far outside its limits, or if it crosses the limits without a jump
-#: in more than this share of the crossings. `joint_sensors.py` then finds the fault.
+#: Assume that the unit, sign or zero of a joint is wrong, and drop no single reading, in two cases:
+#: more than this share of its readings is far outside its limits, or it crosses the limits without
+#: a jump in more than this share of the crossings. `joint_sensors.py` then finds the fault.
 WRONG_SCALE = 0.5
 #: subtract whole turns from readings of a joint only if at least this share of those readings is
 #: then within the limits and close to the reading before

@@ -210,8 +210,7 @@ class LengthDisagreement(Detector):
         """Return the change of each length difference since the arm was healthy, with its limits.
 
         For a muscle without enough healthy messages, such as one that was isolated for a minute,
-        the healthy difference is assumed to be 0, with limits for this case (GAP_YOUNG,
-        GAP_LEARNED).
+        the healthy difference is assumed to be 0, and the limits are GAP_YOUNG or GAP_LEARNED.
 
         Args:
             gap: Measured minus computed lengths [m], (M,).

@@ -59,8 +59,8 @@ RESTARTED = 5.0
 #: suspect that a column belongs to another muscle, or has lost its offset, if its length has
 #: changed by more than this during the pause [m]
 DISCONTINUOUS = 0.02
-#: Assume that columns are exchanged or reversed since a pause of the messages only if correcting
-#: this divides their change over the pause by this factor, and if they had changed more than all
+#: Blame exchanged or reversed columns for changes of lengths over a pause only if putting the
+#: columns right divides these changes by this factor. The changes must also exceed those of all
 #: other lengths by this factor.
 CONTINUOUS = 3.0
 #: look for exchanged muscles only after one of these findings: an exchange causes no others
@@ -131,9 +131,9 @@ class ExchangeCheck:
         """Explain a finding: return the finding of the driver's fault that explains it, if any.
 
         Exchanged muscles or a reversed length are considered first. If neither explains `finding`,
-        and `finding` only states that the readings do not fit the learned body, several lengths
-        that have changed in a recent pause of the messages explain it: they have lost their
-        offsets. Otherwise, the result is `finding`.
+        lost length offsets may explain it: `finding` must only state that the readings do not fit
+        the learned body, and several lengths must have changed in a recent pause of the messages.
+        Otherwise, the result is `finding`.
         """
         if finding is None or finding.kind not in EXPLAINED_BY_SILENCE:
             return finding

@@ -53,8 +53,8 @@ ANGLE_MOVED_INITIAL = 0.8
 LENGTH_MOVED = 0.07
 # A minute of learning changed the shape of initial networks by 0.32 and of learned networks by
 # 0.18. Multiplying all lengths by 1.5 changes it by 0.5.
-#: while a learned network is in use, reject a candidate if the changes of its lengths from posture
-#: to posture differ by more than this share from those of the network in use
+#: while a learned network is in use, reject a candidate whose changes of length from posture to
+#: posture differ by more than this share from those of the network in use
 SHAPE_MOVED = 0.3
 #: the same limit as SHAPE_MOVED, but while an initial network is in use
 SHAPE_MOVED_INITIAL = 0.42
