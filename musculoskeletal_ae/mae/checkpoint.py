@@ -129,7 +129,7 @@ class Metadata(Strict, frozen=True):
                 raise ValueError(f'layer_sizes {sizes}; legal: {expected}')
 
     def sizes_by_group(self) -> list[tuple[int, ...]]:
-        """Return the layer sizes of each group."""
+        """Return the layer sizes of each group's block."""
         depth = len(self.layer_sizes) // len(self.groups)
         return [self.layer_sizes[g * depth :][:depth] for g in range(len(self.groups))]
 
@@ -217,7 +217,7 @@ def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoin
     """Check safetensors bytes and return their network.
 
     Args:
-        data: The bytes.
+        data: Content of the checkpoint.
         robot: The robot whose joints and muscles the network must have in the same order, or None
             to accept any. The network's estimate of this robot's middle posture must be within
             LARGEST_ESTIMATES.
@@ -236,7 +236,7 @@ def restored(data: bytes, robot: Robot | None = None) -> Mae:
     """Return the network like `from_bytes`, but with errors that state only the problem.
 
     Args:
-        data: The bytes.
+        data: Content of the checkpoint.
         robot: See `from_bytes`.
 
     Raises:

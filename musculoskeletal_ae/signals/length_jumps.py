@@ -113,7 +113,7 @@ class PresumedRupture:
         This is the case if a single tendon has jumped, is slack, and may have been wound in.
 
         Args:
-            jump: The jump.
+            jump: The jump whose new level has lasted.
             tension: Measured tensions [N], (M,); NaN where they are unknown.
             used: Which muscles are not isolated, (M,).
         """
@@ -288,7 +288,7 @@ class LengthJumps:
         """Use another body state: remove its isolated muscles from `displaced`.
 
         Args:
-            body: The body state.
+            body: The body state that applies from now on.
             is_calibrated: Whether new length offsets have been calibrated. If so, `displaced` is
                 emptied, and no rupture is presumed any more.
         """

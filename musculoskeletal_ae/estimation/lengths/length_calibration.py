@@ -293,7 +293,7 @@ class LengthCalibration:
         """Return why a fit is not reliable, as a text for users, or '' if it is reliable.
 
         Args:
-            fit: The fit.
+            fit: The fit to judge.
             residual: Median residual of each length [m], (M,).
         """
         if self.wiring is not None and self.remedy:

@@ -80,7 +80,7 @@ class MomentCollector:
         return len(self._moments)
 
     def moments(self) -> Moments:
-        """Return all moments."""
+        """Return all moments that have been kept."""
         return Moments(*map(np.array, zip(*self._moments)))
 
     def step(self, tension: Array, length: Array, dt: float, theta: Array | None) -> None:

@@ -88,5 +88,5 @@ class RecentMessages:
             self._messages.pop()
 
     def clear(self) -> None:
-        """Clear all messages."""
+        """Clear all messages, because they no longer describe the arm."""
         self._messages.clear()
