@@ -115,7 +115,7 @@ class JointSensorCheck:
         self._has_tensions = robot.tension_source.is_known
         self._mae: Mae | None = None
         self.trust = JointTrust.full(robot.joint_count)
-        #: messages in order of time; the last NEWEST of them are judged by the earlier ones
+        #: messages in order of time; the last NEWEST messages are judged by those before
         self._messages: deque[_CountedMessage] = deque(maxlen=EARLIER + NEWEST)
         #: θ − θ̂ [rad] (D,) and l − l_net(θ̂, T_end) [m] (M,) of each message with the network in use
         self._compared: deque[tuple[Array, Array]] = deque(maxlen=EARLIER + NEWEST)

@@ -330,5 +330,5 @@ class Verification:
 
 
 def _late_median(values: Array) -> float:
-    """Return the median of the later half of values (N,), when the suspect has responded."""
+    """Return the median of the later half of values (N,): by then, the suspect has responded."""
     return float(np.median(values[len(values) // 2 :]))

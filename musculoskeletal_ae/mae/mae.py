@@ -639,7 +639,7 @@ def read_blocks(bases: Sequence[int]) -> list[tuple[int, ...]]:
 
 
 def latent_places(groups: Sequence[Group], bases: Sequence[int]) -> list[Ints]:
-    """Return for each block the places in z of the parts that its decoder reads, its own first."""
+    """Return, for each block, which places of z its decoder reads: its own, then its base's."""
     ends = np.cumsum([0, *(sum(map(len, group)) for group in groups)])
     return [
         np.concatenate([np.arange(ends[r], ends[r + 1]) for r in read])

@@ -46,8 +46,8 @@ LONGEST_STEP = 0.1
 #: than this [s]: detectors and learning are tuned at 100 Hz, and more messages would take most of
 #: the processor time of the nodes of a fast arm
 SPACING = 0.006
-#: treat requests as one stream if no two successive ones are further apart than this [s]: `ros2
-#: topic pub` sends one message a second
+#: treat requests as one stream if each follows the one before within this time [s]: `ros2 topic
+#: pub` sends one message a second
 STREAM_GAP = 1.5
 #: if a message was sent earlier than the message before by more than this [ns], assume another
 #: clock or a clock that was set back, not reordering

@@ -180,7 +180,8 @@ class PassiveTendonEntry(Strict, frozen=True):
     joints: Names
     #: joint positions from which the polynomial of the length counts [rad or m]
     centre: Annotated[tuple[Number, ...], Meta(max_length=LONGEST_LIST)]
-    #: terms of its length [m]: the coefficient, and the power of each joint's distance to `centre`
+    #: terms of its length [m]: a coefficient each, and for each joint the power of its distance
+    #: from `centre`
     length: Annotated[
         tuple[Annotated[tuple[Number, ...], Meta(max_length=LONGEST_LIST)], ...],
         Meta(min_length=1, max_length=LONGEST_LIST),

@@ -95,7 +95,7 @@ class PassiveTendons:
         Args:
             factor: Factor of the stiffness at each joint, (D,); a tendon uses the mean over its
                 joints.
-            shift: Displacement of the postures with the same lengths [rad], (D,).
+            shift: Displacement of the posture in which a tendon has the same length [rad], (D,).
         """
         spanned, law = self.spanned, self.arrays.law.copy()
         law[:, 0] *= (spanned @ factor) / np.maximum(spanned.sum(axis=1), 1)

@@ -20,8 +20,8 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
-#: treat a smaller ∂L_e/∂T of an elastic element and its tendon as this [m/N], to avoid a division
-#: by zero
+#: assume at least this ∂L_e/∂T of an elastic element and its tendon [m/N], to avoid a division by
+#: zero
 LEAST_COMPLIANCE = 1e-7
 
 

@@ -259,8 +259,9 @@ def _check(part: str, element: ET.Element) -> None:
             child = element.find(tag)
             present = set() if child is None else set(child.keys())
             if missing := NUMBERS[tag].keys() - present:
-                expected = f'{", ".join(sorted(missing))}; remove <inertial> of a link without mass'
-                raise RobotDescriptionError(f'{part}: {tag}: expected {expected}')
+                expected = f'expected {", ".join(sorted(missing))}'
+                remedy = 'or remove <inertial> if the link has no mass'
+                raise RobotDescriptionError(f'{part}: {tag}: {expected}, {remedy}')
     if element.tag == 'inertia':
         names = [['ixx', 'ixy', 'ixz'], ['ixy', 'iyy', 'iyz'], ['ixz', 'iyz', 'izz']]
         inertia = [[float(element.get(name, 0.0)) for name in row] for row in names]

@@ -38,7 +38,7 @@ JUMP = 2.0
 #: expect this standard deviation of the measured housing temperature, averaged over EVERY [°C]
 NOISE = 0.1
 #: assume this ratio r = R₁/R₂ of the thermal resistances from winding to housing and from housing
-#: to air; it is typical of small motors, which vary widely
+#: to air: a typical value of small motors, whose ratios vary widely
 RATIO = 0.4
 #: at first, assume that holding T_limit makes the housing this much warmer than the air [°C]
 RISE = 80.0
@@ -255,7 +255,7 @@ class Heat:
         factor = np.exp(logs - self._reference)
         texts = (
             'heats up at {:.2g} times its earlier rate under the same tension',
-            'has {:.2g} times its earlier time constant of cooling',
+            'cools with {:.2g} times its earlier time constant',
         )
         self.changed = {
             int(m): texts[k].format(factor[k, m])

@@ -62,7 +62,7 @@ class Limits(NamedTuple):
     #: reject a length that changes by more than this plus a part that grows with time [m]
     step: float = 0.02
     speed: float = 1.0  # largest plausible speed of a muscle length [m/s]
-    longest_step: float = 0.05  # upper limit of dt in this formula [s]
+    longest_step: float = 0.05  # upper limit of dt in `step + speed · dt` [s]
     settled: float = 1.0  # time after which a new level of a length is accepted [s]
     #: report implausible messages as a fault, not as a glitch, once they have lasted for this time
     #: [s]

@@ -144,7 +144,7 @@ class MuscleReadings:
         return MuscleReadings.of_rows(self.rows[messages])
 
     def copy(self) -> MuscleReadings:
-        """Return a copy, whose quantities may be assigned without changing this object."""
+        """Return a copy whose quantities can be changed without an effect on this object."""
         return MuscleReadings.of_rows(self.rows.copy())
 
     def replace(self, **values: ArrayLike) -> MuscleReadings:

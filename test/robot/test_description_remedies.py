@@ -470,7 +470,7 @@ URDF = {
     ),
     'no mass': Row(
         (in_urdf('<mass value="0.8"/>', ''),),
-        'mass: expected value; remove <inertial> of a link without mass',
+        'mass: expected value, or remove <inertial> if the link has no mass',
         (lambda directory, _=None: in_pattern(directory, r'(<link name="forearm">)\s*<inertial>.*?'
                                          '</inertial>'),),
     ),

@@ -251,7 +251,7 @@ class LengthDisagreement(Detector):
         by_muscle = np.delete(change, muscle)  # what remains unexplained if this length is wrong
         limit = min(UNEXPLAINED * np.linalg.norm(change), np.linalg.norm(by_muscle))
         if np.linalg.norm(unexplained) <= limit:
-            return None  # false joint sensors explain it; `joint_sensor_check.py` judges them
+            return None  # joint sensors are false; `joint_sensor_check.py` judges them
         is_alone = self._others_agree(muscle, change, largest)
         kind = ConditionKind.LENGTH_DISAGREES if is_alone else ConditionKind.LENGTHS_DISAGREE
         return Finding(muscle, kind, f'its {evidence}')

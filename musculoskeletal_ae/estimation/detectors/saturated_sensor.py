@@ -73,7 +73,7 @@ class SaturatedSensor(Detector):
         self._value: Array = np.full(count, np.nan)  # value at which the reading was clipped [N]
         self._visits: Ints = np.zeros(count, dtype=np.int64)
         self._has_visits = False  # whether the reading of any muscle has been clipped
-        self._has_left = np.ones(count, dtype=bool)  # whether it has been clearly below `_value`
+        self._has_left = np.ones(count, dtype=bool)  # whether readings were clearly below `_value`
 
     def step(self, observation: Observation) -> Finding | None:
         """Report a muscle whose tension reading is clipped, or return None.

@@ -222,7 +222,7 @@ class ExchangeCheck:
         tension, length = (np.array(part) for part in zip(*messages))
 
         def scores(wiring: Wiring) -> Array:
-            """Return the anomaly scores of all messages with their columns wired in this way."""
+            """Return the anomaly scores of all messages, with the columns put right by `wiring`."""
             ordered, shifted = wiring.unsigned(tension), wiring.signed(length) - offset
             state = mae.estimate(ordered, shifted)
             return anomaly(residuals(state, ordered, shifted, mae.isolated))
