@@ -85,7 +85,7 @@ class HealthMonitor:
     def step(self, observation: Observation) -> Finding | None:
         """Check a message for which there is an estimate; return the first finding or None.
 
-        If exchanged muscles or a reversed length explain this finding, they are reported instead.
+        If a fault of the driver explains the finding (`exchange`), it is reported instead.
         """
         findings = [detector.step(observation) for detector in self._detectors]
         self._exchange.note(observation)
