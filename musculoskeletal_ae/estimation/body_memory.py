@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keeps length offsets and isolated muscles on disk, for the next start of the estimator.
 
-An estimator that finds the file `estimator.offsets` isolates the muscles that it names. It uses the
-saved length offsets, so that estimates and commands change little. It considers them unknown until
-the next length calibration, because the modules may have lost their counts meanwhile. The file
-contains no offsets if they are known to be zero, as those of absolute sensors that were never
-calibrated. If the body is healthy as well, there is no file.
+An estimator that finds the file `estimator.offsets` isolates the muscles that the file names. It
+uses the saved length offsets, so that estimates and commands change little at the restart. It
+considers these offsets unknown until the next length calibration, because the modules may have lost
+their counts meanwhile. The file contains no offsets if all are known to be zero, as with absolute
+sensors that were never calibrated. No file is created as long as, in addition, no muscle is
+isolated.
 
-Without this file, a restarted estimator would assume a healthy body with offsets of zero, and the
-other nodes would have to infer from the change that this is wrong.
+Without this file, a restarted estimator would publish a healthy body with offsets of zero, and the
+other nodes would have to find out by themselves that this is wrong.
 """
 
 from __future__ import annotations
@@ -34,9 +35,9 @@ class BodyMemory:
     """Reads and writes the file of length offsets and isolated muscles.
 
     Attributes:
-        found: The body state that the previous estimator has left behind; None if there was none.
-            Its offsets are known only if they were known to be zero, otherwise they are unknown,
-            with 0 for muscles that the file does not name.
+        found: The body state that the previous estimator saved; None if there is no file. Its
+            offsets are known only if the file states that all are zero. Otherwise they are unknown:
+            the saved values, or 0 for muscles that the file does not name.
     """
 
     def __init__(self, directory: Path | None, muscles: Sequence[str]) -> None:

@@ -10,8 +10,8 @@ M is the inertia matrix, G the muscle Jacobian ∂l/∂θ, and J the Jacobian of
 torques due to velocity and weight, and those of the joints' springs and dampers. The bone-side
 tension T_end follows from the measured tension T, tendon friction μ, and the direction s in which a
 tendon slid last (`signals/friction.py`). σ is the residual torque of the healthy moving arm
-(`estimation/healthy_torque.py`). The term with F₀ keeps those components of F small that produce no
-joint torque, such as the component along a stretched arm.
+(`estimation/healthy_torque.py`). The term with F₀ limits components of F that produce no joint
+torque, such as the component along a stretched arm.
 
 θ and Gᵀ T_end pass through the same second-order low-pass filter, which also yields θ̇ and θ̈. The
 result is the residual of the momentum observer (De Luca 2005), without numerical differentiation
@@ -36,9 +36,9 @@ from musculoskeletal_ae.robot.robot import Robot
 #: filter joint angles and torques with this bandwidth ω [1/s] and a damping ratio of 0.5; critical
 #: damping would make the filter a third slower
 BANDWIDTH = 25.0
-LARGEST_USUAL = 20.0  # F₀: expect no larger force at the hand in normal use [N]
-#: regularise the estimated force F with ‖F‖²/F₀² [1/N²], so that components stay small that produce
-#: no joint torque
+LARGEST_USUAL = 20.0  # F₀: expect no larger force than this at the hand in normal use [N]
+#: regularise the estimated force F with ‖F‖²/F₀² [1/N²], so that components that produce no joint
+#: torque stay small
 REGULARISATION = np.eye(3) / LARGEST_USUAL**2
 #: assume that a joint may rest against its stop within this distance from its limit [rad], which is
 #: roughly the error of an estimated angle
@@ -59,7 +59,8 @@ class Contact(NamedTuple):
         torque: External torques at the joints [N·m], (D,); 0 where the stop of a joint may be the
             only cause.
         force: Function that computes the force [N], (3,), which acts on the origin of the end
-            effector, in the axes of the root link. It is a function because few callers need it.
+            effector, in the axes of the root link. It is a function because few callers need the
+            force.
         distance: Root sum square of the torques, each divided by its standard deviation on the
             healthy arm; NaN if this deviation is not calibrated, or if a reading is not finite.
         is_contact: Whether `distance` has exceeded CONTACT in two consecutive messages (IN_A_ROW).

@@ -44,7 +44,7 @@ def estimate(mae: Mae, bone_tension: Array, length: Array, state: State | None =
         mae: The network; its isolated muscles are ignored.
         bone_tension: Bone-side tensions [N], (M,).
         length: Muscle lengths [m], (M,).
-        state: The state that the network reconstructs from them; None to compute it here.
+        state: The state that the network reconstructs from these readings; None to compute it here.
     """
     state = mae.estimate(bone_tension, length) if state is None else state
     error = residuals(state, bone_tension, length, mae.isolated)

@@ -9,10 +9,10 @@
                          └───────── isolated muscles, anomaly ──────────────────────────┘
 
 The body state consists of the length offsets, the isolated muscles and the anomaly. Only the
-estimator creates a new one, when one of these changes; its node publishes it. `length_trust.py`
-decides which length offsets are known, on the evidence of the other parts. During a length
-calibration, only the detectors that do not need lengths report findings. `suspects.py` describes
-the sequence from a rupture to resuming.
+estimator creates a new body state, whenever one of these three changes, and its node publishes it.
+`length_trust.py` decides which length offsets are known, on the evidence of the other parts. During
+a length calibration, only the detectors that do not need lengths report findings. `suspects.py`
+describes the sequence from a rupture to resuming.
 """
 
 import math
@@ -63,7 +63,7 @@ JOINTS_AGE = 0.05
 
 
 class Output(NamedTuple):
-    """What the estimator has computed from one message.
+    """Results of the estimator for one message.
 
     Attributes:
         sample: The checked readings of the message.
@@ -86,7 +86,7 @@ class Output(NamedTuple):
 class Estimator:
     """Estimates the joint angles from each message, and monitors the health of the body.
 
-    `time` is a time of the messages' clock [s], `now` a time of a steady clock [s].
+    In all methods, `time` comes from the messages' clock [s], and `now` from a steady clock [s].
 
     Attributes:
         robot: The nominal body, with all muscles.
@@ -110,8 +110,8 @@ class Estimator:
         joint_stream: Judges single readings of the joint sensors.
         joint_check: Decides which joint sensors are trusted.
         measured: Joint angles from joint sensors [rad], (D,), at the last message with an estimate;
-            None unless all joint sensors are trusted and reported a usable value within the 0.05 s
-            before it.
+            None unless all joint sensors are trusted and reported a usable value within 0.05 s
+            before that message.
         load: The newest external load; None as in `Output`.
         stepped_at: Time on the steady clock at which the last message was accepted while there was
             a network [s].
@@ -123,8 +123,8 @@ class Estimator:
         Args:
             robot: The nominal body.
             preset: Name of the preset that provides the detectors.
-            first_generation: Generation of the first body state; larger than those of all body
-                states before a restart.
+            first_generation: Generation of the first body state; it must be larger than those of
+                all body states before a restart.
         """
         self.robot = robot
         self.trust = LengthTrust(robot.muscle_count)
@@ -145,8 +145,8 @@ class Estimator:
         self.measured: Array | None = None
         self.stepped_at = -math.inf
         self.load: Contact | None = None
-        #: time since the health of the body was checked: by reception, of which each message counts
-        #: at most LONGEST_STEP, and by publication [s]
+        #: times since the health of the body was last checked [s]: between receptions, of which
+        #: each message adds at most LONGEST_STEP, and between publications
         self._unchecked = self._unchecked_sent = 0.0
         self._commands = ModuleCommands()
         self._rejected = Persistence()  # why messages are rejected
@@ -182,7 +182,7 @@ class Estimator:
     def advice(self) -> str:
         """Advice on how to end the anomaly, as a text for users; '' without an anomaly."""
         if self.suspects.verification is not None:
-            return f'wait until the muscle has been verified, within {LONGEST:g} s'
+            return f'wait for the verification of the muscle, which ends within {LONGEST:g} s'
         return sentence(self.remedy)
 
     # -- settings and services ------------------------------------------------------------------
@@ -237,7 +237,7 @@ class Estimator:
         """Consider the length offsets unknown until the next length calibration.
 
         Args:
-            evidence: Why they are unknown.
+            evidence: Why the offsets are unknown.
             offset: Offsets that are used meanwhile [m], (M,); 0 by default.
         """
         unknown = LengthOffsets.unknown(self.robot.muscle_count)
@@ -248,7 +248,7 @@ class Estimator:
         """Start a length calibration, during which the arm stands in a posture or moves gently.
 
         Args:
-            posture: Positions of the joints at which the arm stands [rad or m], (D,); () if it
+            posture: Positions of the joints at which the arm stands [rad or m], (D,); () if the arm
                 moves gently.
 
         Raises:
@@ -274,7 +274,7 @@ class Estimator:
         """Record joint angles θ [rad], (D,), that joint sensors measured at `now` [s].
 
         θ is NaN for joints that the message does not contain. A joint that had readings before is
-        reported as missing once it has had none for a second.
+        reported as missing once it has had no reading for a second.
         """
         usable = self.joint_stream.take(now, theta)
         impossible = self.joint_stream.impossible(now)
@@ -284,7 +284,7 @@ class Estimator:
 
     @property
     def joint_trust(self) -> JointTrust:
-        """Which joint sensors are trusted; times are those of the steady clock."""
+        """The trust in each joint sensor, with times on the steady clock."""
         return self.joint_check.trust
 
     def confirm_joint_sensors(self) -> tuple[int, ...]:
@@ -309,9 +309,9 @@ class Estimator:
         verification = self.suspects.verification
         if verification is not None and verification.muscle in restored:
             raise MusculoskeletalError(
-                f'{self.robot.muscles[verification.muscle]} is being verified, which ends by '
-                f'itself within {LONGEST:g} s; wait until then, and call estimator/restore again '
-                'if the muscle is still isolated'
+                f'{self.robot.muscles[verification.muscle]} is being verified; this ends by itself '
+                f'within {LONGEST:g} s; wait until then, and call estimator/restore again if the '
+                'muscle is still isolated'
             )
         if problems := list(filter(None, map(self._repair_problem, restored))):
             again = 'then call estimator/restore again'
@@ -389,18 +389,18 @@ class Estimator:
         return posture_of_marker(self.robot, pose, start)
 
     def report(self, now: float) -> Report:
-        """Report the status for /diagnostics; `now` is a time of the steady clock [s]."""
+        """Report the status for /diagnostics; `now` is a time on the steady clock [s]."""
         return estimator_status.report(self, now)
 
     def conditions(self, now: float) -> tuple[Condition, ...]:
         """Return the conditions of readings, body and network that users should know.
 
-        `now` is a time of the steady clock [s].
+        `now` is a time on the steady clock [s].
         """
         return estimator_status.conditions(self, now)
 
     def rejected_because(self, now: float) -> str:
-        """Return why all muscle states of the last 0.1 s or longer were rejected; '' otherwise."""
+        """Return why all muscle states have been rejected for longer than 0.1 s; '' otherwise."""
         return self._rejected.lasting(now)
 
     def _use_sample(self, sample: MuscleSample, now: float) -> Output | None:
@@ -529,9 +529,9 @@ class Estimator:
             self.stream.use_body(self.body)
 
     def _measured_theta(self, readings: Array) -> Array | None:
-        """Return the readings [rad], (D,), as the measured posture, or None.
+        """Return the readings [rad], (D,), if they show the posture of all joints, else None.
 
-        It is None unless every joint has a fresh reading of a sensor that is trusted.
+        Every joint must have a fresh reading from a trusted sensor.
         """
         is_known = not self.joint_trust.unused and np.isfinite(readings).all()
         return readings if is_known else None
@@ -599,8 +599,8 @@ class Estimator:
     def _handle(self, finding: Finding | None, now: float) -> bool:
         """Latch a finding and isolate its muscle, as its kind and the settings require.
 
-        A finding that makes one length unreliable also revokes its offset, one that makes several
-        lengths unreliable revokes all offsets.
+        A finding that makes a single length unreliable also revokes the offset of this length. A
+        finding that makes several lengths unreliable revokes all offsets.
 
         Returns:
             Whether this finding has just been latched; False if `finding` is None, or if an earlier

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of the estimator, from which the parameters of its node are generated, too."""
+"""Settings of the estimator, from which the parameters of its node are generated."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ STOP, ISOLATE = ON_ANOMALY = ('stop', 'isolate')  # legal values of the paramete
 
 @dataclass(frozen=True)
 class EstimatorSettings(CheckedSettings):
-    """How the estimator reacts to an anomaly. `Estimator.configure` takes changed settings."""
+    """How the estimator reacts to an anomaly. `Estimator.configure` applies changed settings."""
 
     on_anomaly: str = settable(
         STOP,

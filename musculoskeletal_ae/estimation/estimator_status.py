@@ -17,15 +17,15 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.estimator import Estimator
     from musculoskeletal_ae.mae.mae import Mae
 
-#: blame the joint sensor itself if at least this share of its readings is impossible; below it, a
-#: second publisher or a loose contact may be the cause
+#: blame the joint sensor itself if at least this share of its readings is impossible; with a
+#: smaller share, a second publisher or a loose contact may be the cause
 ALL = 0.9
 #: report this value of `contact` and `tension` for a robot that does not measure tensions
 UNKNOWN_TENSION = 'unknown: tension_source is none'
 
 
 def report(core: Estimator, now: float) -> Report:
-    """Report the status of an estimator; `now` is the time of a steady clock [s].
+    """Report the status of an estimator; `now` is the time on a steady clock [s].
 
     The value `verification` is 'none' or 'running', and `last outcome` is a value of
     `suspect_verification.Outcome`, so that programs can read both.
@@ -71,7 +71,7 @@ def _finding(core: Estimator) -> Iterator[Condition]:
     names = [core.robot.muscles[muscle] for muscle in finding.muscles]
     detail = f'{", ".join(names)}: {finding.evidence}'
     if core.suspects.verification is not None:
-        detail += f' (it is being verified, which ends by itself within {LONGEST:g} s)'
+        detail += f' (the muscle is being verified; this ends by itself within {LONGEST:g} s)'
     yield finding.kind.condition(detail, names, level='error', steps=core.remedy)
 
 
@@ -84,7 +84,7 @@ def _changed_modules(core: Estimator) -> Iterator[Condition]:
 def _isolated(core: Estimator) -> Iterator[Condition]:
     """Yield a condition for each isolated muscle, except one that is only being verified.
 
-    Another condition names the muscles that must not be lost as well.
+    A further condition names the remaining muscles that the estimate needs.
     """
     verification = core.suspects.verification
     verified = None if verification is None else verification.muscle
@@ -134,7 +134,7 @@ def _doubted_joints(core: Estimator) -> Iterator[Condition]:
 
 
 def _unreadable_joints(core: Estimator, now: float) -> Iterator[Condition]:
-    """Yield conditions on joints with lasting impossible readings, and on joints without any."""
+    """Yield conditions on joints with lasting impossible readings, or without any readings."""
     if series := core.joint_stream.impossible(now):
         names = [core.robot.joints[j] for j in series]
         impossible = sum(each.impossible for each in series.values())

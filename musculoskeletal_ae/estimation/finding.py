@@ -17,8 +17,8 @@ from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-#: discard the messages of this time before a fault was detected [s], because the fault may have
-#: begun that much earlier
+#: discard messages that arrived within this time before a fault was detected [s], because the fault
+#: may have begun that much earlier
 DETECTION_DELAY = 2.0
 
 
@@ -40,7 +40,7 @@ class Finding:
     others: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse kinds that are no findings, because a finding latches an anomaly."""
+        """Refuse a kind that is no finding: it neither stops the arm nor isolates a muscle."""
         if self.kind.reaction is None:
             raise ValueError(
                 f'{self.kind.identifier} has no reaction that stops the arm or isolates a muscle; '
@@ -64,7 +64,7 @@ class Observation:
 
     Attributes:
         sample: The checked readings.
-        estimate: What the network estimates from these readings.
+        estimate: The network's estimate for these readings.
         demand: Tensions that the newest command demands of the muscle modules [N], (M,); None
             without a command, and for position-controlled modules.
         dt: Time since the previous message [s]; the caller limits it after a pause.

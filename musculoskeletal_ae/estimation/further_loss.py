@@ -26,8 +26,8 @@ def needed_muscles(robot: Robot, mae: Mae) -> dict[str, str]:
         mae: The network in use, without the isolated muscles.
 
     Returns:
-        For the name of each such muscle, a text that names the joints that would be undetermined
-        without it; empty if no muscle is isolated.
+        By the name of each such muscle, a text with the joints that would be undetermined without
+        the muscle; empty if no muscle is isolated.
     """
     if not mae.isolated:
         return {}

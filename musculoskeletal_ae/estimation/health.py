@@ -24,7 +24,7 @@ from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 
 
 class HealthMonitor:
-    """Checks messages with all detectors, and returns the finding of the first that has one.
+    """Checks messages with all detectors, and returns the first finding.
 
     Attributes:
         residual: The detector that compares the network's residual with its healthy spread; it also
@@ -85,7 +85,7 @@ class HealthMonitor:
     def step(self, observation: Observation) -> Finding | None:
         """Check a message for which there is an estimate; return the first finding or None.
 
-        If exchanged muscles or a reversed length explain this finding, they are reported instead.
+        If a fault of the driver explains the finding (`exchange`), it is reported instead.
         """
         findings = [detector.step(observation) for detector in self._detectors]
         self._exchange.note(observation)

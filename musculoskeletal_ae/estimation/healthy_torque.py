@@ -34,7 +34,7 @@ class HealthyTorque:
         self._square, self._time = np.zeros(joint_count), 0.0
 
     def put_into(self, mae: Mae) -> Mae:
-        """Put the measured residual torque σ into a network, and return the copy with it.
+        """Put the measured residual torque σ into a copy of a network, and return the copy.
 
         A network that contains no σ is returned unchanged. Before the first measurement, the σ of
         the network is adopted instead, and later measurements are averaged with it.

@@ -3,23 +3,23 @@
 
 The readings are mainly compared with the muscle lengths:
 
-    x_j = (θ_j − θ̂_j) − median of the same in earlier messages
+    x_j = (θ_j − θ̂_j) − median of θ_j − θ̂_j in earlier messages
 
 θ_j is the reading of joint sensor j, and θ̂_j the network's estimate from tensions and lengths,
 which no joint sensor enters. A false sensor therefore changes its own x_j only. This also holds if
 only some joints have sensors, and if two sensors are exchanged.
 
-The earlier messages are the anchor. Both x_j and the median are computed with the network in use,
-again for each new network. If the network learns from a false sensor, it follows the new readings
-and departs from the earlier ones, so that their difference stays. A constant offset of a sensor
-cancels out.
+The earlier messages are the reference. Both x_j and the median are computed with the network in
+use, and are computed again for each new network. A network that learns from a false sensor follows
+the new readings and departs from the earlier ones, so the difference between the two remains. A
+constant offset of a sensor cancels out.
 
-A sensor is doubted while the median of |x_j| over the newest messages exceeds a limit: a constant
-or a multiple of the healthy spread of θ_j − θ̂_j, whichever is larger. The spread is that of earlier
-messages when they arrived: a network that has learned from them fits them better than it will fit
-the next ones, above all at the beginning. Only messages of different postures count, because the
-error of a network in one posture says little about others. Messages of an arm that carries a load
-do not count.
+A sensor is doubted once the median of |x_j| over the newest messages exceeds a limit: a constant or
+a multiple of the healthy spread of θ_j − θ̂_j, whichever is larger. This spread is computed with
+the estimates that were made when the earlier messages arrived. A network that has since learned
+from these messages fits them better than it will fit later ones, above all at the beginning. Only
+messages of different postures count, because the error of a network in one posture says little
+about others. Messages of an arm that carries a load do not count.
 
 A change of muscle lengths also changes θ̂. The readings are therefore compared with two hypotheses:
 the sensors of the joints with large x are false, or the length of a single muscle has changed.
@@ -27,13 +27,14 @@ the sensors of the joints with large x are false, or the length of a single musc
     Δ = l − l_net(θ, T_end) − median of earlier l − l_net(θ̂, T_end)
 
 θ are the readings without their usual deviations, and the estimates for joints without a sensor.
-Under the first hypothesis, the angles of the joints in question may have any value: θ̂ and a motion
-along the muscle Jacobian. Under the second, Δ of one muscle does not count. Sensors are doubted if
-the first hypothesis leaves a clearly smaller sum of squares of Δ, in healthy spreads.
+Under the first hypothesis, the angles of the joints in question may have any value: θ̂ plus any
+motion, whose effect on the lengths follows from the muscle Jacobian. Under the second, Δ of one
+muscle does not count. Sensors are doubted only if the first hypothesis leaves a clearly smaller sum
+of squares of Δ, measured in healthy spreads.
 
-A sensor is not used either while it reports impossible readings again and again
-(`signals/joint_stream.py`). Its other readings may be wrong as well, for example if two programs
-publish.
+While a sensor reports impossible readings again and again (`signals/joint_stream.py`), it is not
+used either. Its other readings may be wrong as well, for example if two programs publish joint
+angles.
 """
 
 from collections import deque
@@ -60,9 +61,9 @@ EARLIER = 600
 LOADED = 3.0
 ENOUGH = 80  # judge a sensor by at least this many earlier messages
 NEWEST = 48  # judge this many of the newest messages, by all messages before them
-#: Judge a sensor by its deviation x in three windows, each with the number of newest messages, the
-#: smallest limit of the median of |x| [rad], and the limit in healthy spreads. The short
-#: window finds large errors fast; the long one averages over more postures.
+#: Judge a sensor by its deviation x in three windows. Each has a number of newest messages, the
+#: smallest limit of the median of |x| [rad], and the limit in healthy spreads; the larger limit
+#: applies. The short window finds large errors fast; the long window averages over more postures.
 WINDOWS = ((6, 0.12, 7.0), (24, 0.07, 3.0), (NEWEST, 0.06, 2.2))
 #: Trust a doubted sensor again once the median of its deviation |x| is below AGREEING_LIMIT [rad]
 #: or AGREEING_SPREADS healthy spreads, whichever is larger: over the newest AGREEING messages,
@@ -92,7 +93,7 @@ class _CountedMessage(NamedTuple):
 
 
 class _Usual(NamedTuple):
-    """What is usual on the healthy arm: medians of earlier messages, and spreads about them."""
+    """Usual values on the healthy arm: medians of earlier messages, and spreads about them."""
 
     deviation: Array  # usual deviation θ − θ̂ of each joint sensor [rad], (D,); 0 if unknown
     #: spread of these deviations in the newest of the messages, when they arrived [rad], (D,); NaN
@@ -114,7 +115,7 @@ class JointSensorCheck:
         self._has_tensions = robot.tension_source.is_known
         self._mae: Mae | None = None
         self.trust = JointTrust.full(robot.joint_count)
-        #: messages in order of time; the last NEWEST of them are judged by the earlier ones
+        #: messages in order of time; the last NEWEST messages are judged by those before
         self._messages: deque[_CountedMessage] = deque(maxlen=EARLIER + NEWEST)
         #: θ − θ̂ [rad] (D,) and l − l_net(θ̂, T_end) [m] (M,) of each message with the network in use
         self._compared: deque[tuple[Array, Array]] = deque(maxlen=EARLIER + NEWEST)
@@ -134,7 +135,7 @@ class JointSensorCheck:
         theta, tension, length = map(np.array, zip(*readings))
         estimate = mae.estimate(tension, np.nan_to_num(length)).theta
         used = ~np.isin(np.arange(length.shape[1]), mae.isolated)
-        # Messages in which a muscle was isolated that is used now cannot be compared.
+        # Messages in which a muscle that is used now was isolated cannot be compared.
         is_complete = np.isfinite(length[:, used]).all(axis=1)
         deviation = np.where(is_complete[:, None], theta - estimate, np.nan)
         residual = np.where(is_complete[:, None] & used, length, np.nan)
@@ -155,7 +156,7 @@ class JointSensorCheck:
     def confirm(self) -> tuple[int, ...]:
         """Confirm all doubted sensors, because a user says that they are right.
 
-        Earlier readings, which contradict them, are discarded.
+        Earlier readings of these sensors, which contradict the present ones, are discarded.
 
         Returns:
             Indices of the joints whose sensors were in doubt.
@@ -189,12 +190,12 @@ class JointSensorCheck:
     # -- messages -------------------------------------------------------------------------------
 
     def step(self, observation: Observation, theta: Array, now: float, load: float = 0.0) -> None:
-        """Judge the sensors by one message. The arm has no anomaly, and its offsets are known.
+        """Judge the sensors by a message of an arm without an anomaly and with known offsets.
 
         Args:
             observation: The message.
             theta: Usable readings of the joint sensors [rad], (D,), NaN for other joints.
-            now: Time of a steady clock [s].
+            now: Time on a steady clock [s].
             load: Evidence d for an external load; the message is skipped if it exceeds LOADED. NaN
                 if unknown.
         """
@@ -205,7 +206,7 @@ class JointSensorCheck:
         if self._mae is None or self._since < SPACING - 1e-9 or np.isnan(theta).all():
             return
         has_moved = (np.abs(estimate - self._counted_at) > MOVED).any()
-        # Also while the arm stands still, look for readings that are far from the estimate.
+        # Look for readings that are far from the estimate even while the arm stands still.
         usual = 0.0 if self._usual is None else self._usual.deviation
         is_far = np.abs(theta - estimate - usual) > GROSS
         if not (has_moved or (is_far & ~self.trust.is_doubted).any()):
@@ -246,7 +247,7 @@ class JointSensorCheck:
             self._give_up(agrees)
 
     def _compute_usual(self) -> _Usual:
-        """Compute what is usual: medians of the earlier messages, and spreads about them."""
+        """Compute the usual values: medians of the earlier messages, and spreads about them."""
         earlier = list(self._compared)[:-NEWEST]
         deviation, residual = (
             np.array([each[part] for each in earlier]).reshape(len(earlier), len(values))
@@ -255,7 +256,7 @@ class JointSensorCheck:
         count = np.isfinite(deviation).sum(axis=0)
         is_known = count >= ENOUGH
         middle = np.where(is_known, _median(deviation), 0.0)
-        newest = deviation[-ENOUGH:]  # of the earlier messages
+        newest = deviation[-ENOUGH:]  # the newest of the earlier messages
         messages = islice(self._messages, len(earlier) - len(newest), len(earlier))
         arrived = np.array([message.deviation for message in messages]).reshape(newest.shape)
         arrived = np.where(np.isnan(newest), np.nan, arrived)
@@ -299,7 +300,7 @@ class JointSensorCheck:
         Args:
             joints: The joints whose sensors may be false, (D,).
             excess: Deviations x of the sensors in these messages [rad], (N, D).
-            usual: What is usual on the healthy arm, from earlier messages.
+            usual: Usual values on the healthy arm, from earlier messages.
         """
         mae, spread = self._mae, usual.residual_spread
         assert mae is not None
@@ -313,7 +314,7 @@ class JointSensorCheck:
         used = ~np.isin(np.arange(length.shape[1]), mae.isolated)
 
         def misfit(is_free: Bools, muscles: Bools) -> float:
-            """Return how badly some lengths fit if the joints `is_free` may have any angle."""
+            """Return the misfit of the lengths of `muscles` if the joints `is_free` may move."""
             theta = np.where(is_free, estimate, read)
             change = (length - mae.lengths(theta, tension)) / spread
             jacobian = mae.muscle_jacobian(theta, tension) / spread[:, None]
@@ -369,7 +370,8 @@ def _unexplained(change: Array, jacobian: Array) -> float:
 
     Args:
         change: Length changes, in healthy spreads, (N, M).
-        jacobian: Changes of the lengths with each of these joints, (N, M, K).
+        jacobian: Derivatives of the lengths by the angles of these K joints, divided by the healthy
+            spreads, (N, M, K).
     """
     if jacobian.shape[2]:
         motion = np.einsum('nkm,nm->nk', np.linalg.pinv(jacobian), change)

@@ -8,11 +8,11 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 
-# If the end effector cannot come closer, the camera sees another marker or is not calibrated.
-#: reject a pose if the end effector stays further than this from its position [m]
+# Beyond these limits, the camera sees another marker or is not calibrated.
+#: reject a pose if the end effector stays further than this from the marker's position [m]
 MARKER_DISTANCE = 0.05
-#: reject a pose if the orientation of the end effector differs from the estimated one by more than
-#: this angle [rad]
+#: reject a pose if, in the nearest posture, the orientation of the end effector differs from the
+#: marker's by more than this angle [rad]
 MARKER_ANGLE = 0.3
 
 
@@ -37,6 +37,6 @@ def posture_of_marker(robot: Robot, pose: pin.SE3, start: Array) -> Array:
             f'in the nearest posture, the end effector is {posture.distance:.3f} m and '
             f'{posture.angle:.2f} rad away from the pose of the marker; '
             f'legal: at most {MARKER_DISTANCE:g} m and {MARKER_ANGLE:g} rad; '
-            'check which marker the camera sees, and its calibration',
+            'check which marker the camera sees, and how the camera is calibrated',
         )
     return posture.observed_theta

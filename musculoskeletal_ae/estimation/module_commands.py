@@ -2,10 +2,10 @@
 """Stores the newest commands to the muscle modules, to compare readings with them.
 
 On a busy computer, readings and commands are late, and a module still obeys an earlier command when
-it sends a reading. Which one is not known: if no message is later than the delay d of the reading,
-it is one of those that the estimator received in the last 2 d. A reading is therefore compared with
-that command of this time from which it differs least. On an idle computer, d is 0, and this is the
-newest command.
+it sends a reading. It is not known which command that was. If no command was later than the
+reading, whose delay is d, it was one of those that the estimator received in the last 2 d. A
+reading is therefore compared with the nearest value between the values of these commands. On an
+idle computer, d is 0, and only the newest command remains.
 """
 
 from collections import deque
@@ -22,8 +22,8 @@ from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 #: safe state (doc/howto/your_driver.md). The age is measured on the steady clock, because the
 #: modules do not wait for pauses of this process.
 COMMAND_AGE = 0.5
-#: store commands for this time [s]; what a module obeyed when it sent a reading is unknown if the
-#: reading is later than half of this time
+#: store commands for this time [s]; if a reading is late by more than half of this time, the
+#: command that its module obeyed is unknown
 STORED = 1.0
 
 
@@ -38,7 +38,7 @@ class _Command(NamedTuple):
 class ModuleCommands:
     """Stores the newest commands to the muscle modules.
 
-    If the newest command is older than 0.5 s (COMMAND_AGE), there is none.
+    A command that is older than 0.5 s (COMMAND_AGE) counts as no command.
     """
 
     def __init__(self) -> None:
@@ -94,9 +94,9 @@ class ModuleCommands:
         now: float,
         wanted: Callable[[_Command], Array | None],
     ) -> Array | None:
-        """Return what the modules were to reach, as near to the reading as it may have been, (M,).
+        """Return the wanted value that is nearest to the reading of each module, (M,).
 
-        Between two commands, everything between their values may have been wanted.
+        Between two commands, any value between theirs may have been in force.
         """
         if not self._is_up_to_date(now) or 2.0 * delay > STORED:
             return None
@@ -106,7 +106,7 @@ class ModuleCommands:
             if value is None:
                 break
             values.append(value)
-            if command.time <= now - 2.0 * delay:  # no earlier one was in force
+            if command.time <= now - 2.0 * delay:  # no earlier command was in force
                 break
         if len(values) < 2:
             return values[0] if values else None

@@ -8,15 +8,16 @@ the vector of gravity, so the balance of the joints in several postures shows it
     S(u, m)   = Σ_postures Σ_j ½ (ν + 1) ln(1 + (r_j / σ_j)² / ν),   σ_j = NOISE Σ_m |G_mj| T_m
     evidence  = min S(u, m) over u within UPRIGHT of g  −  min S(u, m) over all u
 
-Y(θ) u is the torque that holds the weight of the arm where gravity is u, Y_hand that of a mass of
-1 kg in the hand, g the gravity of `robot.urdf`, and τ_ext the external torque that the contact
-estimator computes with g (`estimation/contact.py`). u are directions on a sphere, and m masses of a
-payload. A payload is thus no evidence: it acts in the direction of gravity. S is the negative
-logarithm of a Student likelihood, because friction and pushes cause large residuals now and then.
+Y(θ) u is the torque that holds the weight of the arm where gravity is u, and Y_hand(θ) u the torque
+that holds 1 kg in the hand. g is the gravity of `robot.urdf`, and τ_ext the external torque that
+the contact estimator computes with g (`estimation/contact.py`). u runs over directions on a sphere,
+and m over masses of a payload. Because the best m is chosen for each u, a payload does not look
+like another direction of gravity. S is the negative logarithm of a Student likelihood, because
+friction and pushes cause large residuals now and then.
 
-S is summed over the newest n postures, and the evidence is the largest one of all n. A base that is
-turned while the arm works is thus found as soon as one that was wrong from the beginning. Earlier
-postures are discarded once the newest ones show the direction of `robot.urdf`.
+S is summed over the newest n postures, for each n, and the largest evidence of all n counts. A base
+that is turned while the arm works is thus detected as soon as a base that was wrong from the
+beginning. Earlier postures are discarded once the newest ones show the direction of `robot.urdf`.
 
 A posture is used only if it differs from the last one that was used. An arm that stands still, with
 the same friction all the time, therefore adds no evidence. At the stop of a joint, the muscles need
@@ -79,8 +80,8 @@ class Tilt(NamedTuple):
         """Direction of gravity that the tensions show, as a text for users."""
         x, y, z = self.direction
         return (
-            f'the tensions show that gravity acts along ({x:.1f}, {y:.1f}, {z:.1f}) of the root '
-            f'link, about {self.angle:.0f}° away from the direction in robot.urdf'
+            f'the tensions show that gravity acts along ({x:.1f}, {y:.1f}, {z:.1f}) in the '
+            f'axes of the root link, about {self.angle:.0f}° away from the direction in robot.urdf'
         )
 
 

@@ -10,9 +10,9 @@ A muscle must not be restored while one of these problems is present:
 
 l' is the length that the network computes at the posture that joint sensors measure or, without
 them, at the posture that the other muscles indicate. A length may be wrong because the tendon is
-still ruptured, because the winch has not come back yet, or because the module has another length
-offset since the repair. A tendon that is slack because no tension is demanded may be longer than
-l'; the controller winds it in.
+still ruptured, because the winch is still moving, or because the module has another length offset
+since the repair. A tendon that is slack because no tension is demanded may be longer than l'; the
+controller winds it in.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 """Verifies whether a suspect muscle is faulty, by its response to being wound in slightly.
 
 The arm has stopped, and the estimate does not use the suspect. The controller lowers the length
-command l_target of the suspect by a few millimetres. The tension T of the suspect is compared with
-the tension T_ref that muscle stiffness control demands, and its length l with the length l' that is
-estimated from the other muscles:
+command l_target of the suspect by a few millimetres. The length l of the suspect is compared with
+the length l' that is estimated from the other muscles. Its tension T is compared with the tension
+T_ref that muscle stiffness control demands:
 
     T_ref = T_bias + K (l − l_target)
 
@@ -76,10 +76,10 @@ SHARE = 0.35
 #: demanded tension T_ref by more than this [N]
 JAM_EXCESS = 20.0
 #: conclude that a slack tendon is ruptured if its stretch exceeds the stretch at T_bias by this
-#: factor: a healthy tendon would have tension
+#: factor, because a healthy tendon would then have tension
 STRETCHED = 1.5
-#: with a position-controlled module, wait no longer than this for a tendon that is wound in to have
-#: tension [s]
+#: wait at most this long for tension in the tendon of a position-controlled module that winds in
+#: [s]
 LONGEST_WINDING = 2.5
 BEHIND = 0.005  # judge whether a module follows once its position command has decreased by this [m]
 STANDS = 0.0005  # treat a winch as standing still if the length changes by less than this [m]
@@ -181,7 +181,7 @@ class PositionLaw(ModuleLaw):
         super().__init__(bias, math.inf)
         self._elongation = elongation
         self._reference = 0.0  # x_0 − L_e(T_0) [m]
-        #: stretch of a healthy tendon with tension [m]
+        #: a healthy tendon has tension if its stretch exceeds this [m]
         self.stretched = STRETCHED * elongation(bias)
 
     def stretch(self, row: _Moment) -> float:
@@ -227,7 +227,7 @@ class Verification:
         self._time = 0.0
         self._highest_command = -math.inf
         self._before = bias, bias  # T and T_ref before the suspect was wound in [N]
-        self._rows: list[_Moment] = []  # while the suspect was wound in
+        self._rows: list[_Moment] = []  # readings while the suspect was wound in
         self._watched = 0.0  # duration of winding in so far [s]
 
     def step(
@@ -330,5 +330,5 @@ class Verification:
 
 
 def _late_median(values: Array) -> float:
-    """Return the median of the later half of values (N,), when the suspect has responded."""
+    """Return the median of the later half of values (N,): by then, the suspect has responded."""
     return float(np.median(values[len(values) // 2 :]))

@@ -32,7 +32,7 @@ consequences:
                             finding stays latched as for several muscles.
 
 A muscle may be repaired while its finding is latched, and the repair may make its length jump, or
-its winch may take seconds to come back. A wrong length of this muscle alone therefore neither
+its winch may take seconds to come to rest. A wrong length of this muscle alone therefore neither
 replaces the finding nor revokes its length offset (`Evidence.MOVED`). `Estimator.reset` checks
 whether the length agrees with the rest of the arm, and so does `Estimator.restore` for isolated
 muscles. While a muscle is being verified, it cannot be restored.
@@ -119,7 +119,7 @@ class SuspectHandling:
         Args:
             finding: The finding of a detector.
             isolated: Indices of the muscles isolated so far.
-            now: Time of a steady clock [s].
+            now: Time on a steady clock [s].
 
         Returns:
             Indices of the muscles that are isolated from now on.
@@ -150,8 +150,8 @@ class SuspectHandling:
     def explains(self, finding: Finding) -> bool:
         """Return whether the repair of a muscle explains a new finding of a wrong length.
 
-        It does if the latched finding names the same muscle and asks for its repair: a repaired
-        muscle may have another length offset.
+        The repair explains it if the latched finding names the same muscle and asks for a repair,
+        because a repaired muscle may have another length offset.
         """
         suspected = self.finding
         if suspected is None or suspected.kind.steps != REPAIR:

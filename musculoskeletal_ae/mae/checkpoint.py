@@ -37,7 +37,7 @@ FORMAT_VERSION = 1  # reject checkpoints of any other version of the file format
 #: reject a larger checkpoint [bytes]; those of the shipped robots are a hundred times smaller
 MAX_BYTES = 64 * 1024 * 1024
 MAX_HEADER_BYTES = 1024 * 1024  # reject a checkpoint with a larger header [bytes]
-#: reject a checkpoint with a number of a larger absolute value: no trained network has one, and it
+#: reject a checkpoint with a number beyond ± this: no trained network has such a number, which
 #: could overflow when `Mae` folds units and standardisation into the layers
 LARGEST = 1e9
 SMALLEST_STD = 1e-9  # reject a checkpoint with a smaller standard deviation, which is a divisor
@@ -50,8 +50,8 @@ SMALLEST_EIGENVALUE = 1e-12
 #: one; rounding can make eigenvalues slightly negative, springs cannot
 SMALLEST_SPRING_EIGENVALUE = -1e-6
 #: Reject a network if its postures of a prismatic joint span less than this share of the joint's
-#: range. Networks from before θ of such joints was in rad have a 17 times smaller span. A network
-#: whose inputs are not standardised passes, because its span is unknown.
+#: range. Early networks, which took the positions of such joints in m, have a 17 times smaller
+#: span. A network whose inputs are not standardised passes, because its span is unknown.
 LEAST_SPAN = 0.25
 #: reject a network whose estimate at the middle of all joint ranges exceeds these absolute values:
 #: θ [rad], T [N], l [m] and muscle Jacobian G [m/rad]
@@ -82,7 +82,7 @@ class Metadata(Strict, frozen=True):
     preset: str
     version: Count
     training: Annotated[str, Meta(max_length=10_000)]
-    anomaly_calibrated: bool | None  # None if there are no anomaly statistics
+    anomaly_calibrated: bool | None  # None without anomaly statistics
     anomaly_samples: Count
     anomaly_thresholds: Annotated[dict[str, Threshold], Meta(max_length=1000)]
     anomaly_postures: Annotated[int, Meta(ge=0, le=10_000)]
@@ -91,7 +91,8 @@ class Metadata(Strict, frozen=True):
     uncertain: bool  # whether the covariance of the estimates is included
     drive: bool = False  # whether learned constants of motor currents are included
     elastic: bool = False  # whether learned springs of the joints are included
-    #: index of the base of each group's block, or of the block itself; () if none has a base
+    #: for each group's block, the index of its base (the block whose inputs it uses as well) or,
+    #: without a base, its own index; () if no block has a base
     bases: Annotated[tuple[Count, ...], Meta(max_length=1000)] = ()
 
     def __post_init__(self) -> None:
@@ -114,7 +115,7 @@ class Metadata(Strict, frozen=True):
         bases, count = self.bases_by_group(), len(self.groups)
         are_bases = len(bases) == count and max(bases) < count
         if not are_bases or any(bases[base] != base for base in bases):
-            expected = f'for each of {count} groups the index of its base, which is its own base'
+            expected = f'for each of {count} groups the index of its base, and for a base its own'
             raise ValueError(f'bases {self.bases}; legal: {expected}')
         # Encoder and decoder have equally many hidden layers; the latent layer is between them.
         depth, rest = divmod(len(self.layer_sizes), len(self.groups))
@@ -128,7 +129,7 @@ class Metadata(Strict, frozen=True):
                 raise ValueError(f'layer_sizes {sizes}; legal: {expected}')
 
     def sizes_by_group(self) -> list[tuple[int, ...]]:
-        """Return the layer sizes of each group."""
+        """Return the layer sizes of each group's block."""
         depth = len(self.layer_sizes) // len(self.groups)
         return [self.layer_sizes[g * depth :][:depth] for g in range(len(self.groups))]
 
@@ -145,7 +146,7 @@ class Metadata(Strict, frozen=True):
             depth = len(sizes) // 2
             for i, (into, out) in enumerate(pairwise(sizes)):
                 stack = 'encoder' if i < depth else 'decoder'
-                if i == depth:  # the decoder also reads the part of z of its base
+                if i == depth:  # the decoder also reads its base's part of z
                     into = len(latents[g])
                 layer = g * depth + i % depth
                 shapes[f'{stack}.{layer}.weight'] = out, into
@@ -170,7 +171,7 @@ class Metadata(Strict, frozen=True):
 
 
 def to_bytes(mae: Mae) -> bytes:
-    """Return a network as safetensors bytes, from which `from_bytes` restores it exactly."""
+    """Return a network as safetensors bytes, which `from_bytes` converts back without loss."""
     anomaly = mae.anomaly
     tensors: dict[str, Array] = {'mean': mae.mean, 'std': mae.std}
     for name, stack in (('encoder', mae.encoder), ('decoder', mae.decoder)):
@@ -216,7 +217,7 @@ def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoin
     """Check safetensors bytes and return their network.
 
     Args:
-        data: The bytes.
+        data: Content of the checkpoint.
         robot: The robot whose joints and muscles the network must have in the same order, or None
             to accept any. The network's estimate of this robot's middle posture must be within
             LARGEST_ESTIMATES.
@@ -232,10 +233,10 @@ def from_bytes(data: bytes, robot: Robot | None = None, source: str = 'checkpoin
 
 
 def restored(data: bytes, robot: Robot | None = None) -> Mae:
-    """Return the restored network like `from_bytes`, but with errors that state the problem only.
+    """Return the network like `from_bytes`, but with errors that state only the problem.
 
     Args:
-        data: The bytes.
+        data: Content of the checkpoint.
         robot: See `from_bytes`.
 
     Raises:
@@ -430,8 +431,8 @@ def _check_fit(mae: Mae, robot: Robot) -> None:
     if is_standardised and (narrow & robot.units.slides).any():
         names = ', '.join(np.array(robot.joints)[narrow & robot.units.slides])
         raise CheckpointError(
-            f'its postures of {names} span less than {LEAST_SPAN:.0%} of the joint range; an early '
-            'version took the positions of prismatic joints in m'
+            f'its postures of {names} span less than {LEAST_SPAN:.0%} of the joint range, as in '
+            'networks of an early version, which took the positions of prismatic joints in m'
         )
     theta = 0.5 * (robot.lower + robot.upper)
     tension = np.full(robot.muscle_count, robot.tension.bias)

@@ -19,8 +19,8 @@ rad).
 The layers of a larger block grow in proportion to its D + M. If they grew by the square root, the
 error of θ of a body with 17 joints and 40 muscles would be 0.0045 instead of 0.0030 rad per joint.
 The number of mini-batches grows with D + M of the largest block to the power of 1.5, up to
-MOST_STEPS: the estimation error from T and l is then a tenth lower for the larger body than for the
-arm with 5 joints, and with growth in proportion it would be higher.
+MOST_STEPS. The error of estimates from T and l is then a tenth lower for the body with 17 joints
+than for the arm with 5 joints; with growth in proportion to D + M, it would be higher.
 """
 
 import math
@@ -102,7 +102,7 @@ def size(group: Group) -> float:
 
 
 def default_steps(groups: Iterable[Group]) -> int:
-    """Return how many mini-batches a network with one block per group needs to begin with."""
+    """Return how many mini-batches the initial training of one block per group needs."""
     return min(grown(STEPS, groups, 1.5), MOST_STEPS)
 
 
@@ -134,8 +134,8 @@ def overload_states(robot: Robot, count: int, rng: np.random.Generator) -> State
     """Return random states of the geometric model, some of which exceed the tension limit.
 
     `highest_tensions` describes the range of the tensions. If the robot has fewer muscles than
-    joints somewhere, a share REST_SHARE of the states are equilibria (`rest_states`): from them the
-    network learns θ, and from the others it learns G around them.
+    joints somewhere, a share REST_SHARE of the states are equilibria (`rest_states`): from the
+    equilibria, the network learns θ, and from the other states, it learns G around them.
     """
     highest = highest_tensions(robot, count, rng)
     anywhere = random_states(robot, count, rng, highest, margin=POSTURE_MARGIN)
@@ -198,7 +198,7 @@ def loss(network: Network, samples: Tensor) -> Tensor:
     values = torch.cat([rows.repeat(3, 1), twins])  # (4N, D+2M)
     error = network.decoder(network.encode(values, mask))
     error = error - (values - network.mean) / network.std
-    # The difference between the errors of l of a sample and of its twin, divided by the distance of
+    # A sample and its twin have different errors of l. Their difference, divided by the distance of
     # the two, is the error of ∂l/∂θ in the direction from one to the other.
     between = (error[-count:] - error[:count])[:, -muscles:] / TWIN_DISTANCE
     slope = (between.square().sum(dim=1) + TINY).sqrt().mean()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains the initial network of a robot on its geometric model, as its preset says."""
+"""Trains the initial network of a robot on its geometric model, as a preset specifies."""
 
 from dataclasses import replace
 from typing import NamedTuple
@@ -13,12 +13,12 @@ from musculoskeletal_ae.mae.training import Progress, TrainedNetwork, rest_state
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
-#: compute the residuals' first mean and covariance from this many states that were not trained on
+#: compute the first mean and covariance of the residuals from this many held-out states
 HELD_OUT_STATES = 5000
 
 
 class Trained(NamedTuple):
-    """Result of `initial_mae`."""
+    """An initial network, and the losses of its training."""
 
     mae: Mae  # the network with its history and anomaly statistics
     losses: list[float]  # loss of every mini-batch
@@ -47,7 +47,7 @@ def initial_mae(
 
 
 def completed(robot: Robot, trained: TrainedNetwork, preset: str, seed: int) -> Trained:
-    """Return a trained network completed to a `Mae`, with its history and anomaly statistics.
+    """Complete a trained network to a `Mae` with its history and anomaly statistics.
 
     The statistics are those of held-out states of the geometric model.
 

@@ -82,8 +82,9 @@ class BlockDiagonal:
                 already has this order.
             out: Indices that bring the outputs of the blocks, one block after another, into the
                 order of the result; None if the result has the order of the blocks.
-            starts: If given, sum the outputs, once they are in the order `out`, from each of these
-                places to the next. The transposed weight of blocks that share inputs needs it.
+            starts: If given, bring the outputs into the order `out`, and sum them from each of
+                these places to the next. The transposed weight of blocks that share inputs needs
+                this.
         """
         ends = np.cumsum([0, *map(len, blocks)]).tolist()
         self._blocks = [*zip(map(slice, ends, ends[1:]), blocks)]
@@ -310,8 +311,8 @@ class Mae:
     elasticity: JointElasticity | None = None  # springs of the joints; None if not learned
     #: groups of joints and muscles, each with a block of the network; () for one block
     groups: tuple[Group, ...] = ()
-    #: index of the block whose inputs and part of z each block uses as well, such as that of the
-    #: wrist for a finger; its own index if it uses no other; () if none does
+    #: for each block, the index of its base, whose inputs and part of z it uses as well, as a
+    #: finger uses those of the wrist; its own index without a base; () if no block has a base
     bases: tuple[int, ...] = ()
     isolated: tuple[int, ...] = ()  # indices of isolated muscles in T and l
     _enter: dict[Mask, Stack] = field(init=False, repr=False)
@@ -611,7 +612,7 @@ class Mae:
     def _read_joints(self) -> list[tuple[int, ...]]:
         """The joints that each block reads, those of its base first.
 
-        A base has no other base, so a joint has the same place in each of these lists.
+        A base has no base itself, so a joint has the same place in each of these lists.
         """
         return [
             union([self.groups[r] for r in reversed(read)]).joints
@@ -638,7 +639,7 @@ def read_blocks(bases: Sequence[int]) -> list[tuple[int, ...]]:
 
 
 def latent_places(groups: Sequence[Group], bases: Sequence[int]) -> list[Ints]:
-    """Return for each block the places in z of the parts that its decoder reads, its own first."""
+    """Return, for each block, which places of z its decoder reads: its own, then its base's."""
     ends = np.cumsum([0, *(sum(map(len, group)) for group in groups)])
     return [
         np.concatenate([np.arange(ends[r], ends[r + 1]) for r in read])

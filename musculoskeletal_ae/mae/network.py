@@ -62,8 +62,8 @@ class Network(nn.Module):
     Its layers have D+2M+3, *hidden, D+M, *reversed hidden and D+2M units. The inputs are (θ, T, l)
     and the three entries of the mask. With several groups, each group has a separate block of
     layers, with the group's own D, M and hidden layers. A block may have another block as its base,
-    as a finger has the wrist. It then has the inputs of both, and its decoder reads both parts of
-    z.
+    as a finger has the wrist. The block then has the inputs of both, and its decoder reads both
+    parts of z.
     """
 
     mean: Tensor

@@ -27,10 +27,12 @@ POLYNOMIALS = (
     (2.8769, -3.1427, 1.2046),
     (2.8366, -3.0525, 1.2012),
 )
-# Use an eigendecomposition for matrices whose smaller side is longer than this. At 413 × 827, as in
-# a hand of 23 joints, it takes half the time of the polynomials; at 163 × 327, as long as they do.
+# Use an eigendecomposition for matrices whose smaller side is longer than this. The
+# eigendecomposition takes half the time of the polynomials at 413 × 827, as in a hand of 23 joints,
+# and as long as they do at 163 × 327.
 LARGE = 256
-#: raise eigenvalues to at least this multiple of the largest; float32 does not resolve smaller ones
+#: raise eigenvalues to at least this multiple of the largest one, because float32 does not resolve
+#: smaller eigenvalues
 LEAST_EIGENVALUE = 1e-7
 #: train the weight matrices by Muon with this multiple of the step size of Adam for the biases
 MATRIX_RATIO = 12.5

@@ -20,8 +20,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, State
 
 #: Assume at least this standard deviation of a residual in scaled units: 0.02 N or 0.01 mm, which
-#: no sensor resolves. It keeps the covariance invertible if a network reconstructs some combination
-#: of its inputs perfectly.
+#: no sensor resolves. This floor keeps the covariance invertible if a network reconstructs some
+#: combination of its inputs perfectly.
 FLOOR = 1e-4
 #: give the residuals of an ignored muscle this standard deviation in scaled units, which is 2000 N
 #: or 1 m, so that they do not matter
@@ -36,7 +36,7 @@ def residuals(
     """Return the residuals e in scaled units, (..., 2M), which are 0 for isolated muscles.
 
     Args:
-        restored: States that the network restored from the measured T and l.
+        restored: States that the network reconstructed from the measured T and l.
         tension: Measured T [N], (..., M).
         length: Measured l [m], (..., M).
         isolated: Indices of isolated muscles.
@@ -105,7 +105,7 @@ class AnomalyStatistics:
 
 @dataclass(frozen=True, eq=False)
 class TouchStatistics:
-    """Statistics that distinguish contact from friction (`estimation/contact.py`)."""
+    """Tendon friction and residual torque, by which contact is detected."""
 
     friction: Array  # tendon friction μ of each muscle, (M,): T = T_end e^{±μ}
     #: root mean square of the estimated τ_ext of the healthy moving arm [N·m], (D,); positive

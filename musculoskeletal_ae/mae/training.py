@@ -125,7 +125,7 @@ class TrainedNetwork(NamedTuple):
 
 # -- errors ------------------------------------------------------------------------------------
 
-#: report the errors of each output in this unit, with this factor from SI units
+#: name of each output, unit in which its errors are reported, and factor from SI units to this unit
 OUTPUTS = (('theta', 'rad', 1.0), ('tension', 'N', 1.0), ('length', 'mm', 1e3))
 
 
@@ -142,7 +142,7 @@ class PairError(NamedTuple):
 def pair_errors(mae: Mae, states: State) -> list[PairError]:
     """Return the mean errors over N states, for all nine pairs of mask and output.
 
-    The states are true; the network reconstructs each from the two quantities that a mask selects.
+    The network reconstructs each of the true `states` from the two quantities that a mask selects.
     """
     result = []
     for mask in Mask:

@@ -39,23 +39,23 @@ SILENCE = 1.0
 #: treat the state of a running arm as unknown after a gap between two messages that is longer than
 #: this [s]: the controller pauses (`max_age`), and the detectors discard their evidence
 INTERRUPTION = 0.2
-#: let at most this much time between two messages or steps advance detectors, commands and emulated
-#: arms [s]; after a longer pause, they do not catch up
+#: advance detectors, commands and emulated arms by at most this time between two messages or steps
+#: [s]; after a longer pause, they do not catch up
 LONGEST_STEP = 0.1
-#: skip a message that follows the last used one sooner than this, where about 100 messages a second
-#: suffice [s]: detectors and learning are tuned at 100 Hz, and more messages would take most of the
-#: processor time of the nodes of a fast arm
+#: where about 100 messages a second suffice, skip a message that follows the last used one sooner
+#: than this [s]: detectors and learning are tuned at 100 Hz, and more messages would take most of
+#: the processor time of the nodes of a fast arm
 SPACING = 0.006
-#: treat requests as one stream if no two are further apart than this [s]; it exceeds SILENCE,
-#: because `ros2 topic pub` sends one message a second
+#: treat requests as one stream if each follows the one before within this time [s]: `ros2 topic
+#: pub` sends one message a second
 STREAM_GAP = 1.5
-#: attribute a time of sending that lies further back than this to another clock, or to one that was
-#: set back, and not to reordering [ns]
+#: if a message was sent earlier than the message before by more than this [ns], assume another
+#: clock or a clock that was set back, not reordering
 REORDERING = 1_000_000_000
 #: let the minimum of r − s rise at this rate, because clocks drift by up to 1e-4, and NTP slews
 #: them by up to 5e-4
 DRIFT = 1e-3
-#: report no longer delay than this [s]: a node that makes no progress for this time ends
+#: limit the reported delay to this [s]: a node that makes no progress for this time ends
 #: (`ros/hang_detection.py`)
 LONGEST_DELAY = 10.0
 
@@ -91,7 +91,7 @@ def nanoseconds(stamp: Any) -> int:
 
 
 class Arrival:
-    """The arrival of the messages of one topic. `now` is a time of a steady clock [s].
+    """The arrival of the messages of one topic. `now` is a time on a steady clock [s].
 
     Attributes:
         received_at: Time of reception of the newest message [s].

@@ -21,8 +21,8 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.joint_units import JointUnits
 
-#: reject a message with more entries in an array, or a trajectory with more joints × points; no arm
-#: needs nearly as many
+#: reject a message with more entries than this in an array, or a trajectory with more joints ×
+#: points; no arm needs nearly as many
 MOST_ENTRIES = 10_000
 #: reject a wrench whose force [N] or torque [N·m] exceeds this along any axis
 MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)
@@ -30,11 +30,11 @@ MOST_WRENCH = np.array([1000.0] * 3 + [30.0] * 3)
 MOST_TWIST = np.array([5.0] * 3 + [20.0] * 3)
 #: reject accelerometer readings outside this range [m/s²]; a sensor at rest measures 9.81
 LEAST_GRAVITY, MOST_GRAVITY = 3.0, 30.0
-#: reject a trajectory with a higher velocity at its end [rad/s], because the arm holds its last
-#: point
+#: reject a trajectory that ends with a higher velocity than this [rad/s], because the arm holds its
+#: last point
 LAST_VELOCITY = 1e-6
-MOST_EFFORT = 1000.0  # reject a request for a higher torque or force of one joint [N·m or N]
-UNIT_TOLERANCE = 0.01  # reject a quaternion whose norm deviates further from 1
+MOST_EFFORT = 1000.0  # reject a request for more torque or force at one joint than this [N·m or N]
+UNIT_TOLERANCE = 0.01  # reject a quaternion whose norm differs from 1 by more than this
 
 
 def read_array(message: Any, rows: int, columns: int, owner: str = 'muscle') -> Array:
@@ -186,7 +186,7 @@ def read_names(message: Any) -> list[str]:
 def read_imu(message: Any, links: Sequence[str], prefix: str = '') -> tuple[str, Array]:
     """Return the link that carries an IMU, and the acceleration [m/s²], (3,), of an Imu message.
 
-    The frame of the message names the link, after `prefix`.
+    The frame of the message is the name of the link, which may follow `prefix`.
     """
     link, vector = message.header.frame_id.removeprefix(prefix), message.linear_acceleration
     if link not in links:

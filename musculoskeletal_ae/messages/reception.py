@@ -11,7 +11,7 @@ from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.messages.arrival import Arrival
 
-LONGEST_TEXT = 500
+LONGEST_TEXT = 500  # cut the text of a refusal or rejection after this many characters
 SHOWN = 10.0  # report a refusal or an internal error for this time after it happened [s]
 
 
@@ -92,7 +92,7 @@ class Reception:
     def reject(self, source: str, reason: str, detail: str) -> bool:
         """Count a rejected message or request; return whether it is the first for this reason.
 
-        `source` names the topic or service, and `detail` describes this case in the message.
+        `source` names the topic or service, and `detail` describes this case for users.
         """
         self.last_rejected = f'{source}: {detail}'[:LONGEST_TEXT]
         self.rejected[f'{source}: {reason}'] += 1

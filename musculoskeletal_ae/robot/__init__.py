@@ -3,5 +3,5 @@
 
 `description` reads the directory. `robot` builds the model from it: `kinematics` (poses, gravity),
 `routes` (muscle lengths and G), `series_elastic` and `stiffness`. `tension` solves for muscle
-tensions. `design/` tests whether the arm can be held.
+tensions. `design/` tests whether the muscles can hold the arm.
 """

@@ -45,8 +45,8 @@ SHARE = 0.7
 AHEAD = 0.04
 #: correct this fraction of the tension error by one length command to a position-controlled module
 ADMITTANCE = 0.5
-#: let a position-controlled module wind in again at this speed beyond a length at which its tension
-#: exceeded T_limit [m/s]
+#: after the tension of a position-controlled module exceeded T_limit, let its shortest permitted
+#: length command decrease at this speed [m/s]
 RECOVERY = 0.01
 DEPTH = 0.015  # wind a suspect muscle under stiffness control in by at most this [m]
 
@@ -91,7 +91,7 @@ class Actuation(ABC):
         return np.maximum(self._whole.bias, DESIRED_SHARE * self._whole.limit)
 
     def known_tension(self, measured: Array) -> Array:
-        """Return measured tensions [N], (..., M), or the assumed ones if none are measured."""
+        """Return measured tensions [N], (..., M), or assumed tensions if none are measured."""
         if self.knows_tension:
             return measured
         return np.full_like(measured, self.assumed_tension)
@@ -225,7 +225,7 @@ class Actuation(ABC):
 
     @abstractmethod
     def usable_lead(self, lead: Array | float) -> Array | float:
-        """Return how much further than `depth` a command may run ahead of a lagging module [m].
+        """Return by how much a command to a lagging module may exceed `depth` [m].
 
         Args:
             lead: Lag of each module behind its command while it winds in [m], scalar or (M,).
@@ -316,7 +316,7 @@ class StiffnessControl(Actuation):
         return demand
 
     def tension_per_length(self, tension: Array) -> Array:  # noqa: ARG002
-        """Return the gain K of each module [N/m], (M,), which does not depend on the tension."""
+        """Return the control stiffness K_stiff of each module [N/m], (M,), at any tension."""
         return self._stiffness
 
     def length_for(self, length: Array, tension: Array, wanted: Array) -> Array:  # noqa: ARG002
@@ -359,7 +359,7 @@ class StiffnessControl(Actuation):
         return tension
 
     def depth(self, tension: Array, rate: Array, limit: Array) -> Array:  # noqa: ARG002
-        """Return how far [m] a command that demands the tensions `limit` lies below l, (M,)."""
+        """Return by how much [m] a command is shorter than l if it demands `limit`, (M,)."""
         return self.largest_depth(limit)
 
     def largest_depth(self, limit: Array) -> Array:

@@ -48,8 +48,8 @@ Fail = Callable[[str], RobotDescriptionError]
 #: URDF's types of joints that are neither revolute nor prismatic, by degrees of freedom
 OTHER_JOINTS = {1: 'continuous', 3: 'planar', 6: 'floating'}
 
-#: refuse a stiffness matrix with a lower eigenvalue, relative to the largest one; rounding may make
-#: an eigenvalue slightly negative
+#: refuse a stiffness matrix with an eigenvalue below this multiple of the largest one; rounding may
+#: make an eigenvalue slightly negative
 LEAST_EIGENVALUE = -1e-9
 
 #: T_bias, T_limit and T_max of a muscle whose entry states none [N]
@@ -65,7 +65,7 @@ NO_TENSION = (
 )
 BY_CURRENT = (
     'tensions are computed from motor currents; scale, offset and drive friction are learned, and '
-    'the tension limits are wrong by as much as these constants until then'
+    'until then their errors make the tension limits equally wrong'
 )
 
 
@@ -91,7 +91,7 @@ class Wrap(NamedTuple):
     #: point on the side where the tendon passes [m]; a point inside the object makes it a ring
     side: Array | None
     side_link: str | None = None  # link in whose frame `side` is; None for `link`
-    swivels: bool = False  # whether it is a pulley that swivels about `axis`
+    swivels: bool = False  # whether the object is a pulley that swivels about `axis`
 
 
 def written(item: RoutePoint | Wrap) -> dict[str, Any]:
@@ -105,7 +105,7 @@ def written(item: RoutePoint | Wrap) -> dict[str, Any]:
     return entry
 
 
-#: route of a tendon: points that are connected by straight lines, or around the wrap between them
+#: route of a tendon: points, connected by straight lines or around the wrap between two points
 Route = tuple[RoutePoint | Wrap, ...]
 
 
@@ -169,7 +169,7 @@ class RobotDescription:
 
     @property
     def held_joints(self) -> tuple[str, ...]:
-        """Movable joints of the URDF that are held fixed, as they are neither in θ nor coupled."""
+        """Movable joints of the URDF that are held fixed: they are neither in θ nor coupled."""
         known = {*self.couplings, *self.joints}
         return tuple(name for name in self.model.names[1:] if name not in known)
 

@@ -28,7 +28,7 @@ class Line(NamedTuple):
     points: Array  # corners of the polyline [m], (N, 3)
     width: float  # width of the line [m]
     colour: tuple[float, ...]  # red, green, blue in [0, 1]
-    name: str = ''  # name of the muscle; only the first branch of its tendon has one
+    name: str = ''  # name of the muscle; '' except for the first branch of its tendon
 
 
 def tension_share(robot: Robot, tension: Array) -> Array:
@@ -91,7 +91,7 @@ def save_picture(lines: Sequence[Line], path: Path, title: str = '', whole: bool
     """Save a picture of lines in true proportions, seen from the front and from the side.
 
     Args:
-        lines: The lines.
+        lines: The lines, as `draw_arm` returns them.
         path: The file of the picture.
         title: Title of the picture; if empty, one that explains the colours.
         whole: Whether to show all lines; if false, the picture shows the region of the muscles.

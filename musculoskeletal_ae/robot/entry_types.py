@@ -5,9 +5,9 @@ from typing import Annotated
 
 from msgspec import Meta
 
-#: refuse a number whose absolute value is larger [SI units], because it is certainly a mistake
+#: refuse a number beyond ± this [SI units], because it is certainly a mistake
 LARGEST = 1e8
-LONGEST_LIST = 1000  # refuse a list of more entries: muscles, points of a route, joints
+LONGEST_LIST = 1000  # refuse a longer list, such as of muscles, route points or joints
 
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Meta(gt=0.0, le=LARGEST)]

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random equilibria of robots whose joints follow springs and too few muscles.
+"""Random equilibria of robots with springs at the joints and fewer muscles than joints.
 
 An underactuated hand has fewer muscles than joints: springs return its fingers, and one tendon may
-bend several joints. The lengths of its muscles do not determine its posture. At rest, however, it
-follows from lengths and tensions, because weight and springs balance the tensions:
+bend several joints. The lengths of its muscles do not determine its posture. At rest, however, the
+posture follows from lengths and tensions, because weight g, springs K θ − b and passive tendons h
+balance the tensions:
 
     g(θ) + K θ − b + h(θ) + G(θ)ᵀ T = 0
 
@@ -16,7 +17,8 @@ constant tensions, or wind like springs of stiffness k between T_bias and T_limi
     T = T_0 + k (l(θ) − l(θ_0))
 
 With constant tensions, an arm settles only where it is stable without the modules, and often at its
-stops. Winding modules also hold it where a tendon would pull itself past an axis.
+stops. Winding modules also hold an arm in postures in which a tendon would pull itself past an
+axis.
 """
 
 from typing import NamedTuple
@@ -28,38 +30,39 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 
 STEPS = 30  # move towards an equilibrium in at most this many steps
-REUSED = 5  # compute the stiffness that tensions cause in every fifth of these steps
+REUSED = 5  # compute the stiffness due to tensions only in every fifth of these steps
 LARGEST_STEP = 0.2  # turn a joint by at most this in one of these steps [rad]
 #: let the stiffness that determines a step be at least this share of the largest one
 LEAST_STIFFNESS = 0.002
-#: use equilibria in which no joint lacks a larger share of the muscles' typical torque
+#: accept an equilibrium if the unbalanced torque of each joint is at most this share of the typical
+#: torque of the muscles at this joint
 BALANCED = 0.01
-#: let this torque of a joint be at least this share of the largest one
+#: treat the typical torque at a joint as at least this share of the largest typical torque at any
+#: joint
 LEAST_TORQUE = 1e-3
 SEARCHED = 200  # search equilibria from this many random postures
-#: wind by this share of the tension near a found equilibrium (standard deviation); θ follows
+#: vary the tensions of a found equilibrium by this share (standard deviation) to get another one
 VARIATION = 0.1
-#: scatter the torques by this share of the muscles' torques (standard deviation), for joint
-#: friction
+#: vary the torques by this share of the muscles' torques (standard deviation), as joint friction
+#: does
 SCATTER = 0.03
 SMALL = 1e-9  # divide torques by at least this [N·m]
 
 
 class Equilibrium(NamedTuple):
-    """N equilibria."""
+    """N equilibria, and how tensions and postures change near them."""
 
-    theta: Array  # θ [rad], (N, D)
-    tension: Array  # T [N], (N, M)
-    jacobian: Array  # G [m/rad], (N, M, D)
-    stiffness: Array  # k of each muscle [N/m]; 0 where the tension is constant, (N, M)
-    by_torque: Array  # ∂θ/∂τ [rad/(N·m)]; 0 at a stop, (N, D, D)
+    theta: Array  # joint angles θ [rad], (N, D)
+    tension: Array  # tensions T [N], (N, M)
+    jacobian: Array  # muscle Jacobian G [m/rad], (N, M, D)
+    stiffness: Array  # stiffness k of each muscle [N/m]; 0 at constant tension, (N, M)
+    by_torque: Array  # change of θ per torque, ∂θ/∂τ [rad/(N·m)]; 0 at a stop, (N, D, D)
 
 
 def has_followers(robot: Robot) -> bool:
-    """Return whether springs and too few muscles move some group of joints.
+    """Return whether a group of joints has fewer muscles than joints, and a spring at one of them.
 
-    The group has fewer muscles than joints, and a spring at one of them. Without measured tensions,
-    no equilibrium can be told from another, so the result is false.
+    Without measured tensions, no equilibrium can be told from another, so the result is false.
     """
     if not robot.tension_source.is_known:
         return False
@@ -87,7 +90,7 @@ def equilibrium_states(
     Returns:
         The equilibria; None if none was found.
     """
-    # Most arms have no followers, so nodes that solve no other quadratic programme need no solver.
+    # Imported here, because most arms have no followers, and their nodes then load no solver.
     from musculoskeletal_ae.robot.tension import least_tension
 
     theta, limits = robot.random_postures(searched, rng), robot.tension
@@ -157,20 +160,20 @@ def settled_states(
 class _Law(NamedTuple):
     """How the tensions of N states depend on the lengths."""
 
-    tension: Array  # T_0 [N], (N, M)
-    length: Array  # l(θ_0) [m], (N, M)
-    stiffness: Array  # k [N/m], (N, M)
+    tension: Array  # tensions T_0 at the start [N], (N, M)
+    length: Array  # lengths l(θ_0) at the start [m], (N, M)
+    stiffness: Array  # stiffness k of each muscle [N/m], (N, M)
 
 
 class _Linearised(NamedTuple):
     """Equations linearised at N postures, from which the next step is computed."""
 
-    tension: Array  # T [N], (N, M)
-    jacobian: Array  # G [m/rad], (N, M, D)
-    stiffness: Array  # ∂T/∂l [N/m], (N, M)
-    bend: Array  # Σ T ∂²l/∂θ² [N·m/rad], (N, D, D)
-    by_torque: Array  # ∂θ/∂τ [rad/(N·m)]; 0 at a stop, (N, D, D)
-    is_stable: Bools  # (N,)
+    tension: Array  # tensions T [N], (N, M)
+    jacobian: Array  # muscle Jacobian G [m/rad], (N, M, D)
+    stiffness: Array  # derivative ∂T/∂l [N/m], (N, M)
+    bend: Array  # stiffness due to tensions, Σ T ∂²l/∂θ² [N·m/rad], (N, D, D)
+    by_torque: Array  # change of θ per torque, ∂θ/∂τ [rad/(N·m)]; 0 at a stop, (N, D, D)
+    is_stable: Bools  # whether each posture is stable, (N,)
 
 
 def _linearised(

@@ -67,9 +67,9 @@ def groups(crossed: Bools) -> tuple[Group, ...]:
 def parts(crossed: Bools, group: Group) -> tuple[Group, ...]:
     """Divide a group into a shared part and parts that depend on it, but not on each other.
 
-    The joints of the shared part are as few as possible of those that most muscles cross, such as
-    the wrist of a hand, so that no other part has more than half of the joints. Its muscles cross
-    none of the other joints.
+    The shared part has as few as possible of the joints that most muscles cross, such as the wrist
+    of a hand. No other part may have more than half of the joints. The muscles of the shared part
+    cross none of the other joints.
 
     Args:
         crossed: Whether each muscle of the body crosses each joint, (M, D).

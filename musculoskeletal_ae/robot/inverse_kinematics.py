@@ -4,8 +4,9 @@
     θ = IK(P_marker, θ_initial = θ_est):  min_θ ‖p(θ) − p‖²/σ_p² + ‖log(R(θ)ᵀ R)‖²/σ_R²
 
 (paper, §II-A) within the joint limits. p and R are the measured position and orientation of the end
-effector, p(θ) and R(θ) those at the joint angles θ, and σ_p and σ_R the standard deviations of the
-measurement. The sum is minimised by damped Gauss–Newton (`gauss_newton`) with pinocchio's Jacobian.
+effector, with the standard deviations σ_p and σ_R. p(θ) and R(θ) are its position and orientation
+at the joint angles θ. The sum is minimised by damped Gauss–Newton (`gauss_newton`) with pinocchio's
+Jacobian.
 
 Near a singular posture the pose determines some joints poorly, and camera noise would move them
 arbitrarily. Every step is therefore damped, and the search ends with the step that reduces the sum
@@ -22,9 +23,10 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.gauss_newton import minimise_each
 from musculoskeletal_ae.robot.robot import Robot
 
-#: by default, expect a typical camera to measure a marker with σ_p [m] and σ_R [rad], (6,)
+#: by default, expect these standard deviations σ_p [m] and σ_R [rad] of a marker's pose, as of a
+#: typical camera, (6,)
 SPREADS = np.repeat([0.002, 0.01], 3)
-#: the same with so large a σ_R that any orientation is accepted
+#: like SPREADS, but with σ_R so large that any orientation is accepted
 POSITION_ONLY = np.repeat([0.002, 100.0], 3)
 ROUNDS = 30  # end the search after this many steps
 #: damp each step by this prior standard deviation, so that joints that the pose does not determine
@@ -38,7 +40,7 @@ class Posture(NamedTuple):
 
     theta: Array  # joint angles θ of the solution [rad], (D,)
     distance: float  # distance of the end effector from the pose [m]
-    angle: float  # angle between its orientation and that of the pose [rad]
+    angle: float  # angle between the orientations of end effector and pose [rad]
     #: θ, with NaN for joints that do not move the end effector and therefore remain unknown, (D,)
     observed_theta: Array
 

@@ -36,7 +36,7 @@ class JointElasticity:
     tendons: PassiveTendons = field(default_factory=lambda: PassiveTendons.none(0))
 
     def __post_init__(self) -> None:
-        """Give an elasticity without passive tendons arrays of the right size."""
+        """If there are no passive tendons, set empty ones for the right number of joints."""
         if not self.tendons:
             object.__setattr__(self, 'tendons', PassiveTendons.none(len(self.preload)))
 
@@ -59,13 +59,13 @@ class JointElasticity:
 
     @cached_property
     def typical_stiffness(self) -> Array:
-        """Stiffness of each joint [N·m/rad], (D,), with the passive tendons as at their centre."""
+        """Stiffness of each joint [N·m/rad], (D,), with that of passive tendons at their centre."""
         stiffness: Array = np.diag(self.stiffness) + self.tendons.typical_stiffness
         return stiffness
 
     @property
     def rest(self) -> Array:
-        """Posture in which no spring of K exerts torque [rad], (D,); 0 for joints without one."""
+        """Posture in which no spring of K exerts torque [rad], (D,); 0 for unsprung joints."""
         rest: Array = np.linalg.pinv(self.stiffness, hermitian=True) @ self.preload
         return rest
 

@@ -42,8 +42,8 @@ class JointPoses(NamedTuple):
     axis: Array  # joint axes, (N, J, 3); zero at index 0
 
 
-#: refuse a coupling whose polynomial has more coefficients; two chained couplings of degree 4 have
-#: degree 16
+#: refuse a coupling whose polynomial has more coefficients than this; two chained couplings of
+#: degree 4 have degree 16
 MOST_TERMS = 17
 
 

@@ -3,8 +3,8 @@
 
 The core knows one kind of joint. All entries of θ are in [rad], all joint torques in [N·m]. A
 prismatic joint is treated as if a pinion of radius RACK moved it: θ is the angle of the pinion. In
-files, messages and texts, its position is in [m], its torque is a force in [N]. With r = RACK for
-prismatic joints and r = 1 for revolute ones,
+files, messages and texts, its position is in [m], and its torque is a force in [N]. With r = RACK
+for prismatic joints and r = 1 for revolute ones,
 
     position = r θ,   effort = τ / r,   stiffness outside = K / r²
 

@@ -40,7 +40,7 @@ def reduced(model: pin.Model, locked: Sequence[int], at: Array) -> pin.Model:
     Args:
         model: The model, which is not changed.
         locked: Indices of the joints to fix.
-        at: Positions of all joints, at which these joints are fixed.
+        at: Positions of all joints; those in `locked` are fixed at theirs.
     """
     named, names = model.copy(), dict[str, str]()
     for i, frame in enumerate(named.frames):

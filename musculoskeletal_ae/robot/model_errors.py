@@ -21,13 +21,13 @@ ELASTIC = 0.2  # assume this standard deviation of an elongation, relative to th
 #: assume this standard deviation of a length, because tendons do not run straight between route
 #: points [m]
 SMOOTH = 0.003
-#: multiply the standard deviation by this, because tendons make detours around bones: lengths of
-#: four emulated arms with small detours (`kin`) differ from the model as expected without this
-#: factor, those of four arms with larger detours (`foreign`) by 1.4 to 2.1 times as much
+#: Multiply the standard deviation by this, because tendons make detours around bones. Without this
+#: factor, lengths of four emulated arms with small detours (`kin`) differ from the model as
+#: expected, and those of four arms with larger detours (`foreign`) by 1.4 to 2.1 times as much.
 SHAPE_FACTOR = 1.7
-#: treat a larger difference between a measured length and the geometric model as a fault [m];
-#: healthy lengths of the emulated individuals 0 to 9 of arm26 and musashi_left_arm differ by up to
-#: 42 mm (notes/removed_benches.md)
+#: treat a difference between a measured length and the geometric model as a fault if it is larger
+#: than this [m]; healthy lengths of the emulated individuals 0 to 9 of arm26 and musashi_left_arm
+#: differ by up to 42 mm (notes/removed_benches.md)
 LARGEST = 0.045
 
 

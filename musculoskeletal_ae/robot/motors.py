@@ -35,10 +35,10 @@ Radius = Annotated[float, Meta(ge=1e-4, le=10.0)]
 
 
 class MotorTopics(NamedTuple):
-    """Topics of a ros2_control robot. The defaults stand for a robot that has none of them."""
+    """Topics of a ros2_control robot. The defaults stand for a robot without motor topics."""
 
     states: str = ''  # topic of the JointState messages that contain the motors
-    commands: str = ''  # positions that the motors should reach; '' to command no motor
+    commands: str = ''  # topic of the commanded positions; '' to command no motor
 
 
 NO_MOTORS = MotorTopics()  # topics of a robot that publishes muscle_states
@@ -57,7 +57,7 @@ class Constants(Strict, frozen=True):
     effort_zero: Number | UnsetType = UNSET  # effort of the motor at which T is 0
 
     def __post_init__(self) -> None:
-        """Check the values that may have either sign, but not every size."""
+        """Check that the direction is 1 or −1, and that the tension per effort is not 0."""
         if self.direction not in (UNSET, 1.0, -1.0):
             raise ValueError(f'direction: expected 1 or -1, got {self.direction:g}')
         if self.tension_per_effort == 0.0:
@@ -92,7 +92,7 @@ class MotorFile(Constants, frozen=True, kw_only=True):
         super().__post_init__()
         for key, name in (('state_topic', self.state_topic), ('command_topic', self.command_topic)):
             if name is not None and not TOPIC_NAME.fullmatch(name):
-                legal = 'words of letters, digits and _ that are joined by /, as in joint_states'
+                legal = 'words of letters, digits and _, joined by /, as in arm/joint_states'
                 raise ValueError(f'{key}: {name!r} is no name of a topic; legal: {legal}')
 
 
@@ -112,7 +112,7 @@ class Motors:
 
 
 def motor_topics(robot: str | Path) -> MotorTopics:
-    """Return the topics of the motors of a robot: a shipped name, or a directory.
+    """Return the motor topics of a robot, which is a shipped name or a directory.
 
     Raises:
         RobotDescriptionError: If the robot is unknown, or its motors.yaml is invalid.

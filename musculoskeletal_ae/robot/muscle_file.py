@@ -27,8 +27,8 @@ from musculoskeletal_ae.robot.joint_tree import MOST_TERMS
 from musculoskeletal_ae.schema import Strict
 
 STIFFNESS, POSITION = 'stiffness', 'position'  # values of `actuation`
-MOST_POWER = 12  # refuse a larger power of an angle in the length of a passive tendon
-SHORTEST_AXIS = 1e-6  # refuse a shorter vector as an axis, because it defines no direction
+MOST_POWER = 12  # refuse a higher power than this in the length of a passive tendon
+SHORTEST_AXIS = 1e-6  # refuse an axis shorter than this, because it defines no direction
 
 
 class ElasticEntry(Strict, frozen=True):
@@ -97,7 +97,7 @@ class RouteEntry(Strict, frozen=True):
         axis = np.array(self.axis)
         length = float(np.linalg.norm(axis))
         if length < SHORTEST_AXIS:
-            legal = f'a vector of at least the length {SHORTEST_AXIS:g}'
+            legal = f'a vector with a length of at least {SHORTEST_AXIS:g}'
             raise ValueError(f'axis: expected {legal}, got {list(self.axis)}')
         if self.wrap == 'pulley' and self.side is not None:
             raise ValueError(
@@ -107,7 +107,7 @@ class RouteEntry(Strict, frozen=True):
             out = np.array(self.side) - np.array(self.xyz)
             beside = np.linalg.norm(np.cross(axis / length, out))
             if beside < 1e-9 and np.linalg.norm(out) >= self.radius:
-                raise ValueError('side: expected a point beside the axis, got one on it')
+                raise ValueError('side: expected a point beside the axis, got a point on the axis')
 
 
 class MuscleEntry(Strict, frozen=True):
@@ -180,14 +180,15 @@ class PassiveTendonEntry(Strict, frozen=True):
     joints: Names
     #: joint positions from which the polynomial of the length counts [rad or m]
     centre: Annotated[tuple[Number, ...], Meta(max_length=LONGEST_LIST)]
-    #: terms of its length [m]: the coefficient, and the power of each joint's distance to `centre`
+    #: terms of its length [m]: a coefficient each, and for each joint the power of its distance
+    #: from `centre`
     length: Annotated[
         tuple[Annotated[tuple[Number, ...], Meta(max_length=LONGEST_LIST)], ...],
         Meta(min_length=1, max_length=LONGEST_LIST),
     ]
 
     def __post_init__(self) -> None:
-        """Check that the parts of the entry have the same number of joints."""
+        """Check that all parts have the same number of joints, and check `slack` and the powers."""
         count = len(self.joints)
         if len(self.centre) != count:
             raise ValueError(f'centre: expected {count} numbers, got {len(self.centre)}')

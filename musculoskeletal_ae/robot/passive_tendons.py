@@ -32,7 +32,7 @@ class Passive(NamedTuple):
     power: Ints  # powers p of all R terms, (R, D)
     coefficient: Array  # factor c of each term [m/rad^p], (R,)
     first: Ints  # index of the first term of each tendon, then R, (T+1,)
-    law: Array  # k [N/m], x_low and x_high [m] of each tendon, (T, 3)
+    law: Array  # spring constant k [N/m], x_low and x_high [m] of each tendon, (T, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,7 @@ class PassiveTendons:
         theta = np.asarray(theta, dtype=float)
         rows = np.ascontiguousarray(theta.reshape(-1, theta.shape[-1]))
         torque, gradient = np.zeros(rows.shape), np.zeros((*rows.shape, rows.shape[1]))
-        # numba is a slow import, which help texts do not need
+        # Imported here, because help texts should not wait for the slow import of numba.
         from musculoskeletal_ae.robot.passive_torque import hold_postures
 
         hold_postures(self.arrays, rows, torque, gradient)
@@ -93,8 +93,9 @@ class PassiveTendons:
         """Return tendons that deviate like the springs of their joints.
 
         Args:
-            factor: Factor of the stiffness at each joint, (D,); the mean over its joints counts.
-            shift: Displacement of the postures with the same lengths [rad], (D,).
+            factor: Factor of the stiffness at each joint, (D,); a tendon uses the mean over its
+                joints.
+            shift: Displacement of the posture in which a tendon has the same length [rad], (D,).
         """
         spanned, law = self.spanned, self.arrays.law.copy()
         law[:, 0] *= (spanned @ factor) / np.maximum(spanned.sum(axis=1), 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Computes, in compiled code, what holds joints against passive tendons (`passive_tendons.py`)."""
+"""Computes, in compiled code, torques that hold joints against passive tendons."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @njit(cache=True)
 def monomial(passive: Passive, term: int, theta: Array, a: int, b: int) -> float:
-    """Return a term of a length at θ (D,), differentiated by θ_a and θ_b; −1 stands for neither."""
+    """Return a term of a length at θ (D,), differentiated by θ_a and θ_b unless these are −1."""
     value = passive.coefficient[term]
     for j in range(len(theta)):
         power, order = passive.power[term, j], int(j == a) + int(j == b)
@@ -30,9 +30,10 @@ def monomial(passive: Passive, term: int, theta: Array, a: int, b: int) -> float
 
 @njit(cache=True)
 def add_passive(passive: Passive, theta: Array, torque: Array, gradient: Array) -> None:
-    """Add what holds joints at θ (D,) against passive tendons to `torque` [N·m] and `gradient`.
+    """Add the torques that hold joints at θ (D,) against passive tendons to `torque` [N·m].
 
-    `gradient` [N·m/rad] (D, D) is the derivative of `torque` (D,) with respect to θ.
+    Add their derivatives with respect to θ to `gradient` [N·m/rad], (D, D). `torque` has the shape
+    (D,).
     """
     joints = len(theta)
     slope = np.empty(joints)

@@ -108,8 +108,8 @@ class Robot:
     def elongation(self, tension: Array) -> Array:
         """Return the elongation of series elastic elements and tendons [m], (M,).
 
-        The stretch of the tendons is that of their lengths at θ = 0. `tension` are the tensions
-        [N], (M,).
+        The stretch of the tendons is computed for their lengths at θ = 0. `tension` are the
+        tensions [N], (M,).
         """
         return self.series_elastic.elongation(self.routes.length_at_zero, tension)
 
@@ -152,7 +152,7 @@ class Robot:
         return changed
 
     def with_moved_points(self, shifts: Iterable[Array]) -> Robot:
-        """Return a copy whose route points are moved, as `with_routes` does.
+        """Return a copy whose route points are moved; see `with_routes`.
 
         Args:
             shifts: Displacement of each point in the frame of its link [m], (3,), muscle by muscle.
@@ -200,10 +200,10 @@ class Robot:
         return relative - self.series_elastic.elongation(absolute, tension)
 
     def joint_load(self, torque: Array, jacobian: Array) -> Array:
-        """Return an upper limit of the load of each joint in N postures [N·m], (D,).
+        """Return an upper bound of the load of each joint in N postures [N·m], (D,).
 
         The load of a joint is the magnitude of its holding torque, plus the magnitudes of the
-        torques that the muscles exert on it at T_bias. The limit is the sum of the largest values
+        torques that the muscles exert on it at T_bias. The bound is the sum of the largest values
         that these two parts have in any posture.
 
         Args:

@@ -10,8 +10,8 @@ with the points p_i, and f_geo the same relative to θ = 0. If joint k turns abo
 through the point o_k, a point p of the route moves by ∂p/∂θ_k = a_k × (p − o_k). For a straight
 segment, G is the difference of the motions of its two end points, projected onto the line between
 them. For a segment that may wrap around a sphere or cylinder (`wrapping`), G is the motion of the
-end points relative to that object's link, projected onto the directions in which the tendon leaves
-them.
+end points relative to the link of that object. This motion is projected onto the directions in
+which the tendon leaves the end points.
 
 A tendon may have several branches, joined by pulleys. The length of each branch counts 1/divisor,
 and the branch carries 1/divisor of the tension.

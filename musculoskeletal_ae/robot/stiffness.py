@@ -3,9 +3,10 @@
 
     K_θ = Gᵀ diag(k) G + Σ_i T_i ∂²l_i/∂θ²,    k = (1/K_stiff + ∂L_e/∂T)⁻¹
 
-K_θ is the joint stiffness, k the stiffness of each muscle with the control stiffness K_stiff and
-the elongation L_e of its elastic element, T_i the tension and l_i the length of muscle i, and
-G = ∂l/∂θ. `check_robot` takes G and L_e from the geometric model, the controller from the network.
+K_θ is the joint stiffness, and G = ∂l/∂θ. k is the stiffness of each muscle, with the control
+stiffness K_stiff and the elongation L_e of its elastic element. T_i is the tension and l_i the
+length of muscle i. `check_robot` takes G and L_e from the geometric model, the controller from the
+network.
 
 A muscle that MSC holds at T_bias does not resist shortening. The one-sided stiffness therefore
 counts such a muscle as slack, with k = 0. For position-controlled modules, K_stiff is infinite. The
@@ -19,8 +20,8 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 
-#: treat a smaller ∂L_e/∂T of an elastic element and its tendon as this [m/N], to avoid a division
-#: by zero
+#: assume at least this ∂L_e/∂T of an elastic element and its tendon [m/N], to avoid a division by
+#: zero
 LEAST_COMPLIANCE = 1e-7
 
 

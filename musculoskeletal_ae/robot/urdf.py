@@ -3,7 +3,7 @@
 
 The URDF parser silently ignores elements that it does not know, so the file is checked here first.
 The parser only warns about a missing or malformed mass or inertia, and continues with a massless
-link. If a file still contains xacro macros, it ignores the macros and reads the rest.
+link. If a file still contains xacro macros, the parser ignores the macros and reads the rest.
 """
 
 import math
@@ -18,18 +18,18 @@ import pinocchio as pin
 from musculoskeletal_ae.exceptions import RobotDescriptionError, printable
 from musculoskeletal_ae.robot.joint_tree import Coupling
 
-#: refuse a file with more links and joints; recursive parsers overflow their stack at thousands of
-#: links
+#: refuse a file with more links and joints than this; recursive parsers overflow their stack at
+#: thousands of links
 MOST_PARTS = 2000
-#: refuse elements that are nested more deeply; the parser that MuJoCo and pinocchio use has the
-#: same limit
+#: refuse elements that are nested more deeply than this; the parser that MuJoCo and pinocchio use
+#: has the same limit
 DEEPEST = 500
 #: elements below <robot> that xacro understands only with its prefix
 PREPROCESSED = 'include', 'macro', 'property'
 #: namespace of the elements of xacro, a preprocessor of URDFs
 XACRO = 'http://www.ros.org/wiki/xacro'
 EXPAND = 'expand it to a new file first:  xacro FILE > NEW.urdf'
-#: refuse any number of a larger absolute value, except efforts and velocities [SI units]
+#: refuse any number beyond ± this, except efforts and velocities [SI units]
 LARGEST = 1e6
 
 LIMITED = 'revolute', 'prismatic'  # types of joints that need limits
@@ -152,7 +152,7 @@ def _preprocessor_parts(root: ET.Element) -> Iterator[tuple[str, str]]:
 
 
 def _limit_mimics(parts: list[ET.Element]) -> bool:
-    """Turn continuous joints with <mimic> into limited revolute ones; return whether there are any.
+    """Turn continuous joints with <mimic> into limited revolute joints; return whether any exist.
 
     Pinocchio represents a continuous joint by two coordinates, which cannot follow the single
     coordinate of the mimicked joint. A revolute joint must have limits. It gets limits so wide that
@@ -175,8 +175,8 @@ def _limit_mimics(parts: list[ET.Element]) -> bool:
 def _check_tree(file: Path, parts: list[ET.Element]) -> None:
     """Check that links and joints form a tree.
 
-    Pinocchio's parser would only report them on stderr, or leave them out. If several joints have
-    the same child, it would use the last one.
+    If they do not, pinocchio's parser would only print a message on stderr, or leave parts out. If
+    several joints have the same child, it would use the last one.
     """
     links = {part.get('name', '') for part in parts if part.tag == 'link'}
     for (tag, name), count in Counter((part.tag, part.get('name')) for part in parts).items():
@@ -259,8 +259,9 @@ def _check(part: str, element: ET.Element) -> None:
             child = element.find(tag)
             present = set() if child is None else set(child.keys())
             if missing := NUMBERS[tag].keys() - present:
-                expected = f'{", ".join(sorted(missing))}; remove <inertial> of a link without mass'
-                raise RobotDescriptionError(f'{part}: {tag}: expected {expected}')
+                expected = f'expected {", ".join(sorted(missing))}'
+                remedy = 'or remove <inertial> if the link has no mass'
+                raise RobotDescriptionError(f'{part}: {tag}: {expected}, {remedy}')
     if element.tag == 'inertia':
         names = [['ixx', 'ixy', 'ixz'], ['ixy', 'iyy', 'iyz'], ['ixz', 'iyz', 'izz']]
         inertia = [[float(element.get(name, 0.0)) for name in row] for row in names]

@@ -42,7 +42,7 @@ from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.kinematics import Kinematics
 
 TINY = 1e-12  # divide by at least this, and count a smaller distance as zero
-#: count a point as outside if it is less than this beneath the surface, relative to the radius
+#: count a point as outside if it lies beneath the surface by less than this share of the radius
 RIM = 1e-6
 Vector = tuple[float, float, float] | Array
 
@@ -381,7 +381,8 @@ def arc_points(
     axis, centre = rotation[j] @ objects.axis[s], translation[j] + rotation[j] @ objects.centre[s]
     across = np.eye(3) - np.outer(axis, axis)
     ahead, speed = across @ leave, float(np.linalg.norm(across @ leave))
-    # The straight parts end where they are nearest to the axis, or to the centre of a sphere.
+    # The straight parts end where they are nearest to the axis of a cylinder, or the centre of a
+    # sphere.
     first, last = ((centre - start) @ ahead / speed**2, (centre - end) @ across @ arrive / speed**2)
     turn = np.linspace(0.0, max(length - first - last, 0.0) * speed / radius, most)[:, None]
     begin = start + first * leave - centre

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The body state: length offsets, isolated muscles and the anomaly as one immutable value.
 
-The estimator owns the body state. It publishes each change as a whole on the latched topic
-`body_state`, with the number of the change. All other nodes use the newest message. It states
-everything that they need, so that they compare it with no other message. Before the first message,
-they assume a healthy body.
+The estimator owns the body state. After each change, it publishes the whole state on the latched
+topic `body_state`, with a number that rises (`generation`). All other nodes use the newest message,
+which contains everything that they need: they combine it with no other message. Before the first
+message, they assume a healthy body.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Trust(IntEnum):
 
 
 class Anomaly(IntEnum):
-    """What has become of the estimator's newest finding (the newest fault that it has detected).
+    """State of the estimator's newest finding, that is, of the newest fault that it has detected.
 
     It is published in `body_state`. A restarted estimator does not know earlier findings, and
     therefore reports NONE. Only ENDED lets an arm that was stopped for a verification move again.
@@ -51,7 +51,7 @@ class Anomaly(IntEnum):
     ENDED = 3  # the anomaly was ended by a verification or by `estimator/reset`
 
 
-#: treat an anomaly as present, so that the arm is stopped, in these stages
+#: treat an anomaly as present in these states, in which the arm is to stop
 PRESENT = frozenset({Anomaly.FOUND, Anomaly.VERIFYING})
 
 
@@ -61,8 +61,8 @@ class LengthOffsets:
 
     Attributes:
         offset: Offset of each length sensor [m], (M,).
-        deviation: Standard deviation of each offset [m], (M,). A revoked offset keeps the one that
-            it had.
+        deviation: Standard deviation of each offset [m], (M,). It does not change when the offset
+            is revoked.
         trust: Value of `Trust` for each offset, (M,).
     """
 
@@ -78,12 +78,12 @@ class LengthOffsets:
 
     @classmethod
     def none(cls, muscle_count: int) -> LengthOffsets:
-        """Return no offsets: all are 0 and exactly known, as those of absolute sensors."""
+        """Return no offsets: all are 0 and exactly known, as with absolute sensors."""
         return cls(np.zeros(muscle_count), np.zeros(muscle_count))
 
     @classmethod
     def unknown(cls, muscle_count: int) -> LengthOffsets:
-        """Return unknown offsets, which nothing has determined; they are 0 until then."""
+        """Return unknown offsets: they are 0 until something determines them."""
         return cls(np.zeros(muscle_count), np.full(muscle_count, UNKNOWN))
 
     def __eq__(self, other: object) -> bool:
@@ -120,7 +120,7 @@ class BodyState:
     Attributes:
         offsets: Length offsets of all muscles.
         isolated: Indices of the isolated muscles, in ascending order.
-        anomaly: What has become of the newest finding.
+        anomaly: State of the newest finding.
         suspect: Index of the muscle that the newest finding names; None before the first finding.
         generation: Number of the state. The estimator raises it with each change, and never uses a
             number again, even after a restart. 0 stands for the assumption that every node starts
@@ -196,7 +196,7 @@ class BodyState:
         """Return the state with another anomaly.
 
         Args:
-            anomaly: What has become of the newest finding.
+            anomaly: State of the newest finding.
             suspect: Index of the muscle that this finding names; None if there is no finding.
         """
         return replace(self, anomaly=anomaly, suspect=suspect)
@@ -230,7 +230,7 @@ def _check(rows: Array) -> None:
         legal = (
             f'offset within ±{MOST_OFFSET:g} m; standard deviation >= 0; trust {values(Trust)}; '
             f'isolated 0 or 1; anomaly {values(Anomaly)}, other than 0 for at most one muscle, and '
-            f'{Anomaly.VERIFYING:d} only for an isolated one; generation a whole number >= 0, the '
-            'same for all muscles'
+            f'{Anomaly.VERIFYING:d} only for an isolated muscle; generation a whole number >= 0, '
+            'the same for all muscles'
         )
         raise MessageError('impossible body state', f'expected {legal}, got {rows.tolist()}')

@@ -24,13 +24,13 @@ REVERSAL = 0.0004  # b: let friction reverse over this sliding distance [m]
 #: likely due to sliding as due to noise
 NOISE = 0.00013
 LATEST = 0.07  # give the newest deviation this weight a in the running mean ē (`FrictionDirection`)
-SPIKE = 0.0002  # clip a length that is further than this outside the range of the last two [m]
+SPIKE = 0.0002  # clip a length to the range of the last two, extended by this on both sides [m]
 #: limit the learned scale error |γ| of a motor current (`Transmission`) to this
 LARGEST_GAIN = 1.5
 #: before anything is learned, expect that scale error γ, offset b/T_limit and friction F/T_limit of
 #: a motor current (`Transmission`) have these standard deviations; the means of γ and b are 0
 DRIVE_SPREAD = 0.2, 0.05, 0.1
-#: before anything is learned, expect this mean of F/T_limit
+#: before anything is learned, expect this mean of the friction ratio F/T_limit
 DRIVE_FRICTION_MEAN = 0.08
 
 

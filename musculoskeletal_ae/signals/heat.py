@@ -13,9 +13,10 @@ c₂ is measured, c₁ is not. While the arm operates, an extended Kalman filter
 the logarithms of κ = k/C₂, τ₁ = R₁C₁ and τ₂ = R₂C₂, and c_a. Process noise lets the constants
 change slowly. The ratio r = R₁/R₂ cannot be estimated (doc/explanation/control_and_safety.md).
 
-If the highest permitted tension of a muscle is held for a certain time, the winding just reaches
-the temperature limit. If κ or τ₂ departs from its first known value by the factor CHANGED, the
-module has changed: its motor drags, its housing is covered, or its tension sensor is faulty.
+The highest permitted tension of a muscle heats the winding just to the temperature limit if it is
+held for HELD or MOMENT seconds. If κ or τ₂ departs from its first known value by the factor
+CHANGED, the module has changed: its motor drags, its housing is covered, or its tension sensor is
+faulty.
 """
 
 import math
@@ -28,8 +29,8 @@ from musculoskeletal_ae.robot.robot import Robot
 HELD = 60.0  # plan no tension that overheats a winding when it is held for this time [s]
 MOMENT = 5.0  # command no tension that overheats a winding when it is held for this time [s]
 EVERY = 1.0  # compute the winding temperatures at this interval, from the means over it [s]
-#: after a longer gap between two messages than this, let the temperatures settle without learning
-#: the thermal constants [s]
+#: after a gap between two messages that is longer than this [s], let the temperatures settle
+#: without learning the thermal constants
 LONGEST = 10.0
 #: If a housing's temperature differs from the estimate by more than this [°C], adopt it without
 #: learning from it: the sensor or another source of heat is the cause, not the motor.
@@ -37,7 +38,7 @@ JUMP = 2.0
 #: expect this standard deviation of the measured housing temperature, averaged over EVERY [°C]
 NOISE = 0.1
 #: assume this ratio r = R₁/R₂ of the thermal resistances from winding to housing and from housing
-#: to air; it is typical of small motors, which vary widely
+#: to air: a typical value of small motors, whose ratios vary widely
 RATIO = 0.4
 #: at first, assume that holding T_limit makes the housing this much warmer than the air [°C]
 RISE = 80.0
@@ -56,16 +57,16 @@ FAR = 2.5
 SLOPE = 1e-4  # compute the numerical derivatives of the filter with this step
 #: compare later thermal constants with those that were learned after this time [s]
 LEARNED = 1200.0
-#: use learned thermal constants as this reference only if the standard deviation of their
-#: logarithms is below this
+#: use learned thermal constants as the reference for later ones only if their logarithms have a
+#: smaller standard deviation than this
 KNOWN = 0.2
-REST_STEP = 30.0  # search for the end of a rest in steps of this [s]
-LONGEST_REST = 3600.0  # end this search here, and report a longer rest as 'more than 60 min' [s]
+REST_STEP = 30.0  # search for the end of a rest in steps of this time [s]
+LONGEST_REST = 3600.0  # search up to this rest [s]; report a longer one as 'more than 60 min'
 CHANGED = 1.5  # report a module once a thermal constant differs from its reference by this factor
 
 
 def flow(state: Array, square: Array, dt: float) -> Array:
-    """Return the state to which the thermal model flows in a time dt of constant tension.
+    """Return the state of the thermal model after a time dt of constant tension.
 
     Args:
         state: The state at the beginning, (6, ...): temperature of the winding minus that of the
@@ -254,7 +255,7 @@ class Heat:
         factor = np.exp(logs - self._reference)
         texts = (
             'heats up at {:.2g} times its earlier rate under the same tension',
-            'has {:.2g} times its earlier time constant of cooling',
+            'cools with {:.2g} times its earlier time constant',
         )
         self.changed = {
             int(m): texts[k].format(factor[k, m])

@@ -41,11 +41,11 @@ STUCK_TIME = 5.0  # examine a repeated reading only if it lasts for at least thi
 #: report a repeated reading as stuck if the lengths show that its joint moves by more than this
 #: [rad]
 STUCK_MOTION = 0.2
-#: report a repeated reading as stuck if the lengths show that its joint is further away from it
-#: than this [rad]
+#: report a repeated reading as stuck if the lengths show a joint angle that differs from the
+#: reading by more than this [rad]
 STUCK_OFFSET = 0.5
-#: assume that a joint has moved unnoticed only if this leaves at most this fraction of the mean
-#: square of the length errors
+#: assume that a joint has moved unnoticed only if its motion leaves at most this fraction of the
+#: mean square of the length errors unexplained
 STUCK_EXPLAINED = 0.5
 #: kinds of faults: angles in degrees, a wrong sign, exchanged joints, a stuck reading
 DEGREES, SIGN, ORDER, STUCK = 'degrees', 'joint sign', 'joint order', 'joint stuck'
@@ -61,7 +61,7 @@ class JointFault(NamedTuple):
 
 
 def corrected(theta: Array, faults: Iterable[JointFault], units: JointUnits) -> Array:
-    """Return corrected angles θ [rad], (N, D), as the joint sensors without these faults."""
+    """Return the angles θ [rad], (N, D), that the sensors would measure without these faults."""
     theta = units.to_position(theta)  # the sensors publish positions
     for fault in faults:
         joints = list(fault.joints)

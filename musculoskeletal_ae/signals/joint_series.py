@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Finds false readings of joint sensors in a finished series, such as a recording.
 
-A node judges each reading by the earlier ones (`joint_stream.py`). Afterwards, more is known. A
-constant that interrupts other readings again and again is false: a program that publishes zeros
-beside the driver, or a driver that publishes 0 for a failed read. The constant is recognised by
-the jumps with which it begins and ends,
+A node judges each reading by the earlier ones (`joint_stream.py`). In a finished series, the later
+readings help as well. A constant that interrupts other readings again and again is false: it comes
+from a program that publishes zeros beside the driver, or from a driver that publishes 0 for a
+failed read. Such a constant is recognised by the jumps with which it begins and ends,
 
     |θ_n − θ_n−1| > step + speed · dt
 
-with the step and speed of `joint_stream.py`, or by readings that are the same before and after it
-and further than the step from it. All readings with the value of a false constant are left out,
-even where the arm happens to be close to it. The remaining readings pass through a `JointStream`.
+with the step and speed of `joint_stream.py`, or by readings that are nearly the same before and
+after it, and differ from it by more than the step. All readings with the value of a false constant
+are left out, even where the arm happens to be close to it. The remaining readings pass through a
+`JointStream`.
 
-Encoders count whole turns, or wrap around at 0 or π. Whole turns are therefore subtracted from
-readings that are then within the joint limits and continuous.
+Encoders may count whole turns, or wrap around at 0 or π. Whole turns are therefore subtracted from
+readings if the remaining angles are continuous and within the joint limits.
 
-If a sensor has impossible readings again and again even then, none of its readings during that time
-is usable, as on a running arm (`estimation/joint_sensor_check.py`).
+If a sensor still has impossible readings again and again, none of its readings during that time is
+usable, as on a running arm (`estimation/joint_sensor_check.py`).
 """
 
 from collections import defaultdict
@@ -43,11 +44,11 @@ LEAST_REPEATED = 3  # examine a repeated value only if it occurs at least this o
 #: Treat a value that appears in one uninterrupted run as false in three cases: the readings before
 #: and after the run differ by less than the share RETURNING of the jumps at its ends; at least
 #: FOREIGN_SHARE of the joints jump at once; or the run lasts although at most the share NOISY of
-#: the other readings repeat the one before. Otherwise, a sensor may have slipped.
+#: the other readings repeat the reading before. Otherwise, a sensor may have slipped.
 RETURNING, NOISY = 0.5, 0.1
-#: Assume that the unit, sign or zero of a joint is wrong, and drop no single reading, if more than
-#: this share of its readings is far outside its limits, or if it crosses the limits without a jump
-#: in more than this share of the crossings. `joint_sensors.py` then finds the fault.
+#: Assume that the unit, sign or zero of a joint is wrong, and drop no single reading, in two cases:
+#: more than this share of its readings is far outside its limits, or it crosses the limits without
+#: a jump in more than this share of the crossings. `joint_sensors.py` then finds the fault.
 WRONG_SCALE = 0.5
 #: subtract whole turns from readings of a joint only if at least this share of those readings is
 #: then within the limits and close to the reading before
@@ -75,7 +76,7 @@ class JointSeries(NamedTuple):
             not usable.
         share: Share of the messages with at least one false reading, in [0, 1].
         text: Description of the false readings for users; '' if there are none.
-        remedy: What to do about them, for users.
+        remedy: What users should do about the false readings.
     """
 
     theta: Array
@@ -182,8 +183,8 @@ def _subtract_turns(robot: Robot, time: Array, theta: Array) -> list[tuple[int, 
 def _drop_constants(robot: Robot, time: Array, theta: Array) -> list[tuple[int, str]]:
     """Replace constants that interrupt other readings by NaN.
 
-    A program that publishes beside the driver shows as a constant posture, a failing sensor as a
-    constant reading of one joint.
+    A program that publishes beside the driver appears as a constant posture, and a failing sensor
+    as a constant reading of one joint.
 
     Args:
         robot: The robot.
@@ -268,7 +269,7 @@ def _interrupting(which: Ints, readings: Array, largest: Array) -> list[int]:
     sure = np.bincount(constants[is_sure], minlength=count)
     repeated = np.bincount(which, minlength=count)
     same = np.bincount(which[1:][np.diff(which) == 0], minlength=count)
-    is_noisy = same.sum() - same < NOISY * (len(which) - repeated)  # if the constant is left out
+    is_noisy = same.sum() - same < NOISY * (len(which) - repeated)  # without the constant
     is_held = is_noisy & (same >= LEAST_REPEATED - 1)
     is_false = repeated >= LEAST_REPEATED
     is_false &= interruptions >= np.maximum(INTERRUPTING * appearances, 1)
@@ -280,7 +281,7 @@ def _text(is_affected: Bools, found: list[tuple[int, str]], consequence: str) ->
     """Return a text on false readings.
 
     Args:
-        is_affected: Which messages have them, (N,).
+        is_affected: Which messages have false readings, (N,).
         found: The number of readings of each kind, with a text about it.
         consequence: What is done with the readings.
     """

@@ -4,10 +4,10 @@
     |θ_j − θ_j,accepted| ≤ step + speed · dt
 
 A reading is usable if it is a number within the joint limits (plus `LIMITS.joint_outside`) and
-satisfies this equation. θ_j,accepted is the last usable reading of joint j, and dt is the time
+satisfies this inequality. θ_j,accepted is the last usable reading of joint j, and dt is the time
 since its previous reading, limited to `LIMITS.longest_step`. Single impossible readings, such as 0
 or −π, and bursts of them are therefore not usable. Each joint is judged by itself, so that a bad
-sensor does not affect the readings of the others. However, if at least half of the joints in a
+sensor does not affect the readings of the others. However, if at least half of the readings in a
 message are impossible, no reading in it is usable: the message then describes another posture, for
 example that of another program.
 
@@ -15,9 +15,9 @@ The level of a sensor changes if the sensor slips on its axis. The new level is 
 readings have followed each other plausibly for `LIMITS.settled`. This file cannot say which level
 is right: the estimator compares both with the muscle lengths (`estimation/joint_sensor_check.py`).
 
-As with `MuscleStream`, each node that reads the messages drops single readings by its own stream.
-What a lasting fault of a sensor means for others is decided by the estimator alone, which publishes
-it as the trust in this sensor (`joint_trust.py`).
+Each node that reads the messages drops single readings with its own stream, as with `MuscleStream`.
+Only the estimator decides whether a sensor with a lasting fault is trusted, and publishes this
+trust for the other nodes (`joint_trust.py`).
 """
 
 import math
@@ -34,7 +34,8 @@ from musculoskeletal_ae.signals.limits import LIMITS
 #: accept a change of at most this plus SPEED · dt between two readings of a joint sensor [rad]; it
 #: is far beyond the noise, resolution and backlash of sensors
 STEP = 0.1
-#: expect no joint to move faster [rad/s]; emulated arms reach 5.4 rad/s when a tendon slips
+#: expect no joint to move faster than this [rad/s]; emulated arms reach 5.4 rad/s when a tendon
+#: slips
 SPEED = 10.0
 #: report a series of impossible readings that has lasted for this time [s]; a burst of glitches is
 #: shorter, even together with the time after which new readings are accepted (`LIMITS.settled`)
@@ -64,7 +65,7 @@ class ImpossibleSeries(NamedTuple):
         since: Time of its first impossible reading [s].
         until: Time of its newest impossible reading [s].
         impossible: Number of impossible readings in the series.
-        total: Number of all readings in the series, possible ones included.
+        total: Number of all readings in the series, including possible readings.
     """
 
     since: float
@@ -73,11 +74,11 @@ class ImpossibleSeries(NamedTuple):
     total: int
 
     def is_present(self, now: float) -> bool:
-        """Return whether readings still arrive at the time `now` [s]."""
+        """Return whether the series still continues at the time `now` [s]."""
         return now - self.until <= ENDED
 
     def is_lasting(self, now: float) -> bool:
-        """Return whether the series is present, and more than a burst or a slip of the sensor."""
+        """Return whether the series is present, and longer than a burst or a slip of the sensor."""
         return self.is_present(now) and self.until - self.since > LASTING
 
 
@@ -85,7 +86,7 @@ _NONE = ImpossibleSeries(-math.inf, -math.inf, 0, 0)  # stands for no series so 
 
 
 class JointChannel:
-    """Judges the readings of one joint sensor, and records series of impossible ones.
+    """Judges the readings of one joint sensor, and records series of impossible readings.
 
     Attributes:
         series: The newest series of impossible readings.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which joint sensors are trusted, as the estimator has decided.
+"""The trust in each joint sensor, on which the estimator decides.
 
 The estimator compares the joint sensors with the muscle lengths, and watches for lasting series of
 impossible readings (`estimation/joint_sensor_check.py`). It publishes its decision on the latched
-topic `joint_sensor_trust`. Nothing else judges whether a plausible reading is right. Every change
+topic `joint_sensor_trust`. No other code judges whether a plausible reading is right. Every change
 creates a new `JointTrust`.
 """
 

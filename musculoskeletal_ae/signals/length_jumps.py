@@ -11,9 +11,9 @@ receives every message and decides:
     waiting ── the lengths have returned ───────────────────► no jump
     waiting ── no length has jumped for `LIMITS.settled` ───► no jump: the new level is accepted
 
-A failed read may be so close to the lengths before it that only the way back is a jump. Changes of
-more than half the legal one are therefore counted as well, if they come shortly before a jump or
-while its new level is not accepted yet.
+A failed read may yield a length so close to the one before it that only the return to the true
+length is a jump. Changes of more than half the legal change are therefore counted as well, if they
+come shortly before a jump, or while the new level after a jump is not accepted yet.
 
 The muscles whose new level is accepted are displaced until the next length calibration, unless a
 rupture explains the jump (`PresumedRupture`).
@@ -39,7 +39,7 @@ LARGE = 0.5
 
 @dataclass(frozen=True)
 class Change:
-    """Sum of those changes of lengths, in one or several messages, that exceed half the legal one.
+    """Sum of the changes of lengths that exceed half the legal change, over one or more messages.
 
     The sum over several messages shows whether a length is still at another level. The length
     itself does not show this: a module whose length jumped winds in or pays out, which can bring
@@ -72,7 +72,7 @@ class Change:
         return self.pause > LIMITS.pause
 
     def __add__(self, later: Change) -> Change:
-        """Return these changes and later ones together."""
+        """Return the sum of these changes and later changes."""
         return Change(
             self.change + later.change,
             np.maximum(self.allowed, later.allowed),
@@ -89,7 +89,7 @@ class Change:
 
 
 class PresumedRupture:
-    """Recognizes jumps of a length that a ruptured tendon may have caused.
+    """Recognises jumps of a length that a ruptured tendon may have caused.
 
     A motor winds in a ruptured tendon quickly. If messages are late or lost meanwhile, the length
     of this tendon appears to jump. A rupture is presumed if exactly one tendon is slack and has
@@ -113,7 +113,7 @@ class PresumedRupture:
         This is the case if a single tendon has jumped, is slack, and may have been wound in.
 
         Args:
-            jump: The jump.
+            jump: The jump whose new level has lasted.
             tension: Measured tensions [N], (M,); NaN where they are unknown.
             used: Which muscles are not isolated, (M,).
         """
@@ -157,7 +157,8 @@ class LengthJumps:
             calibration; these lengths are not reliable.
         newest: Indices of the muscles whose new level was accepted with the last message.
         count: Number of jumps whose new level was accepted, since the start.
-        is_unseen: Whether the last of them was during a pause of the messages (`Change.is_unseen`).
+        is_unseen: Whether the last of these jumps was during a pause of the messages
+            (`Change.is_unseen`).
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -223,7 +224,8 @@ class LengthJumps:
         show how far the arm has moved until the next message.
 
         Args:
-            length: Lengths as measured [m], (M,). One that is not finite is taken as unchanged.
+            length: Lengths as measured [m], (M,). A length that is not finite is taken as
+                unchanged.
             used: Which muscles to check, (M,).
             now: Time of reception by a steady clock [s].
             delay: How late the message is (`Arrival.delay`) [s].
@@ -254,7 +256,7 @@ class LengthJumps:
         return True
 
     def _note(self, large: Change) -> None:
-        """Note a large change: add it to the present jump, or begin one if it is too large."""
+        """Note a large change: add it to the present jump, or begin a jump if it is too large."""
         if self._jump is not None:
             self._jump += large
             return
@@ -286,8 +288,8 @@ class LengthJumps:
         """Use another body state: remove its isolated muscles from `displaced`.
 
         Args:
-            body: The body state.
-            is_calibrated: Whether new length offsets have been calibrated. Then `displaced` is
+            body: The body state that applies from now on.
+            is_calibrated: Whether new length offsets have been calibrated. If so, `displaced` is
                 emptied, and no rupture is presumed any more.
         """
         if is_calibrated:

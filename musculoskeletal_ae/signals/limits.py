@@ -26,7 +26,8 @@ class Limits(NamedTuple):
     Nodes and tools that process muscle states or estimates all use these limits.
     """
 
-    #: reject a measured angle that exceeds the joint's range by more than this fraction of it
+    #: reject a measured angle that exceeds the joint's range by more than this fraction of the
+    #: range
     joint_outside: float = 0.1
     #: treat an estimate as implausible if an angle exceeds the joint's range by more than this
     #: fraction of the range
@@ -46,15 +47,13 @@ class Limits(NamedTuple):
     # A module's temperature changes by at most `temperature_step + temperature_rate · dt` in the
     # time dt since the last accepted temperature. The first temperature is accepted after later
     # readings have differed from it by at most `temperature_step` for the time `glitch`.
-    temperature_step: float = (
-        5.0  # largest change between readings, apart from its rise with time [°C]
-    )
+    temperature_step: float = 5.0  # constant part of the largest change between readings [°C]
     temperature_rate: float = 50.0  # largest rate of a temperature [°C/s]
     #: reject a length if |l| exceeds by more than this [m] the largest |l| that the model has with
     #: joints up to `joint_outside` beyond their ranges; a healthy |l| exceeds it if the tendon
     #: wraps, is slack and has been wound in, or is attached elsewhere than modelled
     length_margin: float = 0.1
-    #: permit a slack tendon to be shorter than `length_margin` permits by this [m], because a
+    #: permit a slack tendon to be shorter by this much [m] than `length_margin` permits, because a
     #: ruptured tendon can be wound in further than any posture requires
     slack_length_margin: float = 1.0
     # Between two messages, a length changes by at most `step + speed · dt`. dt is the time between
@@ -63,12 +62,13 @@ class Limits(NamedTuple):
     #: reject a length that changes by more than this plus a part that grows with time [m]
     step: float = 0.02
     speed: float = 1.0  # largest plausible speed of a muscle length [m/s]
-    longest_step: float = 0.05  # upper limit of dt in this formula [s]
+    longest_step: float = 0.05  # upper limit of dt in `step + speed · dt` [s]
     settled: float = 1.0  # time after which a new level of a length is accepted [s]
     #: report implausible messages as a fault, not as a glitch, once they have lasted for this time
     #: [s]
     glitch: float = 0.1
-    #: after a longer pause of the messages than this, do not compare readings with earlier ones [s]
+    #: after a pause of the messages that is longer than this [s], do not compare readings with
+    #: earlier ones
     pause: float = 0.5
 
 

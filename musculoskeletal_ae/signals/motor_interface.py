@@ -4,12 +4,13 @@
 The motors of the muscles are joints of a ros2_control hardware interface. `robot/motors.py` has the
 equations that connect them with the muscles.
 
-joint_state_broadcaster publishes q and e as a JointState: in any order, mixed with other joints,
-and with NaN for interfaces that the hardware does not have. forward_command_controller takes a
-Float64MultiArray of positions, in the order of its own parameter `joints`.
+joint_state_broadcaster publishes the positions q and efforts e of the motors as a JointState: in
+any order, mixed with other joints, and with NaN for interfaces that the hardware does not have.
+forward_command_controller takes a Float64MultiArray of positions, in the order of its own parameter
+`joints`.
 
-The tension of a motor without effort is unknown, and so is every temperature. Unknown values are
-NaN, never 0.
+The tension of a motor without a measured effort is unknown, and so is every temperature. Unknown
+values are NaN, never 0.
 """
 
 from collections.abc import Callable

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The readings of muscle modules: one value for all quantities, from message to message.
+"""The readings of muscle modules: all quantities of one or more messages in one object.
 
 `MuscleReadings` is also the table of the quantities: each of its entries declares the name, unit
 and possible values of one quantity, in the order of the rows of `muscle_states`. Only this file
@@ -8,9 +8,9 @@ knows that order. All other code takes a quantity by its name, such as `readings
     message ─► read_muscle_states ─► MuscleReadings ─► to_message ─► message
 
 To add a quantity, add its entry to `MuscleReadings`. Messages may then have its row; its values are
-checked, emulated faults and recordings keep them, and `MuscleSample.newest` contains them. What
-else a quantity needs if the emulator measures it is in doc/explanation/architecture.md ("How to add
-…").
+checked, emulated faults and recordings keep them, and `MuscleSample.newest` contains them.
+doc/explanation/architecture.md ("How to add …") lists the further steps for a quantity that the
+emulator measures.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def _possible_temperatures(_: Robot) -> tuple[float, float]:
 
 
 class MuscleReadings:
-    """What the muscle modules read at one moment or at several ones; NaN where it is unknown.
+    """Readings of the muscle modules in one or more messages; NaN where a value is unknown.
 
     Each quantity is an array (M,), or (N, M) for the readings of N messages. Tensions are in N,
     also of robots that measure motor currents.
@@ -114,7 +114,7 @@ class MuscleReadings:
     )
 
     def __init__(self, **values: Array) -> None:
-        """Keep a copy of the values of each quantity by its name, (..., M); others are NaN."""
+        """Copy the values of some quantities, by name, (..., M); all other quantities are NaN."""
         *first, muscles = next(iter(values.values())).shape
         self.rows: Array = np.full((*first, len(QUANTITIES), muscles), np.nan)
         for name, value in values.items():
@@ -140,11 +140,11 @@ class MuscleReadings:
         return cls.of_rows(median_of_rows(np.array([each.rows for each in readings])))
 
     def at(self, messages: Any) -> MuscleReadings:
-        """Return the readings of some messages, which an index, a mask or a slice selects."""
+        """Return the readings of the messages that an index, a mask or a slice selects."""
         return MuscleReadings.of_rows(self.rows[messages])
 
     def copy(self) -> MuscleReadings:
-        """Return a copy, whose quantities may be assigned without changing this object."""
+        """Return a copy whose quantities can be changed without an effect on this object."""
         return MuscleReadings.of_rows(self.rows.copy())
 
     def replace(self, **values: ArrayLike) -> MuscleReadings:

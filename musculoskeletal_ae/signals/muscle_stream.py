@@ -125,7 +125,7 @@ class MuscleStream:
 
     Attributes:
         body: Length offsets and isolated muscles.
-        jumps: The jumps of lengths, and the muscles that are displaced since then.
+        jumps: The jumps of lengths, and the muscles that they have displaced.
     """
 
     def __init__(self, robot: Robot, body: BodyState | None = None, window: int = 1) -> None:
@@ -142,7 +142,7 @@ class MuscleStream:
         self.use_transmission(Transmission(np.zeros(robot.muscle_count)))
         self._levels = LevelCheck(robot)
         self._temperatures = TemperatureCheck(robot.muscle_count)
-        #: readings of the last messages that were accepted, and of all last messages
+        #: readings of the last accepted messages, and of the last messages, accepted or not
         self._accepted: deque[MuscleReadings] = deque(maxlen=window)
         self._received: deque[MuscleReadings] = deque(maxlen=window)
         self._implausible = Persistence()
@@ -195,7 +195,7 @@ class MuscleStream:
     def take(
         self, message: Any, time: float, now: float | None = None, delay: float = 0.0
     ) -> MuscleSample:
-        """Check and convert a message, or readings that arrived otherwise.
+        """Check and convert a message, or readings from another source.
 
         Args:
             message: The message of `muscle_states`, or `MuscleReadings`.

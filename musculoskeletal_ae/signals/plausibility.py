@@ -24,7 +24,7 @@ class LevelCheck:
         self._slack = slack_tension(robot.description.tension.bias)
 
     def plausible(self, readings: MuscleReadings, offset: Array) -> MuscleReadings:
-        """Return the plausible values of a message; implausible ones become −∞.
+        """Return the plausible values of a message; implausible values become −∞.
 
         The length offsets `offset` [m], (M,), are subtracted. A length may exceed its range by
         `slack_length_margin`, because the module may have lost its length offset.

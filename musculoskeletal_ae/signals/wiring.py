@@ -2,8 +2,9 @@
 """Judges which muscle each column of the readings belongs to, and which sign its length has.
 
 Arrays of readings carry no names. A driver may publish muscles in a wrong order, or lengths with a
-wrong sign, and if it reads its commands in the same way, every muscle still obeys its control law.
-Only the lengths tell: those of column j change with the posture like those of another muscle.
+wrong sign. If it reads its commands in the same way, every muscle still obeys its control law. Only
+the lengths then reveal the fault: those of column j change with the posture like those of another
+muscle.
 
     column j shows muscle order[j], with the sign sign[j]                            (`Wiring`)
 
@@ -13,8 +14,9 @@ Known posture. For N messages with measured θ,
 
 is the misfit of column j to muscle k (`square_misfits`). f are the lengths of any model, such as
 the geometric model or a network. The variance is taken within each segment of the recording, so
-length offsets do not matter. Two columns are exchanged if this reduces their summed e² by at least
-the factor BETTER², and one column has the wrong sign if reversing it does (`judge`).
+length offsets do not matter. Two columns count as exchanged if exchanging them divides their summed
+e² by at least BETTER². A column counts as having the wrong sign if reversing the sign does so
+(`judge`).
 
 Unknown posture. The caller states the cost of the readings as they are, and the cost under each of
 the wirings that differ by one fault (`single_faults`). Two cases use this: the fit of a length
@@ -43,7 +45,7 @@ from musculoskeletal_ae.arrays import Array, Bools, Ints
 #: factor. Conclude that the order of two columns is right if exchanging them multiplies their
 #: misfit by at least this factor.
 BETTER = 1.4
-#: assume a wrong order or sign if correcting it divides the cost of all readings by this factor
+#: assume a wrong order or sign if correcting it divides the cost of all readings by at least this
 COST_BETTER = 1.1
 #: add noise of this standard deviation to every misfit [m]; an arm that hardly moves then shows
 #: neither a fault nor that the wiring is right
@@ -118,7 +120,7 @@ class Wiring(NamedTuple):
 
 
 class WiringJudgement(NamedTuple):
-    """What the readings show about the wiring: faults, alternatives and certainly right columns.
+    """Judgement of the wiring by the readings: faults, alternatives and certainly right columns.
 
     Attributes:
         wiring: The wiring that explains the readings best; straight unless a fault is certain.
@@ -170,7 +172,7 @@ def decide(
 
     Args:
         wiring: The wiring that is assumed as long as no other one is clearly better.
-        cost: Its cost.
+        cost: Cost of `wiring`.
         others: Other wirings with their costs.
         better: Factor by which the cost of a better wiring must be lower.
     """

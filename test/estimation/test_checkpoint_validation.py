@@ -278,7 +278,7 @@ def test_a_chosen_network_that_fits_worse_is_used_and_called_so(trained, measure
     weight, bias = mae.decoder[-1]
     off = replace(mae, decoder=(*mae.decoder[:-1], (weight, bias + 0.3 * np.eye(len(bias))[-1])))
     other = _turned(mae, 0.2) if measures else off  # without sensors, a wrong length tells
-    assert ('from its sensor' if measures else 'explains the length of') in choose(other)
+    assert ('from the sensor' if measures else 'error of the length of') in choose(other)
     assert choose(replace(learned, version=9)) == ''
 
 

@@ -175,7 +175,7 @@ def test_a_checkpoint_stores_the_groups_and_gives_the_same_answers(mae, state):
         ({'layer_sizes': [1, 2, 3]}, 'layer_sizes'),
         ({'bases': [0, 1]}, 'bases'),
         ({'bases': [0, 0, 3]}, 'bases'),
-        ({'bases': [1, 2, 2]}, 'which is its own base'),
+        ({'bases': [1, 2, 2]}, 'and for a base its own'),
     ],
 )
 def test_groups_that_do_not_fit_are_refused(mae, change, says):

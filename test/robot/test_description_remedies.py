@@ -213,7 +213,7 @@ MUSCLES = {
         (of_wrap('axis', [0.0, 1.0, 0.0]), of_wrap('wrap', 'sphere')),
     ),
     'axis without direction': Row(
-        (wrap(axis=[0.0, 1e-7, 0.0]),), r'expected a vector of at least the length ([\d.e-]+)',
+        (wrap(axis=[0.0, 1e-7, 0.0]),), r'expected a vector with a length of at least ([\d.e-]+)',
         (of_wrap('axis', lambda match: [0.0, float(match[1]), 0.0]),),
     ),
     'side on the axis': Row(
@@ -470,7 +470,7 @@ URDF = {
     ),
     'no mass': Row(
         (in_urdf('<mass value="0.8"/>', ''),),
-        'mass: expected value; remove <inertial> of a link without mass',
+        'mass: expected value, or remove <inertial> if the link has no mass',
         (lambda directory, _=None: in_pattern(directory, r'(<link name="forearm">)\s*<inertial>.*?'
                                          '</inertial>'),),
     ),
@@ -518,7 +518,7 @@ MOTORS = {
     ),
     'name of a topic': Row(
         (motors(state_topic='motor states'),),
-        'legal: words of letters, digits and _ that are joined by /, as in (joint_states)',
+        'legal: words of letters, digits and _, joined by /, as in (arm/joint_states)',
         (Members(lambda name: motors(state_topic=name)), motors(state_topic='a_1/b2')),
     ),
     'unknown key': Row(

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The detectors of the health monitor, one file for each sign of a fault.
 
-A ruptured tendon is found by `slack_tendon.py` (no tension although some is demanded) or by
-`residual_distance.py` (tensions and lengths do not fit each other); while no commands arrive, by
+A ruptured tendon is found by `slack_tendon.py` (no tension although some is demanded), by
+`residual_distance.py` (tensions and lengths do not fit each other) or, while no commands arrive, by
 `length_disagreement.py`. Only `../suspect_verification.py` tells a rupture from a false sensor.
 """

@@ -32,11 +32,12 @@ class FrozenSensor(Detector):
     def __init__(self, robot: Robot) -> None:
         self._robot = self._complete_robot = robot
         self._mae: Mae | None = None
-        self._last: Array | None = None  # last readings of l and T, (2, M)
-        #: time without a change of l and of T [s]
+        self._last: Array | None = None  # last readings of length and tension, (2, M)
+        #: time for which the readings of length and tension have not changed [s]
         self._unchanged_time: Array = np.zeros((2, robot.muscle_count))
-        #: numbers of messages near T_bias in which the reading stayed the same and in which it
-        #: changed, and those in which it has stayed the same since its last change, (3, M)
+        #: for each tension reading, the numbers of messages near T_bias in which it stayed the
+        #: same, in which it changed, and in which it has stayed the same since the last change,
+        #: (3, M)
         self._near_bias: Array = np.zeros((3, robot.muscle_count))
         self._reduced_mae: Mae | None = None  # network without the observed muscle
         #: shortest and longest predicted length of the observed muscle [m]

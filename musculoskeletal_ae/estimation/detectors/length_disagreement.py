@@ -52,7 +52,7 @@ class Largest(NamedTuple):
     all: Array | float  # largest root mean square of the differences of all muscles in use [m]
 
     def excess(self, change: Array, used: Bools) -> float:
-        """Return the ratio of length differences to these limits; above 1, they are too large.
+        """Return the ratio of length differences to these limits; legal: at most 1.
 
         Args:
             change: Difference of each length [m], (M,).
@@ -89,13 +89,14 @@ class Largest(NamedTuple):
 #: with a network whose detector is not calibrated, tolerate this change Δ of the difference between
 #: measured and computed lengths
 CHANGE_YOUNG = Largest(0.06, 0.028)
-#: with such a network, tolerate this difference g itself while the usual one is not known
+#: with such a network, tolerate this difference g between measured and computed lengths while the
+#: usual difference is not known
 GAP_YOUNG = Largest(0.08, 0.045)
 #: with a network whose detector is calibrated, tolerate this change Δ of the difference between
 #: measured and computed lengths
 CHANGE_LEARNED = Largest(0.035, 0.016)
-#: with a network whose detector is calibrated, tolerate this difference g itself while the usual
-#: one is not known
+#: with a network whose detector is calibrated, tolerate this difference g between measured and
+#: computed lengths while the usual difference is not known
 GAP_LEARNED = Largest(0.035, 0.016)
 #: Store a healthy message at this interval [s]. The stored messages show the usual difference
 #: between measured and computed lengths.
@@ -127,7 +128,7 @@ class LengthDisagreement(Detector):
         #: for muscles that were isolated
         self._healthy: deque[tuple[Array, Array, Array]] = deque(maxlen=HEALTHY_COUNT)
         self._usual: Array = np.zeros(robot.muscle_count)  # g_usual [m], (M,); 0 if unknown
-        #: for which muscles g_usual is known, (M,)
+        #: for which muscles the usual difference g_usual is known, (M,)
         self._has_usual: Bools = np.zeros(robot.muscle_count, dtype=bool)
         self._healthy_time = 0.0  # time since a message was last added to `_healthy` [s]
         self.reset()
@@ -140,7 +141,7 @@ class LengthDisagreement(Detector):
         self._compute_usual()
 
     def reset(self) -> None:
-        """Reset the detector: discard the messages of the last second, keep the healthy ones."""
+        """Reset the detector: discard messages of the last second, keep healthy messages."""
         self._recent: deque[Array] = deque(maxlen=COUNT)
         self._since, self._unmeasured, self._beyond = 0.0, 0.0, 0.0
         self.gap = None
@@ -209,13 +210,13 @@ class LengthDisagreement(Detector):
         """Return the change of each length difference since the arm was healthy, with its limits.
 
         For a muscle without enough healthy messages, such as one that was isolated for a minute,
-        the healthy difference is assumed to be 0, and the limits are wider.
+        the healthy difference is assumed to be 0, and the limits are GAP_YOUNG or GAP_LEARNED.
 
         Args:
             gap: Measured minus computed lengths [m], (M,).
 
         Returns:
-            The difference of each length [m], (M,), and the limits of these differences.
+            The change of each difference [m], (M,), and the limits of these changes.
         """
         assert self._mae is not None
         is_learned = self._mae.is_calibrated
@@ -244,13 +245,13 @@ class LengthDisagreement(Detector):
         shift = np.linalg.lstsq(jacobian, -change, rcond=None)[0]
         unexplained = change + jacobian @ shift
         evidence = (
-            'length differs from that at the measured posture by '
+            'length differs from the length expected in the measured posture by '
             f'{largest.text(change, self._used, muscle)}'
         )
-        by_muscle = np.delete(change, muscle)  # what stays unexplained if this length is wrong
+        by_muscle = np.delete(change, muscle)  # what remains unexplained if this length is wrong
         limit = min(UNEXPLAINED * np.linalg.norm(change), np.linalg.norm(by_muscle))
         if np.linalg.norm(unexplained) <= limit:
-            return None  # false joint sensors explain it; `joint_sensor_check.py` judges them
+            return None  # joint sensors are false; `joint_sensor_check.py` judges them
         is_alone = self._others_agree(muscle, change, largest)
         kind = ConditionKind.LENGTH_DISAGREES if is_alone else ConditionKind.LENGTHS_DISAGREE
         return Finding(muscle, kind, f'its {evidence}')

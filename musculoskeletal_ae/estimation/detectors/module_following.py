@@ -7,7 +7,8 @@ A module under muscle stiffness control turns its winch until the tension T is t
 
 T_ref is the tension that the command demands at the measured length l. This law holds for every
 module alone: in any posture, in contact, and with any network. A healthy module corrects a
-difference T_limit at the speed CORRECTING or faster. The rest of the difference is not explained:
+difference of T_limit at the speed CORRECTING or faster, and a smaller difference in proportion. The
+rest of the difference is unexplained:
 
     e = |T − T_ref| − T_limit · max(0, v) / CORRECTING
 
@@ -15,21 +16,21 @@ v is the speed at which the winch turns in the direction that reduces the differ
 weak motor, a wrong reading of tension or length, and commands that do not arrive or are reversed
 all lead to a large e. Tendons without tension are left to `slack_tendon.py`.
 
-The evidence is a time. It grows while e is above a tolerance and shrinks while e is below it,
-the faster the farther e is away from it, but at most by one second per second. A module is reported
-after FAULTY seconds of evidence. The constants are those of slow and badly tuned modules: about
-twice the slowest healthy emulated one, and 10 % of the commanded tension for a stiffness or a
-sensor's gain that differs from muscles.yaml. `python -m bench mishaps` shows how soon faults are
-reported, and its option `--healthy` that healthy modules are not.
+The evidence is a time. It grows while e is above a tolerance and shrinks while e is below it, the
+faster the farther e is away from it, but at most by one second per second. A module is reported
+after FAULTY seconds of evidence. The constants tolerate slow and badly tuned modules: about twice
+as slow as the slowest healthy emulated module, and with an error of 10 % of the commanded tension
+because a stiffness or a sensor's gain differs from muscles.yaml. `python -m bench mishaps` shows
+how soon faults are reported, and its option `--healthy` that healthy modules are not.
 
 A position-controlled module has no T_ref. Its e is a length:
 
     e = |l − l_target| − LAG · max(0, v)
 
-It may stay behind while T > FULL · T_max, because it cannot pull harder.
+The module may stay behind while T > FULL · T_max, because it cannot pull harder.
 
-The readings of such a module may be consistent with a posture. The residuals of the network then do
-not reveal the fault.
+The readings of a module that does not follow may be consistent with a posture. The residuals of the
+network then do not reveal the fault.
 """
 
 import numpy as np
@@ -44,8 +45,8 @@ from musculoskeletal_ae.signals.limits import slack_tension
 FAULTY = 1.0  # report a module once the evidence against it amounts to this time [s]
 #: smooth differences from the command, and winding speeds, with this time constant [s]
 SMOOTHING = 0.1
-#: reduce the evidence while the winch turns at more than this share of its largest speed, if that
-#: is known: it can hardly correct faster
+#: reduce the evidence while the winch turns at more than this share of its largest speed, if this
+#: speed is known: the winch can hardly correct faster
 FULL_SPEED = 0.5
 #: expect a healthy module to wind at least this fast [m/s] while |T − T_ref| is T_limit
 CORRECTING = 0.2
@@ -55,8 +56,8 @@ ALLOWED, ALLOWED_SHARE = 0.04, 0.1
 #: let the evidence grow at its fastest rate once the unexplained difference e exceeds the tolerance
 #: by this share of T_limit
 CLEAR = 0.05
-#: tolerate in addition this many standard deviations of a tension that a motor current shows; a
-#: tension sensor has none
+#: tolerate in addition this many standard deviations of a tension that is computed from a motor
+#: current; for a tension sensor, the standard deviation is 0
 SURE = 2.0
 BEHIND = 0.005  # tolerate this distance of a position-controlled module from its target length [m]
 #: let the evidence grow at its fastest rate once a position-controlled module is further behind
@@ -64,8 +65,8 @@ BEHIND = 0.005  # tolerate this distance of a position-controlled module from it
 CLEARLY_BEHIND = 0.005
 #: expect a healthy position-controlled module to lag behind its command by at most this time [s]
 LAG = 0.6
-#: reduce the evidence against a position-controlled module above this share of T_max, because it
-#: cannot pull harder
+#: reduce the evidence against a position-controlled module while its tension exceeds this share of
+#: T_max, because the motor cannot pull harder
 FULL = 0.9
 
 
@@ -84,9 +85,9 @@ class ModuleFollowing(Detector):
         """Reset the detector: discard all evidence."""
         count = self._complete_robot.muscle_count
         self._evidence: Array = np.zeros(count)  # time of evidence [s]
-        self._length: Array | None = None  # l in the previous message [m]
+        self._length: Array | None = None  # length in the previous message [m]
         self._difference: Array | None = None  # smoothed difference from the command [N or m]
-        self._speed: Array = np.zeros(count)  # smoothed dl/dt [m/s]
+        self._speed: Array = np.zeros(count)  # smoothed rate of the length [m/s]
 
     def step(self, observation: Observation) -> Finding | None:
         """Report the module with the most evidence against it; None if that is less than 1 s."""
@@ -183,6 +184,7 @@ class PositionFollowing(ModuleFollowing):
         assert observation.command is not None
         away = 1e3 * (observation.sample.length[muscle] - observation.command[muscle])
         return (
-            f'its length differs by {away:.0f} mm from its command, and does not approach it: its '
-            'motor is jammed or weak, its length reading is wrong, or it gets no commands'
+            f'its length differs by {away:.0f} mm from the commanded length, and does not approach '
+            'this length: its motor is jammed or weak, its length reading is wrong, or it gets no '
+            'commands'
         )

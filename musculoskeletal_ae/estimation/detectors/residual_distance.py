@@ -22,7 +22,7 @@ anomaly equally well. If tendons are slack, only they can be suspect.
 
 Slack. While a slack tendon is being wound in, its measured length is longer than the reconstructed
 length, and messages are no evidence. The measured length of a ruptured tendon is shorter than the
-restored length, so its messages are evidence.
+reconstructed length, so its messages are evidence.
 """
 
 import math
@@ -47,8 +47,8 @@ NORM = 'norm'  # name under which a checkpoint stores the threshold of the anoma
 #: most this multiple of d without the suspect
 EQUALLY_LIKELY = 1.5
 IN_A_ROW = 5  # report the suspect after this many consecutive messages above the threshold
-#: raise the threshold if the posture is further than this from the nearest calibrated one [joint
-#: ranges], because the network is less accurate there
+#: raise the threshold if the posture is further than this [joint ranges] from the nearest
+#: calibrated posture, because the network is less accurate there
 NEAR = 0.25
 WIDEST = 3.0  # multiply the threshold by at most this factor, so that ruptures are still detected
 
@@ -68,7 +68,7 @@ class ResidualDistance(Detector):
     Attributes:
         symbol: Symbol of the statistic in messages to users, such as 'd'.
         threshold_name: Name under which the checkpoint stores the threshold of the statistic.
-        threshold: Threshold of the statistic; ∞ if the checkpoint has no calibrated one.
+        threshold: Threshold of the statistic; ∞ if it has not been calibrated.
         reading: Distance and most suspect muscle of the last message; None before the first.
     """
 
@@ -79,8 +79,8 @@ class ResidualDistance(Detector):
 
         Args:
             robot: The nominal body.
-            slack: The detector that knows which slack tendons are being wound in. Messages from
-                this time are ignored. With None, no message is ignored.
+            slack: The detector that knows which slack tendons are being wound in; meanwhile,
+                messages are ignored. With None, no message is ignored.
         """
         self._robot = self._complete_robot = robot
         self._slack = slack
@@ -222,7 +222,7 @@ class ResidualDistance(Detector):
         """Return the indices of the suspect muscles among the candidates, the most suspect first.
 
         Without the first muscle, the residual of the other muscles is most likely on a healthy arm.
-        Muscles follow without which it is nearly as likely.
+        The further muscles are those without which it is nearly as likely.
 
         Args:
             bone_tension: Bone-side tensions [N], (M,).

@@ -3,12 +3,12 @@
 
     T_read = min(T + noise, T_sat),   T_sat < T_limit
 
-The readings of a working sensor contain noise, also where a motor can pull no harder. Readings that
+The readings of a working sensor contain noise, even where a motor can pull no harder. Readings that
 stay exactly the same, although this sensor's readings usually vary, are therefore clipped: by the
 sensor, its amplifier or the driver. A muscle is reported in two cases:
 
 - Its readings have been clipped twice at the same value, were lower in between, and have not been
-  higher. A frozen sensor is not lower in between (`frozen_sensor.py`).
+  higher. Readings of a frozen sensor are not lower in between (`frozen_sensor.py`).
 - Its reading stays the same although its module winds in. The sensor may then also be frozen.
 
 A sensor is not checked if its readings often repeat. Messages that repeat the readings of most
@@ -16,9 +16,9 @@ muscles are skipped, such as those of a simulator without noise at rest. Values 
 checked, because an ideal module may hold exactly T_bias.
 
 Such a muscle is no longer safe: while its command demands more than T_sat, the module winds in
-without seeing the tension grow, and neither the limiter nor the watchdog sees it. Emulated arms of
-which all sensors saturated at 120 to 150 N reached 350 to 420 N, with a limit of 200 N. A sensor
-that saturates above T_limit is no fault, because the limiter keeps the readings below.
+although its reading does not rise, and neither the limiter nor the watchdog notices. Emulated arms
+whose sensors all saturated at 120 to 150 N reached 350 to 420 N, although T_limit was 200 N. A
+sensor that saturates above T_limit is no fault, because the limiter keeps the readings below.
 """
 
 import numpy as np
@@ -31,13 +31,13 @@ from musculoskeletal_ae.robot.robot import Robot
 #: report a module that winds in if its tension reading has stayed the same for this long [s], and
 #: the module has wound in by WOUND meanwhile
 WINDING_TIME = 0.5
-WOUND = 0.005  # see WINDING_TIME [m]
+WOUND = 0.005  # length that the module must have wound in for such a report [m]
 #: record that a reading has been clipped at a value (a visit) once it has stayed exactly there for
 #: this long [s]
 LASTING = 0.15
 VISITS = 2  # report a muscle once its reading has been clipped this often at the same value
 SAME = 2e-3  # treat two tension readings as the same value if they differ by less than this share
-#: record that a reading has been clipped again only after it has been lower by this share
+#: record that a reading has been clipped again only after it has fallen by this share in between
 BELOW = 0.1
 #: forget a value, because the sensor does not saturate there, once the reading has been higher for
 #: this long [s]; a spike is shorter
@@ -58,8 +58,8 @@ class SaturatedSensor(Detector):
         self._robot, count = robot, robot.muscle_count
         self._limit = robot.description.tension.limit
         self._bias = robot.description.tension.bias
-        self._highest: Array = np.zeros(count)  # highest reading of two successive ones [N]
-        #: share of the lower readings that differed from the previous one
+        self._highest: Array = np.zeros(count)  # highest value of two successive readings [N]
+        #: share of the readings below the highest ones that differed from the reading before, (M,)
         self._varying: Array = np.zeros(count)
         self.reset()
 
@@ -68,17 +68,17 @@ class SaturatedSensor(Detector):
         count = self._robot.muscle_count
         self._before: Array = np.full(count, np.nan)  # reading of the previous message [N]
         self._unchanged: Array = np.zeros(count)  # time without a change of the reading [s]
-        self._length: Array = np.zeros(count)  # l when the reading changed last [m]
-        self._beyond: Array = np.zeros(count)  # time for which the reading has been higher [s]
+        self._length: Array = np.zeros(count)  # length when the reading changed last [m]
+        self._beyond: Array = np.zeros(count)  # time for which it has exceeded `_value` [s]
         self._value: Array = np.full(count, np.nan)  # value at which the reading was clipped [N]
         self._visits: Ints = np.zeros(count, dtype=np.int64)
         self._has_visits = False  # whether the reading of any muscle has been clipped
-        self._has_left = np.ones(count, dtype=bool)  # whether readings have fallen since then
+        self._has_left = np.ones(count, dtype=bool)  # whether readings were clearly below `_value`
 
     def step(self, observation: Observation) -> Finding | None:
         """Report a muscle whose tension reading is clipped, or return None.
 
-        It must have been clipped twice at the same value, or while its module winds in.
+        The reading must have been clipped twice at the same value, or while the module winds in.
         """
         sample, dt, value = observation.sample, observation.dt, self._value
         reading = sample.newest.tension

@@ -38,7 +38,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS, share_outside, slack_tension
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
-#: report a tendon without tension if its stretch exceeds the expected one by this many standard
+#: report a tendon without tension if its stretch exceeds the expected stretch by this many standard
 #: deviations
 SIGMAS = 3.0
 #: Treat a tendon as taut if its tension exceeds T_slack by this many standard deviations. Tensions
@@ -50,7 +50,7 @@ RECENT = 5
 #: while a muscle module winds in slack, wait until it has wound in this length before the muscle is
 #: reported [m]
 SLACK_LENGTH = 0.06
-SLACK_SPEED = 0.005  # wait no longer for a muscle module that winds in more slowly than this [m/s]
+SLACK_SPEED = 0.005  # stop waiting for a muscle module that winds in more slowly than this [m/s]
 DEAD_TIME = 0.5  # report a muscle that has had no tension for this long [s]
 
 
@@ -67,8 +67,9 @@ class SlackTendon(Detector):
         self._slack_time: Array = np.zeros(muscle_count)  # time without tension [s]
         #: time without tension and without winding in [s]
         self._idle_time: Array = np.zeros(muscle_count)
-        self._taut_excess: Array = np.zeros(muscle_count)  # `excess` when the tension was lost [m]
-        self._wound_length: Array = np.zeros(muscle_count)  # l when it was last wound in [m]
+        #: measured length minus route length when the tendon became slack [m]
+        self._taut_excess: Array = np.zeros(muscle_count)
+        self._wound_length: Array = np.zeros(muscle_count)  # length when last wound in [m]
         self.is_winding_in: Bools = np.zeros(muscle_count, dtype=bool)
 
     def use(self, mae: Mae) -> None:
@@ -98,7 +99,7 @@ class SlackTendon(Detector):
             self.is_winding_in[:] = False
             return None
         begins = is_slack & (self._slack_time == 0.0)
-        # The estimated posture explains a part of the length; remove it.
+        # Subtract the part of the length that the estimated posture explains.
         excess = length - self._robot.routes.relative_lengths(theta) if is_slack.any() else length
         self._taut_excess = np.where(begins, excess, self._taut_excess)
         self._slack_time = np.where(is_slack, self._slack_time + dt, 0.0)

@@ -13,7 +13,7 @@ from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.signals.heat import Heat
 
 #: stop the arm because of a changed module only if its winding is hotter than this [°C]; a cooler
-#: one is only reported in /diagnostics
+#: module is only reported in /diagnostics
 COOL = 60.0
 
 

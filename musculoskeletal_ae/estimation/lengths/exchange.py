@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decides whether a finding is explained by a driver that has restarted or has another wiring.
+"""Decides whether a restart of the driver, or a wrong wiring, explains a finding.
 
 If a driver restarts with two muscles exchanged, in readings and commands, their lengths jump or no
 longer fit the rest of the arm. The same applies if it reverses the sign of a length. Detectors then
 report lost length offsets or a damaged muscle, and the advice that follows would be wrong. Two
 observations reveal what the driver has done:
 
-Silence. A driver that restarts is silent for a moment. The arm moves little meanwhile, so that
-putting the columns back makes their lengths continue those before the silence. If no other order
-and no sign does this for several lengths, and the readings do not fit the learned body, then these
-lengths have lost their offsets.
+Silence. A driver that restarts is silent for a moment, in which the arm moves little. Putting
+exchanged columns back therefore makes their lengths continue those before the silence. If neither
+an exchange nor a reversed sign explains why several lengths have changed, and the readings do not
+fit the learned body, then these lengths have lost their offsets.
 
 Anomaly score. If muscles are exchanged, putting the two columns back restores the usual anomaly
-score A in all recent messages (`signals/wiring.py`). A network that has learned the arm is exact
-enough for this. With any other network, the length calibration judges the order, because the arm
-moves meanwhile. Shortly after a silence, wrong signs are judged in this way as well: a length near
-0 changes by little when its sign is reversed. Without a silence, no driver has restarted, and a
-length offset that has been lost could look like a wrong sign.
+score A in all recent messages (`signals/wiring.py`). Only a network that has learned the arm is
+exact enough for this. With any other network, the length calibration judges the order, because the
+arm moves during the calibration. Shortly after a silence, wrong signs are judged by the anomaly
+score as well, because a length near 0 hardly changes when its sign is reversed. Without a silence,
+signs are not judged: no driver has restarted, and a lost length offset could look like a wrong
+sign.
 """
 
 import math
@@ -36,15 +37,15 @@ from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.signals.wiring import Wiring, WiringJudgement, decide, single_faults
 
 SPACING = 0.25  # store at most one message in this time [s]
-#: take the median anomaly score A of at most this many stored messages as the usual one
+#: take the median anomaly score A of at most this many stored messages as the usual score
 USUAL_COUNT = 120
 ENOUGH = 20  # judge no finding before this many messages have been stored
 RECENT = 20  # judge a finding by this many of the newest messages
 #: judge a finding only by recent messages whose anomaly score A exceeds this multiple of the usual
-#: one, because the others are from before the fault
+#: score, because the others are from before the fault
 ANOMALOUS = 2.0
 #: assume an exchange only if the anomaly score, with the columns put back, is below this multiple
-#: of the usual one
+#: of the usual score
 USUAL = 1.5
 #: Assume an exchange only if putting the columns back divides the anomaly score by at least this
 #: factor. On messages of two learned arms, USUAL and BETTER together blamed an exchange for 3 of
@@ -52,14 +53,14 @@ USUAL = 1.5
 BETTER = 3.0
 #: assume that the driver may have restarted after a pause of all messages of this length [s]
 SILENT = 0.3
-#: for this time after such a pause, compare the lengths before and after it to explain a finding
-#: [s]
+#: for this time after a pause of all messages [s], compare the lengths before and after the pause
+#: to explain a finding
 RESTARTED = 5.0
 #: suspect that a column belongs to another muscle, or has lost its offset, if its length has
 #: changed by more than this during the pause [m]
 DISCONTINUOUS = 0.02
-#: Assume that columns are exchanged or reversed since a pause of the messages only if correcting
-#: this divides their change over the pause by this factor, and if they had changed more than all
+#: Blame exchanged or reversed columns for changes of lengths over a pause only if putting the
+#: columns right divides these changes by this factor. The changes must also exceed those of all
 #: other lengths by this factor.
 CONTINUOUS = 3.0
 #: look for exchanged muscles only after one of these findings: an exchange causes no others
@@ -85,14 +86,14 @@ class ExchangeCheck:
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
         self._mae: Mae | None = None
-        #: T_end and l as read of recent messages
+        #: bone-side tensions, and lengths as read, of recent messages
         self._messages: deque[tuple[Array, Array]] = deque(maxlen=USUAL_COUNT)
         self._offset: Array = np.zeros(robot.muscle_count)  # length offsets of these messages [m]
         self._since = 0.0  # time since a message was last kept [s]
         #: time [s] and lengths as read [m], (M,), of the newest message, accepted or not
         self._newest: tuple[float, Array] | None = None
-        #: time of the first message after the last silence [s], and the lengths as read before and
-        #: in it [m], (M,) each
+        #: time of the first message after the last silence [s], and the lengths as read before the
+        #: silence and in this message [m], (M,) each
         self._silence: tuple[float, Array, Array] | None = None
 
     def use(self, mae: Mae) -> None:
@@ -130,20 +131,21 @@ class ExchangeCheck:
         """Explain a finding: return the finding of the driver's fault that explains it, if any.
 
         Exchanged muscles or a reversed length are considered first. If neither explains `finding`,
-        and `finding` only states that the readings do not fit the learned body, several lengths
-        that have changed in a recent pause of the messages explain it: they have lost their
-        offsets. Otherwise, the result is `finding`.
+        lost length offsets may explain it: `finding` must only state that the readings do not fit
+        the learned body, and several lengths must have changed in a recent pause of the messages.
+        Otherwise, the result is `finding`.
         """
         if finding is None or finding.kind not in EXPLAINED_BY_SILENCE:
             return finding
         if not observation.lengths_known:
             return finding
-        judgement, reason = None, 'the lengths then continue those before a pause'
+        judgement, reason = None, 'if this is corrected, the lengths continue those before a pause'
         if self._may_have_restarted:
             judgement = self._judge_silence()
         is_explained = judgement is not None and judgement.is_faulty
         if not is_explained and finding.kind in EXPLAINED:
-            judgement, reason = self._judge(observation), 'the lengths then fit the arm again'
+            judgement = self._judge(observation)
+            reason = 'if this is corrected, the lengths fit the arm'
         if judgement is None or not judgement.is_faulty:
             is_vague = finding.kind is ConditionKind.RESIDUAL_DISTANCE
             return (self._jumped_in_silence() if is_vague else None) or finding
@@ -163,7 +165,7 @@ class ExchangeCheck:
 
         The result is None if fewer than two lengths have changed. A driver that counts lengths from
         0 again changes all of them. An arm that has moved in the pause changes them as well, but
-        that leads to no finding that could be explained here.
+        its readings fit the learned body and cause no finding.
         """
         if not self._may_have_restarted or self._silence is None or self._mae is None:
             return None
@@ -220,7 +222,7 @@ class ExchangeCheck:
         tension, length = (np.array(part) for part in zip(*messages))
 
         def scores(wiring: Wiring) -> Array:
-            """Return the anomaly scores of all messages with their columns wired in this way."""
+            """Return the anomaly scores of all messages, with the columns put right by `wiring`."""
             ordered, shifted = wiring.unsigned(tension), wiring.signed(length) - offset
             state = mae.estimate(ordered, shifted)
             return anomaly(residuals(state, ordered, shifted, mae.isolated))

@@ -7,11 +7,12 @@ decides when to fit and whether the result is reliable.
 
 Offsets cannot correct readings in a wrong order, or lengths with a wrong sign. Such readings would
 often lead to plausible but false offsets. Before offsets of a moving arm are accepted, the wiring
-is therefore judged (`signals/wiring.py`), and a wrong one is refused with the names of the muscles.
-A standing arm does not show the wiring.
+is therefore judged (`signals/wiring.py`), and a wrong wiring is refused with the names of the
+muscles. A standing arm does not show the wiring.
 
 If an arm stands still, some offsets explain its readings even if it does not stand in the stated
-posture. They are known only if the joint sensors, if there are any, measure that posture.
+posture. On an arm with joint sensors, the offsets are therefore accepted only if the sensors
+measure that posture.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from musculoskeletal_ae.signals.wiring import WiringJudgement, judge
 ENOUGH_WITH_ANGLES = 20.0  # with joint sensors, require gentle motion for this long [s]
 ENOUGH = 38.0  # without joint sensors, require gentle motion for this long [s]
 STANDING = 1.0  # require the arm to stand still in a posture stated by the user for this long [s]
-#: begin the first fit after this time, and fits of an arm that stands at this interval [s]
+#: begin the first fit after this time [s], and all fits of a standing arm at this interval
 FIRST_FIT = 0.5
 FIT_INTERVAL = 2.0  # begin later fits of a moving arm at this interval [s]
 #: Do one piece of a fit, which takes 1 to 2 ms, for every PIECE_TIME [s] since the last message.
@@ -43,22 +44,23 @@ FIT_INTERVAL = 2.0  # begin later fits of a moving arm at this interval [s]
 #: with messages at 50 to 200 Hz.
 PIECE_TIME = 0.005
 MOST_PIECES = 4  # do at most this many pieces of a fit at one message, so that none is delayed
-#: reject a fit with a larger median residual of a length [m]; correct offsets leave 0.0003 m
+#: reject a fit if the median residual of a length is larger than this [m]; correct offsets leave
+#: 0.0003 m
 LARGEST_RESIDUAL = 0.02
-#: reject a fit with a larger cost per residual: correct offsets cost 0.2 to 0.5, offsets of a wrong
-#: posture 1.1, and pure noise 0.95
+#: reject a fit with a larger cost per residual than this: correct offsets cost 0.2 to 0.5, offsets
+#: of a wrong posture 1.1, and pure noise 0.95
 LARGEST_COST = 0.75
 #: advise these steps if the order or the sign of the readings is wrong
 CORRECT_DRIVER = Step.CORRECT_WIRING, Step.CALIBRATE_LENGTHS
-#: advise this if a calibration in gentle motion fails: it needs an accurate network, which one that
-#: has not learned the arm may not be
+#: advise this if a calibration in gentle motion fails; a network that has not learned the arm may
+#: not be accurate enough for it
 OTHER_WAY = (
     'provide joint sensors; or set zero_posture, hold the arm there, and call estimator/zero'
 )
 #: treat this many successive moments (means over 0.25 s) as one independent measurement, when the
 #: standard deviation of an offset is computed
 CORRELATED = 10.0
-#: during the calibration, use a newer estimate of the offsets only if one of them differs by more
+#: during the calibration, use a newer estimate of the offsets only if an offset differs by more
 #: than this from the one in use [m]
 SHIFTED = 0.02
 #: Reject a stated posture if a joint sensor differs by more than this [rad]. A larger difference is
@@ -76,9 +78,9 @@ class LengthCalibration:
 
     Attributes:
         posture: Positions of the joints at which the arm stands, as the user has stated them [rad
-            or m], (D,); () if it moves gently.
+            or m], (D,); () if the arm moves gently.
         wiring: Whether muscles are exchanged or lengths have a wrong sign, according to the newest
-            fit; None before that has been judged.
+            fit; None before the wiring has been judged.
     """
 
     def __init__(self, robot: Robot, mae: Mae | None, posture: tuple[float, ...] = ()) -> None:
@@ -113,7 +115,7 @@ class LengthCalibration:
         self._best: Fit | None = None
         self._has_angles = False  # whether joint angles are measured most of the time
         self._problem = ''  # why the last fit is not reliable, or the stated posture is wrong
-        self._estimate: LengthOffsets | None = None  # the newest one, which may be unreliable
+        self._estimate: LengthOffsets | None = None  # newest estimate, which may be unreliable
         self._used: Array | None = None  # offsets in use [m], (M,); None before the first estimate
         #: θ measured last while the arm stands [rad], (D,) each
         self._measured: deque[Array] = deque(maxlen=MOST)
@@ -133,7 +135,7 @@ class LengthCalibration:
     def offsets(self) -> LengthOffsets | None:
         """The newest estimate of the offsets; None before the first.
 
-        While the arm stands in a stated posture, there is none until the offsets are known.
+        While the arm stands in a stated posture, there is no estimate until the offsets are known.
         """
         return None if self.is_standing and not self.is_done else self._estimate
 
@@ -201,7 +203,7 @@ class LengthCalibration:
             return None
         if self.is_done:
             return Evidence.CALIBRATED
-        # Use the first estimate, and any other only after a substantial change.
+        # Use the first estimate, and a later estimate only after a substantial change.
         if self._used is None or np.abs(offsets.offset - self._used).max() > SHIFTED:
             self._used = offsets.offset
             return Evidence.CALIBRATING
@@ -291,7 +293,7 @@ class LengthCalibration:
         """Return why a fit is not reliable, as a text for users, or '' if it is reliable.
 
         Args:
-            fit: The fit.
+            fit: The fit to judge.
             residual: Median residual of each length [m], (M,).
         """
         if self.wiring is not None and self.remedy:
@@ -307,7 +309,7 @@ class LengthCalibration:
         # At a high cost, the fit may have found wrong postures that are similar to the true ones.
         if not cost <= LARGEST_COST:
             problem = 'no offsets explain the lengths and tensions'
-            excess = f'the cost is {cost:.2f}; legal: at most {LARGEST_COST:g}'
+            excess = f'the cost of the fit is {cost:.2f}; legal: at most {LARGEST_COST:g}'
             return f'{problem}: {excess}; {OTHER_WAY}'
         return ''
 

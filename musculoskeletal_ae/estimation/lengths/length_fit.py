@@ -106,7 +106,8 @@ class LengthFit:
         few = moments.rows(_few(moments))
         guesses = yield from self._guesses(moments, few)
         likeliest = yield from self._best(guesses, few, FIRST_ROUNDS)
-        # Let all moments decide between the new start and the earlier fit: a few may mislead.
+        # Let all moments decide between the new start and the earlier fit: a few moments may
+        # mislead.
         candidates = [likeliest.constants]
         if before is not None:
             candidates.append(before.constants)
@@ -117,8 +118,8 @@ class LengthFit:
 
         Each wiring that differs by one fault is fitted to a few moments. The fit begins with the
         postures of `fit`, which are roughly right although some columns are wrong. All moments
-        decide among the likeliest wirings. If a fault is found, another one is searched for. The
-        generator yields after each short piece of work.
+        decide among the likeliest wirings. If a fault is found, the search continues for a further
+        fault. The generator yields after each short piece of work.
 
         Args:
             fit: The fit to the readings as they are.

@@ -51,7 +51,7 @@ JOINT_FRICTION = 0.03
 
 #: after a reversal, let the friction of a joint change its sign over this motion [rad]
 STICKING = 0.003
-#: relate joint friction to a torque of at least this share of that of the muscles at T_bias: a
+#: relate joint friction to at least this share of the torque of the muscles at T_bias, because a
 #: joint with a vertical axis carries no weight
 LEAST_WEIGHT = 0.1
 
@@ -141,7 +141,7 @@ class LengthModel:
         unbalanced, jacobian = self.torque(theta, pull)
         torque = unbalanced + joint_friction * turning
         # A stop can carry any torque, so the residual of a joint at its stop means nothing. It is
-        # replaced by a typical one, so that the fit neither seeks nor avoids stops.
+        # replaced by a typical residual, so that the fit neither seeks nor avoids stops.
         low, high = self.robot.lower + AT_STOP, self.robot.upper - AT_STOP
         is_free = (low < theta) & (theta < high)
         torque = np.where(is_free, torque, TORQUE_NOISE)
@@ -181,7 +181,7 @@ class MomentFit:
     """Fit of the constants, and of the postures of K moments, as a `gauss_newton.Problem`."""
 
     def __init__(self, model: LengthModel, moments: Moments, theta: Array) -> None:
-        """Prepare the fit; the first postures `theta` (K, D) show how the joints turn."""
+        """Prepare the fit; it starts with postures `theta` (K, D), which show how joints turn."""
         self._model, self._moments = model, moments
         self._turning = _turning(theta)
         self._largest_step = np.full(model.robot.joint_count, LARGEST_STEP)
@@ -196,7 +196,7 @@ class MomentFit:
         return LengthPoint(constants, theta, value)
 
     def weigh(self, point: LengthPoint) -> None:
-        """Compute the robust weights of lengths and torques; those of the limits are 1."""
+        """Compute the robust weights of length and torque residuals; joint limits weigh 1."""
         self._weight = student(point.residual)
         self._weight[:, -point.theta.shape[1] :] = 1.0
 
@@ -235,7 +235,7 @@ class MomentFit:
         )
 
     def moved(self, point: LengthPoint, step: SolvedStep) -> LengthPoint:
-        """Return the point to which a step of the solver leads; LARGEST_STEP limits the angles."""
+        """Return the point to which a step leads; each angle changes by at most LARGEST_STEP."""
         turned = np.clip(step.samples, -self._largest_step, self._largest_step)
         return self.point(point.constants + step.common, point.theta + turned)
 

@@ -20,7 +20,7 @@ WINDOW = 0.25  # average readings over this time; the mean is called a moment [s
 #: conclude that the arm has moved since the last moment if a length has changed by more than this
 #: [m]
 MOVED = 0.002
-#: skip moments in which a muscle is faster, because inertial forces matter then [m/s]
+#: skip moments in which a muscle is faster than this [m/s], because inertial forces matter then
 FASTEST = 0.05
 MOST = 240  # keep at most this many of the newest moments, which bounds the time of a fit
 
@@ -67,11 +67,12 @@ class MomentCollector:
         self._used, self._posture = used, posture
         self._no_angles = np.full(joint_count, np.nan)
         self._direction = FrictionDirection()
-        self._window: list[tuple[Array, ...]] = []  # T, l, s and raw l of each message
+        #: tension, length, sliding direction and raw length of each message
+        self._window: list[tuple[Array, ...]] = []
         self._angles: list[Array] = []  # measured θ in the same window
         self._span = 0.0  # duration of the present window so far [s]
         self._moments: list[tuple[Array, ...]] = []
-        self._last_length: Array = np.zeros(len(used))  # l from which motion is measured [m]
+        self._last_length: Array = np.zeros(len(used))  # length from which motion counts [m]
         self.time = 0.0
         self.has_moved_away = False
 
@@ -79,7 +80,7 @@ class MomentCollector:
         return len(self._moments)
 
     def moments(self) -> Moments:
-        """Return all moments."""
+        """Return all moments that have been kept."""
         return Moments(*map(np.array, zip(*self._moments)))
 
     def step(self, tension: Array, length: Array, dt: float, theta: Array | None) -> None:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Decides which length offsets may be trusted: the only place where evidence becomes trust.
+"""Decides, for all nodes, which length offsets may be trusted.
 
 Detectors, the length calibration, the joint sensors, the check of a repaired muscle and a restart
-provide evidence. `TRANSITIONS` has the trust that follows from each of them. A finding revokes
+provide evidence. `TRANSITIONS` states which trust follows from each of them. A finding revokes
 offsets if the declaration of its kind says so (`conditions.py`). The estimator publishes the result
 on `body_state`, and all other nodes follow it.
 
@@ -31,7 +31,7 @@ CONFIRMED = 0.01
 
 
 class Evidence(Enum):
-    """What decides about length offsets, besides findings; the value is a text for users."""
+    """Evidence on length offsets, apart from findings; the values are texts for users."""
 
     ASSUMED = 'assumed to be 0'
     NOT_CALIBRATED = 'not calibrated since the start'
@@ -53,8 +53,8 @@ class Transition(NamedTuple):
 _ANY, _UNKNOWN = frozenset(Trust), frozenset({Trust.UNKNOWN})
 _KNOWN, _REVOKED = frozenset({Trust.KNOWN}), frozenset({Trust.REVOKED})
 
-#: change the trust in an offset as each evidence declares; ASSUMED, the evidence at the start, is
-#: no key, because nothing leads back to it
+#: change the trust in an offset in this way by each kind of evidence; ASSUMED is missing, because
+#: it is the evidence at the start and is never taken later
 TRANSITIONS = {
     Evidence.NOT_CALIBRATED: Transition(_ANY, Trust.UNKNOWN),
     Evidence.RESTARTED: Transition(_ANY, Trust.UNKNOWN),

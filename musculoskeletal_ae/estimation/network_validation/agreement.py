@@ -7,8 +7,8 @@ Three quantities are compared:
     lengths   the muscle lengths that the network computes at the same posture
     shape     the change of these lengths from posture to posture, on fixed random states
 
-If joint sensors measured the postures, they are the reference. The limit of the median error of
-each joint or muscle is then ANGLE_WORSE times the error of the network in use, but at least
+If joint sensors measured the postures, the sensors are the reference. The limit of the median error
+of each joint or muscle is then ANGLE_WORSE times the error of the network in use, but at least
 ANGLE_FLOOR or LENGTH_FLOOR. The shape is compared only if the candidate's mean error of length is
 larger than that of the network in use.
 
@@ -39,20 +39,22 @@ LENGTH_FLOOR = 0.06  # never reject a network for a smaller error of a length th
 #: above these errors, reject a network whose error exceeds that of the network in use by this
 #: factor
 ANGLE_WORSE = 1.5
-#: call a network that a user has chosen worse than the one in use only from this error on [rad]
+#: call a chosen network worse than the one in use only if its error exceeds this [rad]
 ANGLE_CLEAR = 0.1
 # Limits relative to the network in use. The first update of an initial network changed θ by up to
 # 0.56 rad and lengths by up to 0.05 m; an update of a learned network changed θ by up to 0.31 rad.
-#: while a learned network is in use, reject candidates whose θ differs from its θ by more [rad]
+#: while a learned network is in use, reject candidates whose θ differs from its θ by more than this
+#: [rad]
 ANGLE_MOVED = 0.45
-#: while an initial network is in use, reject candidates whose θ differs from its θ by more [rad]
+#: while an initial network is in use, reject candidates whose θ differs from its θ by more than
+#: this [rad]
 ANGLE_MOVED_INITIAL = 0.8
-#: reject candidates one of whose lengths differs from that of the network in use by more [m]
+#: reject a candidate if a length differs by more than this from that of the network in use [m]
 LENGTH_MOVED = 0.07
 # A minute of learning changed the shape of initial networks by 0.32 and of learned networks by
 # 0.18. Multiplying all lengths by 1.5 changes it by 0.5.
-#: while a learned network is in use, reject a candidate if the changes of its lengths from posture
-#: to posture differ by more than this share from those of the network in use
+#: while a learned network is in use, reject a candidate whose changes of length from posture to
+#: posture differ by more than this share from those of the network in use
 SHAPE_MOVED = 0.3
 #: the same limit as SHAPE_MOVED, but while an initial network is in use
 SHAPE_MOVED_INITIAL = 0.42
@@ -137,8 +139,9 @@ class AgreementCheck:
             return ''
         unit = self._robot.units[worst]
         return (
-            f'it estimates {self._robot.joints[worst]} {unit.position_text(error[worst])} away '
-            f'from its sensor, the network before {unit.position_text(in_use[worst])}'
+            f'its estimate of {self._robot.joints[worst]} differs from the sensor by '
+            f'{unit.position_text(error[worst])}, that of the network before by '
+            f'{unit.position_text(in_use[worst])}'
         )
 
     def _estimates(self, mae: Mae) -> tuple[Array, Array, Ints]:

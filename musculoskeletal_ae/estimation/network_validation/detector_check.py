@@ -20,8 +20,8 @@ from musculoskeletal_ae.mae.residuals import AnomalyStatistics, residuals
 
 #: reject a network if no imitated rupture raises d to at least this share of its threshold
 LEAST_RUPTURED = 0.1
-#: raise a detector's threshold that a candidate inherits to at least this multiple of the largest
-#: residual distance d in recent messages, so that the candidate reports nothing on a healthy arm
+#: raise the threshold of an inherited detector to at least this multiple of the largest residual
+#: distance d in recent messages, so that the candidate reports nothing on a healthy arm
 WIDENED = 3.5
 
 
@@ -47,7 +47,7 @@ def measures(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> Ite
         return float(np.median(statistics.distances(error) / threshold))
 
     yield measure(tension, length)
-    # Use only LEAST messages for each simulated rupture; more would not change the result.
+    # Use only LEAST messages for each imitated rupture; more messages would not change the result.
     rows = np.linspace(0, len(length) - 1, LEAST).astype(int)
     is_intact = 1.0 - np.eye(tension.shape[1])
     for factors in np.delete(is_intact, tuple(isolated), axis=0):
@@ -68,7 +68,7 @@ def faults(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) -> Itera
     if ruptured < LEAST_RUPTURED:
         yield (
             f'detector: d is {ruptured:.2g} times its threshold with a ruptured muscle, '
-            f'required {LEAST_RUPTURED:g}'
+            f'required: at least {LEAST_RUPTURED:g}'
         )
 
 

@@ -2,9 +2,9 @@
 """Checks how exactly a candidate network reconstructs the readings of recent messages.
 
 Three errors are compared. With mask ②, the network estimates joint angles from tensions and
-lengths, and reconstructs both: two errors. With mask ①, it computes the lengths at these joint
-angles: the third error. The median error of each muscle over the messages must be below WORSE times
-that of the network in use, or below FLOOR.
+lengths, and reconstructs the tensions (first error) and the lengths (second error). With mask ①, it
+computes the lengths at these joint angles (third error). The median error of each muscle over the
+messages must be below WORSE times that of the network in use, or below FLOOR.
 """
 
 from collections.abc import Iterable, Iterator
@@ -15,7 +15,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.estimation.network_validation.recent_messages import RecentMessages
 from musculoskeletal_ae.mae.mae import Mae
 
-#: reject a network whose error exceeds the one of the network in use by this factor
+#: reject a network whose error exceeds that of the network in use by this factor
 WORSE = 2.0
 #: never reject a network for errors of tensions T [N] and lengths l [m] smaller than these; ① and ②
 #: are the masks with which the network computes them
@@ -69,8 +69,8 @@ def worse_length(
     if not error[worst] > max(CLEAR, WORSE * before[worst]):
         return ''
     return (
-        f'it explains the length of {muscles[worst]} to {1e3 * error[worst]:.0f} mm, the network '
-        f'before to {1e3 * before[worst]:.0f} mm'
+        f'its error of the length of {muscles[worst]} is {1e3 * error[worst]:.0f} mm, that of the '
+        f'network before was {1e3 * before[worst]:.0f} mm'
     )
 
 

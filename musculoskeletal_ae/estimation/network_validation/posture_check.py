@@ -62,8 +62,8 @@ LIMITS = {
     'mean θ by ①': 0.6,
     'mean θ by ③': 0.7,
 }
-#: divide the error of a length by at least this standard deviation [m], so that a small error of a
-#: muscle that hardly changes its length is no large relative error
+#: divide the error of a length by at least this standard deviation [m]: a small error of a muscle
+#: that hardly changes its length is then no large relative error
 LEAST_SPREAD = 0.04
 LEAST_ARM = 0.01  # divide errors of the muscle Jacobian by moment arms of at least this size [m]
 #: before comparing lengths, multiply the modelled elongation of each muscle by a factor between
@@ -200,7 +200,7 @@ class PostureCheck:
         share = rng.uniform(size=(count, robot.muscle_count))
         tension = robot.tension.bias + share * (robot.tension.limit - robot.tension.bias)
         if has_followers(robot):
-            # The tensions determine θ by ② where the robot can rest, and not elsewhere.
+            # With ②, tensions and lengths determine θ only where the robot can rest.
             rests = equilibrium_states(robot, len(theta[::2]), rng, SEARCHED)
             if rests is not None:
                 theta[::2], tension[::2] = rests

@@ -25,7 +25,7 @@ class _Message(NamedTuple):
 class RecentMessages:
     """Stores the healthy messages of the last 10 s, at most one in 0.1 s.
 
-    All times are of one steady clock [s].
+    All times come from one steady clock [s].
     """
 
     def __init__(self, joint_count: int) -> None:
@@ -88,5 +88,5 @@ class RecentMessages:
             self._messages.pop()
 
     def clear(self) -> None:
-        """Clear all messages."""
+        """Clear all messages, because they no longer describe the arm."""
         self._messages.clear()

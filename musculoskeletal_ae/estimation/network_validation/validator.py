@@ -2,8 +2,8 @@
 """Checkpoint validation: decides which network the estimator uses.
 
     candidate of the learner ─► checks ─► accepted, or rejected with a reason
-    network of a user        ─► checks ─► accepted, with what it does worse; or refused
-    an anomaly begins        ─► a proven network again; the doubtful one is rejected
+    network of a user        ─► checks ─► accepted, with a note on what it does worse; or refused
+    an anomaly begins        ─► a proven network is used again; the doubtful one is rejected
 
 Four checks compare a candidate with the geometric model, the arm and the network in use:
 
@@ -15,8 +15,8 @@ Four checks compare a candidate with the geometric model, the arm and the networ
                        and would detect a rupture
 
 The first network is only subject to the first and the last check, because its error on a body that
-differs from its model cannot be predicted. A network that a user has chosen is not subject to
-the third check; where it is clearly worse than the network in use, `unsuitable_because` says so.
+differs from its model cannot be predicted. A network that a user has chosen is not subject to the
+third check; if it is clearly worse than the network in use, `unsuitable_because` says so.
 
 All limits leave a margin to the values of healthy networks: initial and learned networks of both
 presets, on arm26 and musashi_left_arm, with both emulator models. `python -m bench gate` prints
@@ -66,9 +66,10 @@ class CheckpointValidator:
         is_anomaly: Whether an anomaly is present.
         postures: The check on the geometric model.
         unsuitable_because: Why the network in use, which a user has chosen, fits this arm worse
-            than the one before; '' if it does not.
+            than the network before it; '' if it fits as well.
         accepted: Called with each network that is used from now on.
-        rejected: Called with each network that is not used, or no longer, and with the reason.
+        rejected: Called with each network that is rejected, at once or after an anomaly, and with
+            the reason.
     """
 
     def __init__(self, robot: Robot, use: Callable[[Mae], Mae] = lambda mae: mae) -> None:
@@ -76,7 +77,8 @@ class CheckpointValidator:
 
         Args:
             robot: The nominal body.
-            use: Puts a network to use, and returns it with what has been measured for it.
+            use: Puts a network to use, and returns it with the torques measured so far
+                (`Estimator.use`).
         """
         self._robot, self._use = robot, use
         self.unsuitable_because = ''
@@ -148,8 +150,8 @@ class CheckpointValidator:
     def follow(self, body: BodyState, now: float) -> Mae | None:
         """Follow a change of the body state.
 
-        Other length offsets make the messages useless. If an anomaly begins, a network that was
-        accepted shortly before may be its cause; it is replaced by a proven one, and rejected.
+        New length offsets make the stored messages useless. If an anomaly begins, a network that
+        was accepted shortly before may be its cause; it is replaced by a proven one, and rejected.
 
         Returns:
             The proven network that is used again; None if the network in use does not change.
@@ -164,7 +166,7 @@ class CheckpointValidator:
             return None
         self.unsuitable_because = ''
         self.accepted(self._use(proven))
-        self.rejected(doubtful, 'an anomaly was detected soon after it was accepted')
+        self.rejected(doubtful, 'an anomaly was detected soon after this network was accepted')
         return proven
 
     def _accept(self, mae: Mae, now: float, unsuitable_because: str = '') -> None:
@@ -189,7 +191,7 @@ class CheckpointValidator:
         )
 
     def _weakness(self, mae: Mae) -> str:
-        """Return in what a network is clearly worse than the learned one in use, for users.
+        """Return for users how a network is clearly worse than the learned network in use.
 
         On recent messages, the errors of estimated joint angles are compared, if joint sensors
         measured them, or else those of the lengths that each network computes at its estimate.
