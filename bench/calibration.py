@@ -4,8 +4,8 @@
     python -m bench calibration [--robot NAME|DIR] [--seeds 0,1,…] [--minutes 5]
 
 The constants of `emulator.kin.individual.Spread` were set once, with seeds 0–9 of musashi_left_arm,
-and are never changed to improve a result. They meet two targets on the held-out motion (5 minutes at
-100 Hz; mean of ‖θ_est − θ_true‖ over samples and individuals):
+and are never changed to improve a result. They meet two targets on the held-out motion (5 minutes
+at 100 Hz; mean of ‖θ_est − θ_true‖ over samples and individuals):
 
 - Before learning, preset `paper` has an error of 0.32–0.42 rad, as in the paper.
 - The oracle, least squares on the true body, has an error of 0.04–0.06 rad in motion.

@@ -200,8 +200,8 @@ class TorchLengths:
         angles, tensions = self._tensor(theta, requires_grad=True), self._tensor(tension)
         values = torch.cat((angles, tensions, torch.zeros_like(tensions)), dim=1)
         mask = torch.zeros(len(theta), dtype=torch.long, device=values.device)
-        restored = self._network((values * self._scale).float(), mask) / self._scale
-        length = restored[:, -self._muscles :]
+        reconstructed = self._network((values * self._scale).float(), mask) / self._scale
+        length = reconstructed[:, -self._muscles :]
 
         def pullback(gradient: Array) -> Array:
             by_angles = torch.autograd.grad(length, angles, self._tensor(gradient))[0]

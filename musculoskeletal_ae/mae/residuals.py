@@ -31,18 +31,18 @@ LEAST_MOTION = 60.0
 
 
 def residuals(
-    restored: State, tension: Array, length: Array, isolated: Sequence[int] = ()
+    reconstructed: State, tension: Array, length: Array, isolated: Sequence[int] = ()
 ) -> Array:
     """Return the residuals e in scaled units, (..., 2M), which are 0 for isolated muscles.
 
     Args:
-        restored: States that the network reconstructed from the measured T and l.
+        reconstructed: States that the network reconstructed from the measured T and l.
         tension: Measured T [N], (..., M).
         length: Measured l [m], (..., M).
         isolated: Indices of isolated muscles.
     """
-    by_tension = TENSION_SCALE * (restored.tension - tension)
-    by_length = LENGTH_SCALE * (restored.length - length)
+    by_tension = TENSION_SCALE * (reconstructed.tension - tension)
+    by_length = LENGTH_SCALE * (reconstructed.length - length)
     if isolated:
         by_tension[..., list(isolated)] = by_length[..., list(isolated)] = 0.0
     return np.concatenate((by_tension, by_length), axis=-1)

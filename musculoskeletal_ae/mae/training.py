@@ -146,8 +146,8 @@ def pair_errors(mae: Mae, states: State) -> list[PairError]:
     """
     result = []
     for mask in Mask:
-        restored = mae.decode(mae.encode(mask, *states))
-        for (output, unit, factor), got, true in zip(OUTPUTS, restored, states, strict=True):
+        reconstructed = mae.decode(mae.encode(mask, *states))
+        for (output, unit, factor), got, true in zip(OUTPUTS, reconstructed, states, strict=True):
             error = factor * (got - true)
             norm = float(np.linalg.norm(error, axis=1).mean())
             result.append(PairError(mask, output, unit, norm, np.abs(error).mean(axis=0)))

@@ -233,8 +233,8 @@ class EstimatorNode(Shell):
             covariance = self.robot.units.covariance_of_positions(output.covariance)
             self.covariance.publish(array_message(covariance, 'joint', 'joint'))
         if is_heard(self.muscles):
-            restored = np.array([state.length, state.tension])
-            self.muscles.publish(array_message(restored, 'quantity', 'muscle'))
+            reconstructed = np.array([state.length, state.tension])
+            self.muscles.publish(array_message(reconstructed, 'quantity', 'muscle'))
         if is_heard(self.anomaly):
             self.anomaly.publish(Float64(data=output.anomaly))
         if output.contact is not None and is_heard(self.wrench):

@@ -36,12 +36,12 @@ def message_errors(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) 
         return {}
     tension, length = messages.readings(mae)
     muscle_count = tension.shape[1]
-    restored = mae.estimate(tension, length)
+    reconstructed = mae.estimate(tension, length)
     used = np.delete(np.arange(muscle_count), tuple(isolated))
     parts = (
-        restored.tension - tension,
-        restored.length - length,
-        mae.lengths(restored.theta, tension) - length,
+        reconstructed.tension - tension,
+        reconstructed.length - length,
+        mae.lengths(reconstructed.theta, tension) - length,
     )
     errors = {name: np.zeros(muscle_count) for name in FLOOR}
     for error, part in zip(errors.values(), parts, strict=True):

@@ -125,10 +125,10 @@ class PostureCheck:
         """
         own_length = mae.lengths(self.theta, self.tension)
         for mask, symbol in zip(Mask, '①②③', strict=True):
-            restored = mae.decode(mae.encode(mask, self.theta, self.tension, own_length))
+            reconstructed = mae.decode(mae.encode(mask, self.theta, self.tension, own_length))
             length = self._softened(own_length) if symbol == '①' else own_length
             truth = self.theta, self.tension, length
-            for name, value, true in zip('θTl', restored, truth, strict=True):
+            for name, value, true in zip('θTl', reconstructed, truth, strict=True):
                 usual = self.length if name == 'l' and symbol == '①' else true
                 spread = np.maximum(usual.std(axis=0), LEAST_SPREAD if name == 'l' else 1e-9)
                 yield f'{name} by {symbol}', _root_mean_square(value - true) / spread
