@@ -47,8 +47,9 @@ class Limits(NamedTuple):
     # A module's temperature changes by at most `temperature_step + temperature_rate · dt` in the
     # time dt since the last accepted temperature. The first temperature is accepted after later
     # readings have differed from it by at most `temperature_step` for the time `glitch`.
-    temperature_step: float = 5.0  # constant part of the largest change between readings [°C]
-    temperature_rate: float = 50.0  # largest rate of a temperature [°C/s]
+    #: reject a temperature that changes by more than this plus a part that grows with time [°C]
+    temperature_step: float = 5.0
+    temperature_rate: float = 50.0  # let this permitted change grow at this rate [°C/s]
     #: reject a length if |l| exceeds by more than this [m] the largest |l| that the model has with
     #: joints up to `joint_outside` beyond their ranges; a healthy |l| exceeds it if the tendon
     #: wraps, is slack and has been wound in, or is attached elsewhere than modelled
@@ -61,9 +62,9 @@ class Limits(NamedTuple):
     # stayed at the new level for `settled`.
     #: reject a length that changes by more than this plus a part that grows with time [m]
     step: float = 0.02
-    speed: float = 1.0  # largest plausible speed of a muscle length [m/s]
-    longest_step: float = 0.05  # upper limit of dt in `step + speed · dt` [s]
-    settled: float = 1.0  # time after which a new level of a length is accepted [s]
+    speed: float = 1.0  # let this permitted change grow at this rate [m/s]
+    longest_step: float = 0.05  # let it grow no further after this time [s]
+    settled: float = 1.0  # accept a length that has jumped once it has stayed for this time [s]
     #: report implausible messages as a fault, not as a glitch, once they have lasted for this time
     #: [s]
     glitch: float = 0.1
