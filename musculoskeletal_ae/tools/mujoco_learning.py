@@ -33,7 +33,9 @@ from musculoskeletal_ae.experiments.recording import (
 from musculoskeletal_ae.exporting.exported_mjcf import export_into
 from musculoskeletal_ae.importing import convert
 from musculoskeletal_ae.importing.source import listed
+from musculoskeletal_ae.learning.convergence import MOST_UPDATES
 from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.recordings import complete
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import train_on
@@ -96,7 +98,9 @@ def train(args: Namespace) -> None:
 def learn(robot: Robot, initial: Mae, model: Path, seed: int, minutes: float) -> Learned:
     """Let the emulated arm of an imported file explore and learn.
 
-    If the emulated arm diverges, the exploration ends early. The network keeps what it has learned
+    During the exploration, each rest causes an update, as on a real arm. Afterwards, the network is
+    trained until it represents the body that was fitted to all samples, as after a recording. If
+    the emulated arm diverges, the exploration ends early. The network keeps what it has learned
     before.
 
     Args:
@@ -123,6 +127,9 @@ def learn(robot: Robot, initial: Mae, model: Path, seed: int, minutes: float) ->
     except DivergedError as error:
         minutes, problem = loop.time / 60.0, str(error)
     speed = 60.0 * minutes / (time.perf_counter() - start)
+    title = 'training the network on the learned body'
+    with ProgressBar(title, MOST_UPDATES, ends_early=True) as bar:
+        complete(learner, bar.add)
     movable = movable_joints(robot)
     error_of = make_error_function(held_out, joints=movable if movable.any() else None)
     before, after, samples = error_of(initial), error_of(learner.mae), len(learner.samples)
