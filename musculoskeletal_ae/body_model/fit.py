@@ -111,12 +111,12 @@ def fit_body(
     fit = fitted()
     theta = corrected(fit)
     before = body.remainder.at(theta, observed.tension)
-    body.remainder = learned_remainder(body, measured(theta), fit.weight, priors)
+    body.remainder, left_out = learned_remainder(body, measured(theta), fit.weight, priors)
     # Fit the constants again if the remainder changed; otherwise both would explain the same
     # lengths.
     if np.abs(body.remainder.at(theta, observed.tension) - before).max() > LEAST_NOISE:
         fit = fitted()
-    body.regressions = learned_regressions(body, measured(corrected(fit)), fit)
+    body.regressions = learned_regressions(body, measured(corrected(fit)), fit, left_out)
     return fit
 
 
@@ -270,7 +270,7 @@ def fit_to_network(
         body.parameters[m] = problem.run()
     if not with_remainder:
         return
-    body.remainder = learned_remainder(body, observed, everything.astype(float), priors)
+    body.remainder, _ = learned_remainder(body, observed, everything.astype(float), priors)
     explained = replace(observed, length=lengths - body.remainder.at(theta, read))
     for m, prior in enumerate(priors):
         problem = MuscleFit(body, poses, explained, everything[:, m], prior, NETWORK_ERROR, m)

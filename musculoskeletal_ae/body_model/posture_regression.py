@@ -6,8 +6,8 @@
 p is the scalar product of two inputs and d their squared distance. Inputs are the lengths l, and
 the tensions T times a factor f. They are scaled to mean 0 and standard deviation 1, and p and d are
 divided by the number of lengths. θ is therefore a line and a parabola in l, and a rest that may be
-rough. The constants a, σ, b, c, w and f are those with the largest evidence. All joints of a group
-share them.
+rough. The constants a, σ, b, c, w and f are those with the largest evidence. Each joint has its
+own, because lengths may determine some joints smoothly and others hardly at all.
 
 The body estimates θ by searching the posture whose lengths are l. This amplifies errors of the
 lengths. It fails where lengths do not determine the posture, and where muscles lengthen together
@@ -28,18 +28,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.body_model.remainder import FEW_SAMPLES, LEAST_SAMPLES, squares
+from musculoskeletal_ae.body_model.remainder import FEW_SAMPLES, LEAST_SAMPLES, judging, squares
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
     from musculoskeletal_ae.body_model.fit import FittedBody
+    from musculoskeletal_ae.body_model.remainder import LeftOut
     from musculoskeletal_ae.learning.samples import Observations
     from musculoskeletal_ae.robot.groups import Group
     from musculoskeletal_ae.robot.robot import Robot
@@ -56,17 +57,37 @@ ROUNDS = 40  # end a search that starts from STARTS after this many iterations
 FEW_ROUNDS = 4  # end a search that continues from the last result after this many iterations
 CONSTANT = 0.3  # expect the mean of θ in all postures to differ from that in the samples by this²
 JITTER = 1e-8  # add this variance to keep covariances positive definite
-LEAST_SPREAD = 1e-6  # leave out inputs that vary less than this in the samples [m, N]
+#: leave out inputs and joints that vary less than this in the samples [m, N, rad]
+LEAST_SPREAD = 1e-6
 #: leave out joints that a smaller share of the samples measures, and muscles whose lengths a
 #: smaller share of them contains
 MEASURED_SHARE = 0.5
-#: leave out joints that vary less than this in the samples [rad], because such samples do not show
-#: which lengths follow from a motion of the joint
+#: compute the predictive variance of each joint as if its standard deviation in the samples were at
+#: least this [rad], because samples of a joint that hardly moved do not show how it moves elsewhere
 LEAST_ANGLE_SPREAD = 0.05
 #: expect the body's posture within this share of the joint ranges from their middle
 USUAL_SHARE = 0.3
 DIFFERENCE = 1e-4  # differentiate lengths with this step [rad]
 UNKNOWN_SPREAD = 1e3  # assume this standard deviation of a length that a sample lacks [m]
+
+
+class Pairs(NamedTuple):
+    """Squared distances and products of pairs of scaled inputs, (N, K) each."""
+
+    of_lengths: tuple[Array, Array]  # distance and product of the lengths alone
+    of_tensions: tuple[Array, Array]  # distance and product of the tensions alone
+
+    @classmethod
+    def of(cls, one: Array, other: Array) -> Pairs:
+        """Return the pairs of N and K inputs, (N, 2M) and (K, 2M)."""
+        parts = zip(np.split(one, 2, axis=1), np.split(other, 2, axis=1), strict=True)
+        return cls(*((squares(own, each), own @ each.T) for own, each in parts))
+
+    def scaled(self, logarithms: Array) -> tuple[Array, Array]:
+        """Return the distances d and the products p, with tensions scaled by f."""
+        factor = np.exp(2.0 * logarithms[5])
+        (distance, product), (by_tension, product_of_tensions) = self
+        return distance + factor * by_tension, product + factor * product_of_tensions
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,16 +97,16 @@ class PostureRegression:
     joints: Ints  # indices of the D joints that it estimates
     muscles: Ints  # indices of the M muscles
     mean: Array  # mean of l [m] and T [N] in the samples, (2M,)
-    #: units of l [m] and T [N] in which p and d are those of the module's docstring; infinite for
-    #: inputs that do not vary in the samples, (2M,)
+    #: units of l [m] and T [N] in which p and d are those of the module's docstring with f = 1;
+    #: infinite for inputs that do not vary in the samples, (2M,)
     scale: Array
     angle_mean: Array  # mean of θ in the samples [rad], (D,)
     angle_spread: Array  # s, standard deviation of θ in the samples [rad], (D,)
     body_variance: Array  # v_body [rad²], (D,)
-    logarithms: Array  # natural logarithms of a, σ, b, c, w and f, (6,)
+    logarithms: Array  # natural logarithms of a, σ, b, c, w and f for each joint, (D, 6)
     inputs: Array  # l and T of the samples, minus `mean` and in units of `scale`, (N, 2M)
-    root: Array  # lower Cholesky factor of their covariance, (N, N)
-    weights: Array  # α, (N, D): θ = mean + s k(·, inputs) α
+    roots: tuple[Array, ...]  # lower Cholesky factor of their covariance for each joint, (N, N)
+    weights: Array  # α, (D, N): θ = mean + s k(·, inputs) α
 
     def combined(self, theta: Array, tension: Array, length: Array) -> Array:
         """Return θ_est of the regression's joints [rad], (N, D).
@@ -96,35 +117,45 @@ class PostureRegression:
             length: Lengths of all muscles [m].
         """
         inputs = np.hstack([length[:, self.muscles], tension[:, self.muscles]])
-        inputs, of_body = (inputs - self.mean) / self.scale, theta[:, self.joints]
-        distance = squares(inputs, self.inputs)
-        across = _kernel(distance, inputs @ self.inputs.T, self.logarithms)
-        size = np.square(inputs).sum(axis=1)
-        prior = _kernel(np.zeros_like(size), size, self.logarithms)
-        known = np.square(solve_triangular(self.root, across.T, lower=True)).sum(axis=0)
-        variance = np.maximum(prior - known, 0.0) + np.exp(2.0 * self.logarithms[1])
-        variance = variance[:, None] * self.angle_spread**2
-        share = self.body_variance / (self.body_variance + variance)
-        estimate = self.angle_mean + self.angle_spread * (across @ self.weights)
-        combined: Array = of_body + share * (estimate - of_body)
-        return combined
+        inputs, result = (inputs - self.mean) / self.scale, theta[:, self.joints]
+        pairs, (own, tensions) = (
+            Pairs.of(inputs, self.inputs),
+            np.split(np.square(inputs), 2, axis=1),
+        )
+        size, size_of_tensions = own.sum(axis=1), tensions.sum(axis=1)
+        least = np.maximum(self.angle_spread, LEAST_ANGLE_SPREAD)
+        for d, (logarithms, root) in enumerate(zip(self.logarithms, self.roots, strict=True)):
+            across = _kernel(*pairs.scaled(logarithms), logarithms)
+            product = size + np.exp(2.0 * logarithms[5]) * size_of_tensions
+            prior = _kernel(np.zeros_like(product), product, logarithms)
+            known = np.square(solve_triangular(root, across.T, lower=True)).sum(axis=0)
+            variance = np.maximum(prior - known, 0.0) + np.exp(2.0 * logarithms[1])
+            share = self.body_variance[d] / (self.body_variance[d] + least[d] ** 2 * variance)
+            estimate = self.angle_mean[d] + self.angle_spread[d] * (across @ self.weights[d])
+            result[:, d] += share * (estimate - result[:, d])
+        return result
 
 
 def learned_regressions(
-    body: CalibratedBody, observed: Observations, fit: FittedBody
+    body: CalibratedBody, observed: Observations, fit: FittedBody, left_out: Sequence[LeftOut]
 ) -> tuple[PostureRegression, ...]:
     """Learn the regression of each group from the samples in which its joints were measured.
 
-    Joints that fewer than half of the samples measure, or that hardly move in them, are left out,
+    Joints that fewer than half of the samples measure, or that do not move in them, are left out,
     and so are muscles that fewer than half of the samples contain.
 
     Args:
         body: The fitted body, with its remainder.
         observed: The samples, with measured joint angles that the fit has corrected.
         fit: The fit of the body to these samples.
+        left_out: Errors of the lengths of left-out samples, for each group with a remainder.
     """
     result = []
-    starts = {each.muscles.tobytes(): each.logarithms for each in body.regressions}
+    starts = {
+        (each.muscles.tobytes(), joint): logarithms
+        for each in body.regressions
+        for joint, logarithms in zip(each.joints.tolist(), each.logarithms, strict=True)
+    }
     for group in body.robot.groups:
         joints, muscles = np.array(group.joints, dtype=int), np.array(group.muscles, dtype=int)
         is_measured = np.isfinite(observed.theta[:, joints])
@@ -135,17 +166,19 @@ def learned_regressions(
         rows = np.flatnonzero(is_used)
         if len(rows) < LEAST_SAMPLES or not is_input.any():
             continue
-        is_estimated &= observed.theta[rows][:, joints].std(axis=0) >= LEAST_ANGLE_SPREAD
+        is_estimated &= observed.theta[rows][:, joints].std(axis=0) >= LEAST_SPREAD
         if not is_estimated.any():
             continue
-        error, weight = _body_errors(body, observed, fit, rows, group)
+        error, weight = _body_errors(body, observed, fit, rows, group, left_out)
         joints, muscles = joints[is_estimated], muscles[is_input]
         weighted = weight[:, None] * np.square(error[:, is_estimated])
         body_variance = weighted.sum(axis=0) / weight.sum()
-        start = starts.get(muscles.tobytes())
+        own_starts = [starts.get((muscles.tobytes(), joint)) for joint in joints.tolist()]
         used = observed[rows]
         used = replace(used, length=used.length + body.crept(used.age))
-        result.append(_learned(body.robot, used, joints, muscles, weight, body_variance, start))
+        result.append(
+            _learned(body.robot, used, joints, muscles, weight, body_variance, own_starts)
+        )
     return tuple(result)
 
 
@@ -156,9 +189,9 @@ def _learned(
     muscles: Ints,
     weight: Array,
     body_variance: Array,
-    start: Array | None,
+    starts: Sequence[Array | None],
 ) -> PostureRegression:
-    """Learn one regression from samples with robust weights; `start` is that of the search."""
+    """Learn one regression from samples with robust weights; the search begins at `starts`."""
     theta, tension = observed.theta[:, joints], observed.tension[:, muscles]
     if not robot.tension_source.is_known:
         tension = np.zeros_like(tension)
@@ -168,25 +201,31 @@ def _learned(
     scale = spread * np.sqrt(len(muscles))
     angle_mean, angle_spread = theta.mean(axis=0), theta.std(axis=0)
     scaled, targets = (inputs - mean) / scale, (theta - angle_mean) / angle_spread
-    evidence = _Evidence(np.split(scaled, 2, axis=1), targets, weight)
-    starts, rounds = STARTS, ROUNDS
-    if start is not None and len(scaled) >= FEW_SAMPLES:
-        starts, rounds = (start,), FEW_ROUNDS
+    pairs, noise, rows = Pairs.of(scaled, scaled), weight.max() / weight, judging(len(scaled))
+    judged = pairs if len(rows) == len(scaled) else Pairs.of(scaled[rows], scaled[rows])
+    logarithms, roots, weights = list[Array](), list[Array](), list[Array]()
+    for start, target in zip(starts, targets.T, strict=True):
+        evidence = _Evidence(judged, target[rows], noise[rows])
+        logarithms.append(_likeliest(evidence, start if len(scaled) >= FEW_SAMPLES else None))
+        roots.append(cholesky(_covariance(pairs, noise, logarithms[-1]), lower=True))
+        weights.append(cho_solve((roots[-1], True), target))
+    return PostureRegression(
+        joints, muscles, mean, scale, angle_mean, angle_spread, body_variance,
+        np.array(logarithms), scaled, tuple(roots), np.array(weights),
+    )  # fmt: skip
+
+
+def _likeliest(evidence: _Evidence, start: Array | None) -> Array:
+    """Return the logarithms with the largest evidence, (6,); `start` is the last result."""
+    starts, rounds = (STARTS, ROUNDS) if start is None else ((start,), FEW_ROUNDS)
     found = [
         minimize(
             evidence, each, jac=True, method='L-BFGS-B', bounds=BOUNDS, options={'maxiter': rounds}
         )
         for each in starts
     ]
-    logarithms = min(found, key=lambda result: result.fun).x
-    root = cholesky(evidence.covariance(logarithms), lower=True)
-    factor = np.exp(logarithms[5])
-    scale[len(muscles) :] /= factor
-    scaled[:, len(muscles) :] *= factor
-    return PostureRegression(
-        joints, muscles, mean, scale, angle_mean, angle_spread, body_variance, logarithms,
-        scaled, root, cho_solve((root, True), targets),
-    )  # fmt: skip
+    logarithms: Array = min(found, key=lambda result: result.fun).x
+    return logarithms
 
 
 def _kernel(distance: Array, product: Array, logarithms: Array) -> Array:
@@ -198,46 +237,38 @@ def _kernel(distance: Array, product: Array, logarithms: Array) -> Array:
     return kernel
 
 
+def _covariance(pairs: Pairs, noise: Array, logarithms: Array) -> Array:
+    """Return the covariance of the samples, (N, N); `noise` has their variances in units of σ²."""
+    variance = noise * (np.exp(2.0 * logarithms[1]) + JITTER)
+    covariance: Array = _kernel(*pairs.scaled(logarithms), logarithms) + np.diag(variance)
+    return covariance
+
+
 class _Evidence:
     """Computes the negative logarithm of the evidence and its derivatives by six logarithms."""
 
-    def __init__(self, inputs: Sequence[Array], targets: Array, weight: Array) -> None:
-        self._targets = targets
-        self._distances = [squares(part, part) for part in inputs]  # of lengths, and of tensions
-        self._products = [part @ part.T for part in inputs]
-        self._noise = weight.max() / weight  # variances of θ in units of σ²
-
-    def _pairs(self, logarithms: Array) -> tuple[Array, Array]:
-        """Return d and p of all pairs of samples, (N, N) each."""
-        factor = np.exp(2.0 * logarithms[5])
-        (distance, of_tensions), (product, product_of_tensions) = self._distances, self._products
-        return distance + factor * of_tensions, product + factor * product_of_tensions
-
-    def covariance(self, logarithms: Array) -> Array:
-        """Return the covariance of the samples, (N, N)."""
-        noise = self._noise * (np.exp(2.0 * logarithms[1]) + JITTER)
-        covariance: Array = _kernel(*self._pairs(logarithms), logarithms) + np.diag(noise)
-        return covariance
+    def __init__(self, pairs: Pairs, targets: Array, noise: Array) -> None:
+        self._pairs, self._targets, self._noise = pairs, targets, noise
 
     def __call__(self, logarithms: Array) -> tuple[float, Array]:
         deviation = (logarithms - USUAL) / SPREAD
         rough, noise, line, parabola, width, factor = np.exp(2.0 * logarithms)
-        targets = self._targets
+        covariance = _covariance(self._pairs, self._noise, logarithms)
         try:
-            root = cholesky(self.covariance(logarithms), lower=True, check_finite=False)
+            root = cholesky(covariance, lower=True, check_finite=False)
         except LinAlgError:
             return 1e12, np.zeros(len(logarithms))
         inverse = cho_solve((root, True), np.eye(len(root)), check_finite=False)
-        weights = inverse @ targets
-        value = 0.5 * float((targets * weights).sum() + deviation @ deviation)
-        value += targets.shape[1] * float(np.log(np.diag(root)).sum())
-        slope = targets.shape[1] * inverse - weights @ weights.T
-        d, p = self._pairs(logarithms)
+        weights = inverse @ self._targets
+        value = 0.5 * float(self._targets @ weights + deviation @ deviation)
+        value += float(np.log(np.diag(root)).sum())
+        slope = inverse - np.outer(weights, weights)
+        d, p = self._pairs.scaled(logarithms)
         relative = 1.0 / (1.0 + 0.5 * d / width)
         by_distance = -0.5 * rough / width * np.square(relative)
         by_product = line + 2.0 * parabola * p
-        by_tension = by_distance * self._distances[1]
-        by_tension += by_product * self._products[1]
+        distance_of_tensions, product_of_tensions = self._pairs.of_tensions
+        by_tension = by_distance * distance_of_tensions + by_product * product_of_tensions
         gradient = [
             (slope * rough * relative).sum(),
             noise * (np.diag(slope) @ self._noise),
@@ -250,7 +281,12 @@ class _Evidence:
 
 
 def _body_errors(
-    body: CalibratedBody, observed: Observations, fit: FittedBody, rows: Ints, group: Group
+    body: CalibratedBody,
+    observed: Observations,
+    fit: FittedBody,
+    rows: Ints,
+    group: Group,
+    left_out: Sequence[LeftOut],
 ) -> tuple[Array, Array]:
     """Return by how much the body misestimates the postures of samples, and the samples' weights.
 
@@ -268,14 +304,14 @@ def _body_errors(
     theta = np.where(np.isfinite(observed.theta[rows]), observed.theta[rows], theta)
     error, weight = fit.residual[np.ix_(rows, muscles)], fit.weight[np.ix_(rows, muscles)]
     spread, correlation = np.tile(fit.noise[muscles], (len(rows), 1)), np.eye(len(muscles))
-    if (known := body.remainder.group_of(group.muscles)) is not None:
+    for known, own in zip(body.remainder.groups, left_out, strict=True):
+        if known.muscles.tolist() != muscles.tolist():
+            continue
         correlation = known.correlation @ known.correlation.T
-        is_known = np.isin(rows, known.left_out.rows)
-        place = np.searchsorted(known.left_out.rows, rows[is_known])
-        error[is_known], weight[is_known] = (
-            part[place] for part in (known.left_out.error, known.left_out.weight)
-        )
-        spread[is_known] = np.sqrt(known.left_out.variance[place])
+        is_known = np.isin(rows, own.rows)
+        place = np.searchsorted(own.rows, rows[is_known])
+        error[is_known], weight[is_known] = own.error[place], own.weight[place]
+        spread[is_known] = np.sqrt(own.variance[place])
     is_missing = ~(weight > 0.0)
     error[is_missing], spread[is_missing] = 0.0, UNKNOWN_SPREAD
     direction = np.zeros_like(tension)

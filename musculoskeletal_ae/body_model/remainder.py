@@ -143,7 +143,6 @@ class GroupRemainder:
     #: lower Cholesky factor of k + σ² diag(1/ω) for each row of `crossed` that differs, with the
     #: mean ω of all muscles, (N, N) each
     roots: tuple[Array, ...]
-    left_out: LeftOut
 
     def at(self, theta: Array, tension: Array) -> Array:
         """Return the remainder of the group's muscles [m], (N, M), at θ and T of the whole body."""
@@ -194,10 +193,6 @@ class Remainder:
             result[:, group.muscles] = group.at(theta, tension)
         return result if self.before is None else result + self.before.at(theta, tension)
 
-    def group_of(self, muscles: Sequence[int]) -> GroupRemainder | None:
-        """Return the part of the group with exactly these muscles; None if there is none."""
-        return next((g for g in self.groups if g.muscles.tolist() == list(muscles)), None)
-
     def covariance(self, theta: Array, tension: Array) -> Array:
         """Return the posterior covariance of the remainder [m²] for a known body, (N, M, M)."""
         result = np.zeros((len(theta), self.muscle_count, self.muscle_count))
@@ -218,7 +213,7 @@ class Remainder:
 
 def learned_remainder(
     body: CalibratedBody, observed: Observations, weight: Array, priors: Sequence[MusclePrior]
-) -> Remainder:
+) -> tuple[Remainder, tuple[LeftOut, ...]]:
     """Learn the remainder of a fitted body from the samples whose joint angles are all known.
 
     Args:
@@ -226,10 +221,13 @@ def learned_remainder(
         observed: The samples, with joint angles corrected for the offsets of the joint sensors.
         weight: Robust weights of the lengths, (N, M).
         priors: Prior of each muscle.
+
+    Returns:
+        The remainder, and for each of its groups the errors of the lengths of left-out samples.
     """
     present, before = body.remainder, body.remainder.before
     starts = {group.joints.tobytes(): group.logarithms for group in present.groups}
-    groups = []
+    groups, left_out = list[GroupRemainder](), list[LeftOut]()
     for group in body.robot.groups:
         joints, muscles = np.array(group.joints), np.array(group.muscles)
         rows = np.flatnonzero(np.isfinite(observed.theta[:, joints]).all(axis=1))
@@ -243,14 +241,16 @@ def learned_remainder(
             limb, own.limb(joints, muscles), weight[np.ix_(rows, muscles)], priors_of_group
         )
         start = starts.get(joints.tobytes())
-        groups.append(group_remainder(body.robot, joints, muscles, rows, of_group, start))
-    return Remainder(body.robot.muscle_count, tuple(groups), before)
+        learned, errors = group_remainder(body.robot, joints, muscles, rows, of_group, start)
+        groups.append(learned)
+        left_out.append(errors)
+    return Remainder(body.robot.muscle_count, tuple(groups), before), tuple(left_out)
 
 
 def group_remainder(
     robot: Robot, joints: Ints, muscles: Ints, rows: Ints, lengths: Lengths, start: Array | None
-) -> GroupRemainder:
-    """Learn the remainder of one group from samples.
+) -> tuple[GroupRemainder, LeftOut]:
+    """Learn the remainder of one group from samples; also return errors of left-out samples.
 
     The robust weights follow from the errors with which the last remainder predicts left-out
     samples. With few samples, or without a last remainder, it is learned twice.
@@ -285,11 +285,10 @@ def group_remainder(
         cholesky(_covariance(inputs, inputs, of_joints, logarithms) + mean_noise, lower=True)
         for of_joints, _ in _alike(crossed)
     )
-    left_out_errors = LeftOut(rows, error, variance, lengths.weight)
-    return GroupRemainder(
-        joints, muscles, scale, crossed, logarithms, inputs, weights, correlation, roots,
-        left_out_errors,
-    )  # fmt: skip
+    group = GroupRemainder(
+        joints, muscles, scale, crossed, logarithms, inputs, weights, correlation, roots
+    )
+    return group, LeftOut(rows, error, variance, lengths.weight)
 
 
 def _likeliest(
@@ -299,11 +298,7 @@ def _likeliest(
 
     A search of at most `rounds` iterations begins at each of `starts`.
     """
-    count = len(lengths.theta)
-    rows = np.arange(count)
-    if count > JUDGING:
-        rows = np.linspace(0, count - 1, JUDGING).astype(int)
-    evidence = _Evidence(lengths.part(rows), scale, crossed)
+    evidence = _Evidence(lengths.part(judging(len(lengths.theta))), scale, crossed)
     found = [
         minimize(
             evidence, each, jac=True, method='L-BFGS-B', bounds=BOUNDS, options={'maxiter': rounds}
@@ -312,6 +307,11 @@ def _likeliest(
     ]
     logarithms: Array = min(found, key=lambda result: result.fun).x
     return logarithms
+
+
+def judging(count: int) -> Ints:
+    """Return the indices of the samples from which an evidence is computed, at most JUDGING."""
+    return np.linspace(0, count - 1, min(count, JUDGING)).astype(int)
 
 
 class _Solution(NamedTuple):

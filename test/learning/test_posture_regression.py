@@ -86,10 +86,10 @@ def test_a_joint_that_hardly_moved_in_the_samples_is_left_to_the_body(arm26, sta
     theta, rng = observed.theta.copy(), np.random.default_rng(0)
     theta[:, 0] = spread * rng.uniform(-1.0, 1.0, len(theta))
     length = stage.body.lengths(theta, observed.tension, np.zeros_like(observed.tension))[0]
-    body = fitted(arm26, replace(observed, theta=theta, length=length))
+    body = fitted(arm26, replace(observed, theta=theta, length=with_slack(length)))
     theta, tension, length = stage.states(300)
-    estimate = body.estimated(theta, tension, length)
-    np.testing.assert_array_equal(estimate[:, 0], theta[:, 0])
+    estimate = body.estimated(theta, tension, with_slack(length))
+    assert np.abs(estimate[:, 0] - theta[:, 0]).max() < 0.02
 
 
 def test_a_muscle_that_no_sample_contains_is_no_input_of_the_regression(arm26, stage):
