@@ -146,7 +146,7 @@ class ReachLimits:
         paid_out = np.maximum(jacobian @ velocity, 0.0)
         ends = self.of(jacobian, at.velocity, robot.actuation.tension_of_lag(lag, paid_out))
         torque = robot.kinematics.inverse_dynamics(at.theta, velocity, acceleration)
-        stops = supporting_stops(robot, at.theta)
+        stops = supporting_stops(robot, at.theta, at.velocity)
         exertion = least_tension(jacobian, torque, *ends, stops=stops)
         return float(np.abs(exertion.missing_torque).max())
 
@@ -177,7 +177,7 @@ class PathCost:
         jacobians = self._mae.muscle_jacobian(postures, tensions)
         torques = []
         for theta, jacobian in zip(postures, jacobians):
-            ends, stops = self._limits.of(jacobian, moved), supporting_stops(robot, theta)
+            ends, stops = self._limits.of(jacobian, moved), supporting_stops(robot, theta, moved)
             torque = robot.kinematics.holding_torque(theta)
             exertion = least_tension(jacobian, torque, *ends, stops=stops)
             torques.append(exertion.missing_torque)

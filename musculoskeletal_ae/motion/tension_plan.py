@@ -67,7 +67,9 @@ class Stiffening:
             torque = robot.kinematics.inverse_dynamics(*at) + effort
             desired = settings.desired_stiffness(robot.units)
             near = None if solution is None else self._near
-            solution = stiffness_command(robot, mae, at.theta, torque, desired, limit, near)
+            solution = stiffness_command(
+                robot, mae, at.theta, torque, desired, limit, near, at.velocity
+            )
             self._near = solution.tension if near is None else near
             self.solution = solution
         # Use only half of the remaining rate. The other half is for the stretch of the series

@@ -167,21 +167,22 @@ def test_a_target_that_the_others_cannot_hold_is_refused_or_approached():
     np.testing.assert_array_equal(bench.core.target_state.theta, NOT_THERE)
 
 
-def test_a_posture_that_the_others_hold_with_a_joint_stop_is_approached_and_lacks_no_torque():
+@pytest.mark.parametrize('method', ['proposed', 'tension', 'stiffness'])
+def test_a_posture_that_the_others_hold_with_a_joint_stop_is_held_and_lacks_no_torque(method):
     lifted = [np.where(joint, ROBOT.lower, at) for joint in np.eye(2) for at in POSTURES[:50]]
     theta = next(
         theta
         for theta in lifted
         if not held(theta) and not lacking(ROBOT_WITHOUT, ExactMae(ROBOT), theta)
     )
-    bench = Bench(target_duration=0.2)
+    bench = Bench(method=method, target_duration=0.2)
     bench.dt = SELDOM
     bench.isolate([LOST])
     bench.theta = theta
     bench.step()
     bench.target(theta)
     bench.step(50)
-    assert not bench.follower.missing_torque.any()
+    assert not bench.core.activities.entered.missing_torque.any()
 
 
 def test_exploration_is_refused_without_muscles_and_the_report_names_the_remedy():
