@@ -140,11 +140,14 @@ class Reach(NamedTuple):
             refused the target.
         trapped: The entries of `distances` for motions that ended at a joint stop, in a posture
             that the remaining muscles can neither hold nor leave.
+        approaches: Distance ‖θ_target − θ‖ after each second of every approach that was not refused
+            [rad].
     """
 
     share: float
     distances: list[float | None]
     trapped: list[float]
+    approaches: list[list[float]]
 
 
 def measure_reach(
@@ -165,11 +168,12 @@ def measure_reach(
             continue
         if count >= 100 and len(held) >= targets:
             break
-    distances, trapped = list[float | None](), list[float]()
+    distances, trapped, approaches = list[float | None](), list[float](), list[list[float]]()
     for theta in held[:targets]:
         try:
             loop.target(theta)
-            #: time at rest so far [s], and posture one second ago
+            approaches.append([float(np.linalg.norm(loop.arm.theta - theta))])
+            #: time at rest so far [s], and the posture one second ago
             rest_time, before = 0, loop.arm.theta
             for _ in range(LONGEST_APPROACH):
                 if rest_time == SETTLING:
@@ -179,7 +183,8 @@ def measure_reach(
                 is_resting = still and not loop.core.activities.follower.progress.is_moving
                 rest_time = rest_time + 1 if is_resting else 0
                 before = loop.arm.theta
-            distance = float(np.linalg.norm(before - theta))
+                approaches[-1].append(float(np.linalg.norm(before - theta)))
+            distance = approaches[-1][-1]
             distances.append(distance)
             if np.abs(before - theta).max() > FALLEN:
                 jacobian = loop.arm.individual.muscle_jacobian(before[None])[0]
@@ -188,7 +193,7 @@ def measure_reach(
             distances.append(None)
         except InfeasibleError:
             trapped.append(distance)
-    return Reach(len(held) / max(count, 1), distances, trapped)
+    return Reach(len(held) / max(count, 1), distances, trapped, approaches)
 
 
 def isolations_of_healthy_arm(
@@ -224,6 +229,7 @@ def measure(study: Study, seed: int) -> Measured:
     two = [error(mae.without(pair)) for pair in combinations(muscles, 2)]
     correct, distances, shares, sensor_errors, trapped = [], [], [], [], []
     by_muscle: dict[str, dict[str, Any]] = {}
+    approaches: dict[str, list[list[float]]] = {}
     for m in rng.permutation(robot.muscle_count)[:1].tolist() if study.quick else muscles:
         loop, _ = run_with_fault(study, seed, m, '')
         isolated, reason = loop.verdicts[0] if loop.verdicts else ((), 'nothing')
@@ -232,6 +238,7 @@ def measure(study: Study, seed: int) -> Measured:
         shares.append(reach.share)
         distances += reach.distances
         trapped += reach.trapped
+        approaches[robot.muscles[m]] = reach.approaches
         row = {'found': reason, 'held_share': reach.share, 'estimate_rad': one[m]}
         for sensor in ('length',) if study.quick else ('length', 'tension'):
             loop, errors = run_with_fault(study, seed, m, sensor)
@@ -261,7 +268,8 @@ def measure(study: Study, seed: int) -> Measured:
     numbers['proposed_one_isolated_rad'] = float(np.mean(arrived)) if arrived else None
     if free := len(arrived) - len(trapped):
         numbers['proposed_not_trapped_rad'] = (sum(arrived) - sum(trapped)) / free
-    return Measured(numbers, {'one': one, 'two': two, 'healthy': healthy_error})
+    traces = {'one': one, 'two': two, 'healthy': healthy_error, 'approaches': approaches}
+    return Measured(numbers, traces)
 
 
 def isolated(study: Study, rows: Rows) -> Plot:
@@ -279,4 +287,23 @@ def isolated(study: Study, rows: Rows) -> Plot:
     return figure, 'Estimation error with each muscle isolated; one point per individual.'
 
 
-EXPERIMENT = Experiment(__doc__, measure, (isolated,), 60.0)
+def approaches(_: Study, rows: Rows) -> Plot:
+    """Draw the distance from each target over time, and name the muscles without which it stays."""
+    figure, (panel,) = plots.new_figure(8.0, 3.6)
+    for seed, row in rows.items():
+        for muscle, distances in row.traces['approaches'].items():
+            for distance in distances:
+                is_away = distance[-1] > FALLEN
+                label = f'individual {seed} without {muscle}' if is_away else None
+                style = {'color': None, 'lw': 2.0} if is_away else {'color': plots.AFTER, 'lw': 0.8}
+                panel.plot(distance, label=label, **style)
+    legend = 'right' if panel.get_legend_handles_labels()[1] else ''
+    plots.tidy(panel, 'time [s]', '‖θ_target − θ‖ [rad]', legend=legend)
+    caption = (
+        'Distance from the target after the rupture of each muscle. Motions that end further than '
+        f'{FALLEN} rad away have a label.'
+    )
+    return figure, caption
+
+
+EXPERIMENT = Experiment(__doc__, measure, (isolated, approaches), 60.0)

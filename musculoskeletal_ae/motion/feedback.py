@@ -53,19 +53,19 @@ class Shift(NamedTuple):
     torque: Array  # u: the planned tensions support this shift [rad], (D,)
 
 
-def supporting_stiffness(mae: Mae) -> Array | float:
-    """Return the torque k by which planned tensions support each radian of a shift.
+def largest_support(mae: Mae) -> Array | float:
+    """Return the torque SUPPORT σ by which planned tensions support a shift of CORRECTION.
 
     Args:
-        mae: The network, which contains the residual torque of the healthy arm.
+        mae: The network, which contains the residual torque σ of the healthy arm.
 
     Returns:
-        The torques [N·m/rad], (D,); 0 if the residual torque is not known.
+        The torques [N·m], (D,); 0 if the residual torque is not known.
     """
     if mae.touch is None or not mae.touch.calibrated:
         return 0.0
-    stiffness: Array = SUPPORT * mae.touch.spread / CORRECTION
-    return stiffness
+    torque: Array = SUPPORT * mae.touch.spread
+    return torque
 
 
 def depends_on_limit(tension: Array, before: Array, limit: Array) -> bool:

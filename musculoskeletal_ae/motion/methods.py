@@ -28,7 +28,12 @@ from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot import stiffness as robot_stiffness
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import Exertion, TensionProgramme, least_tension
+from musculoskeletal_ae.robot.tension import (
+    Exertion,
+    TensionProgramme,
+    least_tension,
+    supporting_stops,
+)
 
 # Solve this many quadratic programmes, each with G at the tension that the previous one found. A
 # third programme would change the tension by well under a newton.
@@ -134,9 +139,10 @@ def proposed(
     """
     bias = robot.tension.bias
     exertion = Exertion(np.clip(tension, bias, limit), np.zeros(robot.joint_count))
+    stops = supporting_stops(robot, theta)
     for _ in range(SOLVES):
         jacobian = mae.muscle_jacobian(theta, exertion.tension)
-        exertion = least_tension(jacobian, torque, bias, limit)
+        exertion = least_tension(jacobian, torque, bias, limit, stops=stops)
     return Solution(first_command(robot, mae, theta, exertion.tension), *exertion)
 
 
@@ -211,6 +217,7 @@ def stiffness_command(
     desired: Array,
     limit: Array | float,
     near: Array | None = None,
+    velocity: Array | float = 0.0,
 ) -> Solution:
     """Return the command whose joint stiffness is nearest to the desired one (method `stiffness`).
 
@@ -236,12 +243,15 @@ def stiffness_command(
         limit: Highest tension that may be planned [N], scalar or (M,).
         near: Tension of a nearby solution [N], (M,); the search then starts there and needs only
             one round. None if no such solution is known.
+        velocity: Velocity θ̇ of the joints [rad/s], (D,), which decides whether a joint stop
+            supports them.
     """
+    stops = supporting_stops(robot, theta, velocity)
     high = np.array(np.broadcast_to(limit, robot.muscle_count), dtype=float)
     jacobian = mae.muscle_jacobian(theta, np.minimum(robot.tension.bias + MARGINS[0], high))
     for margin in MARGINS:
         low = np.minimum(robot.tension.bias + margin, high)
-        tension, missing = least_tension(jacobian, torque, low, high)
+        tension, missing = least_tension(jacobian, torque, low, high, stops=stops)
         if not missing.any():
             break
     rounds = SOLVES if near is None else 1
@@ -250,7 +260,7 @@ def stiffness_command(
     # If no tensions within their limits exert the torque, the stiffness cannot be chosen.
     lowest = highest = np.diag(model.joint_stiffness(tension))
     for _ in range(rounds):
-        programme = TensionProgramme(model.jacobian, torque, low, high)
+        programme = TensionProgramme(model.jacobian, torque, low, high, stops)
         try:
             start = programme.nearest(tension)
         except InfeasibleError:
@@ -262,7 +272,7 @@ def stiffness_command(
         within = np.where(desired > 0.0, np.clip(desired, lowest, highest), 0.0)
         tension = _approach(model, programme, start, within)
         model = StiffnessModel.read(robot, mae, theta, tension)
-        missing = torque + model.jacobian.T @ tension if missing.any() else missing
+        missing = np.zeros_like(missing)
     stiffness = JointStiffness(model.joint_stiffness(tension), lowest, highest)
     return Solution(first_command(robot, mae, theta, tension), tension, missing, stiffness)
 

@@ -10,9 +10,15 @@ holdable. `way` returns the cheapest path through a roadmap of random postures, 
     cost of an edge = ∫ 1 + PRICE m(θ) ds,   m = max_j |τ_missing,j|
 
 where τ_missing,j is the torque of joint j that muscles and joint stops do not provide. Tensions
-are limited to T_bias + USED (T_limit − T_bias), so that the path keeps a reserve of tension. If no
-path can keep the reserve, the cost favours postures in which little torque is missing. On an edge,
-tendon friction opposes the motion (`ReachLimits`).
+are limited to T_bias + USED (T_limit − T_bias), so that the path keeps a reserve of tension. On an
+edge, tendon friction opposes the motion (`ReachLimits`), and the path keeps a reserve of torque:
+
+    τ_reserve = SUPPORT σ d/‖d‖
+
+d is the direction of the edge, and SUPPORT σ the torque by which the feedback supports its largest
+shift (`feedback`). A path without this reserve can lead where friction and the errors of the
+learned body, which the residual torque σ contains, stop the arm. If no path can keep the reserves,
+the cost favours postures in which little torque is missing.
 
 A joint that is at a stop at the start is also at this stop in some postures of the roadmap. An edge
 is evaluated only if the cheapest path contains it (lazy roadmap, Bohlin and Kavraki 2000). Until
@@ -28,6 +34,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.assumed_friction import tendon_friction
+from musculoskeletal_ae.motion.feedback import largest_support
 from musculoskeletal_ae.motion.trajectory import Setpoint
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import AT_STOP, least_tension, supporting_stops
@@ -146,7 +153,7 @@ class ReachLimits:
         paid_out = np.maximum(jacobian @ velocity, 0.0)
         ends = self.of(jacobian, at.velocity, robot.actuation.tension_of_lag(lag, paid_out))
         torque = robot.kinematics.inverse_dynamics(at.theta, velocity, acceleration)
-        stops = supporting_stops(robot, at.theta)
+        stops = supporting_stops(robot, at.theta, at.velocity)
         exertion = least_tension(jacobian, torque, *ends, stops=stops)
         return float(np.abs(exertion.missing_torque).max())
 
@@ -161,6 +168,8 @@ class PathCost:
     def __init__(self, robot: Robot, mae: Mae) -> None:
         self._robot, self._mae = robot, mae
         self._limits = ReachLimits(robot, mae)
+        #: torque of each joint that is kept in reserve if only this joint moves [N·m], (D,)
+        self._reserve = largest_support(mae)
 
     def missing(self, postures: Array, direction: Array | None = None) -> Array:
         """Return the largest missing torque m of each posture [N·m], (N,).
@@ -173,12 +182,13 @@ class PathCost:
         """
         robot, bias = self._robot, self._robot.tension.bias
         moved = np.zeros(robot.joint_count) if direction is None else direction
+        reserve = self._reserve * moved / max(float(np.linalg.norm(moved)), 1e-9)
         tensions = np.broadcast_to(bias, (len(postures), robot.muscle_count))
         jacobians = self._mae.muscle_jacobian(postures, tensions)
         torques = []
         for theta, jacobian in zip(postures, jacobians):
-            ends, stops = self._limits.of(jacobian, moved), supporting_stops(robot, theta)
-            torque = robot.kinematics.holding_torque(theta)
+            ends, stops = self._limits.of(jacobian, moved), supporting_stops(robot, theta, moved)
+            torque = robot.kinematics.holding_torque(theta) + reserve
             exertion = least_tension(jacobian, torque, *ends, stops=stops)
             torques.append(exertion.missing_torque)
         m = np.abs(torques).max(axis=1)

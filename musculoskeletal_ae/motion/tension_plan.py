@@ -16,7 +16,12 @@ from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.assumed_friction import FRICTION, tendon_friction
-from musculoskeletal_ae.motion.feedback import Shift, depends_on_limit, supporting_stiffness
+from musculoskeletal_ae.motion.feedback import (
+    CORRECTION,
+    Shift,
+    depends_on_limit,
+    largest_support,
+)
 from musculoskeletal_ae.motion.methods import Solution, stiffness_command
 from musculoskeletal_ae.motion.slowness import SHARE
 from musculoskeletal_ae.motion.trajectory import Trajectory
@@ -67,7 +72,9 @@ class Stiffening:
             torque = robot.kinematics.inverse_dynamics(*at) + effort
             desired = settings.desired_stiffness(robot.units)
             near = None if solution is None else self._near
-            solution = stiffness_command(robot, mae, at.theta, torque, desired, limit, near)
+            solution = stiffness_command(
+                robot, mae, at.theta, torque, desired, limit, near, at.velocity
+            )
             self._near = solution.tension if near is None else near
             self.solution = solution
         # Use only half of the remaining rate. The other half is for the stretch of the series
@@ -129,7 +136,7 @@ class TensionPlan:
 
     def use_network(self, mae: Mae) -> None:
         """Use the tendon friction and the residual torque that a network has learned."""
-        self._support = supporting_stiffness(mae)
+        self._support = largest_support(mae) / CORRECTION
         self._friction = tendon_friction(self._robot, mae)
 
     def reset(self) -> None:

@@ -10,7 +10,7 @@ from musculoskeletal_ae.control.activities import ActivityControl, Inputs
 from musculoskeletal_ae.control.command import TENSION, Command
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import least_tension
+from musculoskeletal_ae.robot.tension import least_tension, supporting_stops
 
 # Gains of the method `tension`; K_p holds the arm near its target, and K_d damps its motion.
 POSITION_GAIN = 10.0  # gain K_p of the posture error [N·m/rad]
@@ -93,7 +93,7 @@ class TorqueControl(ActivityControl):
         torque = torque + self._feedback(smooth, velocity, target)
         jacobian = inputs.mae.muscle_jacobian(smooth, self._command)
         tension, self._missing_torque = least_tension(
-            jacobian, torque, robot.tension.bias, inputs.limit
+            jacobian, torque, robot.tension.bias, inputs.limit, stops=self._stops(smooth, target)
         )
         # Scale the changes of all tensions by the same factor. If the old and the new tensions hold
         # the arm, all tensions in between then hold it as well.
@@ -104,6 +104,10 @@ class TorqueControl(ActivityControl):
         share = float((fastest / np.maximum(fastest, np.maximum(np.abs(change), 1e-9))).min())
         self._command = self._command + change * share
         return Command(TENSION, self._command.copy())
+
+    def _stops(self, theta: Array, target: Array) -> Array | None:
+        """Return the stops that support joints, (S, D): those at which θ and the target are."""
+        return supporting_stops(self._robot, np.stack([theta, target]))
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
         """Return the torque [N·m], (D,), that pulls θ towards `target` and damps the velocity."""
@@ -144,6 +148,9 @@ class GravityCompensation(TorqueControl):
     def new_target(self) -> Array | None:
         """Present posture [rad], (D,): the target that another method holds after this one."""
         return self._theta
+
+    def _stops(self, theta: Array, target: Array) -> None:
+        """Return no stops: the muscles carry the arm, so that a hand can lead it off a stop."""
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
         low, high = self._robot.lower, self._robot.upper

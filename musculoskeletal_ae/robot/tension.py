@@ -57,7 +57,12 @@ class TensionProgramme:
     """
 
     def __init__(
-        self, muscle_jacobian: Array, torque: Array, low: Array | float, high: Array | float
+        self,
+        muscle_jacobian: Array,
+        torque: Array,
+        low: Array | float,
+        high: Array | float,
+        stops: Array | None = None,
     ) -> None:
         """Set the constraints.
 
@@ -66,24 +71,45 @@ class TensionProgramme:
             torque: Joint torque to produce [N·m], (D,).
             low: Lowest tensions [N], scalar or (M,).
             high: Highest tensions [N], scalar or (M,).
+            stops: The joint stops that provide a part of the torque (`supporting_stops`), (S, D);
+                None if the muscles have to provide all of it.
         """
-        self._jacobian, self._torque, self._count = muscle_jacobian, torque, len(muscle_jacobian)
-        self._eye, limits = _unit(self._count)
-        self._constraints = np.concatenate([-muscle_jacobian, limits], axis=1)
-        least = np.empty(self._count)
-        least[:] = low
-        self._bounds = np.concatenate([torque, least, -np.maximum(high, least + LEAST_GAP)])
+        self._muscles, self._torque = len(muscle_jacobian), torque
+        self._jacobian = muscle_jacobian
+        if stops is not None:  # a stop is a further muscle, whose tension is the torque f
+            self._jacobian = np.concatenate([muscle_jacobian, stops])
+        self._eye, limits = _unit(len(self._jacobian))
+        self._constraints = np.concatenate([-self._jacobian, limits], axis=1)
+        least = self._with_stops(low, 0.0)
+        most = np.maximum(self._with_stops(high, STOP_TORQUE), least + LEAST_GAP)
+        self._bounds = np.concatenate([torque, least, -most])
         _require_finite(self._constraints, self._bounds)
 
-    def minimum(self, quadratic: Array, linear: Array, hard: bool = True) -> Array:
-        """Return the T [N] (M,) that minimises ½ Tᵀ Q T − aᵀ T under the constraints.
+    def _with_stops(self, of_muscles: Array | float, of_stops: float) -> Array:
+        """Return values of the muscles, scalar or (M,), followed by one value for each stop."""
+        values = np.full(len(self._jacobian), of_stops)
+        values[: self._muscles] = of_muscles
+        return values
+
+    def minimum(self, quadratic: Array, linear: Array) -> Array:
+        """Return the T [N] (M,) that minimises ½ Tᵀ Q T − aᵀ T and produces exactly the torque.
+
+        The torque of a stop costs as little as the tension that costs least.
 
         Args:
             quadratic: Q, (M, M).
             linear: a, (M,).
-            hard: Whether T must produce the torque; if false, only the limits apply.
         """
         _require_finite(quadratic, linear)
+        whole = quadratic.diagonal().min() * self._eye
+        whole[: self._muscles, : self._muscles] = quadratic
+        return self._solution(whole, self._with_stops(linear, 0.0))[: self._muscles]
+
+    def _solution(self, quadratic: Array, linear: Array, hard: bool = True) -> Array:
+        """Return the minimum over the tensions and the torques of the stops, (M + S,).
+
+        If `hard` is false, they need not produce the torque, and only their limits apply.
+        """
         equalities = len(self._torque) if hard else 0
         first = len(self._torque) - equalities
         constraints, bounds = self._constraints[:, first:], self._bounds[first:]
@@ -99,7 +125,8 @@ class TensionProgramme:
 
         Of all such tensions, those nearest to `desired` [N], scalar or (M,), are returned.
         """
-        return self.minimum(self._eye, np.full(self._count, desired, dtype=float))
+        _require_finite(desired)
+        return self._solution(self._eye, self._with_stops(desired, 0.0))[: self._muscles]
 
     def compromise(self) -> Exertion:
         """Return the tensions within the limits that come nearest to producing the torque.
@@ -108,8 +135,8 @@ class TensionProgramme:
         """
         jacobian = self._jacobian
         quadratic = jacobian @ jacobian.T + SOFT_WEIGHT * self._eye
-        tension = self.minimum(quadratic, -jacobian @ self._torque, hard=False)
-        return Exertion(tension, self._torque + jacobian.T @ tension)
+        exerted = self._solution(quadratic, -jacobian @ self._torque, hard=False)
+        return Exertion(exerted[: self._muscles], self._torque + jacobian.T @ exerted)
 
 
 def holding_tension(
@@ -156,30 +183,29 @@ def least_tension(
     Raises:
         InfeasibleError: If an entry is not finite.
     """
-    count = len(muscle_jacobian)
-    if stops is not None and len(stops):
-        muscle_jacobian = np.concatenate([muscle_jacobian, stops])
-        low, high, desired = (
-            np.concatenate([np.broadcast_to(of_muscles, count), np.full(len(stops), of_stops)])
-            for of_muscles, of_stops in ((low, 0.0), (high, STOP_TORQUE), (desired, 0.0))
-        )
-    programme = TensionProgramme(muscle_jacobian, torque, low, high)
+    programme = TensionProgramme(muscle_jacobian, torque, low, high, stops)
     try:
-        exertion = Exertion(programme.nearest(desired), np.zeros(len(torque)))
+        return Exertion(programme.nearest(desired), np.zeros(len(torque)))
     except InfeasibleError:
-        exertion = programme.compromise()
-    return exertion._replace(tension=exertion.tension[:count])
+        return programme.compromise()
 
 
 def supporting_stops(robot: Robot, theta: Array, velocity: Array | float = 0.0) -> Array:
-    """Return the stops that support joints at θ [rad], (D,), as the rows of a Jacobian (S, D).
+    """Return the stops that support joints at θ, as the rows of a Jacobian (S, D).
 
     A stop pushes its joint back with any torque, but does not pull it. It is therefore modelled as
     a muscle that turns its joint away from the limit, and whose tension is the torque. A joint that
-    is to move away from its stop, with a velocity θ̇ [rad/s], (D,), needs its muscles for that.
+    is to move away from its stop needs its muscles for that.
+
+    Args:
+        robot: The robot.
+        theta: Joint angles θ [rad], (D,) or (N, D). A stop supports a joint that is at the stop in
+            all N postures, for example in the present one and in its target.
+        velocity: Velocity θ̇ with which the joints are to move [rad/s], (D,).
     """
-    is_low = (theta < robot.lower + AT_STOP) & (velocity < LEAVING)
-    is_high = (theta > robot.upper - AT_STOP) & (velocity > -LEAVING)
+    postures = np.atleast_2d(theta)
+    is_low = (postures < robot.lower + AT_STOP).all(axis=0) & (velocity < LEAVING)
+    is_high = (postures > robot.upper - AT_STOP).all(axis=0) & (velocity > -LEAVING)
     joints = np.eye(robot.joint_count)
     return np.concatenate([-joints[is_low], joints[is_high]])
 
@@ -194,6 +220,6 @@ def _unit(count: int) -> tuple[Array, Array]:
     return eye, np.hstack([eye, -eye])
 
 
-def _require_finite(*parts: Array) -> None:
+def _require_finite(*parts: Array | float) -> None:
     if not all(np.isfinite(part).all() for part in parts):
         raise InfeasibleError('a muscle Jacobian, torque or limit is not finite')

@@ -18,9 +18,11 @@ from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.control.stop_commands import LARGEST_RISE, PAYING_OUT
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
+from musculoskeletal_ae.mae.residuals import LEAST_MOTION, TouchStatistics
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion import reach
 from musculoskeletal_ae.motion.assumed_friction import FRICTION
+from musculoskeletal_ae.motion.feedback import SUPPORT
 from musculoskeletal_ae.motion.planner import Planner
 from musculoskeletal_ae.motion.reach import lacking
 from musculoskeletal_ae.motion.slowness import slowness
@@ -28,7 +30,12 @@ from musculoskeletal_ae.motion.tension_plan import TURNING
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.actuation import DEPTH
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import AT_STOP, TensionProgramme, least_tension
+from musculoskeletal_ae.robot.tension import (
+    AT_STOP,
+    TensionProgramme,
+    least_tension,
+    supporting_stops,
+)
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.simulation.simulation import Simulation
 
@@ -167,21 +174,22 @@ def test_a_target_that_the_others_cannot_hold_is_refused_or_approached():
     np.testing.assert_array_equal(bench.core.target_state.theta, NOT_THERE)
 
 
-def test_a_posture_that_the_others_hold_with_a_joint_stop_is_approached_and_lacks_no_torque():
+@pytest.mark.parametrize('method', ['proposed', 'tension', 'stiffness'])
+def test_a_posture_that_the_others_hold_with_a_joint_stop_is_held_and_lacks_no_torque(method):
     lifted = [np.where(joint, ROBOT.lower, at) for joint in np.eye(2) for at in POSTURES[:50]]
     theta = next(
         theta
         for theta in lifted
         if not held(theta) and not lacking(ROBOT_WITHOUT, ExactMae(ROBOT), theta)
     )
-    bench = Bench(target_duration=0.2)
+    bench = Bench(method=method, target_duration=0.2)
     bench.dt = SELDOM
     bench.isolate([LOST])
     bench.theta = theta
     bench.step()
     bench.target(theta)
     bench.step(50)
-    assert not bench.follower.missing_torque.any()
+    assert not bench.core.activities.entered.missing_torque.any()
 
 
 def test_exploration_is_refused_without_muscles_and_the_report_names_the_remedy():
@@ -249,6 +257,36 @@ def test_a_path_avoids_postures_that_cannot_be_held():
     assert ((robot.lower <= path) & (path <= robot.upper)).all()
     assert lack(start, path) == 0.0
     np.testing.assert_array_equal(reach.way(whole, mae, start, goal), [goal])
+
+
+def test_a_path_keeps_a_reserve_of_torque_for_errors_of_the_learned_body():
+    whole = Robot.load('musashi_left_arm')
+    robot = whole.without([whole.muscles.index('pectoralis_major')])
+    limits, residual = robot.tension, np.full(robot.joint_count, 0.4)
+    friction = np.full(robot.muscle_count, FRICTION)
+    unaware, aware = ExactMae(robot), ExactMae(robot)
+    aware.touch = TouchStatistics(friction, residual, LEAST_MOTION)
+
+    def lack(start, path):
+        """Return by how much the muscles miss SUPPORT times the residual torque on a path [N·m]."""
+        lacks = []
+        for a, b in pairwise([start, *path]):
+            direction = (b - a) / np.linalg.norm(b - a)
+            for theta in np.linspace(a, b, 12):
+                torque = robot.kinematics.holding_torque(theta) + SUPPORT * residual * direction
+                jacobian = unaware.muscle_jacobian(theta, limits.bias)
+                stops = supporting_stops(robot, theta, direction)
+                exertion = least_tension(jacobian, torque, limits.bias, limits.limit, stops=stops)
+                lacks.append(np.abs(exertion.missing_torque).max())
+        return max(lacks)
+
+    postures = robot.random_postures(200, np.random.default_rng(0))
+    known = [theta for theta in postures if not lacking(robot, unaware, theta)]
+    pairs = list(pairwise(known))[:40]
+    hard = [pair for pair in pairs if lack(pair[0], reach.way(robot, unaware, *pair)) > 0.2]
+    assert hard
+    for start, goal in hard:
+        assert lack(start, reach.way(robot, aware, start, goal)) < reach.NOTABLE
 
 
 @pytest.mark.parametrize(
