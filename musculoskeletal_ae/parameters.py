@@ -27,7 +27,6 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError, ParameterError
 from musculoskeletal_ae.options import DEFAULT_ROBOT
 from musculoskeletal_ae.presets.names import DEFAULT, PRESET_NAMES
 
-DEVICES = 'cpu', 'cuda'  # torch devices on which networks can be trained
 #: highest legal value of a parameter without an upper limit: the largest integer of ROS
 UNBOUNDED = 2**63 - 1
 

@@ -90,7 +90,7 @@ def _update_values(robot: Robot, update: Update) -> dict[str, str]:
     values = {
         'error at newest samples': robot.units.errors_text(update.errors) or 'nan rad',
         'loss': f'{update.loss:.4f}',
-        'update': f'{update.seconds:.2f} s on {update.device}',
+        'update': f'{update.seconds:.2f} s',
         'anomaly calibrated': str(update.mae.is_calibrated),
     }
     if update.unchanged:

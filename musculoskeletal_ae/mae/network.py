@@ -7,8 +7,7 @@
 the entries of the third are zero at the input of the first layer.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -18,7 +17,7 @@ from torch import Tensor, nn
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.mae.mae import Layer, Mae, complete_bases, latent_places, read_groups
-from musculoskeletal_ae.mae.units import ActivationName, Mask, scale_vector, visible
+from musculoskeletal_ae.mae.units import ActivationName, Mask, visible
 from musculoskeletal_ae.robot.groups import Group
 
 #: activations by their names in a checkpoint
@@ -180,34 +179,6 @@ def from_mae(mae: Mae) -> Network:
                 layer.weight.copy_(torch.tensor(weight))
                 layer.bias.copy_(torch.tensor(bias))
     return network
-
-
-class TorchLengths:
-    """Computes a network's muscle lengths and their gradients on a torch device, for simulation."""
-
-    def __init__(self, mae: Mae, device: str = 'cpu') -> None:
-        """Copy the weights of a network to the device."""
-        self._network, self._tensor = from_mae(mae).to(device), partial(torch.tensor, device=device)
-        self.lengths, self.friction = mae.lengths, mae.friction
-        self.elasticity = mae.elasticity
-        self._scale = self._tensor(scale_vector(len(mae.joints), len(mae.muscles)))
-        self._muscles = len(mae.muscles)
-
-    def lengths_with_pullback(
-        self, theta: Array, tension: Array
-    ) -> tuple[Array, Callable[[Array], Array]]:
-        """Return the lengths at (θ, T) and their pullback, as `Mae.lengths_with_pullback` does."""
-        angles, tensions = self._tensor(theta, requires_grad=True), self._tensor(tension)
-        values = torch.cat((angles, tensions, torch.zeros_like(tensions)), dim=1)
-        mask = torch.zeros(len(theta), dtype=torch.long, device=values.device)
-        restored = self._network((values * self._scale).float(), mask) / self._scale
-        length = restored[:, -self._muscles :]
-
-        def pullback(gradient: Array) -> Array:
-            by_angles = torch.autograd.grad(length, angles, self._tensor(gradient))[0]
-            return by_angles.numpy(force=True)
-
-        return length.numpy(force=True).astype(float), pullback
 
 
 def _linear(layers: nn.Module) -> list[nn.Linear]:

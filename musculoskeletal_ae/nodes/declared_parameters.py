@@ -21,7 +21,6 @@ from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings a
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.parameters import (
     CHECKPOINT,
-    DEVICES,
     PRESET,
     RATE,
     ROBOT,
@@ -146,11 +145,6 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {  # all parameters of all nodes, 
             settable=True,
         ),
         'state_directory': STATE_DIRECTORY,
-        'device': Parameter(
-            'cpu',
-            'device that trains the network (the CPU if torch cannot use the device)',
-            legal=DEVICES,
-        ),
     },
     'bringup_status': {
         **SHARED,

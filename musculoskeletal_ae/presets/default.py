@@ -29,7 +29,6 @@ class DefaultPreset:
 
     name = DEFAULT
     least_samples = 2
-    simulates_on_devices = True
     methods_without_tension: tuple[str, ...] = 'geometric', 'first', 'proposed'
 
     def initial_steps(self, robot: Robot) -> int:

@@ -33,7 +33,6 @@ class PaperPreset:
 
     name = PAPER_PRESET
     least_samples = THRESHOLD + 1
-    simulates_on_devices = False
     methods_without_tension: tuple[str, ...] = 'geometric', 'first'
 
     def __init__(self, hidden: tuple[int, ...] = HIDDEN) -> None:

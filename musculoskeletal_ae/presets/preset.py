@@ -31,13 +31,11 @@ class Preset(Protocol):
     Attributes:
         name: Name by which users select the preset.
         least_samples: Smallest number of samples with which a network is updated online.
-        simulates_on_devices: Whether the simulator can run on a torch device.
         methods_without_tension: Names of the control methods that need no measured tension.
     """
 
     name: str
     least_samples: int
-    simulates_on_devices: bool
     methods_without_tension: tuple[str, ...]
 
     # -- network and initial training -----------------------------------------------------------

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The interface of all simulators; each preset has one with its own equations."""
 
-from typing import Any, Protocol
+from typing import Protocol
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.equilibrium import ArmState
 
@@ -11,7 +12,7 @@ from musculoskeletal_ae.simulation.equilibrium import ArmState
 class SimulatedBody(Protocol):
     """Steps N simulated arms of one robot; `Preset.make_simulator` returns an instance."""
 
-    def use(self, mae: Any, robot: Robot) -> None:
+    def use(self, mae: Mae, robot: Robot) -> None:
         """Use a network, and the robot with the currently isolated muscles."""
 
     def step(
