@@ -331,7 +331,7 @@ def main(argv: list[str]) -> int:
         initial, robot = options.initial, Robot.load('arm26')
         if initial is None:
             initial = folder / 'initial.safetensors'
-            checkpoint.save(initial_mae(robot).mae, initial)
+            checkpoint.save(initial_mae(robot), initial)
         planned = [each for each in all_attacks() if each[0] in (options.kinds or KINDS)]
         random.Random(seeds[0]).shuffle(planned)  # noqa: S311 - must be repeatable
         planned, rows = planned[: size.attacks], []

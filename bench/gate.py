@@ -159,7 +159,7 @@ def main(argv: list[str]) -> int:
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     robot, spread = Robot.load(args.robot), Spread()
-    initial = {preset: initial_mae(robot, preset).mae for preset in PRESETS}
+    initial = {preset: initial_mae(robot, preset) for preset in PRESETS}
     networks = [(f'initial, {preset}', mae) for preset, mae in initial.items()]
     for _, mae in networks:
         spread.take(CheckpointValidator(robot), mae, 'initial')

@@ -51,7 +51,7 @@ class LearnedArm(NamedTuple):
 
 def initial_network(robot: Robot, file: Path | None) -> Mae:
     """Return the network that `--initial` names, or train that of the geometric model."""
-    return initial_mae(robot).mae if file is None else checkpoint.load(file, robot)
+    return initial_mae(robot) if file is None else checkpoint.load(file, robot)
 
 
 def initial(robot: Robot, folder: Path) -> Mae:
@@ -59,7 +59,7 @@ def initial(robot: Robot, folder: Path) -> Mae:
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / 'initial.safetensors'
     if not file.exists():
-        checkpoint.save(initial_mae(robot).mae, file)
+        checkpoint.save(initial_mae(robot), file)
     return checkpoint.load(file, robot)
 
 

@@ -265,7 +265,7 @@ def learning(name: str, folder: Path) -> tuple[float, float, Path]:
     """Return the times of initial training and of an update [s], and the network file."""
     robot, network = Robot.load(name), folder / f'{name}.safetensors'
     begun = time.process_time()
-    mae = initial_mae(robot).mae
+    mae = initial_mae(robot)
     training = time.process_time() - begun
     checkpoint.save(mae, network)
     exploring = record(EmulatedArm(robot, 0), mae, EXPLORATION_STREAM, EXPLORING)

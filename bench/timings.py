@@ -129,7 +129,7 @@ def row_time(row: Row, function: Callable[[], object]) -> float:
 
 def mae_rows(robot: Robot, preset: str) -> list[Row]:
     """Return rows for the steps of the network; their times do not depend on its weights."""
-    mae = initial_mae(robot, preset, steps=1).mae
+    mae = initial_mae(robot, preset, steps=1)
     eager = from_mae(mae)
     states = random_states(robot, 1, np.random.default_rng(0), robot.tension.limit)
     theta, tension, length = (part[0] for part in states)
@@ -302,7 +302,7 @@ class TorchLengths:
 
 def simulation_rows(robot: Robot, preset: str) -> list[Row]:
     """Return rows for a simulator step of one arm and of many, and for loading a network."""
-    mae = initial_mae(robot, preset, steps=200).mae
+    mae = initial_mae(robot, preset, steps=200)
     rng = np.random.default_rng(0)
 
     def arms(count: int, body: Any = mae) -> Simulation:
@@ -441,7 +441,7 @@ def measure(robot: Robot, preset: str) -> list[Timed]:
             row.products / (one if row.several == 1 else many),
         )
         for row in every
-    ] + message_times(robot, initial_mae(robot, preset, steps=200).mae, preset)
+    ] + message_times(robot, initial_mae(robot, preset, steps=200), preset)
 
 
 def show(robot: Robot, preset: str) -> None:

@@ -157,8 +157,8 @@ def train_initial(study: Study, preset: str) -> None:
         rows.append([step, *np.reshape([*norms], (2, len(Mask), -1)).mean(axis=1).ravel()])
 
     steps = QUICK_STEPS[preset] if study.quick else None
-    trained = initial_mae(robot, preset, progress=note, steps=steps)
-    checkpoint.save(trained.mae, study.network_file(preset, None))
+    mae = initial_mae(robot, preset, progress=note, steps=steps)
+    checkpoint.save(mae, study.network_file(preset, None))
     np.save(study.folder / f'{preset}_initial.npy', rows)
 
 

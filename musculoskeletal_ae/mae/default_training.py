@@ -36,7 +36,6 @@ from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.training import (
     TINY,
     Progress,
-    TrainedNetwork,
     one_thread,
     random_states,
     rest_states,
@@ -209,7 +208,7 @@ def loss(network: Network, samples: Tensor) -> Tensor:
 
 def train(
     robot: Robot, seed: int = 0, steps: int = STEPS, progress: Progress | None = None
-) -> TrainedNetwork:
+) -> Network:
     """Train a new network.
 
     Args:
@@ -217,9 +216,6 @@ def train(
         seed: Random seed of states, weights and order of the samples.
         steps: Number of mini-batches.
         progress: Called after every mini-batch with step, loss, network and mini-batch; or None.
-
-    Returns:
-        The network, the loss of every mini-batch, and how the network was trained.
     """
     rng = np.random.default_rng(seed)
     samples = overload_states(robot, min(SAMPLES, steps * BATCH), rng).scaled()
@@ -231,16 +227,14 @@ def train(
         groups, bases = divided(robot)
         network = Network(*sizes, LAYERS, mean, std, blocks(groups), bases)
     optimiser = Optimiser(network, STEP_SIZE, muon=True)
-    losses = []
     with one_thread():
         for step, batch in zip(range(steps), shuffled(samples, BATCH, rng)):
             value = loss(network, torch.as_tensor(batch, dtype=torch.float32))
             value.backward()
             optimiser.step(annealing(step / steps))
-            losses.append(value.item())
             if progress is not None:
-                progress(step, losses[-1], network, batch)
-    return TrainedNetwork(network, losses, f'{BATCH} by muon')
+                progress(step, value.item(), network, batch)
+    return network
 
 
 def annealing(progress: float) -> float:

@@ -106,14 +106,6 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-class TrainedNetwork(NamedTuple):
-    """A network after the initial training of a preset, with a record of the training."""
-
-    network: Network
-    losses: list[float]  # loss of every mini-batch
-    by: str  # size of the mini-batches and name of the optimiser, for people
-
-
 # -- errors ------------------------------------------------------------------------------------
 
 #: report the errors of each output in this unit, with this factor from SI units

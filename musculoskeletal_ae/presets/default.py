@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.finding import Detector
     from musculoskeletal_ae.learning.updater import Updater
     from musculoskeletal_ae.mae.mae import Mae
-    from musculoskeletal_ae.mae.training import Progress, TrainedNetwork
+    from musculoskeletal_ae.mae.network import Network
+    from musculoskeletal_ae.mae.training import Progress
     from musculoskeletal_ae.mae.units import State
     from musculoskeletal_ae.motion.explored_postures import ExplorationStep
     from musculoskeletal_ae.motion.methods import LengthMethod
@@ -45,7 +46,7 @@ class DefaultPreset:
 
     def train_initial(
         self, robot: Robot, seed: int, steps: int, progress: Progress | None
-    ) -> TrainedNetwork:
+    ) -> Network:
         """Train on lengths and muscle Jacobians under all masks, with Muon."""
         from musculoskeletal_ae.mae.default_training import train
 

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.finding import Detector
     from musculoskeletal_ae.learning.updater import Updater
     from musculoskeletal_ae.mae.mae import Mae
-    from musculoskeletal_ae.mae.training import Progress, TrainedNetwork
+    from musculoskeletal_ae.mae.network import Network
+    from musculoskeletal_ae.mae.training import Progress
     from musculoskeletal_ae.mae.units import State
     from musculoskeletal_ae.motion.explored_postures import ExplorationStep
     from musculoskeletal_ae.motion.methods import LengthMethod
@@ -50,7 +51,7 @@ class PaperPreset:
 
     def train_initial(
         self, robot: Robot, seed: int, steps: int, progress: Progress | None
-    ) -> TrainedNetwork:
+    ) -> Network:
         """Train on L_initial with Adam (§III-B)."""
         from musculoskeletal_ae.paper.initial_training import train
 

@@ -119,7 +119,7 @@ def test_a_refusal_names_the_muscle_whose_lengths_jump(tmp_path):
     arms = {name: behind_a_drum(tmp_path / name, end) for name, end in DRUM_ENDS.items()}
     for name, robot in arms.items():
         with pytest.raises(GateError) as refusal:
-            CheckpointValidator(robot).check(initial_mae(robot, steps=1).mae)
+            CheckpointValidator(robot).check(initial_mae(robot, steps=1))
         reported = 'no network can represent lengths that jump'
         assert (reported in str(refusal.value)) == (name == 'jumps')
     assert re.search(r': straightener \(\d+ mm\); `check_robot` prints', str(refusal.value))

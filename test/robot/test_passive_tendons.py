@@ -151,7 +151,7 @@ def test_an_emulated_arm_rests_where_muscles_hold_weight_and_return_tendons(fing
 
 
 def test_a_network_that_is_saved_keeps_the_torque_of_the_description(finger):
-    mae = initial_mae(finger, steps=1).mae
+    mae = initial_mae(finger, steps=1)
     mae = replace(mae, elasticity=finger.kinematics.elasticity)
     again = checkpoint.from_bytes(checkpoint.to_bytes(mae))
     theta = finger.random_postures(3, np.random.default_rng(3))
