@@ -9,7 +9,7 @@ Each sample has a close neighbour, its twin. The error of G is the difference be
 errors of sample and twin, divided by their distance. Every sample passes through all three masks.
 Muon updates the matrices, with a step size that rises and then falls to zero.
 
-LAYERS and STEPS apply to an arm with 5 joints and 10 muscles. If groups of joints and muscles share
+HIDDEN and STEPS apply to an arm with 5 joints and 10 muscles. If groups of joints and muscles share
 neither, each group gets its own block of the network. A large group is divided further if possible:
 each finger of a hand gets a block that also has the inputs of the wrist. With one block for the
 whole hand, the error after as many mini-batches would be 2.5 times as large, and a mini-batch would
@@ -31,7 +31,7 @@ import torch
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.mae.network import Layers, Network
+from musculoskeletal_ae.mae.network import Network
 from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.training import (
     TINY,
@@ -41,13 +41,14 @@ from musculoskeletal_ae.mae.training import (
     rest_states,
     shuffled,
 )
-from musculoskeletal_ae.mae.units import LENGTH_SCALE, State, scale_vector
+from musculoskeletal_ae.mae.units import LENGTH_SCALE, ActivationName, State, scale_vector
 from musculoskeletal_ae.robot.equilibrium_states import has_followers
 from musculoskeletal_ae.robot.groups import Group, parts
 from musculoskeletal_ae.robot.robot import Robot
 
 # The reference arm has 5 joints and 10 muscles.
-LAYERS = Layers((200, 100), 'silu')  # give the reference arm these hidden layers
+HIDDEN = (200, 100)  # give the reference arm hidden layers of these sizes
+ACTIVATION: ActivationName = 'silu'  # follows every layer except the latent and the last one
 STEPS = 3000  # train the network of the reference arm on this many mini-batches
 MOST_STEPS = 5000  # train the network of any body on at most this many mini-batches
 BATCH = 128  # train on this many samples at once
@@ -123,7 +124,7 @@ def divided(robot: Robot) -> tuple[tuple[Group, ...], tuple[int, ...]]:
 
 def blocks(groups: Iterable[Group]) -> dict[Group, tuple[int, ...]]:
     """Return the blocks of the network: for each group, the sizes of its hidden layers."""
-    return {group: tuple(grown(units, [group]) for units in LAYERS.hidden) for group in groups}
+    return {group: tuple(grown(units, [group]) for units in HIDDEN) for group in groups}
 
 
 # -- samples -----------------------------------------------------------------------------------
@@ -225,7 +226,7 @@ def train(
         torch.manual_seed(seed)
         sizes = robot.joint_count, robot.muscle_count
         groups, bases = divided(robot)
-        network = Network(*sizes, LAYERS, mean, std, blocks(groups), bases)
+        network = Network(*sizes, blocks(groups), ACTIVATION, mean, std, bases)
     optimiser = Optimiser(network, STEP_SIZE, muon=True)
     with one_thread():
         for step, batch in zip(range(steps), shuffled(samples, BATCH, rng)):

@@ -9,7 +9,6 @@ the entries of the third are zero at the input of the first layer.
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -22,18 +21,6 @@ from musculoskeletal_ae.robot.groups import Group
 
 #: activations by their names in a checkpoint
 ACTIVATIONS: dict[str, type[nn.Module]] = {'tanh': nn.Tanh, 'silu': nn.SiLU}
-
-
-class Layers(NamedTuple):
-    """The hidden layers of a network.
-
-    Attributes:
-        hidden: Sizes of the encoder's hidden layers; the decoder has them in reverse order.
-        activation: Follows every layer except the latent and the last one, which are linear.
-    """
-
-    hidden: tuple[int, ...]
-    activation: ActivationName
 
 
 class Blocks(nn.Module):
@@ -73,10 +60,10 @@ class Network(nn.Module):
         self,
         joints: int,
         muscles: int,
-        layers: Layers,
+        blocks: Mapping[Group, tuple[int, ...]],
+        activation: ActivationName,
         mean: Array,
         std: Array,
-        blocks: Mapping[Group, tuple[int, ...]] | None = None,
         bases: Sequence[int] = (),
     ) -> None:
         """Initialise the weights with torch's random generator.
@@ -84,17 +71,16 @@ class Network(nn.Module):
         Args:
             joints: Number of joints D.
             muscles: Number of muscles M.
-            layers: Activation, and hidden layers of a network with one block.
+            blocks: Sizes of the encoder's hidden layers in each group's block; the decoder has them
+                in reverse order.
+            activation: Follows every layer except the latent and the last one, which are linear.
             mean: Mean by which scaled (θ, T, l) are standardised, (D+2M,).
             std: Standard deviation by which scaled (θ, T, l) are standardised, (D+2M,).
-            blocks: Sizes of the hidden layers in each group's block; by default, the network is
-                one block with the hidden layers of `layers`.
             bases: Index of each block's base, or of the block itself if it has none; () if no block
                 has a base.
         """
         super().__init__()
-        self.joints, self.muscles, self.activation = joints, muscles, layers.activation
-        blocks = blocks or {Group.whole(joints, muscles): layers.hidden}
+        self.joints, self.muscles, self.activation = joints, muscles, activation
         self.groups, self.bases = tuple(blocks), complete_bases(bases, len(blocks))
         values, encoders, decoders = joints + 2 * muscles, [], []
         own = [group.columns(joints, muscles) for group in self.groups]
@@ -170,9 +156,8 @@ def from_mae(mae: Mae) -> Network:
     hidden = [len(bias) for _, bias in mae.encoder]
     depth = len(hidden) // len(mae.groups)
     blocks = {g: tuple(hidden[i * depth :][: depth - 1]) for i, g in enumerate(mae.groups)}
-    layers = Layers(blocks[mae.groups[0]], mae.activation)
     sizes = len(mae.joints), len(mae.muscles)
-    network = Network(*sizes, layers, mae.mean, mae.std, blocks, mae.bases)
+    network = Network(*sizes, blocks, mae.activation, mae.mean, mae.std, mae.bases)
     with torch.no_grad():
         for layers, arrays in ((network.encoder, mae.encoder), (network.decoder, mae.decoder)):
             for layer, (weight, bias) in zip(_linear(layers), arrays, strict=True):
