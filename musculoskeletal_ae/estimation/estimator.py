@@ -29,7 +29,6 @@ from musculoskeletal_ae.estimation import estimator_status
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
 from musculoskeletal_ae.estimation.estimate import Estimate, estimate
-from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings
 from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.further_loss import needed_muscles
 from musculoskeletal_ae.estimation.health import HealthMonitor
@@ -185,11 +184,7 @@ class Estimator:
             return f'wait until the muscle has been verified, within {LONGEST:g} s'
         return sentence(self.remedy)
 
-    # -- settings and services ------------------------------------------------------------------
-
-    def configure(self, settings: EstimatorSettings) -> None:
-        """Use these settings from the next message on."""
-        self.suspects.settings = settings
+    # -- networks and services -------------------------------------------------------------------
 
     def use(self, mae: Mae) -> Mae:
         """Use another network and its healthy statistics, without the isolated muscles.
