@@ -152,7 +152,7 @@ def test_a_spring_takes_the_place_of_an_antagonist(tmp_path):
 
 def test_the_report_names_the_springs(springy):
     assert summary(springy, check_robot(springy, 20), 0).count('spring of') == 3
-    assert 'bend: spring of 9 N·m/rad, at rest at 0.3 rad' in springy.description.spring_notes
+    assert 'bend: spring of 9 N·m/rad, at rest at 0.3 rad' in springy.description.notes
 
 
 def test_springs_stiffen_the_joints(springy):

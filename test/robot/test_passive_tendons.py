@@ -107,7 +107,7 @@ def test_their_torque_is_that_of_mujoco(finger):
 
 
 def test_the_import_names_each_of_them_and_keeps_their_damping(imported):
-    notes = ' '.join(imported.robot.description.spring_notes)
+    notes = ' '.join(imported.robot.description.notes)
     for name in ('return', 'strip', 'stop'):
         assert f'passive tendon {name} ' in notes
     assert not [note for note in imported.notes if 'no actuator pulls it' in note]
