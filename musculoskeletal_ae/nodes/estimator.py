@@ -283,7 +283,7 @@ class EstimatorNode(Shell):
         rows[-1] = self.robot.units.to_position(trust.deviation)
         self.trust.publish(array_message(rows, 'quantity', 'joint'))
         if before is not None:
-            self.core.networks.forget()  # the readings so far may be wrong
+            self.core.networks.messages.clear()  # the readings so far may be wrong
             names = ', '.join(self.robot.joints[joint] for joint in trust.unused)
             self.get_logger().warning(f'joint sensors that are not used: {names or "none"}')
             self._report()
