@@ -27,7 +27,7 @@ from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, record
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.options import Parser, number
-from musculoskeletal_ae.presets.names import DEFAULT
+from musculoskeletal_ae.presets.preset import DEFAULT
 from musculoskeletal_ae.robot.robot import Robot
 
 ARM = 'musashi_left_arm'

@@ -19,7 +19,7 @@ from typing import Any, NoReturn, TypeVar
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.output import output_problem
-from musculoskeletal_ae.presets.names import DEFAULT, PRESET_NAMES
+from musculoskeletal_ae.presets.preset import DEFAULT, PRESET_NAMES
 from musculoskeletal_ae.process_signals import INTERRUPTED
 from musculoskeletal_ae.robot.directories import shipped_robots
 

@@ -17,7 +17,7 @@ from msgspec import Meta
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError, ParameterError
 from musculoskeletal_ae.options import DEFAULT_ROBOT
-from musculoskeletal_ae.presets.names import DEFAULT, PRESET_NAMES
+from musculoskeletal_ae.presets.preset import DEFAULT, PRESET_NAMES
 
 #: highest legal value of a parameter without an upper limit: the largest integer of ROS
 UNBOUNDED = 2**63 - 1

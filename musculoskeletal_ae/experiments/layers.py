@@ -37,8 +37,8 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.initial_training import completed
 from musculoskeletal_ae.mae.training import OUTPUTS, pair_errors
 from musculoskeletal_ae.mae.units import Mask
-from musculoskeletal_ae.presets.names import PAPER_PRESET
 from musculoskeletal_ae.presets.paper import PaperPreset
+from musculoskeletal_ae.presets.preset import PAPER_PRESET
 
 #: units of the encoder's hidden layers. The decoder has the same layers in reverse order, and the
 #: latent layer has D + M units.

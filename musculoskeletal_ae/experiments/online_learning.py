@@ -57,7 +57,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, to_mae
 from musculoskeletal_ae.mae.training import OUTPUTS, pair_errors
 from musculoskeletal_ae.mae.units import Mask, State, scale_vector
-from musculoskeletal_ae.presets.names import DEFAULT, PAPER_PRESET
+from musculoskeletal_ae.presets.preset import DEFAULT, PAPER_PRESET
 from musculoskeletal_ae.presets.registry import PRESETS, preset_named
 from musculoskeletal_ae.signals.friction import FrictionDirection
 

@@ -22,7 +22,7 @@ from musculoskeletal_ae.motion.exploration import Exploration
 from musculoskeletal_ae.motion.explored_postures import ExplorationStep
 from musculoskeletal_ae.motion.methods import first_command
 from musculoskeletal_ae.motion.ramps import RAMP_SHARE
-from musculoskeletal_ae.presets.names import PAPER_PRESET
+from musculoskeletal_ae.presets.preset import PAPER_PRESET
 from musculoskeletal_ae.signals.body_state import Anomaly
 from musculoskeletal_ae.signals.friction import directions
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from musculoskeletal_ae.paper.constants import HIDDEN, INITIAL_STEPS, THRESHOLD
-from musculoskeletal_ae.presets.names import PAPER_PRESET
+from musculoskeletal_ae.presets.preset import PAPER_PRESET
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.motion.explored_postures import ExplorationStep
     from musculoskeletal_ae.motion.methods import LengthMethod
     from musculoskeletal_ae.robot.robot import Robot
-    from musculoskeletal_ae.simulation.simulated_body import SimulatedBody
+    from musculoskeletal_ae.simulation.simulation import SimulatedBody
 
 
 class PaperPreset:

@@ -3,6 +3,7 @@
 
 A preset only selects strategies, which are implemented beside related code. Each method imports its
 strategy when it is called, so that reading options and parameters imports neither numpy nor torch.
+`registry.py` has the presets by name.
 """
 
 from __future__ import annotations
@@ -23,7 +24,13 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.motion.explored_postures import ExplorationStep
     from musculoskeletal_ae.motion.methods import LengthMethod
     from musculoskeletal_ae.robot.robot import Robot
-    from musculoskeletal_ae.simulation.simulated_body import SimulatedBody
+    from musculoskeletal_ae.simulation.simulation import SimulatedBody
+
+
+DEFAULT = 'default'  # name of the preset with the most accurate methods of this project
+#: name of the preset that follows the paper, with which experiments compare other presets
+PAPER_PRESET = 'paper'
+PRESET_NAMES = DEFAULT, PAPER_PRESET  # legal values of parameters and options that name a preset
 
 
 class Preset(Protocol):

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import compress
+from typing import Protocol
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -39,6 +40,26 @@ SETTLED = 1e-6
 
 STOP_TORQUE = 0.1  # let `limits` name a joint whose stop exerts more than this torque [N·m]
 TENSION_MARGIN = 1.0  # let `limits` name a muscle that is nearer to T_max than this [N]
+
+
+class SimulatedBody(Protocol):
+    """Steps N simulated arms by the equations of a preset (`Preset.make_simulator`)."""
+
+    def use(self, mae: Mae, robot: Robot) -> None:
+        """Use a network, and the robot with the currently isolated muscles."""
+
+    def step(
+        self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array
+    ) -> ArmState:
+        """Return the state of the arms after a step.
+
+        Args:
+            state: Present state of the arms.
+            command: l_target [m], (N, M); PAID_OUT (∞) for muscles without a command.
+            h: Duration of the step [s].
+            wrench: Wrench on the end effectors in axes of the root link [N, N·m], (N, 6).
+            fixed: Angles that joints are forced to [rad], (N, D); NaN for a free joint.
+        """
 
 
 class Simulation:
