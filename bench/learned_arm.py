@@ -19,6 +19,7 @@ from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 #: Update at this interval [s], with this many training steps. The learned network is as accurate
@@ -47,6 +48,12 @@ class LearnedArm(NamedTuple):
     mae: Mae
     driver: Mae  # network of the geometric model, which computes the commands
     exploring: Recording
+
+
+def add_initial(parser: Parser) -> None:
+    """Add `--initial`, a checkpoint to start from; None if it is not given."""
+    text = 'initial checkpoint (default: train one)'
+    parser.add_argument('--initial', type=Path, metavar='FILE', help=text)
 
 
 def initial_network(robot: Robot, file: Path | None) -> Mae:
