@@ -67,7 +67,6 @@ class Output(NamedTuple):
     Attributes:
         sample: The checked readings of the message.
         state: Joint angles, tensions and lengths that the network estimates from the readings.
-        covariance: Covariance of the joint angles [rad²], (D, D), or None if it is unknown.
         anomaly: Anomaly score A: the size of the network's residual, in scaled units.
         detected: Whether this message made a detector report a fault, which was then latched.
         contact: External load; None while the length offsets are unknown, on a robot whose tensions
@@ -76,7 +75,6 @@ class Output(NamedTuple):
 
     sample: MuscleSample
     state: State
-    covariance: Array | None
     anomaly: float
     detected: bool
     contact: Contact | None = None
@@ -456,9 +454,7 @@ class Estimator:
         detected, contact = False, None
         if sample.jumped or not 0.0 < self._unchecked_sent < SPACING:
             detected, contact = self._check(sample, estimated, readings, now), self.load
-        self.output = Output(
-            sample, estimated.state, estimated.covariance, estimated.anomaly, detected, contact
-        )
+        self.output = Output(sample, estimated.state, estimated.anomaly, detected, contact)
         return self.output
 
     def _check(

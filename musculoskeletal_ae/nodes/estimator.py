@@ -229,8 +229,9 @@ class EstimatorNode(Shell):
                 sample.tension_read, sample.length, sample.sliding, now, self.core.measured
             )
         self.joints.publish(posture_message(self.robot.units, state.theta, stamp))
-        if output.covariance is not None and is_heard(self.covariance):
-            covariance = self.robot.units.covariance_of_positions(output.covariance)
+        known = None if self.core.mae is None else self.core.mae.covariance
+        if known is not None and is_heard(self.covariance):
+            covariance = self.robot.units.covariance_of_positions(known)
             self.covariance.publish(array_message(covariance, 'joint', 'joint'))
         if is_heard(self.muscles):
             restored = np.array([state.length, state.tension])
