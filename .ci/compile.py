@@ -79,5 +79,5 @@ with event.install_listener('numba:compile', Progress()):
         make_arm(robot, seed=0, reality=reality).step(0.001)
     # Networks of the presets have different activations, and one simulator runs them all.
     for preset in PRESETS:
-        Simulation(robot, initial_mae(robot, preset, steps=1).mae).step(0.01)
+        Simulation(robot, initial_mae(robot, preset, steps=1)).step(0.01)
     compute_wrap(robot)

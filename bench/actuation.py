@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.learned_arm import initial_network
+from bench.learned_arm import add_initial, initial_network
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
@@ -232,7 +232,7 @@ def main(argv: list[str]) -> int:
     add('--modules', type=names, default=tuple(KINDS), help=f'modules: {", ".join(KINDS)}')
     add('--seconds', type=positive, default=EXPLORED, help='duration of the exploration [s]')
     add('--held', type=positive, default=HELD, help='hold each target this long [s]')
-    parser.add_initial()
+    add_initial(parser)
     parser.add_workers()
     options = parser.parse_args(argv)
     if wrong := set(options.modules) - set(KINDS):

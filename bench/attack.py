@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from bench import attack_files, attack_kills
+from bench.learned_arm import add_initial
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae import checkpoint
@@ -314,7 +315,7 @@ def main(argv: list[str]) -> int:
         help='number of hostile messages (default: 100 000; with --quick 300)',
     )
     parser.add_out('DIR', 'folder of the logs (default: a temporary one)', is_optional=True)
-    parser.add_initial()
+    add_initial(parser)
     text = 'random seeds (default: 0,1,2,3,4; with --quick 0)'
     parser.add_argument('--seeds', type=numbers, help=text)
     parser.add_argument('--kinds', type=names, help='names of the attacks to run (default: all)')
@@ -331,7 +332,7 @@ def main(argv: list[str]) -> int:
         initial, robot = options.initial, Robot.load('arm26')
         if initial is None:
             initial = folder / 'initial.safetensors'
-            checkpoint.save(initial_mae(robot).mae, initial)
+            checkpoint.save(initial_mae(robot), initial)
         planned = [each for each in all_attacks() if each[0] in (options.kinds or KINDS)]
         random.Random(seeds[0]).shuffle(planned)  # noqa: S311 - must be repeatable
         planned, rows = planned[: size.attacks], []

@@ -158,7 +158,7 @@ class Reader:
 
         self.folder, self.robot = folder, Robot.load('arm26')
         self.sound = self.robot.description.directory
-        self.network = checkpoint.to_bytes(initial_mae(self.robot, steps=2).mae)
+        self.network = checkpoint.to_bytes(initial_mae(self.robot, steps=2))
         store, state = SampleStore(), StateStore(folder / 'state', self.robot)
         state.load(store)
         for theta in self.robot.random_postures(5, np.random.default_rng(0)):

@@ -116,6 +116,6 @@ def main(argv: list[str]) -> None:
     args = parser.parse_args(argv)
 
     robot = Robot.load(args.robot)
-    default, paper = (initial_mae(robot, preset).mae for preset in ('default', 'paper'))
+    default, paper = (initial_mae(robot, preset) for preset in ('default', 'paper'))
     seeds = tqdm(args.seeds, unit='individual', disable=None)
     print(table(calibration(robot, default, paper, seeds, args.minutes)))

@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.learned_arm import initial_network
+from bench.learned_arm import add_initial, initial_network
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.covariance import ellipsoids
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
@@ -159,7 +159,7 @@ def main(argv: list[str]) -> None:
     parser.add_argument(
         '--scale', type=number(0.01, 100.0), default=1.0, help='multiply each covariance by this'
     )
-    parser.add_initial()
+    add_initial(parser)
     parser.add_workers()
     args = parser.parse_args(argv)
 

@@ -32,7 +32,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.lab import CORES, SAMPLE_TIME, Lab
-from bench.learned_arm import initial_network
+from bench.learned_arm import add_initial, initial_network
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.modules import Arm
@@ -238,7 +238,7 @@ def main(argv: list[str]) -> int:
         default=0,
         help='afterwards, push each joint this many times with each of several torques',
     )
-    parser.add_initial()
+    add_initial(parser)
     parser.add_quick('a minute of each arm')
     parser.add_workers()
     options = parser.parse_args(argv)

@@ -201,7 +201,7 @@ def main(argv: list[str]) -> None:
     print(HEAD, flush=True)
     with tempfile.TemporaryDirectory() as folder:
         network = Path(folder) / 'network.safetensors'
-        checkpoint.save(initial_mae(Robot.load(args.robot)).mae, network)
+        checkpoint.save(initial_mae(Robot.load(args.robot)), network)
         for count in args.arms:
             fleet = measure(count, args.robot, network, args.rate, args.seconds)
             print(fleet, flush=True)

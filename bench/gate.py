@@ -22,7 +22,7 @@ from network_attacks import ATTACKS
 
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
-from musculoskeletal_ae.estimation.network_validation.detector_check import LEAST_RUPTURED
+from musculoskeletal_ae.estimation.network_validation.detector_check import LEAST_RUPTURED, measures
 from musculoskeletal_ae.estimation.network_validation.message_errors import FLOOR, WORSE
 from musculoskeletal_ae.estimation.network_validation.posture_check import LIMITS
 from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
@@ -96,7 +96,7 @@ class Spread:
                 is_large = errors[key] > FLOOR[key]
                 ratio = errors[key][is_large] / in_use[is_large]
                 values[f'{key} over that in use'] = ratio.max(initial=0.0)
-        values['d on messages'], *ruptured = [*gate.detector_measures(mae)] or [0.0]
+        values['d on messages'], *ruptured = [*measures(mae, gate.messages, ())] or [0.0]
         self.least_ruptured = min(self.least_ruptured, max(ruptured, default=np.inf))
         for key, value in values.items():
             self.most[key] = max(self.most[key], float(value))
@@ -159,7 +159,7 @@ def main(argv: list[str]) -> int:
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     robot, spread = Robot.load(args.robot), Spread()
-    initial = {preset: initial_mae(robot, preset).mae for preset in PRESETS}
+    initial = {preset: initial_mae(robot, preset) for preset in PRESETS}
     networks = [(f'initial, {preset}', mae) for preset, mae in initial.items()]
     for _, mae in networks:
         spread.take(CheckpointValidator(robot), mae, 'initial')

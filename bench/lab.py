@@ -19,6 +19,7 @@ and its muscle modules do not wait.
 from __future__ import annotations
 
 import tempfile
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from itertools import zip_longest
@@ -233,7 +234,7 @@ class Lab:
             each(self)
         if self.learner.mae is not self._candidate and self._runs_estimator:
             self._candidate = self.learner.mae
-            self.estimator.networks.decide(self._candidate, now)
+            self._decide()
         if (at := self.driver.runs(now)) is not None:
             self._drive(at)
         if (at := self._estimating.runs(now)) is not None:
@@ -291,7 +292,7 @@ class Lab:
         core = self.estimator
         if (trust := core.joint_trust) is not self._published_trust:
             self._published_trust = trust
-            core.networks.forget()
+            core.networks.messages.clear()
             self._to_learner.append(lambda: self.learner.use_joint_trust(trust))
         if core.body is not self._published_body:
             body = self._published_body = core.body
@@ -311,6 +312,12 @@ class Lab:
         except CheckpointError:
             return False
         return True
+
+    def _decide(self) -> None:
+        """Let the estimator decide on the learner's candidate."""
+        if self._candidate is not None:
+            with suppress(CheckpointError):  # `_rejected` is called
+                deque(self.estimator.networks.propose(self._candidate, lambda: self.now), maxlen=0)
 
     def _rejected(self, mae: Mae, reason: str) -> None:
         self.rejected_networks.append(reason)
@@ -413,7 +420,7 @@ class Lab:
             if lab.now >= at and start in lab.before_step:
                 lab.before_step = [each for each in lab.before_step if each is not start]
                 lab._candidate = lab.learner.mae
-                lab.estimator.networks.decide(lab._candidate, lab.now)
+                lab._decide()
                 lab.publish()
 
         return start

@@ -19,6 +19,7 @@ from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.robot.robot import Robot
 
 #: Update at this interval [s], with this many training steps. The learned network is as accurate
@@ -49,9 +50,15 @@ class LearnedArm(NamedTuple):
     exploring: Recording
 
 
+def add_initial(parser: Parser) -> None:
+    """Add `--initial`, a checkpoint to start from; None if it is not given."""
+    text = 'initial checkpoint (default: train one)'
+    parser.add_argument('--initial', type=Path, metavar='FILE', help=text)
+
+
 def initial_network(robot: Robot, file: Path | None) -> Mae:
     """Return the network that `--initial` names, or train that of the geometric model."""
-    return initial_mae(robot).mae if file is None else checkpoint.load(file, robot)
+    return initial_mae(robot) if file is None else checkpoint.load(file, robot)
 
 
 def initial(robot: Robot, folder: Path) -> Mae:
@@ -59,7 +66,7 @@ def initial(robot: Robot, folder: Path) -> Mae:
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / 'initial.safetensors'
     if not file.exists():
-        checkpoint.save(initial_mae(robot).mae, file)
+        checkpoint.save(initial_mae(robot), file)
     return checkpoint.load(file, robot)
 
 

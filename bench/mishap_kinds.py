@@ -841,7 +841,7 @@ def more_friction(lab: Lab, _: Rng) -> Case:
 
 def stop_of_verification(lab: Lab, rng: Rng) -> Case:
     """An operator stops the arm while a suspect is verified."""
-    lab.estimator.suspects.settings = type(lab.estimator.suspects.settings)(on_anomaly='isolate')
+    lab.estimator.suspects.isolates = True
     muscle = _loaded(lab, rng)
     name = lab.arm.robot.muscles[muscle]
     lab.arm.set_ruptured([name])

@@ -550,7 +550,7 @@ def run_graph(
 
     network = folder / 'graph.safetensors'
     if not network.exists():
-        checkpoint.save(initial_mae(Robot.load('arm26')).mae, network)
+        checkpoint.save(initial_mae(Robot.load('arm26')), network)
     for seed in seeds:
         done = {
             each['mishap']

@@ -87,7 +87,7 @@ def main(argv: list[str]) -> int:
     parser.add_workers()
     args = parser.parse_args(argv)
     robot = Robot.load(args.robot)
-    mae = initial_mae(robot).mae
+    mae = initial_mae(robot)
     calls = [(robot, mae, args.reality, seed, args.seconds) for seed in args.seeds]
     with workers(args.jobs, args.scheduler) as processes:
         for lines in processes.in_order(measure, calls):

@@ -58,7 +58,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.motion import reach, slowness
 from musculoskeletal_ae.motion.explored_postures import holdable_postures
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
-from musculoskeletal_ae.presets.names import PAPER_PRESET
+from musculoskeletal_ae.presets.preset import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot
 
 EXPERIMENTS_HEAD = (

@@ -140,7 +140,7 @@ def measured(model: Model, file: Path, folder: Path, args: Namespace) -> dict[st
         robot = import_robot(file, robot_folder, check, joints=model.joints).robot
         preset = preset_named('default')
         steps = preset.initial_steps(robot) // (1 if args.whole else QUICK)
-        initial = initial_mae(robot, preset.name, args.seeds[0], steps=steps).mae
+        initial = initial_mae(robot, preset.name, args.seeds[0], steps=steps)
         result['first'] = seconds()
         result['individuals'] = individuals = list[dict[str, Any]]()
         for seed in args.seeds:

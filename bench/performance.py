@@ -27,7 +27,7 @@ from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, record
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.options import Parser, number
-from musculoskeletal_ae.presets.names import DEFAULT
+from musculoskeletal_ae.presets.preset import DEFAULT
 from musculoskeletal_ae.robot.robot import Robot
 
 ARM = 'musashi_left_arm'
@@ -265,7 +265,7 @@ def learning(name: str, folder: Path) -> tuple[float, float, Path]:
     """Return the times of initial training and of an update [s], and the network file."""
     robot, network = Robot.load(name), folder / f'{name}.safetensors'
     begun = time.process_time()
-    mae = initial_mae(robot).mae
+    mae = initial_mae(robot)
     training = time.process_time() - begun
     checkpoint.save(mae, network)
     exploring = record(EmulatedArm(robot, 0), mae, EXPLORATION_STREAM, EXPLORING)

@@ -206,4 +206,4 @@ def main(argv: list[str]) -> None:
         film(options)
     if 'simulation' in options.only:
         robot = Robot.load(DEFAULT_ROBOT)
-        print(*draw_simulated(robot, initial_mae(robot).mae, options.out), sep='\n')
+        print(*draw_simulated(robot, initial_mae(robot), options.out), sep='\n')

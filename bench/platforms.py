@@ -351,7 +351,9 @@ def _options(argv: list[str]) -> argparse.Namespace:
         '--node', type=Path, metavar='CHECKPOINT',
         help='check only the core and one node, without torch, with this checkpoint of arm26',
     )  # fmt: skip
-    parser.add_folder('working folder (default: a temporary one)')
+    parser.add_argument(
+        '--folder', type=Path, metavar='DIR', help='working folder (default: a temporary one)'
+    )
     parser.add_argument(
         '--tests', nargs='+', metavar='TEST',
         help='tests for pytest (default: those that depend on the platform)',

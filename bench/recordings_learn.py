@@ -81,7 +81,7 @@ def described(body: Body, with_effort: bool) -> tuple[Robot, Mae]:
     with tempfile.TemporaryDirectory() as folder:
         source = 'sensor' if with_effort else 'none'
         robot = Robot.load(body.write(Path(folder) / 'robot', source))
-    return robot, initial_mae(robot, steps=INITIAL_STEPS, seed=0).mae
+    return robot, initial_mae(robot, steps=INITIAL_STEPS, seed=0)
 
 
 def package(case: Case, robot: Robot, mae: Mae, with_effort: bool, seed: int = 0) -> Model:

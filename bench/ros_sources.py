@@ -197,7 +197,9 @@ def _options(argv: list[str]) -> argparse.Namespace:
         help=', '.join(RELEASES),
     )  # fmt: skip
     text = 'working folder with sources, build and wheels'
-    parser.add_folder(text, Path('build/ros_sources'))
+    parser.add_argument(
+        '--folder', type=Path, metavar='DIR', default=Path('build/ros_sources'), help=text
+    )
     return parser.parse_args(argv)
 
 

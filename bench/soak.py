@@ -23,7 +23,7 @@ import time
 import numpy as np
 import torch
 
-from bench.learned_arm import initial_network
+from bench.learned_arm import add_initial, initial_network
 from bench.processes import memory
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
@@ -134,7 +134,7 @@ def main(argv: list[str]) -> int:
         '--steps', type=int, default=STEPS, help='number of training steps of an update'
     )
     parser.add_seed('of the individual')
-    parser.add_initial()
+    add_initial(parser)
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     robot = Robot.load(args.robot)

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.learned_arm import initial_network
+from bench.learned_arm import add_initial, initial_network
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.emulator.modules import Arm
@@ -200,7 +200,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument(
         '--seconds', type=positive, default=EXPLORED, help='time of exploration [s]'
     )
-    parser.add_initial()
+    add_initial(parser)
     parser.add_workers()
     options = parser.parse_args(argv)
     share = 0.25 if options.quick else 1.0

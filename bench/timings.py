@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Times each step of the core, and the same step in plain torch.
 
-    python -m bench timings [--robot NAME|DIR] [--preset NAME] [--device cuda]
+    python -m bench timings [--robot NAME|DIR] [--preset NAME]
 
 The torch side runs the same algorithm on the same input. Its network runs in torch, and autograd
 computes the gradients. The column "bound" estimates a lower bound: the time that this machine needs
@@ -34,9 +34,9 @@ from musculoskeletal_ae.exporting.exported_mjcf import export
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae, read_groups
-from musculoskeletal_ae.mae.network import Network, TorchLengths, from_mae
+from musculoskeletal_ae.mae.network import Network, from_mae
 from musculoskeletal_ae.mae.training import random_states
-from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, visible
+from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, scale_vector, visible
 from musculoskeletal_ae.motion import methods as control
 from musculoskeletal_ae.motion.methods import first_command, stiffness_command
 from musculoskeletal_ae.options import Parser
@@ -129,7 +129,7 @@ def row_time(row: Row, function: Callable[[], object]) -> float:
 
 def mae_rows(robot: Robot, preset: str) -> list[Row]:
     """Return rows for the steps of the network; their times do not depend on its weights."""
-    mae = initial_mae(robot, preset, steps=1).mae
+    mae = initial_mae(robot, preset, steps=1)
     eager = from_mae(mae)
     states = random_states(robot, 1, np.random.default_rng(0), robot.tension.limit)
     theta, tension, length = (part[0] for part in states)
@@ -273,13 +273,40 @@ def eager_proposed_paper(
     return command
 
 
-def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
+class TorchLengths:
+    """Computes a network's muscle lengths and their gradients in torch, for the simulator."""
+
+    def __init__(self, mae: Mae) -> None:
+        self._network = from_mae(mae)
+        self.lengths, self.friction = mae.lengths, mae.friction
+        self.elasticity = mae.elasticity
+        self._scale = torch.tensor(scale_vector(len(mae.joints), len(mae.muscles)))
+        self._muscles = len(mae.muscles)
+
+    def lengths_with_pullback(
+        self, theta: Array, tension: Array
+    ) -> tuple[Array, Callable[[Array], Array]]:
+        """Return the lengths at (θ, T) and their pullback, as `Mae.lengths_with_pullback` does."""
+        angles, tensions = torch.tensor(theta, requires_grad=True), torch.tensor(tension)
+        values = torch.cat((angles, tensions, torch.zeros_like(tensions)), dim=1)
+        mask = torch.zeros(len(theta), dtype=torch.long)
+        restored = self._network((values * self._scale).float(), mask) / self._scale
+        length = restored[:, -self._muscles :]
+
+        def pullback(gradient: Array) -> Array:
+            by_angles = torch.autograd.grad(length, angles, torch.tensor(gradient))[0]
+            return by_angles.numpy(force=True)
+
+        return length.numpy(force=True).astype(float), pullback
+
+
+def simulation_rows(robot: Robot, preset: str) -> list[Row]:
     """Return rows for a simulator step of one arm and of many, and for loading a network."""
-    mae = initial_mae(robot, preset, steps=200).mae
+    mae = initial_mae(robot, preset, steps=200)
     rng = np.random.default_rng(0)
 
-    def arms(count: int, body: Any = mae, device: str | None = None) -> Simulation:
-        simulated = Simulation(robot, body, arms=count, device=device)
+    def arms(count: int, body: Any = mae) -> Simulation:
+        simulated = Simulation(robot, body, arms=count)
         theta = robot.random_postures(count, rng)
         tension = rng.uniform(robot.tension.bias, robot.tension.limit, (count, robot.muscle_count))
         simulated.command = first_command(robot, mae, theta, tension)
@@ -287,22 +314,14 @@ def simulation_rows(robot: Robot, preset: str, device: str | None) -> list[Row]:
         return simulated
 
     def step(simulated: Any) -> Callable[[], object]:
-        # A GPU computes asynchronously. Reading the angles waits until it has finished.
-        return lambda: simulated.step(SIMULATED).theta[-1].tolist()
+        return lambda: simulated.step(SIMULATED)
 
     network, work = TorchLengths(mae), 2 * products(mae, Mask.THETA_TENSION, lengths=True)
     one, per_arm = 'simulation step', 'simulation step, time per arm in a batch of'
     many = f'{per_arm} {MANY}'
-    there = [
-        Row(f'{per_arm} {n} on {device}', step(arms(n, device=device)), None, n)
-        for n in (MANY, 16 * MANY)
-        if device is not None
-    ]
-
     return [
         Row(one, step(arms(1)), step(arms(1, network)), 1, work),
         Row(many, step(arms(MANY)), step(arms(MANY, network)), MANY, work),
-        *there,
         *rollout_rows(robot, mae, arms(ROLLED).state.theta),
         Row('loading a new network into the simulator', partial(Simulation(robot, mae).use, mae)),
     ]
@@ -408,11 +427,11 @@ def _eager_gradient(network: Network, latent: torch.Tensor) -> object:
     return torch.autograd.grad(network.decode(leaf).sum(), leaf)
 
 
-def measure(robot: Robot, preset: str, device: str | None = None) -> list[Timed]:
+def measure(robot: Robot, preset: str) -> list[Timed]:
     """Measure the times of all rows, on one thread."""
     torch.set_num_threads(1)
     one, many = gemm_rate(1), gemm_rate(256)
-    every = mae_rows(robot, preset) + simulation_rows(robot, preset, device)
+    every = mae_rows(robot, preset) + simulation_rows(robot, preset)
     every += emulation_rows(robot)
     return [
         Timed(
@@ -422,15 +441,15 @@ def measure(robot: Robot, preset: str, device: str | None = None) -> list[Timed]
             row.products / (one if row.several == 1 else many),
         )
         for row in every
-    ] + message_times(robot, initial_mae(robot, preset, steps=200).mae, preset)
+    ] + message_times(robot, initial_mae(robot, preset, steps=200), preset)
 
 
-def show(robot: Robot, preset: str, device: str | None = None) -> None:
+def show(robot: Robot, preset: str) -> None:
     """Measure all steps, and print the table of their times."""
     name = robot.description.directory.name
     print(f'{name}, preset {preset}: median time of one call [µs]; torch uses one thread')
     print(f'{"":<64}{"ours":>10}{"torch eager":>14}{"bound":>10}')
-    for row in measure(robot, preset, device):
+    for row in measure(robot, preset):
         numbers = zip((row.ours, row.torch_eager, row.bound), (10, 14, 10))
         cells = (f'{f"{value:.1f}" if value else "":>{width}}' for value, width in numbers)
         print(f'{row.name:<64}{"".join(cells)}')
@@ -441,8 +460,5 @@ def main(argv: list[str]) -> None:
     parser = Parser('timings', 'Times each step of the core, and the same step in plain torch.')
     parser.add_robot()
     parser.add_preset()
-    parser.add_argument(
-        '--device', help='torch device on which to time batches as well, such as cuda'
-    )
     args = parser.parse_args(argv)
-    show(Robot.load(args.robot), args.preset, args.device)
+    show(Robot.load(args.robot), args.preset)

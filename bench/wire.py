@@ -330,7 +330,7 @@ def systems(
     """
     with tempfile.TemporaryDirectory() as folder:
         network = Path(folder) / 'network.safetensors'
-        checkpoint.save(initial_mae(Robot.load(robot)).mae, network)
+        checkpoint.save(initial_mae(Robot.load(robot)), network)
         for rate in rates:
             for kind in kinds:
                 system = System(robot, network, rate, KINDS[kind], emulator)

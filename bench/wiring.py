@@ -143,7 +143,7 @@ class Loop:
             elif calibration is not None:
                 if calibration.remedy:
                     return _named(estimator, calibration.problem)
-                if calibration.problem and calibration.overtime > REFUSING:
+                if calibration.problem and calibration.time - calibration.enough > REFUSING:
                     return set()
             elif self.time > end - LONGEST + NOTHING:
                 return None
@@ -228,7 +228,13 @@ def main(argv: list[str]) -> int:
     parser = Parser('wiring', 'Exchanges muscles, or reverses a sign, in a live driver.')
     parser.add_robot()
     parser.add_seeds((0, 1, 2, 3, 4))
-    parser.add_folder('folder that keeps the learned networks', Path('bench_wiring'))
+    parser.add_argument(
+        '--folder',
+        type=Path,
+        metavar='DIR',
+        default=Path('bench_wiring'),
+        help='folder that keeps the learned networks',
+    )
     parser.add_workers()
     args = parser.parse_args(argv)
     robot, outcomes = Robot.load(args.robot), Counter[str]()

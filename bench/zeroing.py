@@ -167,7 +167,13 @@ def main(argv: list[str]) -> int:
     parser = Parser('zeroing', 'Tests length calibration after power-on.')
     parser.add_robot()
     parser.add_seeds((0, 1, 2, 3, 4))
-    parser.add_folder('folder that keeps the learned networks', Path('bench_zeroing'))
+    parser.add_argument(
+        '--folder',
+        type=Path,
+        metavar='DIR',
+        default=Path('bench_zeroing'),
+        help='folder that keeps the learned networks',
+    )
     parser.add_out('FILE', 'JSON file for the results', is_optional=True)
     parser.add_workers()
     args = parser.parse_args(argv)

@@ -58,7 +58,7 @@ def show_progress(step: int, *_: object) -> None:
 
 
 robot = Robot.load('arm26')  # or the directory of your robot.urdf and muscles.yaml
-initial = initial_mae(robot, steps=options.steps, progress=show_progress).mae
+initial = initial_mae(robot, steps=options.steps, progress=show_progress)
 arm = EmulatedArm(robot, seed=1)
 learner = Learner(robot, initial)
 

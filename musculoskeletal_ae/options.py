@@ -19,7 +19,7 @@ from typing import Any, NoReturn, TypeVar
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.output import output_problem
-from musculoskeletal_ae.presets.names import DEFAULT, PRESET_NAMES
+from musculoskeletal_ae.presets.preset import DEFAULT, PRESET_NAMES
 from musculoskeletal_ae.process_signals import INTERRUPTED
 from musculoskeletal_ae.robot.directories import shipped_robots
 
@@ -171,15 +171,6 @@ class Parser(argparse.ArgumentParser):
         self.add_argument(
             '--out', type=read, metavar=metavar, default=default, required=required, help=text
         )
-
-    def add_folder(self, text: str, default: Path | None = None) -> None:
-        """Add `--folder`, a folder of files that later runs use again; `text` is its help text."""
-        self.add_argument('--folder', type=Path, metavar='DIR', default=default, help=text)
-
-    def add_initial(self) -> None:
-        """Add `--initial`, a checkpoint to start from; None if it is not given."""
-        text = 'initial checkpoint (default: train one)'
-        self.add_argument('--initial', type=Path, metavar='FILE', help=text)
 
     def add_chain(self) -> None:
         """Add the options that select a part of a model to import."""

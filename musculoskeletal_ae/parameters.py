@@ -1,17 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters with default, meaning, unit and legal values, independent of ROS.
 
-Settings that a user may choose are a frozen dataclass whose fields are parameters:
-
-    @dataclass(frozen=True)
-    class Settings(CheckedSettings):
-        hold_time: float = settable(
-            0.5, 'time for which a stop holds the last command', 's', 0.0, 60.0
-        )
-
-`nodes/declared_parameters.py` assembles the parameters of each node from such classes.
-`Parameter.checked` is the only function that validates a value. The constructor of settings calls
-it, and so do the nodes.
+The settings of control are a frozen dataclass whose fields are parameters (`control/settings.py`).
+`nodes/declared_parameters.py` has the parameters of each node. `Parameter.checked` is the only
+function that validates a value. The constructor of the settings calls it, and so do the nodes.
 """
 
 import sys
@@ -25,9 +17,8 @@ from msgspec import Meta
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError, ParameterError
 from musculoskeletal_ae.options import DEFAULT_ROBOT
-from musculoskeletal_ae.presets.names import DEFAULT, PRESET_NAMES
+from musculoskeletal_ae.presets.preset import DEFAULT, PRESET_NAMES
 
-DEVICES = 'cpu', 'cuda'  # torch devices on which networks can be trained
 #: highest legal value of a parameter without an upper limit: the largest integer of ROS
 UNBOUNDED = 2**63 - 1
 
@@ -123,20 +114,6 @@ def naming_parameter(name: str) -> Iterator[None]:
         raise
     except (MusculoskeletalError, OSError) as error:
         raise ParameterError(f'parameter {name}: {error}') from error
-
-
-class CheckedSettings:
-    """Base class of settings: the constructor checks each field that is a parameter."""
-
-    def __post_init__(self) -> None:
-        """Check the fields, and turn lists into tuples.
-
-        Raises:
-            ParameterError: If a value is not legal.
-        """
-        for name, parameter in parameters_of(type(self)).items():
-            with naming_parameter(name):
-                object.__setattr__(self, name, parameter.checked(getattr(self, name)))
 
 
 def settable(

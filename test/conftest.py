@@ -116,7 +116,7 @@ def trained_files(alone) -> dict[str, Path]:
         files = {preset: folder / f'arm26_{preset}.safetensors' for preset in PRESETS}
         for preset, file in files.items():
             if not file.exists():
-                mae = initial_mae(Robot.load('arm26'), preset, seed=3, steps=600).mae
+                mae = initial_mae(Robot.load('arm26'), preset, seed=3, steps=600)
                 checkpoint.save(mae, file)
     return files
 

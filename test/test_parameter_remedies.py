@@ -14,7 +14,7 @@ from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.control.stop_memory import StopMemory
 from musculoskeletal_ae.estimation.lengths.length_calibration import stated_theta
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.mae.training import check_device
+from musculoskeletal_ae.mae.training import train_on
 from musculoskeletal_ae.mujoco_version import check_mujoco
 from musculoskeletal_ae.nodes.declared_parameters import MOVED, PARAMETERS, check_names
 from musculoskeletal_ae.presets.registry import preset_named
@@ -167,7 +167,7 @@ def test_a_directory_for_stops_can_be_chosen_as_the_refusal_says(tmp_path):
 #: what a user chooses, a wrong choice, the advice, and the right ones
 CHOICES = {
     'preset': (preset_named, 'best', 'legal: (.*)$', members()),
-    'device': (check_device, 'cuda:99', r'legal: (cpu)\.', members()),
+    'device': (train_on, 'cuda:99', r'legal: (cpu)\.', members()),
     'version of MuJoCo': (
         check_mujoco, '3.2.0', r'legal: >=([\d.]+),<', [lambda match: f'{match[1]}.0', '3.99.1'],
     ),

@@ -8,7 +8,6 @@ import re
 import socket
 from argparse import Namespace
 from contextlib import closing
-from functools import partial
 from itertools import count
 from pathlib import Path
 from shutil import copytree
@@ -22,7 +21,6 @@ from musculoskeletal_ae.experiments.measurement import _work_folder
 from musculoskeletal_ae.experiments.results import BEGIN, END, text_around_table, write_report
 from musculoskeletal_ae.experiments.study import Study
 from musculoskeletal_ae.figures import save_figure
-from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.simulation import Simulation
 from musculoskeletal_ae.tools import experiment
@@ -224,13 +222,8 @@ def test_the_command_that_makes_the_page_of_the_paper_is_one_of_the_tool(tmp_pat
 # -- simulation, pictures, page -------------------------------------------------------------------
 
 
-def test_presets_that_simulate_on_a_device_are_named(trained):
+def test_the_least_number_of_simulated_arms_is_named(trained):
     robot = Robot.load('arm26')
-    for preset in PRESETS:
-        make = partial(Simulation, robot, trained[preset], arms=1, device='cpu')
-        if not PRESETS[preset].simulates_on_devices:
-            check_remedy(make, preset, 'use one of these presets: (.*)$', [
-                lambda match: match[1].split(', ')[0]])  # fmt: skip
     check_remedy(
         lambda arms: Simulation(robot, trained['default'], arms=arms),
         0,

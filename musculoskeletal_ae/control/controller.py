@@ -229,7 +229,7 @@ class Controller:
 
     def use(self, mae: Mae) -> None:
         """Use another network, which has been validated."""
-        self.mae, self.watchdog.has_checkpoint = mae, True
+        self.mae = mae
         self.stream.use_transmission(mae.transmission)
         robot = self.robot.with_elasticity(mae.elasticity)
         if robot is not self.robot:
@@ -310,15 +310,12 @@ class Controller:
 
     def _use_anomaly(self, body: BodyState) -> None:
         """Stop the arm while an anomaly is present; resume after the verification of a suspect."""
-        self.watchdog.has_anomaly = body.has_anomaly
-        is_verified = body.anomaly is Anomaly.VERIFYING
-        self.stopping.suspect = body.suspect if is_verified else None
         if body.has_anomaly:
             self.stop(ConditionKind.ANOMALY)
         if body.anomaly is Anomaly.ENDED:
             self.supervisor.on_verified()
         else:
-            self.supervisor.on_suspect(is_verified)
+            self.supervisor.on_suspect(body.anomaly is Anomaly.VERIFYING)
 
     def _use_offsets(self, body: BodyState) -> None:
         before = self.stream.body.offsets
@@ -500,6 +497,10 @@ class Controller:
     def stop_conditions(self, now: float) -> list[Condition]:
         """Return the stop causes that are present, in the order of `ConditionKind`."""
         present = self.watchdog.conditions(now)
+        if self.mae is None:
+            present.append(ConditionKind.NO_CHECKPOINT.condition())
+        if self.stream.body.has_anomaly:
+            present.append(ConditionKind.ANOMALY.condition())
         if detail := self.stream.implausible(now):
             present.append(ConditionKind.IMPLAUSIBLE_MUSCLE_STATES.condition(detail))
         if detail := self._revoked_lengths(now):
@@ -520,7 +521,7 @@ class Controller:
             names = '' if len(muscles) == self.robot.muscle_count else self.robot.names(muscles)
             of_muscles = f' of {names}' if names else ''
             return f'the estimator has revoked the length offsets{of_muscles}'
-        if self.watchdog.has_anomaly:
+        if stream.body.has_anomaly:
             return ''
         is_ignored = stream.has_jumped and now - self._jumped_at > REACTION_TIME
         if is_ignored and stream.body.offsets.known:
@@ -672,9 +673,9 @@ class Controller:
         waits = not self.supervisor.is_latched and not present
         causes = {condition.kind for condition in present}
         is_fresh = ConditionKind.STALE_MUSCLE_STATES not in causes
-        may_wind = self.supervisor.may_wind_suspect
+        suspect = self.stream.body.verified if self.supervisor.may_wind_suspect else None
         at_once = self.supervisor.action is Action.RELEASE_AT_ONCE
-        return self.stopping.step(self.sample, 0.0 if waits else dt, is_fresh, may_wind, at_once)
+        return self.stopping.step(self.sample, 0.0 if waits else dt, is_fresh, suspect, at_once)
 
     def _limited(self, desired: Command | None, dt: float) -> Command | None:
         if desired is None or self.sample is None:

@@ -11,7 +11,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.messages.arrival import INTERRUPTION
-from musculoskeletal_ae.parameters import PRESET, CheckedSettings, settable
+from musculoskeletal_ae.parameters import PRESET, naming_parameter, parameters_of, settable
 from musculoskeletal_ae.robot.joint_units import SLIDE, JointUnits
 
 UNREACHABLE = ('refuse', 'nearest')  # legal values of the setting `unreachable`
@@ -32,7 +32,7 @@ def _most_stiffness(radian: float) -> float:
 
 
 @dataclass(frozen=True)
-class Settings(CheckedSettings):
+class Settings:
     """Settings of control; `Controller.configure` applies changed settings."""
 
     method: str = settable(
@@ -101,6 +101,16 @@ class Settings(CheckedSettings):
     #: preset `default` [s]; extended if muscle modules or muscles are too weak; 0 for
     #: first_duration
     target_duration: float = 1.2
+
+    def __post_init__(self) -> None:
+        """Check the fields that are parameters, and turn lists into tuples.
+
+        Raises:
+            ParameterError: If a value is not legal.
+        """
+        for name, parameter in parameters_of(Settings).items():
+            with naming_parameter(name):
+                object.__setattr__(self, name, parameter.checked(getattr(self, name)))
 
     def desired_stiffness(self, units: JointUnits) -> Array:
         """Return the desired stiffness of each joint [N·m/rad], (D,); 0 for unconstrained joints.

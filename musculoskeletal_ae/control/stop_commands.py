@@ -36,13 +36,11 @@ class SafeStop:
     """Commands a stopped arm.
 
     Attributes:
-        suspect: Index of the muscle that may be wound in, or None.
         is_entered: Whether the arm is in a stop.
     """
 
     def __init__(self, robot: Robot, settings: Settings, limiter: CommandLimiter) -> None:
         self._limiter = limiter
-        self.suspect: int | None = None
         self.is_entered = False
         self.use(robot, settings)
         self.leave()
@@ -73,7 +71,7 @@ class SafeStop:
         sample: MuscleSample,
         dt: float,
         is_fresh: bool,
-        may_wind: bool,
+        suspect: int | None,
         releases_at_once: bool = False,
     ) -> Command | None:
         """Return the desired command; None if no command was ever published.
@@ -82,7 +80,7 @@ class SafeStop:
             sample: The newest muscle states.
             dt: Time since the last call [s]; 0 while the arm waits to resume.
             is_fresh: Whether the sample is still up to date. If it is not, no suspect is wound in.
-            may_wind: Whether the suspect may be wound in.
+            suspect: Index of the muscle that may be wound in; None if there is none.
             releases_at_once: Whether to release the arm without holding the last command.
         """
         last = self._limiter.command
@@ -94,10 +92,7 @@ class SafeStop:
         if not self.is_releasing:
             return last
         winds = (
-            self.suspect is not None
-            and may_wind
-            and is_fresh
-            and self._held > self._settings.hold_time + PAYING_OUT
+            suspect is not None and is_fresh and self._held > self._settings.hold_time + PAYING_OUT
         )
         if winds:  # tensions are at T_bias now; a suspect is wound in by length commands
             last = self._limiter.last(LENGTH, sample)
@@ -116,10 +111,8 @@ class SafeStop:
             is_fresh,
         )
         value = np.minimum(last.value + change, np.maximum(end, last.value))
-        if winds and self.suspect is not None:
-            value[self.suspect] = self._wound(
-                self.suspect, float(last.value[self.suspect]), sample, dt
-            )
+        if winds and suspect is not None:
+            value[suspect] = self._wound(suspect, float(last.value[suspect]), sample, dt)
         return Command(LENGTH, value)
 
     def _wound(self, muscle: int, command: float, sample: MuscleSample, dt: float) -> float:

@@ -215,8 +215,6 @@ class Watchdog:
         estimate: Arrival of the new and plausible estimates.
         overload: Detects tensions that are too high.
         heat: Limits tensions by temperature.
-        has_checkpoint: Whether there is a network.
-        has_anomaly: Whether an anomaly is present.
         second_publisher: Description of an additional publisher of a topic, or ''.
     """
 
@@ -226,7 +224,6 @@ class Watchdog:
         self.steps = ControlSteps(clock)
         self.muscle_states, self.estimate = Arrival(clock), Arrival(clock)
         self.overload, self.heat = Overload(robot), HeatLimit(robot)
-        self.has_checkpoint = self.has_anomaly = False
         self.second_publisher = ''
         self.use(robot, settings)
 
@@ -254,12 +251,8 @@ class Watchdog:
         self.overload.take(np.where(used, tension, 0.0), now, delay)
 
     def conditions(self, now: float) -> list[Condition]:
-        """Return the stop causes that are present, in the order of `ConditionKind`."""
+        """Return the stop causes that are present."""
         present = []
-        if not self.has_checkpoint:
-            present.append(ConditionKind.NO_CHECKPOINT.condition())
-        if self.has_anomaly:
-            present.append(ConditionKind.ANOMALY.condition())
         if self.second_publisher:
             present.append(ConditionKind.SECOND_PUBLISHER.condition(self.second_publisher))
         settings = self._settings

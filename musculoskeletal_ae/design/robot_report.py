@@ -96,8 +96,7 @@ def summary(robot: Robot, result: RobotCheck, seed: int) -> str:
     lines = [
         f'{robot.description.directory}',
         f'{robot.joint_count} joints, {robot.muscle_count} muscles; {count} postures, seed {seed}',
-        *robot.description.joint_notes,
-        *robot.description.spring_notes,
+        *robot.description.notes,
         '',
         f'{need}; a posture that is not held counts as not stiff',
         f'held with {tension}, nearest to {shown(desired)} N:  {100 * held.mean():.1f} %',

@@ -362,17 +362,14 @@ class Arm(ABC):
         return self._muscle.winding.copy()
 
     @property
-    def has_diverged(self) -> bool:
-        """Whether a joint has become too fast to simulate (FASTEST); true until `reset`."""
-        # The comparison is False if the speed is NaN.
-        return not np.abs(self._rates[self._order]).max() <= FASTEST
-
-    @property
     def divergence(self) -> str:
-        """Text on how the arm has diverged, with cause and remedy; empty if it has not."""
-        if not self.has_diverged:
-            return ''
+        """How the arm has diverged, with cause and remedy; '' if it has not. `reset` ends this.
+
+        An arm has diverged if a joint is so fast (FASTEST) that it cannot be simulated.
+        """
         speed = np.abs(self._rates[self._order])
+        if speed.max() <= FASTEST:  # false if a speed is NaN
+            return ''
         j = int(np.flatnonzero(~(speed <= FASTEST))[0])
         unit = self.robot.units[j].position
         problem = f'joint {self.robot.joints[j]} moves at {speed[j]:.4g} {unit}/s'
@@ -384,8 +381,8 @@ class Arm(ABC):
         Raises:
             DivergedError: If the arm has diverged.
         """
-        if self.has_diverged:
-            raise DivergedError(f'the emulated arm has diverged: {self.divergence}')
+        if divergence := self.divergence:
+            raise DivergedError(f'the emulated arm has diverged: {divergence}')
 
     def _divergence_cause(self) -> str:
         """Return sentences with the probable cause of a divergence, and its remedy."""
@@ -496,7 +493,7 @@ class Arm(ABC):
             self._age += STEP
             if self._age > self.command_timeout:
                 self._kind = SAFE
-            if self.has_diverged:
+            if self.divergence:
                 return
             self._step()
 

@@ -28,13 +28,11 @@ class Estimate:
         residual: Reconstructed minus measured tensions and lengths in scaled units, 0 for isolated
             muscles, (2M,).
         anomaly: Anomaly score A, the size of the residual.
-        covariance: Covariance of the joint angles [rad²], (D, D); None if the network has none.
     """
 
     state: State
     residual: Array
     anomaly: float
-    covariance: Array | None
 
 
 def estimate(mae: Mae, bone_tension: Array, length: Array, state: State | None = None) -> Estimate:
@@ -50,4 +48,4 @@ def estimate(mae: Mae, bone_tension: Array, length: Array, state: State | None =
     error = residuals(state, bone_tension, length, mae.isolated)
     tension_error, length_error = error[: len(length)], error[len(length) :]
     anomaly = math.sqrt(tension_error @ tension_error) + math.sqrt(length_error @ length_error)
-    return Estimate(state, error, anomaly, mae.covariance)
+    return Estimate(state, error, anomaly)

@@ -29,7 +29,6 @@ from musculoskeletal_ae.estimation import estimator_status
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
 from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
 from musculoskeletal_ae.estimation.estimate import Estimate, estimate
-from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings
 from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.further_loss import needed_muscles
 from musculoskeletal_ae.estimation.health import HealthMonitor
@@ -68,7 +67,6 @@ class Output(NamedTuple):
     Attributes:
         sample: The checked readings of the message.
         state: Joint angles, tensions and lengths that the network estimates from the readings.
-        covariance: Covariance of the joint angles [rad²], (D, D), or None if it is unknown.
         anomaly: Anomaly score A: the size of the network's residual, in scaled units.
         detected: Whether this message made a detector report a fault, which was then latched.
         contact: External load; None while the length offsets are unknown, on a robot whose tensions
@@ -77,7 +75,6 @@ class Output(NamedTuple):
 
     sample: MuscleSample
     state: State
-    covariance: Array | None
     anomaly: float
     detected: bool
     contact: Contact | None = None
@@ -185,11 +182,7 @@ class Estimator:
             return f'wait for the verification of the muscle, which ends within {LONGEST:g} s'
         return sentence(self.remedy)
 
-    # -- settings and services ------------------------------------------------------------------
-
-    def configure(self, settings: EstimatorSettings) -> None:
-        """Use these settings from the next message on."""
-        self.suspects.settings = settings
+    # -- networks and services -------------------------------------------------------------------
 
     def use(self, mae: Mae) -> Mae:
         """Use another network and its healthy statistics, without the isolated muscles.
@@ -461,9 +454,7 @@ class Estimator:
         detected, contact = False, None
         if sample.jumped or not 0.0 < self._unchecked_sent < SPACING:
             detected, contact = self._check(sample, estimated, readings, now), self.load
-        self.output = Output(
-            sample, estimated.state, estimated.covariance, estimated.anomaly, detected, contact
-        )
+        self.output = Output(sample, estimated.state, estimated.anomaly, detected, contact)
         return self.output
 
     def _check(

@@ -117,13 +117,11 @@ class MountingCheck:
         self._angles = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
         moving = sum(float(inertia.mass) for inertia in self._model.inertias[1:])
         self._payloads = moving * np.array(PAYLOADS)
-        self._is_learned = False
         self.reset()
 
     def use(self, mae: Mae) -> None:
         """Use another network; nothing is checked if its anomaly detector is not calibrated."""
         self._mae = mae
-        self._is_learned = mae.is_calibrated
 
     def reset(self) -> None:
         """Reset the check: discard all evidence, for example after a reset by the user."""
@@ -146,7 +144,7 @@ class MountingCheck:
         self._since += dt
         moved = np.abs(theta - self._counted_at)
         has_moved = self._since >= SPACING - 1e-9 and moved.max() > MOVED
-        if not self._is_learned or not has_moved or not np.isfinite(torque).all():
+        if not self._mae.is_calibrated or not has_moved or not np.isfinite(torque).all():
             return
         self._counted_at, self._since = theta, 0.0
         load = tension @ np.abs(self._mae.muscle_jacobian(theta, tension))

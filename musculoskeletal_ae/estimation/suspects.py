@@ -41,7 +41,6 @@ muscles. While a muscle is being verified, it cannot be restored.
 from collections.abc import Iterable
 
 from musculoskeletal_ae.conditions import FindingReaction
-from musculoskeletal_ae.estimation.estimator_settings import ISOLATE, EstimatorSettings
 from musculoskeletal_ae.estimation.finding import Finding
 from musculoskeletal_ae.estimation.suspect_verification import (
     ModuleLaw,
@@ -69,7 +68,7 @@ class SuspectHandling:
     """Latches a finding, and decides which muscles are isolated because of it.
 
     Attributes:
-        settings: Settings with `on_anomaly`.
+        isolates: Whether suspects are isolated and verified, as with `on_anomaly: isolate`.
         finding: The latched finding, or None.
         suspect: Index of the muscle that the newest latched finding names, also after its end; None
             before the first.
@@ -81,7 +80,7 @@ class SuspectHandling:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self.settings = EstimatorSettings()
+        self.isolates = False
         self.finding: Finding | None = None
         self.suspect: int | None = None
         self.verification: Verification | None = None
@@ -125,8 +124,7 @@ class SuspectHandling:
             Indices of the muscles that are isolated from now on.
         """
         isolated, muscle = tuple(isolated), finding.muscle
-        isolates = self.settings.on_anomaly == ISOLATE
-        if finding.kind.reaction in AT_ONCE and isolates and muscle not in isolated:
+        if finding.kind.reaction in AT_ONCE and self.isolates and muscle not in isolated:
             self.last_verdict = muscle, VerificationVerdict(Outcome(finding.kind.identifier))
             self.faults[muscle] = self.last_verdict[1]
             return (*isolated, muscle)
@@ -141,7 +139,7 @@ class SuspectHandling:
             return isolated
         self.finding, self.suspect = finding, muscle
         recent = [time for time in self._acquitted if now - time < WITHIN]
-        may_isolate = isolates and finding.kind.reaction is FindingReaction.ISOLATE
+        may_isolate = self.isolates and finding.kind.reaction is FindingReaction.ISOLATE
         if not may_isolate or len(recent) >= ACQUITTALS:
             return isolated
         self.verification = Verification(muscle, self._law(muscle))

@@ -41,7 +41,7 @@ from musculoskeletal_ae.experiments.study import (
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.explored_postures import TRIES, holdable_postures
 from musculoskeletal_ae.motion.methods import proposed
-from musculoskeletal_ae.presets.names import PAPER_PRESET
+from musculoskeletal_ae.presets.preset import PAPER_PRESET
 from musculoskeletal_ae.robot.tension import holding_tension
 
 #: colours of the methods; a suffix names the preset whose network a method uses

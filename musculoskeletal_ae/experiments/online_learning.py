@@ -57,7 +57,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, to_mae
 from musculoskeletal_ae.mae.training import OUTPUTS, pair_errors
 from musculoskeletal_ae.mae.units import Mask, State, scale_vector
-from musculoskeletal_ae.presets.names import DEFAULT, PAPER_PRESET
+from musculoskeletal_ae.presets.preset import DEFAULT, PAPER_PRESET
 from musculoskeletal_ae.presets.registry import PRESETS, preset_named
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
@@ -158,8 +158,8 @@ def train_initial(study: Study, preset: str) -> None:
         rows.append([step, *np.reshape([*norms], (2, len(Mask), -1)).mean(axis=1).ravel()])
 
     steps = QUICK_STEPS[preset] if study.quick else None
-    trained = initial_mae(robot, preset, progress=note, steps=steps)
-    checkpoint.save(trained.mae, study.network_file(preset, None))
+    mae = initial_mae(robot, preset, progress=note, steps=steps)
+    checkpoint.save(mae, study.network_file(preset, None))
     np.save(study.folder / f'{preset}_initial.npy', rows)
 
 

@@ -28,7 +28,7 @@ from musculoskeletal_ae.experiments.results import (
     read,
 )
 from musculoskeletal_ae.files import read_table, write_whole
-from musculoskeletal_ae.presets.names import PAPER_PRESET
+from musculoskeletal_ae.presets.preset import PAPER_PRESET
 
 TEMPLATE = 'paper.md.jinja'  # name of the page's template, a file in the folder of this module
 #: rows of the tables, by the name of the table in the template

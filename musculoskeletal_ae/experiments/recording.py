@@ -16,14 +16,13 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import ArmReadings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.exploration import Exploration
 from musculoskeletal_ae.motion.explored_postures import ExplorationStep
 from musculoskeletal_ae.motion.methods import first_command
 from musculoskeletal_ae.motion.ramps import RAMP_SHARE
-from musculoskeletal_ae.presets.names import PAPER_PRESET
+from musculoskeletal_ae.presets.preset import PAPER_PRESET
 from musculoskeletal_ae.signals.body_state import Anomaly
 from musculoskeletal_ae.signals.friction import directions
 
@@ -79,15 +78,10 @@ class ClosedLoop:
         mae: Mae,
         settings: Settings | None = None,
         seed: int = 0,
-        on_anomaly: str = 'stop',
     ) -> None:
-        """Connect an arm in its present posture.
-
-        `seed` determines the exploration. `on_anomaly` is the estimator's parameter of this name.
-        """
+        """Connect an arm in its present posture; `seed` determines the exploration."""
         self.arm, self.core, self.stops = arm, Controller(arm.robot, settings, seed), 0
         self.estimator = Estimator(arm.robot, mae.preset)
-        self.estimator.configure(EstimatorSettings(on_anomaly=on_anomaly))
         self._read, self.time = arm.sense(), 0.0
         self.use(mae)
 

@@ -71,7 +71,8 @@ class IsolatingLoop(ClosedLoop):
         #: isolated muscles and the reason, after each verification
         self.verdicts: list[tuple[tuple[int, ...], str]] = []
         self.error = np.nan  # distance ‖θ_est − θ‖ at the last message [rad]
-        super().__init__(arm, mae, Settings(), seed, on_anomaly='isolate')
+        super().__init__(arm, mae, Settings(), seed)
+        self.estimator.suspects.isolates = True
 
     @property
     def isolated(self) -> tuple[int, ...]:

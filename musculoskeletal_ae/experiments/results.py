@@ -25,7 +25,7 @@ from musculoskeletal_ae.experiments.plots import DPI
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS
 from musculoskeletal_ae.experiments.study import Measured, Rows, Study, round_numbers
 from musculoskeletal_ae.files import read_table, write_whole
-from musculoskeletal_ae.presets.names import PAPER_PRESET
+from musculoskeletal_ae.presets.preset import PAPER_PRESET
 from musculoskeletal_ae.schema import Strict, convert
 
 #: result.json of every experiment that was run, by its name

@@ -39,7 +39,7 @@ from musculoskeletal_ae.experiments.recording import (
     record,
 )
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
-from musculoskeletal_ae.presets.names import PAPER_PRESET
+from musculoskeletal_ae.presets.preset import PAPER_PRESET
 from musculoskeletal_ae.presets.registry import PRESETS
 
 REALITIES = KIN, FOREIGN

@@ -24,7 +24,7 @@ from musculoskeletal_ae.experiments.recording import Recording
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
-from musculoskeletal_ae.presets.names import PAPER_PRESET
+from musculoskeletal_ae.presets.preset import PAPER_PRESET
 from musculoskeletal_ae.robot.robot import Robot
 
 HELD_OUT = 300.0  # let the held-out motion last this long [s]

@@ -131,10 +131,8 @@ def run(args: Namespace) -> int:
     robot, notes, comparison = import_robot(args.file, args.out, show_prospects, **chain)
     for note, count in Counter(notes).items():
         print(note + (f' ({count} times)' if count > 1 else ''))
-    for note in robot.description.joint_notes:
-        print(f'coupled: {note}')
-    for note in robot.description.spring_notes:
-        print(f'spring: {note}')
+    for note in robot.description.notes:
+        print(note)
     for warning in robot.description.warnings:
         print(f'warning: {warning}')
     print(length_verdict(comparison))

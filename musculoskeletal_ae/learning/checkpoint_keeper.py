@@ -12,10 +12,9 @@ it into the next candidate. Without an estimator nobody rejects a network, and e
 once.
 
 A network is saved before it is published. A failed save is retried, and does not prevent the
-publication.
+publication. At most one update a second begins (`scheduler`), so candidates are no more frequent.
 """
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,42 +22,10 @@ import numpy as np
 
 from musculoskeletal_ae.exceptions import StateError
 from musculoskeletal_ae.learning.samples import SampleStore
-from musculoskeletal_ae.learning.scheduler import is_recent
 from musculoskeletal_ae.learning.state import StateStore
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-
-
-class Publication:
-    """Decides when a checkpoint is published: each new one once, and at most one per second.
-
-    Attributes:
-        checkpoint: The newest checkpoint; None before the first.
-        count: Number of checkpoints published so far.
-    """
-
-    def __init__(self) -> None:
-        self.checkpoint: bytes | None = None
-        self.count = 0
-        self._is_pending = False
-        self._published_at = -math.inf
-
-    def offer(self, data: bytes | None) -> None:
-        """Replace the checkpoint and mark it for publication; None withdraws it."""
-        self.checkpoint, self._is_pending = data, data is not None
-
-    def hurry(self) -> None:
-        """Hurry: release the next checkpoint at once, even if the last was less than 1 s ago."""
-        self._published_at = -math.inf
-
-    def take(self, now: float) -> bytes | None:
-        """Take the checkpoint if it is due for publication at `now` [s]; return None otherwise."""
-        if not self._is_pending or is_recent(self._published_at, now):
-            return None
-        self._is_pending, self._published_at = False, now
-        self.count += 1
-        return self.checkpoint
 
 
 class CheckpointKeeper:
@@ -69,7 +36,7 @@ class CheckpointKeeper:
             first.
         checkpoint: The network to save, as the content of a checkpoint; None before the first. This
             is the last accepted one.
-        publication: Releases checkpoints for publication.
+        published: Number of checkpoints published so far.
         rejected: Number of networks that the estimator has rejected.
         last_rejected: Reason of the last rejection.
     """
@@ -87,7 +54,9 @@ class CheckpointKeeper:
         """
         self.mae: Mae | None = None
         self.checkpoint: bytes | None = None
-        self.publication = Publication()
+        self.published = 0
+        self._newest: bytes | None = None  # `mae` as the content of a checkpoint
+        self._is_published = True  # whether `_newest` was published
         self.rejected, self.last_rejected = 0, ''
         self._saved: Mae | None = None  # the network of `checkpoint`
         self._in_use: Mae | None = None  # network of the estimator; None without an estimator
@@ -106,7 +75,7 @@ class CheckpointKeeper:
         """Use a new network: number it, publish it as a candidate; save it if no estimator runs."""
         self._publish(self.numbered(mae))
         if self._in_use is None:
-            self._save_newest(self.publication.checkpoint)
+            self._save_newest(self._newest)
 
     def restore(self, mae: Mae) -> None:
         """Save and publish a network that needs no decision, and keep its version.
@@ -114,7 +83,7 @@ class CheckpointKeeper:
         It comes from a user, from the disk or from the estimator.
         """
         self._publish(mae)
-        self._save_newest(self.publication.checkpoint)
+        self._save_newest(self._newest)
 
     def _publish(self, mae: Mae) -> None:
         if mae.touch is not None and not mae.touch.time:
@@ -122,7 +91,15 @@ class CheckpointKeeper:
             mae = _with_torque_of(self.mae, mae)
         self.mae = mae
         self._highest_version = max(self._highest_version, mae.version)
-        self.publication.offer(checkpoint.to_bytes(mae))
+        self._newest, self._is_published = checkpoint.to_bytes(mae), False
+
+    def take_unpublished(self) -> bytes | None:
+        """Return the newest checkpoint to publish it; None if it was published before."""
+        if self._is_published:
+            return None
+        self._is_published = True
+        self.published += 1
+        return self._newest
 
     def _save_newest(self, data: bytes | None) -> None:
         """Save the newest network, of which `data` is the content of a checkpoint."""
@@ -131,8 +108,8 @@ class CheckpointKeeper:
 
     def clear(self) -> None:
         """Clear all networks of the learner, and withdraw the one to be published."""
-        self.mae = self._saved = self.checkpoint = None
-        self.publication.offer(None)
+        self.mae = self._saved = self.checkpoint = self._newest = None
+        self._is_published = True
 
     # -- decisions of the estimator -------------------------------------------------------------
 
@@ -147,7 +124,7 @@ class CheckpointKeeper:
         if self.mae is None:
             return
         if mae.version == self.mae.version:
-            data, newest = self.publication.checkpoint, _with_torque_of(mae, self.mae)
+            data, newest = self._newest, _with_torque_of(mae, self.mae)
             if newest is not self.mae:
                 self.mae, data = newest, checkpoint.to_bytes(newest)
             if self._saved is not self.mae:

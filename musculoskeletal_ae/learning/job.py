@@ -37,7 +37,6 @@ class Update(NamedTuple):
     #: joints (`JointUnits.mean_errors`), with θ_est of the network before the update [rad], (2,)
     errors: Array = np.full(2, np.nan)
     seconds: float = 0.0  # duration of the update [s]
-    device: str = 'cpu'  # device of the training
     #: root mean square over the samples of what the constants of the body model cannot express, for
     #: each length [m], (M,); empty if the preset fits no body
     remainder: Array = np.empty(0)

@@ -313,7 +313,7 @@ class Learner:
         if update is not None:
             self._finish(update, is_learning)
         self.keeper.store(changed=False)
-        return self.keeper.publication.take(now)
+        return self.keeper.take_unpublished()
 
     def _finish(self, update: Update, is_learning: bool) -> None:
         if not is_learning:  # the user has stopped learning, or the samples may show a faulty arm
@@ -374,7 +374,6 @@ class Learner:
     def _start(self, mae: Mae) -> None:
         self.scheduler.statistics_hold = True
         self.trainer.begin(mae)
-        self.keeper.publication.hurry()
         self.keeper.restore(mae)
 
     def save(self) -> Path:

@@ -66,7 +66,7 @@ def _values(learner: Learner) -> dict[str, str]:
     values = {
         'samples': str(len(learner.samples)),
         'accepted': str(learner.samples.accepted),
-        'checkpoints': str(keeper.publication.count),
+        'checkpoints': str(keeper.published),
         'checkpoint version': str(0 if keeper.mae is None else keeper.mae.version),
         'network learned': str(keeper.mae is not None and is_learned(keeper.mae)),
         'samples to begin with': str(learner.scheduler.least_samples),
@@ -90,7 +90,7 @@ def _update_values(robot: Robot, update: Update) -> dict[str, str]:
     values = {
         'error at newest samples': robot.units.errors_text(update.errors) or 'nan rad',
         'loss': f'{update.loss:.4f}',
-        'update': f'{update.seconds:.2f} s on {update.device}',
+        'update': f'{update.seconds:.2f} s',
         'anomaly calibrated': str(update.mae.is_calibrated),
     }
     if update.unchanged:

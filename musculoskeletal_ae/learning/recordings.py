@@ -9,6 +9,7 @@ represents the body that was fitted to all samples (`convergence`).
 """
 
 import math
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -19,6 +20,7 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.bags.storage import LONGEST_PAUSE
 from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.estimation.estimator import Estimator
+from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.collector import SampleCollector
 from musculoskeletal_ae.learning.convergence import STEPS, until_converged
@@ -220,7 +222,7 @@ def learn(
             learner.use_body(learner.body.with_isolated(isolated))
             estimator.isolate(isolated)
             networks.follow(estimator.body, at)
-            networks.forget()
+            networks.messages.clear()
         if learner.mae is not newest:
             _decide(estimator, learner.mae, at)
             newest = learner.mae
@@ -251,7 +253,8 @@ def learn(
 
 def _decide(estimator: Estimator, mae: Mae, now: float) -> None:
     """Let the estimator decide on a network; without any, it uses even one that is rejected."""
-    estimator.networks.decide(mae, now)
+    with suppress(CheckpointError):  # `rejected` is called
+        deque(estimator.networks.propose(mae, lambda: now), maxlen=0)
     if estimator.mae is None:
         estimator.use(mae)
 

@@ -14,7 +14,7 @@ from musculoskeletal_ae.mae.mae import Mae
 
 #: train for this many steps in one update of preset `default`; 100 would reduce the error by 3 %
 STEPS = 50
-#: let at least this time pass between the starts of two updates, and between two checkpoints [s]
+#: let at least this time pass between the starts of two updates [s]
 LEAST_INTERVAL = 1.0
 #: require this many samples for the first update of an arm without joint sensors
 LEAST_BLIND = 20
@@ -61,8 +61,8 @@ class UpdateScheduler:
 
     def is_due(self, now: float, sample_count: int) -> bool:
         """Return whether an update is due at `now` [s]."""
-        enough = sample_count >= self.least_samples
-        return self._has_news and enough and not is_recent(self._began_at, now)
+        is_recent = 0.0 <= now - self._began_at < LEAST_INTERVAL
+        return self._has_news and sample_count >= self.least_samples and not is_recent
 
     def begin(
         self,
@@ -88,8 +88,3 @@ class UpdateScheduler:
         mae = uncalibrated(update.mae) if self._has_changed or update.changed else update.mae
         self.statistics_hold |= mae.is_calibrated
         return mae
-
-
-def is_recent(then: float, now: float) -> bool:
-    """Return whether `then` is at most `now`, and less than `LEAST_INTERVAL` before it."""
-    return 0.0 <= now - then < LEAST_INTERVAL

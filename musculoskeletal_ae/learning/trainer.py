@@ -13,7 +13,6 @@ import math
 import multiprocessing
 import os
 import queue
-import sys
 import threading
 import time
 from multiprocessing.connection import Connection
@@ -21,7 +20,6 @@ from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.job import Job, Update
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -104,10 +102,8 @@ class TrainerProcess(Trainer):
     lost.
     """
 
-    def __init__(self, robot: Robot, preset: str, seed: int = 0, device: str = 'cpu') -> None:
-        """Train on one of `parameters.DEVICES`, or on the CPU if that device is not available."""
+    def __init__(self, robot: Robot, preset: str, seed: int = 0) -> None:
         super().__init__(robot, preset, seed)
-        self._device = device
         self.restarts = 0  # number of training processes that were lost and restarted
         self._mae: Mae | None = None
         self._job: Job | None = None
@@ -127,7 +123,7 @@ class TrainerProcess(Trainer):
         self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self._answers: queue.SimpleQueue[Update | str] = queue.SimpleQueue()
         context = multiprocessing.get_context('spawn')
-        arguments = self.robot.description.directory, self.preset.name, self.seed, self._device
+        arguments = self.robot.description.directory, self.preset.name, self.seed
         try:
             ours, theirs = context.Pipe()
             process = context.Process(target=serve, args=(theirs, *arguments), daemon=True)
@@ -232,19 +228,13 @@ def _talk(
             answers.put(f'{type(error).__name__}: {error}')
 
 
-def serve(connection: Connection, directory: Path, preset: str, seed: int, device: str) -> None:
+def serve(connection: Connection, directory: Path, preset: str, seed: int) -> None:
     """Run the training process until the node closes its end of the connection or dies."""
     faulthandler.enable()
     os.nice(NICENESS)
     import torch
 
-    from musculoskeletal_ae.mae.training import train_on
-
     torch.set_num_threads(1)
-    try:
-        train_on(device)
-    except MusculoskeletalError as error:
-        print(f'{error}; the learner uses the CPU instead', file=sys.stderr, flush=True)
     robot = Robot.load(directory)
     trainer = Trainer(robot, preset, seed)
     try:

@@ -12,7 +12,6 @@ from abc import ABC, abstractmethod
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.covariance import (
@@ -55,8 +54,7 @@ class Updater(ABC):
         estimate = observed_theta(mae, newest)
         errors = self._robot.units.mean_errors(estimate - newest.theta)
         update = self._learn(job)
-        seconds, device = time.perf_counter() - start, str(torch.get_default_device())
-        return update._replace(errors=errors, seconds=seconds, device=device)
+        return update._replace(errors=errors, seconds=time.perf_counter() - start)
 
     @abstractmethod
     def _learn(self, job: Job) -> Update: ...

@@ -25,7 +25,7 @@ from musculoskeletal_ae.files import read_bytes, write_whole
 from musculoskeletal_ae.mae.mae import Layer, Mae, complete_bases, latent_places, read_groups
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, TouchStatistics
 from musculoskeletal_ae.mae.units import UNITS, ActivationName
-from musculoskeletal_ae.presets.names import PRESET_NAMES
+from musculoskeletal_ae.presets.preset import PRESET_NAMES
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity

@@ -9,7 +9,7 @@ it. Each sample has a close neighbour, its twin. The error of G is the differenc
 errors of sample and twin, divided by their distance. Every sample passes through all three masks.
 Muon updates the matrices, with a step size that rises and then falls to zero.
 
-LAYERS and STEPS apply to an arm with 5 joints and 10 muscles. If groups of joints and muscles share
+HIDDEN and STEPS apply to an arm with 5 joints and 10 muscles. If groups of joints and muscles share
 neither, each group gets its own block of the network. A large group is divided further if possible:
 each finger of a hand gets a block that also has the inputs of the wrist. With one block for the
 whole hand, the error after as many mini-batches would be 2.5 times as large, and a mini-batch would
@@ -31,24 +31,24 @@ import torch
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.mae.network import Layers, Network
+from musculoskeletal_ae.mae.network import Network
 from musculoskeletal_ae.mae.optimiser import Optimiser
 from musculoskeletal_ae.mae.training import (
     TINY,
     Progress,
-    TrainedNetwork,
     one_thread,
     random_states,
     rest_states,
     shuffled,
 )
-from musculoskeletal_ae.mae.units import LENGTH_SCALE, State, scale_vector
+from musculoskeletal_ae.mae.units import LENGTH_SCALE, ActivationName, State, scale_vector
 from musculoskeletal_ae.robot.equilibrium_states import has_followers
 from musculoskeletal_ae.robot.groups import Group, parts
 from musculoskeletal_ae.robot.robot import Robot
 
 # The reference arm has 5 joints and 10 muscles.
-LAYERS = Layers((200, 100), 'silu')  # give the reference arm these hidden layers
+HIDDEN = (200, 100)  # give the reference arm hidden layers of these sizes
+ACTIVATION: ActivationName = 'silu'  # follows every layer except the latent and the last one
 STEPS = 3000  # train the network of the reference arm on this many mini-batches
 MOST_STEPS = 5000  # train the network of any body on at most this many mini-batches
 BATCH = 128  # train on this many samples at once
@@ -124,7 +124,7 @@ def divided(robot: Robot) -> tuple[tuple[Group, ...], tuple[int, ...]]:
 
 def blocks(groups: Iterable[Group]) -> dict[Group, tuple[int, ...]]:
     """Return the blocks of the network: for each group, the sizes of its hidden layers."""
-    return {group: tuple(grown(units, [group]) for units in LAYERS.hidden) for group in groups}
+    return {group: tuple(grown(units, [group]) for units in HIDDEN) for group in groups}
 
 
 # -- samples -----------------------------------------------------------------------------------
@@ -209,7 +209,7 @@ def loss(network: Network, samples: Tensor) -> Tensor:
 
 def train(
     robot: Robot, seed: int = 0, steps: int = STEPS, progress: Progress | None = None
-) -> TrainedNetwork:
+) -> Network:
     """Train a new network.
 
     Args:
@@ -217,9 +217,6 @@ def train(
         seed: Random seed of states, weights and order of the samples.
         steps: Number of mini-batches.
         progress: Called after every mini-batch with step, loss, network and mini-batch; or None.
-
-    Returns:
-        The network, the loss of every mini-batch, and how the network was trained.
     """
     rng = np.random.default_rng(seed)
     samples = overload_states(robot, min(SAMPLES, steps * BATCH), rng).scaled()
@@ -229,18 +226,16 @@ def train(
         torch.manual_seed(seed)
         sizes = robot.joint_count, robot.muscle_count
         groups, bases = divided(robot)
-        network = Network(*sizes, LAYERS, mean, std, blocks(groups), bases)
+        network = Network(*sizes, blocks(groups), ACTIVATION, mean, std, bases)
     optimiser = Optimiser(network, STEP_SIZE, muon=True)
-    losses = []
     with one_thread():
         for step, batch in zip(range(steps), shuffled(samples, BATCH, rng)):
             value = loss(network, torch.as_tensor(batch, dtype=torch.float32))
             value.backward()
             optimiser.step(annealing(step / steps))
-            losses.append(value.item())
             if progress is not None:
-                progress(step, losses[-1], network, batch)
-    return TrainedNetwork(network, losses, f'{BATCH} by muon')
+                progress(step, value.item(), network, batch)
+    return network
 
 
 def annealing(progress: float) -> float:

@@ -2,26 +2,18 @@
 """Trains the initial network of a robot on its geometric model, as a preset specifies."""
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.network import to_mae
+from musculoskeletal_ae.mae.network import Network, to_mae
 from musculoskeletal_ae.mae.residuals import AnomalyStatistics, anomaly, residuals
-from musculoskeletal_ae.mae.training import Progress, TrainedNetwork, rest_states
+from musculoskeletal_ae.mae.training import Progress, rest_states
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
 #: compute the first mean and covariance of the residuals from this many held-out states
 HELD_OUT_STATES = 5000
-
-
-class Trained(NamedTuple):
-    """An initial network, and the losses of its training."""
-
-    mae: Mae  # the network with its history and anomaly statistics
-    losses: list[float]  # loss of every mini-batch
 
 
 def initial_mae(
@@ -30,7 +22,7 @@ def initial_mae(
     seed: int = 0,
     progress: Progress | None = None,
     steps: int | None = None,
-) -> Trained:
+) -> Mae:
     """Train a network on the geometric model, and add anomaly statistics of the model.
 
     Args:
@@ -42,25 +34,25 @@ def initial_mae(
     """
     chosen = preset_named(preset)
     steps = chosen.initial_steps(robot) if steps is None else steps
-    trained = chosen.train_initial(robot, seed, steps, progress)
-    return completed(robot, trained, preset, seed)
+    network = chosen.train_initial(robot, seed, steps, progress)
+    return completed(robot, network, preset, seed, steps)
 
 
-def completed(robot: Robot, trained: TrainedNetwork, preset: str, seed: int) -> Trained:
+def completed(robot: Robot, network: Network, preset: str, seed: int, steps: int) -> Mae:
     """Complete a trained network to a `Mae` with its history and anomaly statistics.
 
     The statistics are those of held-out states of the geometric model.
 
     Args:
         robot: The geometric model.
-        trained: The network of the initial training.
+        network: The network of the initial training.
         preset: Name of the preset that trained it.
         seed: Random seed of the training.
+        steps: Number of mini-batches.
     """
-    network, losses, by = trained
     history = (
         f'initial training on the geometric model of {robot.description.directory.name}: '
-        f'preset {preset}, seed {seed}, {len(losses)} mini-batches of {by}'
+        f'preset {preset}, seed {seed}, {steps} mini-batches'
     )
     mae = to_mae(network, robot.joints, robot.muscles, preset, history)
     rng = np.random.default_rng([seed, 1])
@@ -68,4 +60,4 @@ def completed(robot: Robot, trained: TrainedNetwork, preset: str, seed: int) -> 
     error = residuals(mae.estimate(tension, length), tension, length)
     statistics = AnomalyStatistics.of(error, calibrated=False)
     statistics = replace(statistics, thresholds={'norm': float(anomaly(error).max())})
-    return Trained(replace(mae, anomaly=statistics), losses)
+    return replace(mae, anomaly=statistics)

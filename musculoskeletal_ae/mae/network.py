@@ -7,10 +7,8 @@
 the entries of the third are zero at the input of the first layer.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,23 +16,11 @@ from torch import Tensor, nn
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.mae.mae import Layer, Mae, complete_bases, latent_places, read_groups
-from musculoskeletal_ae.mae.units import ActivationName, Mask, scale_vector, visible
+from musculoskeletal_ae.mae.units import ActivationName, Mask, visible
 from musculoskeletal_ae.robot.groups import Group
 
 #: activations by their names in a checkpoint
 ACTIVATIONS: dict[str, type[nn.Module]] = {'tanh': nn.Tanh, 'silu': nn.SiLU}
-
-
-class Layers(NamedTuple):
-    """The hidden layers of a network.
-
-    Attributes:
-        hidden: Sizes of the encoder's hidden layers; the decoder has them in reverse order.
-        activation: Follows every layer except the latent and the last one, which are linear.
-    """
-
-    hidden: tuple[int, ...]
-    activation: ActivationName
 
 
 class Blocks(nn.Module):
@@ -74,10 +60,10 @@ class Network(nn.Module):
         self,
         joints: int,
         muscles: int,
-        layers: Layers,
+        blocks: Mapping[Group, tuple[int, ...]],
+        activation: ActivationName,
         mean: Array,
         std: Array,
-        blocks: Mapping[Group, tuple[int, ...]] | None = None,
         bases: Sequence[int] = (),
     ) -> None:
         """Initialise the weights with torch's random generator.
@@ -85,17 +71,16 @@ class Network(nn.Module):
         Args:
             joints: Number of joints D.
             muscles: Number of muscles M.
-            layers: Activation, and hidden layers of a network with one block.
+            blocks: Sizes of the encoder's hidden layers in each group's block; the decoder has them
+                in reverse order.
+            activation: Follows every layer except the latent and the last one, which are linear.
             mean: Mean by which scaled (θ, T, l) are standardised, (D+2M,).
             std: Standard deviation by which scaled (θ, T, l) are standardised, (D+2M,).
-            blocks: Sizes of the hidden layers in each group's block; by default, the network is
-                one block with the hidden layers of `layers`.
             bases: Index of each block's base, or of the block itself if it has none; () if no block
                 has a base.
         """
         super().__init__()
-        self.joints, self.muscles, self.activation = joints, muscles, layers.activation
-        blocks = blocks or {Group.whole(joints, muscles): layers.hidden}
+        self.joints, self.muscles, self.activation = joints, muscles, activation
         self.groups, self.bases = tuple(blocks), complete_bases(bases, len(blocks))
         values, encoders, decoders = joints + 2 * muscles, [], []
         own = [group.columns(joints, muscles) for group in self.groups]
@@ -171,43 +156,14 @@ def from_mae(mae: Mae) -> Network:
     hidden = [len(bias) for _, bias in mae.encoder]
     depth = len(hidden) // len(mae.groups)
     blocks = {g: tuple(hidden[i * depth :][: depth - 1]) for i, g in enumerate(mae.groups)}
-    layers = Layers(blocks[mae.groups[0]], mae.activation)
     sizes = len(mae.joints), len(mae.muscles)
-    network = Network(*sizes, layers, mae.mean, mae.std, blocks, mae.bases)
+    network = Network(*sizes, blocks, mae.activation, mae.mean, mae.std, mae.bases)
     with torch.no_grad():
         for layers, arrays in ((network.encoder, mae.encoder), (network.decoder, mae.decoder)):
             for layer, (weight, bias) in zip(_linear(layers), arrays, strict=True):
                 layer.weight.copy_(torch.tensor(weight))
                 layer.bias.copy_(torch.tensor(bias))
     return network
-
-
-class TorchLengths:
-    """Computes a network's muscle lengths and their gradients on a torch device, for simulation."""
-
-    def __init__(self, mae: Mae, device: str = 'cpu') -> None:
-        """Copy the weights of a network to the device."""
-        self._network, self._tensor = from_mae(mae).to(device), partial(torch.tensor, device=device)
-        self.lengths, self.friction = mae.lengths, mae.friction
-        self.elasticity = mae.elasticity
-        self._scale = self._tensor(scale_vector(len(mae.joints), len(mae.muscles)))
-        self._muscles = len(mae.muscles)
-
-    def lengths_with_pullback(
-        self, theta: Array, tension: Array
-    ) -> tuple[Array, Callable[[Array], Array]]:
-        """Return the lengths at (θ, T) and their pullback, as `Mae.lengths_with_pullback` does."""
-        angles, tensions = self._tensor(theta, requires_grad=True), self._tensor(tension)
-        values = torch.cat((angles, tensions, torch.zeros_like(tensions)), dim=1)
-        mask = torch.zeros(len(theta), dtype=torch.long, device=values.device)
-        reconstructed = self._network((values * self._scale).float(), mask) / self._scale
-        length = reconstructed[:, -self._muscles :]
-
-        def pullback(gradient: Array) -> Array:
-            by_angles = torch.autograd.grad(length, angles, self._tensor(gradient))[0]
-            return by_angles.numpy(force=True)
-
-        return length.numpy(force=True).astype(float), pullback
 
 
 def _linear(layers: nn.Module) -> list[nn.Linear]:

@@ -72,11 +72,11 @@ def shuffled(samples: Array, batch: int, rng: np.random.Generator) -> Iterator[A
             yield samples[order[i : i + batch]]
 
 
-def check_device(device: str) -> None:
-    """Check that torch can use a device.
+def train_on(device: str) -> None:
+    """Train on a torch device from now on: `cpu` or `cuda`.
 
     Raises:
-        MusculoskeletalError: If it cannot; the text names the remedy.
+        MusculoskeletalError: If torch cannot use the device; the text names the remedy.
     """
     try:
         # An available device may still fail to compute, so compute something.
@@ -86,15 +86,6 @@ def check_device(device: str) -> None:
             f'device {device!r}: torch {torch.__version__} cannot use it; legal: cpu. '
             'For a GPU, install its driver and a build of torch that supports it (pytorch.org)'
         ) from error
-
-
-def train_on(device: str) -> None:
-    """Train on one of `parameters.DEVICES` from now on.
-
-    Raises:
-        MusculoskeletalError: If torch cannot use the device.
-    """
-    check_device(device)
     # Set no default device for the CPU: while one is set, every call of torch is slower, and a
     # training step takes a fifth longer.
     torch.set_default_device(None if device == 'cpu' else device)
@@ -113,14 +104,6 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-class TrainedNetwork(NamedTuple):
-    """A network after the initial training of a preset, with a record of the training."""
-
-    network: Network
-    losses: list[float]  # loss of every mini-batch
-    by: str  # size of the mini-batches and name of the optimiser, for people
 
 
 # -- errors ------------------------------------------------------------------------------------

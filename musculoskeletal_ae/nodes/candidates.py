@@ -64,7 +64,7 @@ class Candidates:
     def follow(self, body: BodyState) -> None:
         """Follow a change of the body state, and reject waiting candidates if an anomaly begins."""
         in_use, waiting = self._networks.mae, None
-        begins = body.has_anomaly and not self._networks.is_anomaly
+        begins = body.has_anomaly and not self._networks.body.has_anomaly
         if begins and in_use is not None:
             waiting = self.queue.give_up()
         proven = self._networks.follow(body, time.monotonic())

@@ -17,11 +17,9 @@ from dataclasses import replace
 from difflib import get_close_matches
 
 from musculoskeletal_ae.control.settings import Settings as ControlSettings
-from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings as EstimationSettings
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.parameters import (
     CHECKPOINT,
-    DEVICES,
     PRESET,
     RATE,
     ROBOT,
@@ -69,7 +67,13 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {  # all parameters of all nodes, 
             False, 'calibrate length offsets at the start, for winches without absolute encoders'
         ),
         'state_directory': STATE_DIRECTORY,
-        **parameters_of(EstimationSettings),
+        'on_anomaly': Parameter(
+            'stop',
+            '`stop`: the arm stops until estimator/reset is called; `isolate`: the suspect muscle '
+            'is verified and, if it is faulty, isolated; then the arm resumes',
+            legal=('stop', 'isolate'),
+            settable=True,
+        ),
         'isolate_muscles': Parameter(
             ('',),
             'muscles to isolate at the start, or when estimator/isolate is called, until '
@@ -146,11 +150,6 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {  # all parameters of all nodes, 
             settable=True,
         ),
         'state_directory': STATE_DIRECTORY,
-        'device': Parameter(
-            'cpu',
-            'device that trains the network (the CPU if torch cannot use the device)',
-            legal=DEVICES,
-        ),
     },
     'bringup_status': {
         **SHARED,

@@ -26,7 +26,6 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation.body_memory import BodyMemory
 from musculoskeletal_ae.estimation.estimator import Estimator, Output
-from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings
 from musculoskeletal_ae.estimation.lengths.length_calibration import stated_theta
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
 from musculoskeletal_ae.estimation.suspect_verification import VerificationVerdict
@@ -84,9 +83,7 @@ class EstimatorNode(Shell):
         self.parameters.follow('isolate_muscles', self._on_isolate_muscles)
         self.core.isolate([*self.muscles_to_isolate, *(() if found is None else found.isolated)])
         self.candidates.subscribe()
-        self.parameters.follow(
-            'on_anomaly', lambda value: self.core.configure(EstimatorSettings(on_anomaly=value))
-        )
+        self.parameters.follow('on_anomaly', self._on_anomaly)
         self.follow_muscle_messages(self._on_muscles)
         self.follow_posture('joint_states', self._on_joints, some=True)
         self._publish_body()
@@ -131,6 +128,9 @@ class EstimatorNode(Shell):
 
     def _on_isolate_muscles(self, names: tuple[str, ...]) -> None:
         self.muscles_to_isolate = tuple(self.robot.muscle_indices(names))
+
+    def _on_anomaly(self, response: str) -> None:
+        self.core.suspects.isolates = response == 'isolate'
 
     def _calibrate(self, request: Trigger.Request) -> str:
         self.core.calibrate_lengths(self.posture)
@@ -229,8 +229,9 @@ class EstimatorNode(Shell):
                 sample.tension_read, sample.length, sample.sliding, now, self.core.measured
             )
         self.joints.publish(posture_message(self.robot.units, state.theta, stamp))
-        if output.covariance is not None and is_heard(self.covariance):
-            covariance = self.robot.units.covariance_of_positions(output.covariance)
+        known = None if self.core.mae is None else self.core.mae.covariance
+        if known is not None and is_heard(self.covariance):
+            covariance = self.robot.units.covariance_of_positions(known)
             self.covariance.publish(array_message(covariance, 'joint', 'joint'))
         if is_heard(self.muscles):
             reconstructed = np.array([state.length, state.tension])
@@ -283,7 +284,7 @@ class EstimatorNode(Shell):
         rows[-1] = self.robot.units.to_position(trust.deviation)
         self.trust.publish(array_message(rows, 'quantity', 'joint'))
         if before is not None:
-            self.core.networks.forget()  # the readings so far may be wrong
+            self.core.networks.messages.clear()  # the readings so far may be wrong
             names = ', '.join(self.robot.joints[joint] for joint in trust.unused)
             self.get_logger().warning(f'joint sensors that are not used: {names or "none"}')
             self._report()

@@ -92,7 +92,7 @@ class HardwareEmulatorNode(ArmNode):
             message = ClockMessage()
             message.clock.sec, message.clock.nanosec = divmod(self.time, 10**9)
             self.clock_publisher.publish(message)
-        if self.arm.has_diverged:
+        if self.arm.divergence:
             return
         self.reading = self.arm.sense()
         for reading in self.arm.faults.deliver(self.reading, now):
@@ -122,7 +122,7 @@ class HardwareEmulatorNode(ArmNode):
 
     def _lines(self) -> list[Line]:
         arm = self.arm
-        if arm.has_diverged:
+        if arm.divergence:
             return []
         return draw_arm(self.robot, arm.theta, arm.tension, arm.route_points())
 
@@ -130,8 +130,8 @@ class HardwareEmulatorNode(ArmNode):
         """Yield what is wrong with the emulation, and which faults it imitates."""
         yield from super().conditions()
         kind = ConditionKind
-        if self.arm.has_diverged:
-            yield kind.EMULATION_DIVERGED.condition(self.arm.divergence)
+        if divergence := self.arm.divergence:
+            yield kind.EMULATION_DIVERGED.condition(divergence)
         elif self.arm.safe:
             yield kind.MODULES_IN_SAFE_STATE.condition()
         if faults := self.parameter('faults'):
@@ -142,5 +142,5 @@ class HardwareEmulatorNode(ArmNode):
         # The result is NaN only if all temperatures are NaN.
         hottest = np.fmax.reduce(self.reading.muscles.temperature)
         values = {'hottest module': f'{hottest:.1f} °C', 'real-time factor': f'{self.pace:.2f}'}
-        is_obeying = not (self.arm.has_diverged or self.arm.safe)
+        is_obeying = not (self.arm.divergence or self.arm.safe)
         return Report('following commands' if is_obeying else '', values)

@@ -9,7 +9,6 @@ accepted_checkpoint and rejected_checkpoint are the estimator's answers.
 import math
 import time
 from collections.abc import Iterable, Iterator
-from functools import partial
 from typing import Any
 
 from diagnostic_msgs.msg import KeyValue
@@ -55,7 +54,7 @@ class LearnerNode(Shell):
             seed=value('seed'),
             period=max(1.0 / self.rate, LEAST_PERIOD),
             joint_source=value('joint_source'),
-            trainer=partial(TrainerProcess, device=value('device')),
+            trainer=TrainerProcess,
             directory=self.state_directory(),
         )
         self.publisher = self.create_publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)

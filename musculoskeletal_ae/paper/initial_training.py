@@ -15,7 +15,7 @@ from torch import Tensor
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.network import Network
 from musculoskeletal_ae.mae.optimiser import Optimiser
-from musculoskeletal_ae.mae.training import TINY, Progress, TrainedNetwork, one_thread, shuffled
+from musculoskeletal_ae.mae.training import TINY, Progress, one_thread, shuffled
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.paper.constants import (
     HIDDEN,
@@ -60,7 +60,7 @@ def train(
     steps: int = INITIAL_STEPS,
     progress: Progress | None = None,
     hidden: tuple[int, ...] = HIDDEN,
-) -> TrainedNetwork:
+) -> Network:
     """Train a new network by Adam, with the mask ①, ② or ③ of each sample chosen at random.
 
     Args:
@@ -76,7 +76,6 @@ def train(
     network = new_network(robot.joint_count, robot.muscle_count, seed, hidden)
     optimiser = Optimiser(network, STEP_SIZE, muon=False)
     generator = torch.Generator(torch.get_default_device()).manual_seed(seed)
-    losses = []
     with one_thread():
         for step, batch in zip(range(steps), shuffled(samples, INITIAL_BATCH, rng)):
             values = torch.as_tensor(batch, dtype=torch.float32)
@@ -84,7 +83,6 @@ def train(
             value = loss(network, values, mask)
             value.backward()
             optimiser.step()
-            losses.append(value.item())
             if progress is not None:
-                progress(step, losses[-1], network, batch)
-    return TrainedNetwork(network, losses, f'{INITIAL_BATCH} by adam')
+                progress(step, value.item(), network, batch)
+    return network

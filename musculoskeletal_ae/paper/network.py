@@ -15,8 +15,9 @@ scaling. The latent layer and the output layer are linear.
 import numpy as np
 import torch
 
-from musculoskeletal_ae.mae.network import Layers, Network
+from musculoskeletal_ae.mae.network import Network
 from musculoskeletal_ae.paper.constants import ACTIVATION, HIDDEN
+from musculoskeletal_ae.robot.groups import Group
 
 
 def new_network(
@@ -33,6 +34,5 @@ def new_network(
     values = joints + 2 * muscles
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return Network(
-            joints, muscles, Layers(hidden, ACTIVATION), np.zeros(values), np.ones(values)
-        )
+        blocks = {Group.whole(joints, muscles): hidden}
+        return Network(joints, muscles, blocks, ACTIVATION, np.zeros(values), np.ones(values))

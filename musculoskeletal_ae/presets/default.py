@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING
 
-from musculoskeletal_ae.presets.names import DEFAULT
+from musculoskeletal_ae.presets.preset import DEFAULT
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,12 +16,13 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.finding import Detector
     from musculoskeletal_ae.learning.updater import Updater
     from musculoskeletal_ae.mae.mae import Mae
-    from musculoskeletal_ae.mae.training import Progress, TrainedNetwork
+    from musculoskeletal_ae.mae.network import Network
+    from musculoskeletal_ae.mae.training import Progress
     from musculoskeletal_ae.mae.units import State
     from musculoskeletal_ae.motion.explored_postures import ExplorationStep
     from musculoskeletal_ae.motion.methods import LengthMethod
     from musculoskeletal_ae.robot.robot import Robot
-    from musculoskeletal_ae.simulation.simulated_body import SimulatedBody
+    from musculoskeletal_ae.simulation.simulation import SimulatedBody
 
 
 class DefaultPreset:
@@ -29,7 +30,6 @@ class DefaultPreset:
 
     name = DEFAULT
     least_samples = 2
-    simulates_on_devices = True
     methods_without_tension: tuple[str, ...] = 'geometric', 'first', 'proposed'
 
     def initial_steps(self, robot: Robot) -> int:
@@ -46,7 +46,7 @@ class DefaultPreset:
 
     def train_initial(
         self, robot: Robot, seed: int, steps: int, progress: Progress | None
-    ) -> TrainedNetwork:
+    ) -> Network:
         """Train on lengths and muscle Jacobians under all masks, with Muon."""
         from musculoskeletal_ae.mae.default_training import train
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from musculoskeletal_ae.paper.constants import HIDDEN, INITIAL_STEPS, THRESHOLD
-from musculoskeletal_ae.presets.names import PAPER_PRESET
+from musculoskeletal_ae.presets.preset import PAPER_PRESET
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,12 +16,13 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.finding import Detector
     from musculoskeletal_ae.learning.updater import Updater
     from musculoskeletal_ae.mae.mae import Mae
-    from musculoskeletal_ae.mae.training import Progress, TrainedNetwork
+    from musculoskeletal_ae.mae.network import Network
+    from musculoskeletal_ae.mae.training import Progress
     from musculoskeletal_ae.mae.units import State
     from musculoskeletal_ae.motion.explored_postures import ExplorationStep
     from musculoskeletal_ae.motion.methods import LengthMethod
     from musculoskeletal_ae.robot.robot import Robot
-    from musculoskeletal_ae.simulation.simulated_body import SimulatedBody
+    from musculoskeletal_ae.simulation.simulation import SimulatedBody
 
 
 class PaperPreset:
@@ -33,7 +34,6 @@ class PaperPreset:
 
     name = PAPER_PRESET
     least_samples = THRESHOLD + 1
-    simulates_on_devices = False
     methods_without_tension: tuple[str, ...] = 'geometric', 'first'
 
     def __init__(self, hidden: tuple[int, ...] = HIDDEN) -> None:
@@ -51,7 +51,7 @@ class PaperPreset:
 
     def train_initial(
         self, robot: Robot, seed: int, steps: int, progress: Progress | None
-    ) -> TrainedNetwork:
+    ) -> Network:
         """Train on L_initial with Adam (§III-B)."""
         from musculoskeletal_ae.paper.initial_training import train
 

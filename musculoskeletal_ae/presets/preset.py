@@ -3,6 +3,7 @@
 
 A preset only selects strategies, which are implemented beside related code. Each method imports its
 strategy when it is called, so that reading options and parameters imports neither numpy nor torch.
+`registry.py` has the presets by name.
 """
 
 from __future__ import annotations
@@ -17,12 +18,19 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.estimation.finding import Detector
     from musculoskeletal_ae.learning.updater import Updater
     from musculoskeletal_ae.mae.mae import Mae
-    from musculoskeletal_ae.mae.training import Progress, TrainedNetwork
+    from musculoskeletal_ae.mae.network import Network
+    from musculoskeletal_ae.mae.training import Progress
     from musculoskeletal_ae.mae.units import State
     from musculoskeletal_ae.motion.explored_postures import ExplorationStep
     from musculoskeletal_ae.motion.methods import LengthMethod
     from musculoskeletal_ae.robot.robot import Robot
-    from musculoskeletal_ae.simulation.simulated_body import SimulatedBody
+    from musculoskeletal_ae.simulation.simulation import SimulatedBody
+
+
+DEFAULT = 'default'  # name of the preset with the most accurate methods of this project
+#: name of the preset that follows the paper, with which experiments compare other presets
+PAPER_PRESET = 'paper'
+PRESET_NAMES = DEFAULT, PAPER_PRESET  # legal values of parameters and options that name a preset
 
 
 class Preset(Protocol):
@@ -31,13 +39,11 @@ class Preset(Protocol):
     Attributes:
         name: Name by which users select the preset.
         least_samples: Smallest number of samples with which a network is updated online.
-        simulates_on_devices: Whether the simulator can run on a torch device.
         methods_without_tension: Names of the control methods that need no measured tension.
     """
 
     name: str
     least_samples: int
-    simulates_on_devices: bool
     methods_without_tension: tuple[str, ...]
 
     # -- network and initial training -----------------------------------------------------------
@@ -50,7 +56,7 @@ class Preset(Protocol):
 
     def train_initial(
         self, robot: Robot, seed: int, steps: int, progress: Progress | None
-    ) -> TrainedNetwork:
+    ) -> Network:
         """Train a new network on the geometric model."""
 
     # -- online learning ------------------------------------------------------------------------

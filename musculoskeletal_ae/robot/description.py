@@ -174,8 +174,12 @@ class RobotDescription:
         return tuple(name for name in self.model.names[1:] if name not in known)
 
     @property
-    def joint_notes(self) -> list[str]:
-        """Texts for users on coupled joints, the kind of muscle modules, and joints held fixed."""
+    def notes(self) -> list[str]:
+        """Texts for users on what the robot has besides links, joints, muscles and their routes.
+
+        These are coupled joints, the kind of muscle modules, joints held fixed, springs at joints
+        and passive tendons.
+        """
         lines = [f'{joint} = {coupling}' for joint, coupling in self.couplings.items()]
         if self.actuation == POSITION:
             lines.append(f'the muscle modules follow positions, at {shown(self.speed)} m/s at most')
@@ -191,12 +195,7 @@ class RobotDescription:
             )
         if held := ', '.join(self.held_joints):
             lines.append(f'held fixed at 0: {held}')
-        return lines
-
-    @property
-    def spring_notes(self) -> list[str]:
-        """One line for each spring at a joint, and for each passive tendon."""
-        springs, lines = self.joint_elasticity, list[str]()
+        springs = self.joint_elasticity
         for i, unit in enumerate(JointUnits.of_model(self.model, self.joints)):
             if springs.stiffness[i, i] > 0.0:
                 own = unit.stiffness_text(springs.stiffness[i, i], '.3g')

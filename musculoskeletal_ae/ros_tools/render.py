@@ -10,7 +10,7 @@ from rclpy.node import Node
 from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.options import Parser, picture, positive
+from musculoskeletal_ae.options import Parser, picture
 from musculoskeletal_ae.robot.drawing import Line, save_picture
 from musculoskeletal_ae.ros.messages import SENSOR
 from musculoskeletal_ae.ros_tools.ros_tool import ROS_HELP, Spinner, run_tool, start_ros
@@ -19,6 +19,7 @@ from musculoskeletal_ae.ros_tools.ros_tool import ROS_HELP, Spinner, run_tool, s
 BODY, ESTIMATE = 'hardware_emulator/markers', 'estimated/markers'
 #: wait this long for the preferred topic after markers have arrived on another topic [s]
 DISCOVERY_TIME = 2.0
+PATIENCE = 10.0  # fail if no markers arrive within this time [s]
 
 
 def _line(strip: Marker) -> Line:
@@ -36,13 +37,13 @@ def _render(options: Namespace, arguments: list[str]) -> int:
         take = partial(_take, drawn, topic)
         node.create_subscription(MarkerArray, topic, take, SENSOR)
     first, spinner = node.resolve_topic_name(topics[0]), Spinner(node)
-    spinner.spin_until(lambda: drawn, options.timeout)
+    spinner.spin_until(lambda: drawn, PATIENCE)
     # Wait longer for the preferred topic: its publisher may be discovered later, or send later.
     spinner.spin_until(lambda: topics[0] in drawn, DISCOVERY_TIME if drawn else 0.0)
     if drawn and node.count_publishers(first):
-        spinner.spin_until(lambda: topics[0] in drawn, options.timeout)
+        spinner.spin_until(lambda: topics[0] in drawn, PATIENCE)
     if not drawn:
-        problem = f'no markers on {" or ".join(topics)} within {options.timeout:g} s'
+        problem = f'no markers on {" or ".join(topics)} within {PATIENCE:g} s'
         remedy = 'check that the arm runs, and state its namespace (--ros-args -r __ns:=/NAME)'
         raise MusculoskeletalError(f'{problem}; {remedy}')
     topic = topics[0] if topics[0] in drawn else topics[-1]
@@ -61,16 +62,8 @@ def _take(drawn: dict[str, list[Line]], topic: str, message: MarkerArray) -> Non
 def _parse(arguments: list[str]) -> Namespace:
     parser = Parser('render', 'Writes a picture of a running arm; needs no display.', ROS_HELP)
     parser.add_out('FILE.png', default=Path('arm.png'), read=picture)
-    add = parser.add_argument
-    topic_help = f'topic of the markers to draw (default: {BODY} if published, else {ESTIMATE})'
-    add('--topic', help=topic_help)
-    add(
-        '--timeout',
-        type=positive,
-        default=10.0,
-        metavar='S',
-        help='longest wait for the markers [s]',
-    )
+    text = f'topic of the markers to draw (default: {BODY} if published, else {ESTIMATE})'
+    parser.add_argument('--topic', help=text)
     return parser.parse_args(arguments)
 
 

@@ -192,6 +192,11 @@ class BodyState:
         """Return the state with other length offsets."""
         return replace(self, offsets=offsets)
 
+    @property
+    def verified(self) -> int | None:
+        """Index of the suspect that is being verified, or None."""
+        return self.suspect if self.anomaly is Anomaly.VERIFYING else None
+
     def with_anomaly(self, anomaly: Anomaly, suspect: int | None = None) -> BodyState:
         """Return the state with another anomaly.
 

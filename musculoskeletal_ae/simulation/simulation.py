@@ -5,9 +5,8 @@
 simulation includes muscle stiffness control. A length command l_target, which includes the
 compensation l_comp(T) (paper, §III-E, eq. 6), causes the same tensions at rest as on the robot. An
 arm without a command rests at T_bias, or holds its lengths if its modules follow positions. The
-same compiled code simulates one arm or thousands, on all cores; the network may run on a GPU. The
-preset selects the equations (`Preset.make_simulator`). The module `equilibrium` contains the
-equations of preset `default`.
+same compiled code simulates one arm or thousands, on all cores. The preset selects the equations
+(`Preset.make_simulator`). The module `equilibrium` contains the equations of preset `default`.
 """
 
 import os
@@ -15,7 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import compress
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -23,7 +22,7 @@ from threadpoolctl import ThreadpoolController
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.presets.registry import PRESETS, preset_named
+from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState
@@ -43,6 +42,26 @@ STOP_TORQUE = 0.1  # let `limits` name a joint whose stop exerts more than this 
 TENSION_MARGIN = 1.0  # let `limits` name a muscle that is nearer to T_max than this [N]
 
 
+class SimulatedBody(Protocol):
+    """Steps N simulated arms by the equations of a preset (`Preset.make_simulator`)."""
+
+    def use(self, mae: Mae, robot: Robot) -> None:
+        """Use a network, and the robot with the currently isolated muscles."""
+
+    def step(
+        self, state: ArmState, command: Array, h: float, wrench: Array, fixed: Array
+    ) -> ArmState:
+        """Return the state of the arms after a step.
+
+        Args:
+            state: Present state of the arms.
+            command: l_target [m], (N, M); PAID_OUT (∞) for muscles without a command.
+            h: Duration of the step [s].
+            wrench: Wrench on the end effectors in axes of the root link [N, N·m], (N, 6).
+            fixed: Angles that joints are forced to [rad], (N, D); NaN for a free joint.
+        """
+
+
 class Simulation:
     """Simulates N arms with the learned body of one robot, in compiled code."""
 
@@ -58,7 +77,6 @@ class Simulation:
         mae: Mae,
         preset: str = 'default',
         arms: int = 1,
-        device: str | None = None,
     ) -> None:
         """Start at θ = 0, or at the nearest joint limit, with T_bias and no command.
 
@@ -67,18 +85,12 @@ class Simulation:
             mae: The network with the learned body.
             preset: Name of the preset, which selects the equations.
             arms: Number of arms.
-            device: Torch device of the network, such as `cuda`; None to use numpy.
 
         Raises:
-            MusculoskeletalError: If torch or the preset cannot use the device, or if `arms` is 0.
+            MusculoskeletalError: If `arms` is 0.
         """
         self.robot = robot
-        chosen = preset_named(preset)
-        self._body, self._device = chosen.make_simulator(self.robot), device
-        if device is not None and not chosen.simulates_on_devices:
-            legal = ', '.join(name for name, each in PRESETS.items() if each.simulates_on_devices)
-            problem = f'device {device!r}: preset {preset!r} cannot simulate on a torch device'
-            raise MusculoskeletalError(f'{problem}; use one of these presets: {legal}')
+        self._body = preset_named(preset).make_simulator(self.robot)
         self.wrench = np.zeros((0, 6))  # `start_from` sets its size
         self.use(mae)
         self.start_from(np.zeros((arms, robot.joint_count)))
@@ -90,7 +102,7 @@ class Simulation:
             FloatingPointError: If the new network cannot be simulated; the current network then
                 stays in use.
         """
-        self._body.use(mae if self._device is None else _on_device(mae, self._device), self.robot)
+        self._body.use(mae, self.robot)
         self.mae = mae
 
     def isolate(self, muscles: Iterable[int]) -> None:
@@ -172,8 +184,7 @@ class Simulation:
             np.array(part, float, order='C') for part in (self.command, self.wrench, self.fixed)
         )
         count = len(command)
-        chunk = CHUNK if self._device is None else -(-count // (os.cpu_count() or 1))
-        if count <= chunk:
+        if count <= CHUNK:
             self.state = self._body.step(self.state, command, h, wrench, fixed)
             return
 
@@ -181,19 +192,9 @@ class Simulation:
             state = ArmState(*(part[rows] for part in self.state))
             return self._body.step(state, command[rows], h, wrench[rows], fixed[rows])
 
-        pieces = [slice(first, first + chunk) for first in range(0, count, chunk)]
+        pieces = [slice(first, first + CHUNK) for first in range(0, count, CHUNK)]
         arms = on_all_cores(advance, pieces)
         self.state = ArmState(*map(np.concatenate, zip(*arms, strict=True)))
-
-
-def _on_device(mae: Mae, device: str) -> Any:
-    """Return a network that computes its lengths on a torch device."""
-    # Imported here, because a node that simulates one arm does not need torch.
-    from musculoskeletal_ae.mae.network import TorchLengths
-    from musculoskeletal_ae.mae.training import check_device
-
-    check_device(device)
-    return TorchLengths(mae, device)
 
 
 def on_all_cores(function: Callable[[slice], ArmState], pieces: Sequence[slice]) -> list[ArmState]:

@@ -3,7 +3,6 @@
 
 import math
 from argparse import Namespace
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +18,7 @@ from musculoskeletal_ae.options import Parser, exit_status
 from musculoskeletal_ae.robot.series_elastic import DEFAULT, SeriesElastic
 
 COLUMNS = ['tension', 'absolute_length', 'elongation']
-#: write rows with these tensions into the example table [N]
-EXAMPLE_TENSIONS = (5.0, 15.0, 30.0, 60.0, 110.0, 200.0, 330.0, 500.0)
-EXAMPLE_LENGTHS = (0.15, 0.30, 0.45, 0.60)  # write rows for muscles of these lengths [m]
-#: add noise of this standard deviation to the example table [m]: the resolution of a caliper
-EXAMPLE_NOISE = 1e-4
+NOISE = 1e-4  # assume this standard deviation of elongations [m]: the resolution of a caliper
 LEAST_FORCE, MOST_FORCE = 1e-3, 1e3  # keep `force` in this range, relative to the highest tension
 ROUNDS = 200  # end the fit after this many Gauss–Newton steps
 #: end the fit if a step lowers the sum of squares by less than this, relative to the noise
@@ -35,7 +30,7 @@ LONGEST = 10.0
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Fit a table, or write the synthetic example table."""
+    """Fit a table."""
     parser = Parser(
         'fit_series_elastic',
         'Fits the elongation L_e(l_abs, T) of a muscle to a testbed table and prints the constants '
@@ -44,11 +39,8 @@ def main(argv: list[str] | None = None) -> int:
     text = f'CSV with the columns {", ".join(COLUMNS)} [N, m, m]'
     parser.add_argument('table', type=Path, help=text)
     parser.add_plot('table and fit')
-    text = 'write a synthetic table to TABLE instead (never over an existing file)'
-    parser.add_argument('--make-example', action='store_true', help=text)
-    parser.add_seed('of the example noise')
     args = parser.parse_args(argv)
-    return exit_status(lambda: (write_example if args.make_example else fit)(args))
+    return exit_status(lambda: fit(args))
 
 
 def fit(args: Namespace) -> None:
@@ -105,7 +97,7 @@ def fit_series_elastic(tension: Array, absolute_length: Array, elongation: Array
         elastic = model(log_constants)
         error = elastic.elongation(absolute_length, tension) - elongation
         slope = elastic.by_logarithms(absolute_length, tension)
-        return error / EXAMPLE_NOISE, slope / EXAMPLE_NOISE
+        return error / NOISE, slope / NOISE
 
     # Without bounds, a linear spring would get an infinite `force`, and a tendon without an element
     # an infinite `rate`.
@@ -143,26 +135,6 @@ def read_table(file: Path) -> Array:
 
 def _refusal(file: Path, problem: str) -> RobotDescriptionError:
     return RobotDescriptionError(f'{file}: {problem}')
-
-
-def write_example(args: Namespace) -> None:
-    """Write a synthetic table from the package's default constants and measurement noise."""
-    file, seed = args.table, args.seed
-    true = SeriesElastic(*np.array(list(DEFAULT.values()))[:, None])
-    rng = np.random.default_rng(seed)
-    head = (
-        '# SYNTHETIC one-muscle testbed table, not a measurement: the default constants '
-        f'(force {DEFAULT["force"]:g} N,\n# rate {DEFAULT["rate"]:g} /m, wire_stretch '
-        f'{DEFAULT["wire_stretch"]:g} /N) with {1e3 * EXAMPLE_NOISE:g} mm of noise. Made by\n'
-        f'#   fit_series_elastic --make-example --seed {seed} {file.name}\n# Units: N, m, m.'
-    )
-    with file.open('x', encoding='utf-8') as stream:
-        print(head, ','.join(COLUMNS), sep='\n', file=stream)
-        for length, tension in product(EXAMPLE_LENGTHS, EXAMPLE_TENSIONS):
-            exact = true.elongation(np.array([length]), np.array([tension]))[0]
-            measured = exact + EXAMPLE_NOISE * rng.standard_normal()
-            print(f'{tension:g},{length:g},{measured:.5f}', file=stream)
-    print(f'wrote {file}')
 
 
 def plot(table: Array, constants: SeriesElastic, residual: Array) -> Any:

@@ -14,7 +14,8 @@ from musculoskeletal_ae.design.route_jumps import jump_warning
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.figures import save_plot
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.initial_training import Trained, initial_mae
+from musculoskeletal_ae.mae.initial_training import initial_mae
+from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import (
     OUTPUTS,
     PairError,
@@ -66,15 +67,15 @@ def train(args: Namespace) -> None:
     for line in prospects(robot).lines():
         print(line, file=sys.stderr, flush=True)
     start = time.perf_counter()
-    trained = train_on_model(robot, args)
-    checkpoint.save(trained.mae, args.out)  # first, so that no later error loses the training
-    print(f'{trained.mae.training}; {time.perf_counter() - start:.1f} s')
+    mae, losses = train_on_model(robot, args)
+    checkpoint.save(mae, args.out)  # first, so that no later error loses the training
+    print(f'{mae.training}; {time.perf_counter() - start:.1f} s')
     # This random stream differs from that of the training, so all states are held out.
     rng = np.random.default_rng([args.seed, 2])
     limit, most = robot.tension.limit, robot.tension.max
     states = rest_states(robot, HELD_OUT_STATES, rng)
-    planned = pair_errors(trained.mae, states)
-    off = trained.mae.estimate(states.tension, states.length).theta - states.theta
+    planned = pair_errors(mae, states)
+    off = mae.estimate(states.tension, states.length).theta - states.theta
     print(
         f'error on the geometric model: {robot.units.error_text(off, ".3f")} (mean over unseen '
         'states, from T and l)',
@@ -85,26 +86,29 @@ def train(args: Namespace) -> None:
     rack = f'; {1e3 * RACK:g} mm of a prismatic joint count as 1 rad' * has_slides
     print(table(planned, f'{HELD_OUT_STATES} unseen states, T from 0 to {shown(limit)} N{rack}'))
     if (most > limit).any():
-        overload = pair_errors(trained.mae, random_states(robot, HELD_OUT_STATES, rng, most, limit))
+        overload = pair_errors(mae, random_states(robot, HELD_OUT_STATES, rng, most, limit))
         print(table(overload, f'overload: T from {shown(limit)} to {shown(most)} N'))
     print(joint_table(robot, planned))
     print(f'checkpoint: {args.out}')
-    save_plot(args.plot, lambda: plot(robot, trained, planned))
+    save_plot(args.plot, lambda: plot(robot, mae, losses, planned))
 
 
-def train_on_model(robot: Robot, args: Namespace) -> Trained:
-    """Train a network on the geometric model, and show the progress."""
+def train_on_model(robot: Robot, args: Namespace) -> tuple[Mae, list[float]]:
+    """Train a network on the geometric model, and show the progress.
+
+    Returns:
+        The network, and the loss of every mini-batch.
+    """
     steps = PRESETS[args.preset].initial_steps(robot) // (10 if args.quick else 1)
-    newest = 0.0  # loss of the newest mini-batch
-    with ProgressBar('training', steps, lambda: f'loss {newest:.4f}', is_even=True) as bar:
+    losses = [0.0]
+    with ProgressBar('training', steps, lambda: f'loss {losses[-1]:.4f}', is_even=True) as bar:
         bar.announce(f': drawing states of the geometric model, {steps} mini-batches follow')
 
         def progress(_step: int, loss: float, *_: object) -> None:
-            nonlocal newest
-            newest = loss
+            losses.append(loss)
             bar.add()
 
-        return initial_mae(robot, args.preset, args.seed, progress, steps)
+        return initial_mae(robot, args.preset, args.seed, progress, steps), losses[1:]
 
 
 def table(errors: list[PairError], title: str) -> str:
@@ -131,18 +135,17 @@ def joint_table(robot: Robot, errors: list[PairError]) -> str:
     return '\n'.join(['', 'mean error of each joint angle, estimated from T and l (②)', *lines, ''])
 
 
-def plot(robot: Robot, trained: Trained, errors: list[PairError]) -> Any:
+def plot(robot: Robot, mae: Mae, losses: list[float], errors: list[PairError]) -> Any:
     """Return a figure of the loss, the errors in `table`, and the errors by joint and muscle."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
     figure = Figure(figsize=(13.0, 8.5), layout='constrained')
-    figure.suptitle(trained.mae.training)
+    figure.suptitle(mae.training)
     curve, text, joints, tensions, lengths = figure.subplot_mosaic(
         [['loss', 'loss', 'loss', 'table', 'table', 'table'],
          ['theta', 'theta', 'tension', 'tension', 'length', 'length']]
     ).values()  # fmt: skip
-    losses = np.array(trained.losses)
     curve.semilogy(np.arange(1, len(losses) + 1), losses, lw=0.4, color='C7', label='mini-batch')
     window = max(1, len(losses) // 50)
     smooth = np.convolve(losses, np.full(window, 1.0 / window), mode='valid')

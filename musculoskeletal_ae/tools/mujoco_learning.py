@@ -77,7 +77,7 @@ def train(args: Namespace) -> None:
             raise MusculoskeletalError(f'{folder}: exists; remove it, or choose another --out')
     train_on(args.device)
     robot = _imported(args, robot_folder)
-    initial = train_on_model(robot, args).mae
+    initial = train_on_model(robot, args)[0]
     learned = learn(robot, initial, robot_folder / 'model.xml', args.seed, args.minutes)
     checkpoint.save(learned.mae, args.out)
     speed, count = f'{learned.speed:.1f} times real time', f'{learned.samples} samples'

@@ -281,7 +281,7 @@ def _initial_network(robot: Robot, args: Namespace) -> Mae:
     name = robot.description.directory.name
     if args.seed != DEFAULT_SEED or args.quick:  # the cache contains complete networks of one seed
         print(f'training the initial network of {name}; --checkpoint FILE skips this', flush=True)
-        return train_on_model(robot, args).mae
+        return train_on_model(robot, args)[0]
     file = network_file(robot.description.directory, args.preset)
     if file.exists():
         try:
@@ -292,7 +292,7 @@ def _initial_network(robot: Robot, args: Namespace) -> Mae:
             print(f'initial network of {name} from the cache of bringup.sh: {file}', flush=True)
             return mae
     print(f'training the initial network of {name} (once; cached in {file})', flush=True)
-    mae = train_on_model(robot, args).mae
+    mae = train_on_model(robot, args)[0]
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         checkpoint.save(mae, file)

@@ -5,7 +5,6 @@ import argparse
 from pathlib import Path
 
 from musculoskeletal_ae.options import Parser, exit_status, positive
-from musculoskeletal_ae.parameters import DEVICES
 from musculoskeletal_ae.process_signals import import_heavy
 from musculoskeletal_ae.robot.directories import shipped_robots
 
@@ -70,7 +69,7 @@ def main(argv: list[str] | None = None) -> int:
     text = 'with --from-bag: namespace of the arm if the bags have several'
     parser.add_argument('--from-namespace', metavar='NS', help=text)
     text = 'device for training; it must be one that torch can use'
-    parser.add_argument('--device', choices=DEVICES, default='cpu', help=text)
+    parser.add_argument('--device', choices=('cpu', 'cuda'), default='cpu', help=text)
     parser.add_quick('a tenth of the training, for a first try')
     args = parser.parse_args(argv)
     _check_source(parser, args)

@@ -126,12 +126,11 @@ def stopped(now, steps, suspect=None, settings=None):
     limiter = CommandLimiter(ROBOT, settings or Settings(hold_time=0.0))
     limiter.limit(Command(LENGTH, np.zeros(COUNT)), sample(0.0, BIAS, ROBOT), LIMIT, DT)
     stop, sent = SafeStop(ROBOT, settings or Settings(hold_time=0.0), limiter), []
-    stop.suspect = suspect
     for step in range(steps):
         message = now(step, limiter.command.value)
         is_fresh = message is not None
         message = message or sample(0.0, 150.0, ROBOT)
-        desired = stop.step(message, DT, is_fresh, may_wind=True)
+        desired = stop.step(message, DT, is_fresh, suspect=suspect)
         sent.append(limiter.limit(desired, message, LIMIT, DT).value)
     return np.array(sent)
 

@@ -21,7 +21,7 @@ def stopped(last, settings, now, steps, is_fresh=True):
     limiter.command = last
     stop, sent = SafeStop(ROBOT, settings, limiter), []
     for _ in range(steps):
-        desired = stop.step(now, DT, is_fresh, may_wind=False)
+        desired = stop.step(now, DT, is_fresh, suspect=None)
         sent.append(limiter.limit(desired, now, ROBOT.tension.max, DT).value)
     return np.array(sent)
 

@@ -67,7 +67,7 @@ def test_muscle_stiffness_control_without_a_tension_is_refused(tmp_path):
     with pytest.raises(RobotDescriptionError, match=f"{legal}, got 'weight'"):
         Robot.load(write_robot(tmp_path, tension_source='weight', actuation='position'))
     robot = Robot.load(write_robot(tmp_path, tension_source='none', actuation='position'))
-    assert any('contact estimation' in line for line in robot.description.joint_notes)
+    assert any('contact estimation' in line for line in robot.description.notes)
 
 
 @pytest.mark.parametrize('method', METHODS)

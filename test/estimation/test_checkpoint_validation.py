@@ -15,6 +15,7 @@ from network_attacks import ATTACKS, CONSISTENT, ON_MESSAGES
 from robots import DRUM_ENDS, behind_a_drum
 
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
+from musculoskeletal_ae.estimation.network_validation import detector_check
 from musculoskeletal_ae.estimation.network_validation.message_errors import FLOOR
 from musculoskeletal_ae.estimation.network_validation.posture_check import LIMITS
 from musculoskeletal_ae.estimation.network_validation.validator import (
@@ -31,6 +32,8 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly, BodyState
 
 ROBOT = Robot.load('arm26')
+HEALTHY = BodyState.healthy(ROBOT.muscle_count)
+FAULTY = HEALTHY.with_anomaly(Anomaly.FOUND, 0)
 STILL = np.zeros(ROBOT.muscle_count)  # direction of sliding of tendons that have not slid
 
 
@@ -119,7 +122,7 @@ def test_a_refusal_names_the_muscle_whose_lengths_jump(tmp_path):
     arms = {name: behind_a_drum(tmp_path / name, end) for name, end in DRUM_ENDS.items()}
     for name, robot in arms.items():
         with pytest.raises(GateError) as refusal:
-            CheckpointValidator(robot).check(initial_mae(robot, steps=1).mae)
+            CheckpointValidator(robot).check(initial_mae(robot, steps=1))
         reported = 'no network can represent lengths that jump'
         assert (reported in str(refusal.value)) == (name == 'jumps')
     assert re.search(r': straightener \(\d+ mm\); `check_robot` prints', str(refusal.value))
@@ -166,23 +169,24 @@ def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back(trained)
     gate, old, new = CheckpointValidator(ROBOT), trained['default'], trained['paper']
     gate.take(old, 0.0)
     gate.take(new, 100.0)
-    assert gate.anomaly(True, 100.0 + 0.6 * PROOF) is old
+    assert gate.follow(FAULTY, 100.0 + 0.6 * PROOF) is old
     assert gate.mae is old
-    assert gate.anomaly(True, 108.0) is None
-    assert gate.anomaly(False, 120.0) is None
+    assert gate.follow(FAULTY, 108.0) is None
+    assert gate.follow(HEALTHY, 120.0) is None
     gate.take(new, 130.0)
-    assert gate.anomaly(True, 130.0 + 1.1 * PROOF) is None
+    assert gate.follow(FAULTY, 130.0 + 1.1 * PROOF) is None
     assert gate.mae is new
 
 
 def test_messages_just_before_and_during_an_anomaly_do_not_count_as_healthy(trained):
     gate = CheckpointValidator(ROBOT)
+    gate.follow(HEALTHY, 0.0)
     end = send_healthy_messages(gate)
     before = gate.message_errors(trained['default'])
     tension, length = body()
     for k in range(15):
         gate.message(tension[k], length[k] + 0.2, STILL, end + 0.1 * k)
-    gate.anomaly(True, end + 0.75 * DETECTION_DELAY)
+    gate.follow(FAULTY, end + 0.75 * DETECTION_DELAY)
     for k in range(30):
         gate.message(tension[k], length[k] + 0.2, STILL, end + 2.0 + 0.1 * k)
     after = gate.message_errors(trained['default'])
@@ -213,7 +217,7 @@ def test_many_unproven_networks_leave_the_first_one_to_roll_back_to(trained):
     gate.take(first, 0.0)
     for _ in range(3 * MOST_USED):  # without messages between them, no network is proven
         gate.take(trained['default'], 0.0)
-    assert gate.anomaly(True, 0.0) is first
+    assert gate.follow(FAULTY, 0.0) is first
 
 
 def send_messages_of_the_model(gate, measures):
@@ -288,13 +292,14 @@ def test_decisions_are_told_and_an_anomaly_rejects_the_network_accepted_shortly_
     told = []
     gate.accepted = lambda mae: told.append(('accepted', mae.version))
     gate.rejected = lambda mae, reason: told.append(('rejected', mae.version, reason))
-    first, healthy = trained['default'], BodyState.healthy(ROBOT.muscle_count)
-    gate.follow(healthy, 0.0)
-    gate.decide(replace(first, version=1), 0.0)
-    gate.decide(replace(first, version=1), 1.0)  # it is in use already
-    gate.decide(replace(first, version=2), 20.0)
-    gate.decide(replace(_turned(first, 3.0), version=3), 21.0)
-    proven = gate.follow(healthy.with_anomaly(Anomaly.FOUND, 0), 22.0)
+    first = trained['default']
+    gate.follow(HEALTHY, 0.0)
+    deque(gate.propose(replace(first, version=1), lambda: 0.0))
+    deque(gate.propose(replace(first, version=1), lambda: 1.0))  # it is in use already
+    deque(gate.propose(replace(first, version=2), lambda: 20.0))
+    with pytest.raises(GateError):
+        deque(gate.propose(replace(_turned(first, 3.0), version=3), lambda: 21.0))
+    proven = gate.follow(FAULTY, 22.0)
     assert proven.version == 1
     assert used == [1, 2, 1]
     assert [each[:2] for each in told] == [
@@ -313,7 +318,7 @@ def test_a_network_without_a_calibrated_detector_takes_over_with_that_in_use(tra
     end = send_healthy_messages(gate)
     kept = gate.with_detector(mae, end)
     assert kept.anomaly.calibrated
-    healthy, *ruptured = gate.detector_measures(kept)
+    healthy, *ruptured = detector_check.measures(kept, gate.messages, ())
     assert healthy < 1.0
     assert max(ruptured) > 1.0
     own = calibrated(trained['paper'])
@@ -330,7 +335,7 @@ def test_the_inherited_detector_ignores_only_the_repaired_muscle(trained):
     # Another network without a detector takes over, long after the repair.
     gate.take(kept, end + 1.0)
     again = gate.with_detector(mae, end + 1e4)
-    _, *ruptured = gate.detector_measures(again)
+    _, *ruptured = detector_check.measures(again, gate.messages, ())
     assert max(ruptured) > 1.0
     changed = np.zeros((1, 2 * ROBOT.muscle_count))
     distances = []

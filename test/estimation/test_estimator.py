@@ -13,7 +13,6 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.detectors.missing_values import SILENT
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings
 from musculoskeletal_ae.estimation.module_commands import COMMAND_AGE
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.messages.arrival import INTERRUPTION
@@ -208,7 +207,7 @@ def test_a_muscle_without_numbers_is_isolated_only_if_it_lacks_them_in_all_messa
     robot, mae, healthy, network
 ):
     core = Estimator(robot)
-    core.configure(EstimatorSettings(on_anomaly='isolate'))
+    core.suspects.isolates = True
     if network:
         core.use(mae)
     sound = states(healthy)

@@ -8,7 +8,6 @@ import pytest
 from readings import reading
 
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings
 from musculoskeletal_ae.estimation.suspect_verification import (
     LONGEST,
     PATIENCE,
@@ -88,7 +87,7 @@ class Loop:
         # The healthy modules follow this command.
         self.command = robot.actuation.unchanging_length(healthy.length, healthy.tension)
         self.core.use(mae)
-        self.core.configure(EstimatorSettings(on_anomaly='isolate'))
+        self.core.suspects.isolates = True
         self.rng, self.length = np.random.default_rng(0), healthy.length
 
     def step(self, message, times=1):
@@ -185,7 +184,7 @@ def test_a_healthy_suspect_is_restored_but_a_third_anomaly_is_latched(loop, heal
 
 def test_on_anomaly_stop_is_the_default_and_isolates_no_muscle(robot, calibrated, healthy, cut):
     loop = Loop(robot, calibrated, healthy)
-    loop.core.configure(EstimatorSettings())
+    loop.core.suspects.isolates = False
     loop.step(cut, 300)
     assert loop.core.cause
     assert loop.core.body.isolated == ()
@@ -203,7 +202,7 @@ def test_a_reset_during_verification_restores_the_suspect(loop, healthy, cut):
 
 
 def test_without_a_verification_the_report_names_the_remedy(loop, healthy, cut):
-    loop.core.configure(EstimatorSettings(on_anomaly='stop'))
+    loop.core.suspects.isolates = False
     loop.step(healthy, 30)
     loop.step(cut, 20)
     report = loop.core.report(loop.now)
@@ -303,7 +302,7 @@ def test_a_muscle_whose_length_jumps_is_isolated_as_a_suspect_if_suspects_are_is
     quiet = replace(calibrated.anomaly, thresholds={'distance': 1e6})
     core, jumped, rejected = Estimator(robot), 3, 0
     core.use(replace(calibrated, anomaly=quiet))
-    core.configure(EstimatorSettings(on_anomaly=on_anomaly))
+    core.suspects.isolates = on_anomaly == 'isolate'
     rng = np.random.default_rng(0)
     for n in range(round((LIMITS.settled + 0.5) / DT)):
         length = healthy.length + 1e-4 * rng.standard_normal(6)

@@ -11,7 +11,6 @@ from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.remedy import REPAIR, Step, sentence
@@ -27,10 +26,10 @@ ONE = 0.06 * (np.arange(6) == 2)
 class MovingArm:
     """An estimator and a moving model arm, whose lengths and joint sensors may have offsets."""
 
-    def __init__(self, robot, mae, **detection):
+    def __init__(self, robot, mae, on_anomaly='stop'):
         self.robot, self.core, self.time = robot, Estimator(robot), 0.0
         self.core.use(mae)
-        self.core.configure(EstimatorSettings(**detection))
+        self.core.suspects.isolates = on_anomaly == 'isolate'
         self.rng = np.random.default_rng(0)
         self.off, self.joint_off = np.zeros(robot.muscle_count), np.zeros(robot.joint_count)
         self.tension = robot.tension.bias + 20.0
@@ -401,7 +400,7 @@ def test_joint_sensors_that_are_dead_decide_nothing(robot, mae):
 
 def isolated_for(arm, seconds):
     """Return an arm with joint sensors of which muscle 2 has ruptured and is isolated."""
-    arm.core.configure(EstimatorSettings(on_anomaly='isolate'))
+    arm.core.suspects.isolates = True
     arm.core.isolate([2])
     arm.off, arm.tense = -0.2 * np.eye(6)[2], 1.0 - np.eye(6)[2]
     arm.go(seconds)
@@ -459,7 +458,7 @@ def test_a_muscle_with_another_length_offset_can_be_restored_after_a_calibration
 
 @pytest.mark.parametrize(('on_anomaly', 'isolated'), [('stop', ()), ('isolate', (2,))])
 def test_one_wrong_length_revokes_no_other_offset(moved, on_anomaly, isolated):
-    moved.core.configure(EstimatorSettings(on_anomaly=on_anomaly))
+    moved.core.suspects.isolates = on_anomaly == 'isolate'
     for share in np.linspace(0.0, 1.0, 25):
         moved.off = -0.15 * share * np.eye(6)[2]
         moved.go(0.04)

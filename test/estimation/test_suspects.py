@@ -4,7 +4,6 @@
 import pytest
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.estimation.estimator_settings import EstimatorSettings
 from musculoskeletal_ae.estimation.finding import Finding
 from musculoskeletal_ae.estimation.suspect_verification import Outcome, VerificationVerdict
 from musculoskeletal_ae.estimation.suspects import ACQUITTALS, WITHIN, SuspectHandling
@@ -15,7 +14,7 @@ DISTANCE = Finding(1, ConditionKind.RESIDUAL_DISTANCE, 'd = 9')
 @pytest.fixture
 def suspects(robot):
     handling = SuspectHandling(robot)
-    handling.settings = EstimatorSettings(on_anomaly='isolate')
+    handling.isolates = True
     return handling
 
 
@@ -33,7 +32,7 @@ def suspects(robot):
     ],
 )
 def test_the_consequences_of_each_finding(suspects, kind, on_anomaly, latched, isolated, verified):
-    suspects.settings = EstimatorSettings(on_anomaly=on_anomaly)
+    suspects.isolates = on_anomaly == 'isolate'
     assert suspects.take(Finding(2, kind, ''), (), 0.0) == isolated
     assert (suspects.finding is not None) == latched
     assert (suspects.verification is not None) == verified
@@ -61,7 +60,7 @@ def test_the_first_finding_stays_latched(suspects, robot):
     ],
 )
 def test_only_a_jump_of_the_suspect_alone_is_explained_by_its_repair(suspects, kind, jump):
-    suspects.settings = EstimatorSettings(on_anomaly='stop')
+    suspects.isolates = False
     finding = Finding(1, kind, '')
     suspects.take(finding, (), 0.0)
     is_repair = jump == Finding(1, ConditionKind.LENGTH_JUMP, '')

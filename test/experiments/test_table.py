@@ -17,7 +17,7 @@ from musculoskeletal_ae.experiments.results import (
 )
 from musculoskeletal_ae.experiments.results import ROWS as TABLE
 from musculoskeletal_ae.experiments.runner import EXPERIMENTS
-from musculoskeletal_ae.presets.names import PAPER_PRESET
+from musculoskeletal_ae.presets.preset import PAPER_PRESET
 
 REPOSITORY = Path(__file__).parents[2]
 PAGE = REPOSITORY / 'doc' / 'results' / 'paper.md'

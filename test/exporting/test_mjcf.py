@@ -44,7 +44,7 @@ def learned(tmp_path_factory):
     displaced = import_robot(file, folder / 'displaced').robot
     displaced.routes.absolute_lengths = individual.absolute_lengths
     displaced.routes.length_at_zero = individual.length_at_zero
-    return Learned(robot, individual, initial_mae(displaced, steps=150).mae, folder)
+    return Learned(robot, individual, initial_mae(displaced, steps=150), folder)
 
 
 def differences(one, other):

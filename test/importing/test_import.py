@@ -492,7 +492,7 @@ def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path, capsys):
     mimic = '<mimic joint="shoulder" multiplier="-0.5" offset="0.1"/>'
     file = put(tmp_path, 'arm.urdf', bodies.URDF.format(mimic=mimic))
     assert main([str(file), '--out', str(tmp_path / 'out')]) == 0
-    assert 'coupled: wrist = -0.5 · shoulder +0.1' in capsys.readouterr().out
+    assert 'wrist = -0.5 · shoulder +0.1' in capsys.readouterr().out
     robot = Robot.load(tmp_path / 'out')
     assert robot.joints == ('shoulder',)
     assert robot.description.couplings['wrist'] == ('shoulder', -0.5, 0.1, ())

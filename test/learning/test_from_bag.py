@@ -4,7 +4,6 @@
 import re
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -54,7 +53,7 @@ def teaching(robot):
 def test_learning_from_one_recording_improves_the_estimate_of_another(robot, teaching):
     exploration = part(read(BAGS / 'rupture', robot), 0.0, 30.0)  # long before the rupture
     other = part(teaching, 0.0, 15.0)  # before the arm is pushed
-    mae = initial_mae(robot, steps=150).mae
+    mae = initial_mae(robot, steps=150)
     learner = Learner(robot, mae, steps=20)
     reported = []
     learn(learner, exploration, reported.append)
@@ -100,7 +99,7 @@ def test_false_joint_angles_hardly_change_what_is_learned(kind, robot, teaching,
     errors = []
     for each in ('none', kind):
         recording = read(spoiled(tmp_path / each, each, 180.0), robot)
-        learner = Learner(robot, initial_mae(robot, steps=600).mae, steps=100)
+        learner = Learner(robot, initial_mae(robot, steps=600), steps=100)
         learn(learner, recording)
         errors.append(error(learner.mae, part(teaching, 0.0, 15.0)))
     assert errors[1] <= 1.1 * errors[0]
@@ -180,7 +179,7 @@ def test_progress_and_wrong_joint_sensors_are_reported(
     def trained(_robot, _preset, _seed, progress, steps):
         for step in range(steps):
             progress(step, 0.5)
-        return SimpleNamespace(mae=initial)
+        return initial
 
     monkeypatch.setattr(progress_bar, 'REPORT_INTERVAL', 0.0)
     monkeypatch.setattr(model_training, 'initial_mae', trained)
@@ -362,7 +361,7 @@ def learned_from_bag(arm26, initial, monkeypatch, tmp_path):
 
     def trained(*_):
         trainings.append(1)
-        return SimpleNamespace(mae=initial)
+        return initial
 
     def learned(learner, *_):
         started_from.append(learner.mae)

@@ -59,7 +59,7 @@ def test_nothing_is_learned_from_an_emulated_arm_that_has_diverged(tmp_path, cap
 def test_a_finger_with_a_spring_return_explores_and_learns(tmp_path):
     (tmp_path / 'finger.xml').write_text(bodies.SNAPPING)
     robot = import_robot(tmp_path / 'finger.xml', tmp_path / 'robot').robot
-    mae = initial_mae(robot, steps=300).mae
+    mae = initial_mae(robot, steps=300)
     arm = make_arm(robot, 1, str(tmp_path / 'robot' / 'model.xml'), deviates=True)
     loop, learner = ClosedLoop(arm, mae, seed=101), Learner(robot, mae, seed=1)
     theta = []

@@ -241,7 +241,7 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
     del document['muscles'][added]
     small = Robot.load(write_muscles(directory, document))
     kept = [m for m in range(arm26.muscle_count) if m != added]
-    network = initial_mae(small, 'default', steps=2).mae
+    network = initial_mae(small, 'default', steps=2)
     store = SampleStore()
     for _ in range(4):
         theta, *parts, spread, gravity, _ = stage.sample()

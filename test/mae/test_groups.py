@@ -10,7 +10,7 @@ import torch
 
 from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.mae.checkpoint import from_bytes, to_bytes
-from musculoskeletal_ae.mae.default_training import LAYERS, MOST_STEPS, blocks, default_steps, grown
+from musculoskeletal_ae.mae.default_training import MOST_STEPS, blocks, default_steps, grown
 from musculoskeletal_ae.mae.network import Network, from_mae, to_mae
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.groups import Group, groups, parts
@@ -33,7 +33,7 @@ def mae(request):
     mean, std = rng.normal(size=23), rng.uniform(0.5, 2.0, 23)
     torch.manual_seed(0)
     blocks = {limb: (6 + i, 4) for i, limb in enumerate(LIMBS)}
-    network = Network(JOINTS, MUSCLES, LAYERS, mean, std, blocks, request.param)
+    network = Network(JOINTS, MUSCLES, blocks, 'silu', mean, std, request.param)
     return to_mae(network, tuple('abcde'), tuple('ABCDEFGHI'), 'default', '')
 
 

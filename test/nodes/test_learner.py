@@ -147,7 +147,7 @@ def state(tmp_path):
 def here(monkeypatch):
     """Let learners that run in the test's process train there, too, not in another process."""
     name = 'musculoskeletal_ae.nodes.learner.TrainerProcess'
-    monkeypatch.setattr(name, lambda *values, device: Trainer(*values))  # noqa: ARG005
+    monkeypatch.setattr(name, Trainer)
 
 
 @pytest.fixture

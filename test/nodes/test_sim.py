@@ -217,7 +217,7 @@ def test_preset_paper_runs_and_an_unknown_one_is_refused(graph, arm26, trained_f
 def test_a_prismatic_joint_is_fixed_and_published_in_metres(graph, tmp_path):
     robot = Robot.load(write_robot(tmp_path / 'slider', slider=True))
     file = tmp_path / 'mae.safetensors'
-    checkpoint.save(initial_mae(robot, steps=300).mae, file)
+    checkpoint.save(initial_mae(robot, steps=300), file)
     graph.listen(JointState, 'sim/joint_states')
     graph.host(SimNode, robot=str(tmp_path / 'slider'), checkpoint=str(file))
     fixed = JointState(name=['wrist'], position=[0.03])

@@ -164,7 +164,7 @@ def test_messages_in_the_name_of_the_estimator_stop_the_arm_and_change_nothing(
         assert core.stream.body.isolated == before.isolated == ()
         assert core.stream.body.offsets.known and not core.stream.body.offsets.offset.any()
         assert core.mae is network or core.mae.version == network.version
-        assert not core.watchdog.has_anomaly
+        assert not core.stream.body.has_anomaly
     arm.goes_to([-0.5, -1.2])
     arm.never_jumped()
 
@@ -190,16 +190,16 @@ def test_another_node_cannot_end_an_anomaly(graph, arm26, trained_file, denial):
     arm.target([-0.5, -1.2])
     graph.wait(lambda: arm.count() > 30, 'commands')
     assert graph.set_parameter('hardware_emulator', 'faults', [f'rupture:{name}'])[0]
-    graph.wait(lambda: core.watchdog.has_anomaly, 'the anomaly')
+    graph.wait(lambda: core.stream.body.has_anomaly, 'the anomaly')
     body = replace(core.stream.body.with_anomaly(denial, 3), isolated=(), generation=2**52)
     stranger = graph.publisher(Float64MultiArray, 'body_state', LATCHED)
     stranger.publish(array_message(body.rows, 'quantity', 'muscle'))
     rejected = 'body_state: several publishers'
     graph.wait(lambda: arm.controller.rejected[rejected], 'the rejection')
-    assert core.watchdog.has_anomaly and core.supervisor.is_latched
+    assert core.stream.body.has_anomaly and core.supervisor.is_latched
     graph.node.destroy_publisher(stranger)
     graph.spin(0.5)
-    assert core.watchdog.has_anomaly
+    assert core.stream.body.has_anomaly
     assert not graph.call(Trigger, 'controller/reset').success
 
 
@@ -214,7 +214,7 @@ def test_without_an_estimator_no_body_state_ends_a_stop_by_itself(graph, arm26, 
     assert graph.set_parameter('controller', 'max_age', 0.5)[0]
     graph.end(arm.estimator)
     graph.tell_body(replace(BodyState.healthy(6), generation=2**52))
-    graph.wait(lambda: not core.watchdog.has_anomaly, 'the false body state')
+    graph.wait(lambda: not core.stream.body.has_anomaly, 'the false body state')
     graph.spin(1.0)
     assert core.supervisor.is_latched
     assert not graph.call(Trigger, 'controller/reset').success

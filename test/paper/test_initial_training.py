@@ -14,7 +14,7 @@ from musculoskeletal_ae.robot.robot import Robot
 
 def test_the_network_has_the_printed_layers():
     arm = Robot.load('musashi_left_arm')
-    mae = initial_mae(arm, 'paper', steps=1).mae
+    mae = initial_mae(arm, 'paper', steps=1)
     assert mae.layer_sizes == (5 + 2 * 10 + 3, 200, 30, 5 + 10, 30, 200, 5 + 2 * 10)
 
 

@@ -119,11 +119,11 @@ def test_a_urdf_mimic_is_followed_and_joints_held_fixed_are_named(tmp_path):
     coupled_arm(tmp_path)
     plain = Robot.load(tmp_path)
     assert plain.description.held_joints == ('finger',)
-    assert plain.description.joint_notes == ['held fixed at 0: finger']
+    assert plain.description.notes == ['held fixed at 0: finger']
     urdf = tmp_path / 'robot.urdf'
     urdf.write_text(urdf.read_text().replace('<axis xyz="0 0 1"/>', MIMIC))
     mimic = Robot.load(tmp_path)
-    assert mimic.description.joint_notes == ['finger = -0.5 · bend +0.2']
+    assert mimic.description.notes == ['finger = -0.5 · bend +0.2']
     theta = mimic.random_postures(5, np.random.default_rng(0))
     expected = robot.routes.absolute_lengths(theta)
     np.testing.assert_array_equal(mimic.routes.absolute_lengths(theta), expected)
@@ -138,7 +138,7 @@ def test_a_mimic_is_followed_in_a_default_namespace_and_wheels_elsewhere_are_hel
     )
     text = urdf.read_text().replace('<axis xyz="0 0 1"/>', MIMIC).replace('</robot>', wheels)
     urdf.write_text(text.replace('<robot', '<robot xmlns="http://any"') + '</robot>')
-    notes = Robot.load(tmp_path).description.joint_notes
+    notes = Robot.load(tmp_path).description.notes
     assert notes == ['finger = -0.5 · bend +0.2', 'held fixed at 0: left, right']
 
 
@@ -166,7 +166,7 @@ def test_a_continuous_joint_may_mimic_a_listed_one_since_it_needs_no_limits(tmp_
     rest = re.sub(r'<axis.*?<limit.*?/>', '', rest, count=1, flags=re.DOTALL)
     urdf.write_text(f'{joint}<joint name="finger" {mimic}{rest}')
     robot = Robot.load(tmp_path)
-    assert robot.description.joint_notes == ['finger = 2 · bend']
+    assert robot.description.notes == ['finger = 2 · bend']
     angles = dict(zip(robot.kinematics.model.names[1:], robot.kinematics.tree.angles(ANGLES)))
     assert angles['finger'] == 2.0 * angles['bend']
 

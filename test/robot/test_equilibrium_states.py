@@ -50,7 +50,7 @@ def test_the_finger_explores_postures_in_which_it_can_rest(finger):
 
 
 def test_a_network_tells_two_angles_from_one_tendon_where_the_finger_can_rest(finger):
-    mae = initial_mae(finger, steps=300).mae
+    mae = initial_mae(finger, steps=300)
     states = rest_states(finger, 1000, np.random.default_rng(5))
     error = mae.estimate(states.tension, states.length).theta - states.theta
     spread = states.theta - states.theta.mean(axis=0)

@@ -152,7 +152,7 @@ def test_a_spring_takes_the_place_of_an_antagonist(tmp_path):
 
 def test_the_report_names_the_springs(springy):
     assert summary(springy, check_robot(springy, 20), 0).count('spring of') == 3
-    assert 'bend: spring of 9 N·m/rad, at rest at 0.3 rad' in springy.description.spring_notes
+    assert 'bend: spring of 9 N·m/rad, at rest at 0.3 rad' in springy.description.notes
 
 
 def test_springs_stiffen_the_joints(springy):
@@ -221,7 +221,7 @@ def test_springs_survive_export_and_import(tmp_path):
     stiffness[k, other] = stiffness[other, k] = 0.8
     preload = stiffness @ np.linspace(-0.3, 0.2, robot.joint_count)
     learned = JointElasticity(stiffness, preload, elasticity.damping)
-    mae = replace(initial_mae(robot, steps=1).mae, elasticity=learned)
+    mae = replace(initial_mae(robot, steps=1), elasticity=learned)
     export(robot, mae, tmp_path / 'model')
     again = import_robot(tmp_path / 'model' / 'model.xml', tmp_path / 'again').robot
     np.testing.assert_allclose(again.kinematics.elasticity.stiffness, stiffness, atol=1e-4)
@@ -266,7 +266,7 @@ def test_without_tensions_springs_stay_as_stated(springy):
 def test_an_update_publishes_learned_springs_and_control_uses_them(springy):
     true = springy.kinematics.elasticity.deviating(np.full(3, 0.5), np.full(3, 0.2))
     observed = rests(springy.with_elasticity(true), 40)
-    updater = BodyUpdater(springy, initial_mae(springy, steps=1).mae)
+    updater = BodyUpdater(springy, initial_mae(springy, steps=1))
     nothing = Healthy(np.empty((0, 24), dtype=np.float32), 0.0, 0)
     mae = updater.update(Job(observed, nothing, True, 4)).mae
     core, theta = Controller(springy, Settings()), observed.theta[0]

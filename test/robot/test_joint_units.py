@@ -57,7 +57,7 @@ def test_a_joint_follows_a_prismatic_joint_by_its_position_in_metres(robot):
 
 
 def test_springs_of_prismatic_joints_are_stated_in_newtons_per_metre(robot):
-    assert robot.description.spring_notes == ['wrist: spring of 300 N/m, at rest at 0.02 m']
+    assert 'wrist: spring of 300 N/m, at rest at 0.02 m' in robot.description.notes
     theta = robot.units.to_theta(np.array([-1.0, 0.0, 0.0, 0.03]))
     springs = robot.kinematics.elasticity
     assert robot.units.to_effort(springs.holding_torque(theta))[WRIST] == pytest.approx(3.0)

@@ -47,7 +47,7 @@ def test_torque_constant_gear_and_radius_convert_a_current_to_a_tension(tmp_path
     tension = read_muscle_states(array(rows), robot).tension
     np.testing.assert_allclose(tension, 0.5 * scale)
     np.testing.assert_allclose(robot.tension_source.to_message(tension), 0.5)
-    assert any('100–200 N per A' in line for line in robot.description.joint_notes)
+    assert any('100–200 N per A' in line for line in robot.description.notes)
 
 
 @pytest.mark.parametrize(

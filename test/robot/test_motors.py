@@ -87,7 +87,7 @@ def test_the_description_of_a_robot_has_its_motors_and_a_robot_with_a_driver_has
     directory = arm_with_motors(tmp_path, state_topic='joint_states')
     description = load_description(directory)
     assert description.motors.joints == description.muscles
-    assert any('states on joint_states, commands on no topic' in n for n in description.joint_notes)
+    assert any('states on joint_states, commands on no topic' in n for n in description.notes)
     assert motor_topics(directory) == description.motor_topics == MotorTopics('joint_states')
     assert load_description('arm26').motors is None
     assert motor_topics('arm26') == load_description('arm26').motor_topics == NO_MOTORS

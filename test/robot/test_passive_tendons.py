@@ -107,7 +107,7 @@ def test_their_torque_is_that_of_mujoco(finger):
 
 
 def test_the_import_names_each_of_them_and_keeps_their_damping(imported):
-    notes = ' '.join(imported.robot.description.spring_notes)
+    notes = ' '.join(imported.robot.description.notes)
     for name in ('return', 'strip', 'stop'):
         assert f'passive tendon {name} ' in notes
     assert not [note for note in imported.notes if 'no actuator pulls it' in note]
@@ -151,7 +151,7 @@ def test_an_emulated_arm_rests_where_muscles_hold_weight_and_return_tendons(fing
 
 
 def test_a_network_that_is_saved_keeps_the_torque_of_the_description(finger):
-    mae = initial_mae(finger, steps=1).mae
+    mae = initial_mae(finger, steps=1)
     mae = replace(mae, elasticity=finger.kinematics.elasticity)
     again = checkpoint.from_bytes(checkpoint.to_bytes(mae))
     theta = finger.random_postures(3, np.random.default_rng(3))

@@ -77,11 +77,6 @@ def test_a_table_that_cannot_pin_down_the_constants_is_refused():
         tool.fit_series_elastic(one[:2], one[:2], one[:2])
 
 
-def test_the_shipped_table_is_the_output_of_the_command_in_its_header(tmp_path):
-    assert tool.main(['--make-example', '--seed', '0', str(tmp_path / 'one_muscle.csv')]) == 0
-    assert (tmp_path / 'one_muscle.csv').read_bytes() == TESTBED.read_bytes()
-
-
 def test_the_tool_fits_the_shipped_table_to_its_noise(tmp_path, capsys):
     assert tool.main([str(TESTBED), '--plot', str(tmp_path / 'fit.png')]) == 0
     printed = capsys.readouterr().out
@@ -98,14 +93,6 @@ def test_a_table_saved_by_a_spreadsheet_is_read(tmp_path, capsys):
     file.write_text(text, encoding='utf-8-sig')
     assert tool.main([str(file)]) == 0
     assert 'series_elastic: {' in capsys.readouterr().out
-
-
-def test_the_example_never_overwrites_a_file(tmp_path, capsys):
-    file = tmp_path / 'mine.csv'
-    file.write_text('precious')
-    assert tool.main(['--make-example', str(file)]) == 1
-    assert file.read_text() == 'precious'
-    assert 'error' in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

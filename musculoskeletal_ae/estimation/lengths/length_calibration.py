@@ -166,11 +166,6 @@ class LengthCalibration:
         return self._problem
 
     @property
-    def overtime(self) -> float:
-        """Time for which the arm has moved or stood longer than required [s]."""
-        return self.time - self.enough
-
-    @property
     def remedy(self) -> tuple[Step, ...]:
         """Steps by which a user corrects the driver before a calibration; () if none are needed."""
         return CORRECT_DRIVER if self.wiring is not None and self.wiring.is_faulty else ()

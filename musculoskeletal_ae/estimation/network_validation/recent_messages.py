@@ -52,9 +52,8 @@ class RecentMessages:
         sliding: Array,
         now: float,
         theta: Array | None,
-        is_healthy: bool,
     ) -> None:
-        """Note a message if the arm is healthy and the last stored message is at least 0.1 s old.
+        """Note a message of the healthy arm, if the last stored one is at least 0.1 s old.
 
         Args:
             tension: Tensions as read [N], (M,).
@@ -62,10 +61,9 @@ class RecentMessages:
             sliding: Direction in which each tendon slid last, (M,).
             now: Time of the message [s].
             theta: Measured joint angles [rad], (D,), or None.
-            is_healthy: Whether the arm is healthy, that is, no anomaly is detected.
         """
         is_too_early = bool(self._messages) and 0.0 <= now - self._messages[-1].time < SPACING
-        if not is_healthy or is_too_early:
+        if is_too_early:
             return
         measured = self._unmeasured if theta is None else theta
         self._messages.append(_Message(now, tension, length, sliding, measured))

@@ -62,8 +62,8 @@ class CheckpointValidator:
     All times `now` are readings of one steady clock [s].
 
     Attributes:
-        isolated: Indices of the isolated muscles, which are ignored.
-        is_anomaly: Whether an anomaly is present.
+        body: The body state under which messages arrive; isolated muscles are ignored.
+        messages: The healthy messages of the last seconds.
         postures: The check on the geometric model.
         unsuitable_because: Why the network in use, which a user has chosen, fits this arm worse
             than the network before it; '' if it fits as well.
@@ -84,13 +84,11 @@ class CheckpointValidator:
         self.unsuitable_because = ''
         self.accepted: Callable[[Mae], object] = lambda _: None
         self.rejected: Callable[[Mae, str], object] = lambda _, __: None
-        self._offsets: LengthOffsets | None = None  # length offsets of the messages
+        self.body = BodyState(LengthOffsets.unknown(robot.muscle_count))
+        self.messages = RecentMessages(robot.joint_count)
         self.postures = PostureCheck(robot)
-        self._messages = RecentMessages(robot.joint_count)
         self._used: list[tuple[float, Mae]] = []  # networks, and the times at which they took over
-        self.is_anomaly = False
         self._repaired_at: dict[int, float] = {}  # time of each muscle's last repair [s]
-        self.isolated: tuple[int, ...] = ()
 
     @property
     def mae(self) -> Mae | None:
@@ -99,21 +97,8 @@ class CheckpointValidator:
 
     # -- decisions ------------------------------------------------------------------------------
 
-    def decide(self, mae: Mae, now: float) -> None:
-        """Decide on a candidate of the learner: use it, or call `rejected` with the reason.
-
-        Nothing is decided if it is the network in use. `propose` does the same in steps.
-        """
-        if self.is_in_use(mae):
-            return
-        try:
-            self.check(mae)
-            self._accept(self.with_detector(mae, now), now)
-        except CheckpointError as error:
-            self.rejected(mae, str(error))
-
     def propose(self, mae: Mae, clock: Callable[[], float]) -> Iterator[None]:
-        """Propose a candidate of the learner: decide on it as `decide` does, but in steps.
+        """Propose a candidate of the learner: use it, or call `rejected` with the reason.
 
         Each step takes some milliseconds, so that a node can do other work in between.
 
@@ -151,18 +136,26 @@ class CheckpointValidator:
         """Follow a change of the body state.
 
         New length offsets make the stored messages useless. If an anomaly begins, a network that
-        was accepted shortly before may be its cause; it is replaced by a proven one, and rejected.
+        was accepted shortly before may be its cause; it is rejected, and the newest network that
+        was in use for 10 s (PROOF) without an anomaly is used again, or the oldest one if none was.
 
         Returns:
             The proven network that is used again; None if the network in use does not change.
         """
-        self.isolated = body.isolated
-        if body.offsets != self._offsets:
-            self._offsets = body.offsets
-            self.forget()
+        before, self.body = self.body, body
+        if body.offsets != before.offsets:
+            self.messages.clear()
+        if body.has_anomaly == before.has_anomaly:
+            return None
+        if not body.has_anomaly:
+            self.messages.clear()  # they may describe the arm as it was before a repair
+            return None
+        self.messages.drop_after(now - DETECTION_DELAY)
         doubtful = self.mae
-        proven = self.anomaly(body.has_anomaly, now)
-        if proven is None or doubtful is None:
+        while len(self._used) > 1 and now - self._used[-1][0] < PROOF:
+            del self._used[-1]
+        proven = self.mae
+        if proven is doubtful or proven is None or doubtful is None:
             return None
         self.unsuitable_because = ''
         self.accepted(self._use(proven))
@@ -200,11 +193,13 @@ class CheckpointValidator:
             The quantity, its error and that of the network in use; '' if the network is not clearly
             worse, or if there are too few messages.
         """
-        if self.mae is None or self.mae.covariance is None or not self._messages.are_enough:
+        if self.mae is None or self.mae.covariance is None or not self.messages.are_enough:
             return ''
-        in_use = self.mae.without(self.isolated)
-        mae = mae.without(self.isolated)
-        check = AgreementCheck(self._robot, self.postures, self._messages, in_use, self.isolated)
+        in_use = self.mae.without(self.body.isolated)
+        mae = mae.without(self.body.isolated)
+        check = AgreementCheck(
+            self._robot, self.postures, self.messages, in_use, self.body.isolated
+        )
         if (text := check.worse_angle(mae)) is not None:
             return text
         errors, before = self.message_errors(mae), self.message_errors(in_use)
@@ -229,11 +224,8 @@ class CheckpointValidator:
             now: Time of the measurement [s].
             theta: Joint angles from joint sensors [rad], (D,), or None if there are none.
         """
-        self._messages.note(tension, length, sliding, now, theta, is_healthy=not self.is_anomaly)
-
-    def forget(self) -> None:
-        """Forget the messages, for example when the length offsets change."""
-        self._messages.clear()
+        if not self.body.has_anomaly:
+            self.messages.note(tension, length, sliding, now, theta)
 
     # -- checks ---------------------------------------------------------------------------------
 
@@ -259,7 +251,7 @@ class CheckpointValidator:
 
         A node can do other work between the steps. `check` describes the arguments and the error.
         """
-        faults, steps = list[str](), self._steps(mae.without(self.isolated), is_chosen)
+        faults, steps = list[str](), self._steps(mae.without(self.body.isolated), is_chosen)
         while True:
             # Suppress warnings of overflows, which count as large errors of the candidate.
             with np.errstate(all='ignore'):
@@ -285,30 +277,9 @@ class CheckpointValidator:
         if len(self._used) > MOST_USED:
             del self._used[1]  # the oldest network has proven itself longest, so it stays
 
-    def anomaly(self, detected: bool, now: float) -> Mae | None:
-        """Record whether an anomaly is present, and return to a proven network when one begins.
-
-        A network is proven after 10 s in use without an anomaly. The newest proven network is used
-        again, or the oldest network if none is proven.
-
-        Returns:
-            The network that is used again, or None if the network in use does not change.
-        """
-        if detected == self.is_anomaly:
-            return None
-        self.is_anomaly = detected
-        if not detected:
-            self._messages.clear()  # they may describe the arm as it was before a repair
-            return None
-        self._messages.drop_after(now - DETECTION_DELAY)
-        in_use = self.mae
-        while len(self._used) > 1 and now - self._used[-1][0] < PROOF:
-            del self._used[-1]
-        return self.mae if self.mae is not in_use else None
-
     def message_errors(self, mae: Mae) -> dict[str, Array]:
         """Return the errors of a network on the recent messages; {} if these are too few."""
-        return message_errors.message_errors(mae, self._messages, self.isolated)
+        return message_errors.message_errors(mae, self.messages, self.body.isolated)
 
     def agreement(self, mae: Mae) -> list[Agreement]:
         """Compare a network with joint sensors or, without them, with the network in use.
@@ -317,18 +288,11 @@ class CheckpointValidator:
         """
         if self.mae is None:
             return []
-        in_use = self.mae.without(self.isolated)
-        check = AgreementCheck(self._robot, self.postures, self._messages, in_use, self.isolated)
+        in_use = self.mae.without(self.body.isolated)
+        check = AgreementCheck(
+            self._robot, self.postures, self.messages, in_use, self.body.isolated
+        )
         return check.comparisons(mae)
-
-    def detector_measures(self, mae: Mae) -> Iterator[float]:
-        """Yield ratios of a network's anomaly statistic to its threshold on recent messages.
-
-        The first ratio is that of the recent messages as they are. Each following ratio is that of
-        the same messages with the tension of one muscle set to 0, as if the muscle were ruptured.
-        Nothing is yielded without a calibrated threshold, or if there are too few messages.
-        """
-        return detector_check.measures(mae, self._messages, self.isolated)
 
     def with_detector(self, mae: Mae, now: float) -> Mae:
         """Return a network with a calibrated anomaly detector, if one is available.
@@ -343,21 +307,21 @@ class CheckpointValidator:
         assert statistics is not None
         repaired = [m for m, at in self._repaired_at.items() if 0.0 <= now - at < RELEARNING_TIME]
         statistics = statistics.ignoring(repaired)
-        return detector_check.with_detector_of(statistics, mae, self._messages, self.isolated)
+        return detector_check.with_detector_of(statistics, mae, self.messages, self.body.isolated)
 
     def _steps(self, mae: Mae, is_chosen: bool) -> Iterator[str | None]:
         """Check a candidate step by step; yield a text for each fault, or None between steps."""
         yield from self.postures.faults(mae)
         if self.mae is not None:
             errors = self.message_errors(mae)
-            in_use = self.message_errors(self.mae.without(self.isolated))
+            in_use = self.message_errors(self.mae.without(self.body.isolated))
             yield None
             yield from message_errors.faults(errors, in_use, self._robot.muscles)
             if not is_chosen:
                 for comparison in self.agreement(mae):
                     yield from comparison.faults()
             yield None
-        yield from detector_check.faults(mae, self._messages, self.isolated)
+        yield from detector_check.faults(mae, self.messages, self.body.isolated)
 
     @cached_property
     def _likely_cause(self) -> str:
