@@ -14,6 +14,7 @@ from musculoskeletal_ae.emulator.foreign.arm import ForeignArm
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop
 from musculoskeletal_ae.importing.convert import import_robot
+from musculoskeletal_ae.learning import convergence
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
@@ -23,7 +24,8 @@ from musculoskeletal_ae.tools.train import main
 EXAMPLE = Path(__file__).parents[2] / 'examples' / 'two_joint_arm.xml'
 
 
-def test_a_mujoco_file_is_imported_explored_learned_and_reported(tmp_path, capsys):
+def test_a_mujoco_file_is_imported_explored_learned_and_reported(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(convergence, 'MOST_UPDATES', 2)
     out = tmp_path / 'arm.safetensors'
     options = ['--mujoco', str(EXAMPLE), '--minutes', '0.7', '--quick', '--seed', '1']
     assert main([*options, '--out', str(out)]) == 0
@@ -46,6 +48,7 @@ def test_nothing_is_learned_from_an_emulated_arm_that_has_diverged(tmp_path, cap
         step(arm, duration)
 
     monkeypatch.setattr(ForeignArm, 'step', thrown)
+    monkeypatch.setattr(convergence, 'MOST_UPDATES', 2)
     out = tmp_path / 'arm.safetensors'
     options = ['--mujoco', str(EXAMPLE), '--minutes', '0.7', '--quick', '--seed', '1']
     assert main([*options, '--out', str(out)]) == 0
