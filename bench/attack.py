@@ -267,7 +267,7 @@ def evaluate(attack: 'Attack') -> list[Row]:
     take = violations.pop
     return [
         Row('no message, request or event ends a node', sent, take('no node ends', [])),
-        Row('every node goes on and reports', sent, silent + take('every node goes on', [])),
+        Row('every node goes on to report', sent, silent + take('every node goes on', [])),
         Row('every node answers', tried['requests'], take('every node answers', [])),
         Row('no command changes faster than allowed', count, fast),
         Row('tension above 1.1 × limit lasts 0.5 s at most', len(true), tense),

@@ -69,7 +69,7 @@ class Honesty(NamedTuple):
 
     def text(self) -> str:
         """Return the mean error, the share inside the ellipsoid and the NEES as text."""
-        return f'{self.error:.3f} rad, {self.inside:.3f} inside, NEES {self.nees:.2f}'
+        return f'{self.error:.3f} rad, {self.inside:.3f} in the ellipsoid, NEES {self.nees:.2f}'
 
 
 def errors(mae: Mae, recording: Recording) -> Array:

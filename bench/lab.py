@@ -288,7 +288,7 @@ class Lab:
             self.publish()
 
     def publish(self) -> None:
-        """Publish the changes in the estimator to the other nodes."""
+        """Publish to the other nodes what has changed in the estimator's latched topics."""
         core = self.estimator
         if (trust := core.joint_trust) is not self._published_trust:
             self._published_trust = trust

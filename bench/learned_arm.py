@@ -62,7 +62,7 @@ def initial_network(robot: Robot, file: Path | None) -> Mae:
 
 
 def initial(robot: Robot, folder: Path) -> Mae:
-    """Return the network of the geometric model, from the cache in `folder` if it is there."""
+    """Return the network of the geometric model; train it if `folder` does not contain it yet."""
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / 'initial.safetensors'
     if not file.exists():

@@ -164,7 +164,7 @@ class Files:
         self._path = path
         self._is_bare = not (path / '.git').exists() and (path / 'HEAD').is_file()
         if not self._is_bare and not path.is_dir():
-            legal = 'a clone: a directory with the files, or a git directory'
+            legal = 'a clone of the repository: a directory with its files, or a git directory'
             raise MusculoskeletalError(f'{path}: expected {legal}')
 
     def names(self, pattern: str) -> list[str]:

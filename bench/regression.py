@@ -33,7 +33,7 @@ Predict = Callable[[Array], Array]
 
 
 class Scaling:
-    """Scales inputs as in the training samples, and leaves out constant ones."""
+    """Scales inputs to mean 0 and deviation 1 of the training; drops inputs constant in them."""
 
     def __init__(self, inputs: Array) -> None:
         """Compute mean and standard deviation of the training inputs (N, K)."""

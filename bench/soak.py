@@ -175,7 +175,7 @@ def main(argv: list[str]) -> int:
             print(
                 f'{now / 3600.0:5.1f} h  samples {len(learner.samples)} '
                 f'({learner.samples.accepted} accepted)  error {error:.4f} rad  '
-                f'largest/smallest {worst:.3f}  threshold {threshold:.0f}  '
+                f'largest/smallest error {worst:.3f}  threshold {threshold:.0f}  '
                 f'muscles relearned {reopened}  '
                 f'{memory(os.getpid()):.0f} MB  '
                 f'update {np.median(trainer.seconds[reported:]):.2f} s',

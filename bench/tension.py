@@ -64,8 +64,8 @@ class Excess(NamedTuple):
     """Measures of how far and how long tensions exceeded their limit."""
 
     highest: float  # highest tension, relative to tension.limit
-    longest: float  # longest uninterrupted time above ALLOWED times the limit [s]
-    allowed: float  # largest total time of a muscle above ALLOWED times the limit [s]
+    longest: float  # longest uninterrupted time of a tension above ALLOWED · T_limit [s]
+    allowed: float  # largest total time of a muscle above ALLOWED · T_limit [s]
     limit: float  # largest total time of a muscle above the limit [s]
 
 

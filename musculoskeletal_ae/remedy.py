@@ -94,7 +94,7 @@ class Step(Enum):
     FREE_DISK = 'free_disk', 'make the state directory writable, with free space'
     LEARN_AFRESH = (
         'learn_afresh',
-        'set the parameter fresh of the learner to true, because its samples are wrong',
+        'discard the wrong samples of the learner: set its parameter fresh to true',
         1,
     )
     RESET_EMULATOR = 'reset_emulator', 'call hardware_emulator/reset'

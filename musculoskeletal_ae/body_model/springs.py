@@ -17,8 +17,8 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 
-#: assume that the logarithm α of a spring's true stiffness, relative to the stated one, has this
-#: standard deviation
+#: assume this standard deviation of α, the logarithm of the ratio of a spring's true stiffness to
+#: the stated one
 STIFFNESS_SPREAD = 0.5
 #: assume that the angle at which a spring exerts no torque differs from that of the robot
 #: description by this standard deviation [rad]

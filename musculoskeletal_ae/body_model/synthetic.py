@@ -12,8 +12,8 @@ from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.equilibrium_states import equilibrium_states, has_followers
 from musculoskeletal_ae.robot.robot import Robot
 
-#: draw this share of the samples with tensions as in an arm that holds a posture: most near T_bias,
-#: or, without tension sensors, those that are assumed
+#: draw this share of the samples with tensions as in an arm that holds a posture, most of them near
+#: T_bias; without tension sensors, draw it with the assumed tensions instead
 HELD_SHARE = 0.5
 SEARCHED = 40  # search equilibria from this many random postures
 #: let postures exceed the joint limits by this share of the range, because friction or contact can

@@ -64,7 +64,7 @@ class Contacts(NamedTuple):
             reach = free if each.high > each.low else 'nowhere'
             touching = ', '.join(each.pairs)
             ending = '' if each.is_movable else '; it counts as not movable'
-            problem = f'joint {name} (range {whole}) is free of contact {reach}'
+            problem = f'joint {name} (range {whole}) can move without contact {reach}'
             remedy = 'hold the joint (leave it out of --joints), or exclude the contact in the file'
             lines.append(
                 f'warning: contacts: {problem}; elsewhere, these bodies touch in nearly every '

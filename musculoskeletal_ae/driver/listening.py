@@ -74,7 +74,7 @@ HOTTEST_AT_REST = 55.0
 SLOPES = 0.2, 2.2
 #: count a column of an arm at rest as misplaced only if another muscle fits better by this factor
 BETTER_AT_REST = 2.5
-MOVED = 0.04  # check sign and slope of l only if its range is larger than this [m]
+MOVED = 0.04  # check sign and scale of l only if it has varied by more than this [m]
 #: blame the joint sensors if correcting their angles leaves at most this fraction of the misfit;
 #: otherwise, blame the lengths
 JOINTS_BETTER = 0.8
@@ -416,7 +416,7 @@ class Listening:
             names = self._suspected_signs(theta, length, tension)
             if names and self._look_exchanged(lengths_verdict, theta):
                 # On a symmetric arm, the reversed sign of one joint sensor looks like several
-                # exchanges. One fault is more likely than several.
+                # exchanged muscles. One fault is more likely than several.
                 columns = chain.from_iterable(fault.muscles for fault in lengths_verdict.faults)
                 muscles = ', '.join(self._robot.muscles[m] for m in columns)
                 verdict.failed('joint sign or order', names=' or '.join(names), muscles=muscles)

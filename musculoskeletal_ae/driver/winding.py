@@ -538,15 +538,15 @@ class Winding(MotionTest):
     ) -> Generator[None, None, tuple[float, float] | None]:
         """Return the target [m] at which the tension of muscle m begins to rise.
 
-        The target moves slowly inwards and outwards, past the negative of the measured length,
-        where the tension would rise if a sign were wrong. The search ends at the first response. It
-        also ends if the length or the tension stays exactly constant, which shows that the sensor
-        is not read any more.
+        The target moves slowly inwards and outwards. Its range contains the negative of the
+        measured length, because the tension would rise there if a sign were wrong. The search ends
+        at the first response. It also ends if the length or the tension stays exactly constant,
+        which shows that the sensor is not read any more.
 
         Returns:
             The target and the length at that time [m], or None without a response. The target is
             corrected for the rise of T that was needed to notice the response, so that target and
-            length differ by the difference of their zeros.
+            length differ only because their zeros do.
         """
         home_length, far = (
             home.length[m],

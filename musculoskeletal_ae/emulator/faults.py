@@ -247,7 +247,7 @@ class Faults:
             for name in fault.quantities:
                 value, which = values[name], fault.which
                 size = np.full(len(which), fault.size)
-                if name == 'theta':  # the size is stated in the units of the joints
+                if name == 'theta':  # the size of such a fault is stated in the units of the joints
                     size = self._robot.units.to_theta(size, which)
                 if fault.kind == 'bias':
                     value[which] += size

@@ -105,7 +105,7 @@ class Modules(NamedTuple):
 
 
 class Command(NamedTuple):
-    """Commands to the modules, and faults of the modules, each of shape (M,)."""
+    """Commands to the muscle modules, and the faults to emulate, each of shape (M,)."""
 
     value: Array  # target lengths [m] or tensions [N]
     length_error: Array  # reading of the length sensor minus the true l [m]

@@ -49,7 +49,7 @@ TARGETS = 2  # let the arm approach this many targets without each muscle
 MOVING = 12.0  # let the arm explore for this time before a fault [s]
 #: wait at most this long after a fault for the end of the first verification [s]
 LATEST_VERDICT = 10
-AFTERWARDS = 6.0  # let the arm continue for this time after the wait for the first verification [s]
+AFTERWARDS = 6.0  # then let the arm continue its activity for this time [s]
 #: wait at most this long for the arm to reach a target [s]; this allows for slow winches, and for
 #: further approaches if the arm falls
 LONGEST_APPROACH = 60

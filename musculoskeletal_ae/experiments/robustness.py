@@ -218,7 +218,7 @@ def ablation(_: Study | None, rows: Rows) -> Plot:
     changes = dict(sorted(changes.items(), key=lambda item: float(np.mean(item[1]))))
     figure, (panel,) = plots.new_figure(8.0, 4.6)
     colours = [plots.AFTER] * len(changes)
-    title = 'Change of the error after learning if one group of effects is removed'
+    title = 'Change of the learned error if one group of effects is removed'
     xlabel = 'change of the mean error [mrad]; negative: the effects increase the error'
     plots.ranked_bars(panel, changes, colours, xlabel, title, digits=1)
     panel.axvline(0.0, color=plots.TRUE, lw=1.0)

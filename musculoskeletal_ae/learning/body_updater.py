@@ -44,7 +44,7 @@ REAL_SHARE = 0.1  # replace this share of the training samples by rest samples
 #: replace at most this share of the training samples by motion samples; fewer if there are few, and
 #: half of this share if there are MANY_MESSAGES of them
 MOVING_SHARE = 0.3
-USES = 3  # draw so many training samples that each is used this often on average in one update
+USES = 3  # use each drawn training sample this many times on average in one update
 LEAST_WEIGHT = 0.3  # train only with rest samples whose robust weight in the fit is at least this
 
 

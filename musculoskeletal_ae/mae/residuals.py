@@ -70,7 +70,10 @@ class AnomalyStatistics:
 
     @classmethod
     def of(cls, error: Array, calibrated: bool) -> AnomalyStatistics:
-        """Return the statistics of residuals of shape (N, 2M), N ≥ 2."""
+        """Return the statistics of residuals of shape (N, 2M), N ≥ 2.
+
+        `calibrated` says whether they were measured on the arm, and not on its model.
+        """
         mean = error.mean(axis=0)
         centred = error - mean
         covariance = centred.T @ centred / max(len(error) - 1, 1)

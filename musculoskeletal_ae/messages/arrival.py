@@ -52,8 +52,8 @@ STREAM_GAP = 1.5
 #: if a message was sent earlier than the message before by more than this [ns], assume another
 #: clock or a clock that was set back, not reordering
 REORDERING = 1_000_000_000
-#: let the minimum of r − s rise at this rate, because clocks drift by up to 1e-4, and NTP slews
-#: them by up to 5e-4
+#: let the smallest difference between time of reception and time of sending rise at this rate,
+#: because clocks drift by up to 1e-4, and NTP slews them by up to 5e-4
 DRIFT = 1e-3
 #: limit the reported delay to this [s]: a node that makes no progress for this time ends
 #: (`ros/hang_detection.py`)

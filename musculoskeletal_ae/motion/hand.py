@@ -49,7 +49,7 @@ DAMPING = 0.02
 
 
 class Hand:
-    """Converts poses and twists into trajectories, and remembers the last pose."""
+    """Converts commanded poses and twists of the hand into trajectories of the joints."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot

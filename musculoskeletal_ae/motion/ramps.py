@@ -110,7 +110,7 @@ class LengthRamps:
         return None if self.solution is None else self.solution.missing_torque
 
     def is_over_after(self, dt: float) -> bool:
-        """Return whether the duration of the last goal will be over dt [s] from now."""
+        """Return whether the time for approaching the last goal will have passed in dt [s]."""
         return self._remaining - dt <= 0.0 and not self._goals
 
     @property

@@ -182,7 +182,7 @@ class RobotDescription:
         """
         lines = [f'{joint} = {coupling}' for joint, coupling in self.couplings.items()]
         if self.actuation == POSITION:
-            lines.append(f'the muscle modules follow positions, at {shown(self.speed)} m/s at most')
+            lines.append(f'muscle modules: position-controlled, at {shown(self.speed)} m/s at most')
         if not self.tension_source.is_known:
             lines.append(f'tension_source is none: {NO_TENSION}')
         if (scale := self.tension_source.newton_per_ampere) is not None:

@@ -272,7 +272,11 @@ class Sources:
             )
 
     def look(self) -> None:
-        """Check the graph; resubscribe to latched topics whose messages were rejected."""
+        """Look for second publishers on the ROS graph.
+
+        Once a latched topic has no second publisher any more, subscribe to it again, because its
+        messages were rejected before.
+        """
         for topic in self._authorships:
             self._look(topic)
         for topic in sorted(self._to_renew):

@@ -188,7 +188,7 @@ def _scale(robot: Robot, key: Key, unit: str, header: str) -> float:
     except ValueError:
         raise TableError(
             f'column {header!r}: unknown unit {unit!r}; expected one of {", ".join(legal)}, or a '
-            f'number: --units {key.kind.value}=UNIT'
+            f'factor that converts it to SI units: --units {key.kind.value}=UNIT'
         ) from None
     if not np.isfinite(size) or size == 0.0:
         raise TableError(f'column {header!r}: the unit {unit!r} must be a number other than 0')

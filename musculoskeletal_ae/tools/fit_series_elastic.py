@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`fit_series_elastic`: fits L_e(l_abs, T) to the table of a one-muscle testbed."""
+"""`fit_series_elastic`: fits the elongation of a series elastic element to a testbed's table."""
 
 import math
 from argparse import Namespace

@@ -45,7 +45,7 @@ class Trace(NamedTuple):
 
 
 def curves(unit: str) -> tuple[Trace, ...]:
-    """Return the plots; `unit` is the unit of the estimation error."""
+    """Return the curves that the page draws; `unit` is the unit of the estimation error."""
     return (
         Trace(f'error of the estimate [{unit}]', (GREEN,), (0,)),
         Trace('A: mismatch between T and l', (BLUE,), (1,)),
