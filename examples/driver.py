@@ -34,7 +34,7 @@ from musculoskeletal_ae.ros.messages import array_message, joint_message
 RATE = 100.0  # rate at which sensors are read and motors commanded [Hz]
 TURN = 10.0  # time in which a hand moves the first joint to and fro, if `moved` [s]
 SPOOL = 0.01  # radius of the spools [m]
-SILENCE = 0.5  # time without a command after which tensions decrease to T_bias [s]
+SILENCE = 0.5  # after this time without a command, tensions decrease to T_bias, or motors stop [s]
 RELEASE = 100.0  # rate of this decrease [N/s]
 
 
@@ -55,7 +55,7 @@ class Bus:
         """Return spool angles [rad], T [N], temperatures [°C] and θ [rad].
 
         Positive spool angles wind in. They are 0 at θ = 0 without tension. If `tension_source` of
-        muscles.yaml is current, return the motor currents [A] in place of T.
+        muscles.yaml is current, return the motor currents [A] in place of T; if it is none, NaN.
         """
         now = time.monotonic()
         if self.moved:  # all motors hold T_bias while a hand moves the arm
@@ -75,7 +75,11 @@ class Bus:
         self.arm.command_tension(tension)
 
     def go_to(self, length: np.ndarray) -> None:
-        """Make every motor go to a length [m] (M,), and stay there; for `actuation: position`."""
+        """Make every motor go to a length [m] (M,), and stay there; for `actuation: position`.
+
+        Without tension sensors, limit the current in the motor drives so that no tension exceeds
+        `max` of muscles.yaml: nothing else does.
+        """
         self.arm.command_length(length)
 
 
@@ -88,6 +92,7 @@ class Driver(Node):
         self.bus = Bus(self.robot, self.declare_parameter('moved', False).value)
         # The last command: l_target [m], or T [N] if `by_tension`, and its time of arrival [s].
         self.target, self.by_tension, self.commanded_at = None, False, -SILENCE
+        self.stopped_at = None  # lengths at which motors with position control have stopped [m]
         self.setpoint = np.full(self.robot.muscle_count, self.robot.tension.bias)
         self.states = self.create_publisher(Float64MultiArray, 'muscle_states', 10)
         self.joints = self.create_publisher(JointState, 'joint_states', 10)
@@ -112,12 +117,21 @@ class Driver(Node):
         is_commanded = self.target is not None and time.monotonic() - self.commanded_at < SILENCE
         if not self.by_position:
             self.regulate(length, is_commanded)
-        elif is_commanded:  # without commands, the motors stay where they are
-            self.bus.go_to(self.target)
+        elif is_commanded:
+            self.stopped_at = None
+            self.bus.go_to(self.bounded(self.target, length, tension))
+        elif self.target is not None:  # the motors stay where they are
+            self.stopped_at = length if self.stopped_at is None else self.stopped_at
+            self.bus.go_to(self.bounded(self.stopped_at, length, tension))
         rows = np.stack([length, tension, temperature])
         self.states.publish(array_message(rows, 'quantity', 'muscle'))
         now = self.get_clock().now().to_msg()
         self.joints.publish(joint_message(self.robot.joints, theta, now))
+
+    def bounded(self, target: np.ndarray, length: np.ndarray, tension: np.ndarray) -> np.ndarray:
+        """Return target lengths [m] that wind in no further where the tension is above T_max."""
+        is_high = self.robot.tension_source.to_newtons(tension) > self.robot.tension.max
+        return np.where(is_high, np.maximum(target, length), target)
 
     def regulate(self, length: np.ndarray, is_commanded: bool) -> None:
         """Regulate the tensions that follow from lengths and command by muscle stiffness control.

@@ -62,9 +62,9 @@ LEAST_SPREAD = 1e-6
 #: leave out joints that a smaller share of the samples measures, and muscles whose lengths a
 #: smaller share of them contains
 MEASURED_SHARE = 0.5
-#: compute the predictive variance of each joint as if its standard deviation in the samples were at
-#: least this [rad], because samples of a joint that hardly moved do not show how it moves elsewhere
-LEAST_ANGLE_SPREAD = 0.05
+#: away from the samples, expect each joint to vary by at least this standard deviation [rad],
+#: because samples of a joint that hardly moved do not show how it moves elsewhere
+LEAST_ANGLE_SPREAD = 0.15
 #: expect the body's posture within this share of the joint ranges from their middle
 USUAL_SHARE = 0.3
 DIFFERENCE = 1e-4  # differentiate lengths with this step [rad]
@@ -129,8 +129,9 @@ class PostureRegression:
             product = size + np.exp(2.0 * logarithms[5]) * size_of_tensions
             prior = _kernel(np.zeros_like(product), product, logarithms)
             known = np.square(solve_triangular(root, across.T, lower=True)).sum(axis=0)
-            variance = np.maximum(prior - known, 0.0) + np.exp(2.0 * logarithms[1])
-            share = self.body_variance[d] / (self.body_variance[d] + least[d] ** 2 * variance)
+            unknown, noise = np.maximum(prior - known, 0.0), np.exp(2.0 * logarithms[1])
+            variance = least[d] ** 2 * unknown + self.angle_spread[d] ** 2 * noise
+            share = self.body_variance[d] / (self.body_variance[d] + variance)
             estimate = self.angle_mean[d] + self.angle_spread[d] * (across @ self.weights[d])
             result[:, d] += share * (estimate - result[:, d])
         return result

@@ -62,8 +62,9 @@ def synthetic_samples(
     variances of body and regression (`posture_regression`). From T and l, the network therefore
     estimates the weighted mean of both; from θ and T, it computes the lengths of the body.
 
-    A share NEAR_SHARE of θ_r lies near `postures`. Robots use a part of their joint ranges, and
-    there the network then approaches its target in fewer training steps.
+    A share NEAR_SHARE of θ_r, of those that are no equilibria, lies near `postures`. Robots use a
+    part of their joint ranges, and there the network then approaches its target in fewer training
+    steps.
 
     Args:
         body: The calibrated body.
@@ -79,7 +80,9 @@ def synthetic_samples(
     equilibria = count // 2 if has_followers(robot) else 0
     if equilibria:
         found = equilibrium_states(body.as_robot(), equilibria, rng, SEARCHED)
-        if found is not None:
+        if found is None:
+            equilibria = 0
+        else:
             theta[:equilibria], tension[:equilibria] = found
     if postures is not None:
         near = int(NEAR_SHARE * (count - equilibria))

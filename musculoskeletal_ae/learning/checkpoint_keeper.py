@@ -55,7 +55,7 @@ class CheckpointKeeper:
         self.mae: Mae | None = None
         self.checkpoint: bytes | None = None
         self.published = 0
-        self._newest: bytes | None = None  # `mae` as the content of a checkpoint
+        self._newest: bytes | None = None  # the newest candidate as the content of a checkpoint
         self._is_published = True  # whether `_newest` was published
         self.rejected, self.last_rejected = 0, ''
         self._saved: Mae | None = None  # the network of `checkpoint`

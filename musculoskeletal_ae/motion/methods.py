@@ -139,7 +139,8 @@ def proposed(
     """
     bias = robot.tension.bias
     exertion = Exertion(np.clip(tension, bias, limit), np.zeros(robot.joint_count))
-    stops = supporting_stops(robot, theta)
+    effort = torque - robot.kinematics.holding_torque(theta)
+    stops = supporting_stops(robot, theta, effort=effort)
     for _ in range(SOLVES):
         jacobian = mae.muscle_jacobian(theta, exertion.tension)
         exertion = least_tension(jacobian, torque, bias, limit, stops=stops)
@@ -218,6 +219,7 @@ def stiffness_command(
     limit: Array | float,
     near: Array | None = None,
     velocity: Array | float = 0.0,
+    effort: Array | float = 0.0,
 ) -> Solution:
     """Return the command whose joint stiffness is nearest to the desired one (method `stiffness`).
 
@@ -243,10 +245,11 @@ def stiffness_command(
         limit: Highest tension that may be planned [N], scalar or (M,).
         near: Tension of a nearby solution [N], (M,); the search then starts there and needs only
             one round. None if no such solution is known.
-        velocity: Velocity θ̇ of the joints [rad/s], (D,), which decides whether a joint stop
-            supports them.
+        velocity: Velocity θ̇ of the joints [rad/s], (D,).
+        effort: Torque beyond gravity and inertia, which `torque` contains [N·m], (D,). It decides
+            together with the velocity which joint stops support the joints.
     """
-    stops = supporting_stops(robot, theta, velocity)
+    stops = supporting_stops(robot, theta, velocity, effort)
     high = np.array(np.broadcast_to(limit, robot.muscle_count), dtype=float)
     jacobian = mae.muscle_jacobian(theta, np.minimum(robot.tension.bias + MARGINS[0], high))
     for margin in MARGINS:

@@ -178,11 +178,13 @@ class PathCost:
 
         Args:
             postures: Postures θ [rad], (N, D).
-            direction: Direction in which the joints move slowly, (D,); None if they rest.
+            direction: Direction in which the joints move slowly, (D,), of any length; None if they
+                rest.
         """
         robot, bias = self._robot, self._robot.tension.bias
         moved = np.zeros(robot.joint_count) if direction is None else direction
-        reserve = self._reserve * moved / max(float(np.linalg.norm(moved)), 1e-9)
+        moved = moved / max(float(np.linalg.norm(moved)), 1e-9)
+        reserve = self._reserve * moved
         tensions = np.broadcast_to(bias, (len(postures), robot.muscle_count))
         jacobians = self._mae.muscle_jacobian(postures, tensions)
         torques = []

@@ -73,7 +73,7 @@ class Stiffening:
             desired = settings.desired_stiffness(robot.units)
             near = None if solution is None else self._near
             solution = stiffness_command(
-                robot, mae, at.theta, torque, desired, limit, near, at.velocity
+                robot, mae, at.theta, torque, desired, limit, near, at.velocity, effort
             )
             self._near = solution.tension if near is None else near
             self.solution = solution
@@ -189,7 +189,7 @@ class TensionPlan:
             near = self._stiffening.step(mae, trajectory, time, self.effort, limit, dt)
         if actuation.knows_tension:
             limits = np.minimum(low, inputs.limit) / loss, inputs.limit / loss
-            stops = supporting_stops(robot, at.theta, at.velocity)
+            stops = supporting_stops(robot, at.theta, at.velocity, self.effort)
             supporting = torque + self._support * shift.torque
             tension, missing_torque = least_tension(jacobian, supporting, *limits, near, stops)
             if missing_torque.any():  # report only what is missing without the feedback

@@ -93,7 +93,11 @@ class TorqueControl(ActivityControl):
         torque = torque + self._feedback(smooth, velocity, target)
         jacobian = inputs.mae.muscle_jacobian(smooth, self._command)
         tension, self._missing_torque = least_tension(
-            jacobian, torque, robot.tension.bias, inputs.limit, stops=self._stops(smooth, target)
+            jacobian,
+            torque,
+            robot.tension.bias,
+            inputs.limit,
+            stops=self._stops(smooth, target, effort),
         )
         # Scale the changes of all tensions by the same factor. If the old and the new tensions hold
         # the arm, all tensions in between then hold it as well.
@@ -105,9 +109,9 @@ class TorqueControl(ActivityControl):
         self._command = self._command + change * share
         return Command(TENSION, self._command.copy())
 
-    def _stops(self, theta: Array, target: Array) -> Array | None:
+    def _stops(self, theta: Array, target: Array, effort: Array) -> Array | None:
         """Return the stops that support joints, (S, D): those at which θ and the target are."""
-        return supporting_stops(self._robot, np.stack([theta, target]))
+        return supporting_stops(self._robot, np.stack([theta, target]), effort=effort)
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
         """Return the torque [N·m], (D,), that pulls θ towards `target` and damps the velocity."""
@@ -149,7 +153,7 @@ class GravityCompensation(TorqueControl):
         """Present posture [rad], (D,): the target that another method holds after this one."""
         return self._theta
 
-    def _stops(self, theta: Array, target: Array) -> None:
+    def _stops(self, theta: Array, target: Array, effort: Array) -> None:
         """Return no stops: the muscles carry the arm, so that a hand can lead it off a stop."""
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:

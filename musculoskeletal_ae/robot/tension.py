@@ -13,8 +13,9 @@ programme chooses together with T:
 
     −Gᵀ T + f = τ,   0 ≤ f_j ≤ STOP_TORQUE at a lower stop,   −STOP_TORQUE ≤ f_j ≤ 0 at an upper one
 
-f_j is 0 for all other joints. As f costs next to nothing compared with tensions, a joint at its
-stop leans on it. The plan of a path and that of the tensions along it use these same stops.
+f_j is 0 for all other joints. A newton metre of f costs no more than a newton of tension, so a
+joint at its stop leans on it. The plan of a path and that of the tensions along it use these same
+stops.
 
 T_desired = 0 gives the least tension that holds τ; the control experiment reports it as the QP
 bound. `check_robot` uses T_desired = 0.3 T_limit, the tension of a well-tensed arm.
@@ -39,6 +40,8 @@ SOFT_WEIGHT = 1e-7
 #: nearer than this may come to rest at the stop instead
 AT_STOP = 0.02
 LEAVING = 1e-3  # no stop supports a joint that is to move away from it faster than this [rad/s]
+#: no stop supports a joint that is to push away from it with more than this torque [N·m]
+PUSHING = 1e-3
 STOP_TORQUE = 100.0  # let a stop support a joint with at most this torque [N·m]
 
 
@@ -46,7 +49,7 @@ class Exertion(NamedTuple):
     """Tensions, and the part of the required torque that they do not produce."""
 
     tension: Array  # tensions T [N], (M,)
-    missing_torque: Array  # τ + Gᵀ T, the part of τ that T does not produce [N·m], (D,)
+    missing_torque: Array  # part of τ that neither T nor the stops produce [N·m], (D,)
 
 
 class TensionProgramme:
@@ -190,22 +193,28 @@ def least_tension(
         return programme.compromise()
 
 
-def supporting_stops(robot: Robot, theta: Array, velocity: Array | float = 0.0) -> Array:
+def supporting_stops(
+    robot: Robot, theta: Array, velocity: Array | float = 0.0, effort: Array | float = 0.0
+) -> Array:
     """Return the stops that support joints at θ, as the rows of a Jacobian (S, D).
 
     A stop pushes its joint back with any torque, but does not pull it. It is therefore modelled as
     a muscle that turns its joint away from the limit, and whose tension is the torque. A joint that
-    is to move away from its stop needs its muscles for that.
+    is to move or push away from its stop needs its muscles for that.
 
     Args:
         robot: The robot.
         theta: Joint angles θ [rad], (D,) or (N, D). A stop supports a joint that is at the stop in
             all N postures, for example in the present one and in its target.
         velocity: Velocity θ̇ with which the joints are to move [rad/s], (D,).
+        effort: Torque that the joints are to exert beyond gravity and inertia [N·m], (D,).
     """
     postures = np.atleast_2d(theta)
-    is_low = (postures < robot.lower + AT_STOP).all(axis=0) & (velocity < LEAVING)
-    is_high = (postures > robot.upper - AT_STOP).all(axis=0) & (velocity > -LEAVING)
+    velocity, effort = np.asarray(velocity), np.asarray(effort)
+    is_low = (postures < robot.lower + AT_STOP).all(axis=0)
+    is_high = (postures > robot.upper - AT_STOP).all(axis=0)
+    is_low &= (velocity < LEAVING) & (effort < PUSHING)
+    is_high &= (velocity > -LEAVING) & (effort > -PUSHING)
     joints = np.eye(robot.joint_count)
     return np.concatenate([-joints[is_low], joints[is_high]])
 

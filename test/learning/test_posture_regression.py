@@ -92,6 +92,18 @@ def test_a_joint_that_hardly_moved_in_the_samples_is_left_to_the_body(arm26, sta
     assert np.abs(estimate[:, 0] - theta[:, 0]).max() < 0.02
 
 
+def test_a_joint_that_hardly_moved_is_left_to_a_body_that_is_inaccurate_too(arm26, stage):
+    observed, rng = stage.observations(20), np.random.default_rng(0)
+    theta = observed.theta.copy()
+    theta[:, 1] = -1.0 + 0.03 * rng.uniform(-1.0, 1.0, len(theta))
+    length = stage.body.lengths(theta, observed.tension, np.zeros_like(observed.tension))[0]
+    noisy = length + 0.006 * rng.standard_normal(length.shape)
+    body = fitted(arm26, replace(observed, theta=theta, length=noisy))
+    theta, tension, length = stage.states(300)
+    change = body.estimated(theta, tension, length)[:, 1] - theta[:, 1]
+    assert np.abs(change).max() < 0.06  # the body errs by about 0.045 rad
+
+
 def test_a_muscle_that_no_sample_contains_is_no_input_of_the_regression(arm26, stage):
     observed = stage.observations(20)
     known = np.tile(np.arange(6) != 2, (20, 1))
@@ -99,6 +111,16 @@ def test_a_muscle_that_no_sample_contains_is_no_input_of_the_regression(arm26, s
     assert body.regressions[0].muscles.tolist() == [0, 1, 3, 4, 5]
     theta, tension, length = stage.states(300)
     assert np.isfinite(body.estimated(theta, tension, with_slack(length))).all()
+
+
+def test_half_of_the_synthetic_postures_lie_near_those_of_real_samples(arm26, stage):
+    body = fitted(arm26, stage.observations(60))
+    near = np.array([[0.1, -1.0], [0.2, -0.8]])
+    for postures in (near, near[:1]):
+        data = synthetic_samples(body, np.zeros(6), 400, np.random.default_rng(0), postures)
+        theta = data.entered[:, :2] / scale_vector(2, 6)[:2]
+        is_near = np.linalg.norm(theta - near.mean(axis=0), axis=1) < 0.4
+        assert 0.5 <= is_near.mean() < 0.7
 
 
 def test_synthetic_samples_have_the_combined_estimate_as_target(arm26, stage):

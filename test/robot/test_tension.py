@@ -91,6 +91,17 @@ def test_a_stop_pushes_its_joint_back_and_does_not_pull_it(side):
         assert exertion.tension.shape == (robot.muscle_count,)
 
 
+@pytest.mark.parametrize('side', [-1.0, 1.0])
+def test_no_stop_supports_a_joint_that_is_to_push_or_move_away_from_it(side):
+    robot = Robot.load('arm26')
+    theta = 0.5 * (robot.lower + robot.upper) + [side * 0.5 * (robot.upper - robot.lower)[0], 0.0]
+    away, there = np.array([-side, 0.0]), np.array([side, 0.0])
+    for velocity, effort, count in [
+        (0.0, 0.0, 1), (away, 0.0, 0), (there, 0.0, 1), (0.0, away, 0), (0.0, there, 1)
+    ]:  # fmt: skip
+        assert len(supporting_stops(robot, theta, velocity, effort)) == count
+
+
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('bad', [np.nan, np.inf])
 def test_numbers_that_are_not_finite_are_refused(bad):
