@@ -326,7 +326,7 @@ def main(argv: list[str]) -> None:
             ),
             'simulation step, speed-up over a network in torch': (ratio[step], '≥', 6.0),
             f'{arms}, speed-up over a network in torch': (ratio[batch], '≥', 3.0),
-            'start of any node [CPU s]': (max(used.values()), '≤', 1.5),
+            'start of the slowest node [CPU s]': (max(used.values()), '≤', 1.5),
             'memory of estimator, controller or sim [MB]': (node, '≤', 100.0),
             'online update [s]': (update, '≤', 0.3),
             f'online update, {LARGE} [s]': (large_update, '≤', 2.0),

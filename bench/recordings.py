@@ -108,7 +108,7 @@ def observations(recording: Recording) -> dict[str, Any]:
         gains = {run.name: bend_gain(run, azimuths) for run in recording.runs}
         slopes = {run.name: effort_slope(run, azimuths) for run in recording.runs}
         first = gains[none.name]
-        shown['bend for the same lengths, over that at 0 g'] = {
+        shown['bend at the same lengths, as a multiple of that without payload'] = {
             name: round(gain / first, 3) for name, gain in gains.items()
         }
         shown['slope of the efforts over the commanded bend [1/m]'] = {
@@ -245,7 +245,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument('--draws', type=whole(1, 100), default=DRAWS, help=text)
     text = 'which inputs to use; by default all that the recording has'
     parser.add_argument('--inputs', choices=(LENGTHS, EFFORTS), help=text)
-    text = 'measure cases again that the output has'
+    text = 'also measure again the cases that the output already has'
     parser.add_argument('--again', action='store_true', help=text)
     parser.add_out('DIR', default=Path('doc/results/recordings'))
     args = parser.parse_args(argv)

@@ -41,7 +41,7 @@ _RECOVER = '`record --recover BAG` makes a finished copy for `ros2 bag`'
 class BagCheck:
     """Report on a recording: its contents, whether it is complete, and whether it fits a robot."""
 
-    lines: list[str] = field(default_factory=list)  # texts on the contents of the recording
+    lines: list[str] = field(default_factory=list)  # lines that describe the contents
     faults: list[str] = field(default_factory=list)  # why the recording is incomplete or unfit
 
     def __str__(self) -> str:

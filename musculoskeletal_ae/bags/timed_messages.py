@@ -112,9 +112,9 @@ class TimedMessages:
         longest = max(
             (self._bunched[name].longest for name in topics if name in self._bunched), default=0
         )
-        waiting: list[tuple[int, int, BagMessage]] = []  # heap, ordered by best time
+        waiting: list[tuple[int, int, BagMessage]] = []  # heap, ordered by corrected time
         for n, message in enumerate(self.bag.messages(topics, start, stop + longest)):
-            # All later messages of the bag have best times after `log_time - longest`.
+            # No later message of the bag has a corrected time before `log_time - longest`.
             while waiting and waiting[0][0] < message.log_time - longest:
                 yield heapq.heappop(waiting)[2]
             bunched = self._bunched.get(message.topic)

@@ -71,7 +71,7 @@ class BodyFit:
         return bool(np.median(np.abs(observed.length - length)[observed.known]) > LEAST_CHANGE)
 
     def start_anew(self) -> None:
-        """Start anew from the geometric model, because the network learned another arm."""
+        """Discard the fit, which was that of another arm; start from the geometric model."""
         self._prior_mean = None
         self.body = CalibratedBody(self.body.robot.with_elasticity(None))
 

@@ -438,7 +438,10 @@ def _constants(logarithms: Array) -> Array:
 
 
 def _parts(inputs: Array, crossed: Bools) -> list[Array]:
-    """Return squared distances of inputs by crossed joints, other joints and tensions, (N, N)."""
+    """Return squared distances between inputs, (N, N) each.
+
+    They are those of the crossed joints alone, of the other joints, and of the tensions.
+    """
     joints, of_tensions = inputs[:, : len(crossed)], inputs[:, len(crossed) :]
     parts = joints[:, crossed], joints[:, ~crossed], of_tensions
     return [squares(part, part) for part in parts]

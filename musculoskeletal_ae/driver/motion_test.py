@@ -59,7 +59,7 @@ class WrongOrderError(Exception):
     """Commands wind in other muscles than those whose readings they should change."""
 
     def __init__(self, winds: dict[int, int]) -> None:
-        """Store for each misplaced muscle which muscle its command winds in."""
+        """Store, for each muscle whose command winds in another one, which one that is."""
         super().__init__('wrong order')
         self.winds = winds
 

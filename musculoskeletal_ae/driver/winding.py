@@ -68,9 +68,10 @@ CLIP = 20.0, 0.05
 #: within this distance of −l [m]
 MIRROR_TOLERANCE = 0.008
 #: While the arm is held before the first test, demand at most HELD, and release all muscles above
-#: ALARM; both are fractions of the range from T_bias to the highest test tension. Healthy emulated
-#: arms that still swing reach 0.81. If K is large, T is noisy, and the limit of ALARM is raised by
-#: twice the excess of the tolerance of T over TENSION_TOLERANCE.
+#: ALARM; both are fractions of the range from T_bias to the highest test tension. ALARM is
+#: above 0.81, which healthy emulated arms reach while they still swing. A large K makes T noisy.
+#: Where the tolerance of T exceeds TENSION_TOLERANCE, the alarm tension is raised by twice the
+#: difference.
 HELD, ALARM = 0.5, 0.9
 #: treat T as oscillating, and release all muscles, if it crosses its mean more often than this in
 #: MEAN seconds

@@ -201,7 +201,7 @@ class PositionLaw(ModuleLaw):
                 `row` are then stored, as those from which later changes are measured.
         """
         stretch = self.stretch(row)
-        if is_reference:  # for a slack tendon, x_0 − L_e(T_0) is unknown and assumed to be 0
+        if is_reference:  # x_0 − L_e(T_0) is unknown for a slack tendon, and assumed to be 0 then
             is_slack = row.tension < slack_tension(self.bias)
             self._reference = 0.0 if is_slack else stretch - self._elongation(row.tension)
         wanted, low, high = stretch - self._reference, 0.0, HIGHEST_TENSION

@@ -80,7 +80,7 @@ class IsolatingLoop(ClosedLoop):
         return self.core.stream.body.isolated
 
     def estimate(self, read: ArmReadings, now: float) -> Array:
-        """Estimate θ [rad] (D,), and note the end of a verification and the error."""
+        """Estimate θ [rad] (D,); record the error, and each verification that has ended."""
         core, before = self.estimator, self.core.stream.body
         theta = super().estimate(read, now)
         if before.has_anomaly and not core.body.has_anomaly:

@@ -219,7 +219,7 @@ def ablation(_: Study | None, rows: Rows) -> Plot:
     figure, (panel,) = plots.new_figure(8.0, 4.6)
     colours = [plots.AFTER] * len(changes)
     title = 'Change of the learned error if one group of effects is removed'
-    xlabel = 'change of the mean error [mrad]; negative: the effects increase the error'
+    xlabel = 'mean error without the effects minus that with them [mrad]'
     plots.ranked_bars(panel, changes, colours, xlabel, title, digits=1)
     panel.axvline(0.0, color=plots.TRUE, lw=1.0)
     whole = float(np.mean([numbers[FOREIGN]['after_rad'] for numbers in known.values()]))

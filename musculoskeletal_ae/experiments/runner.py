@@ -168,7 +168,7 @@ def _value(study: Study, part: Part) -> Measured | None:
 def _result(study: Study, part: Part, failures: Mapping[Part, str]) -> Measured | str:
     """Return the result of a part from the folder of the study, or why there is none.
 
-    `failures` are the reasons of the parts that have failed.
+    `failures` says for each failed part why it has failed.
     """
     if part in failures:
         return failures[part]

@@ -301,7 +301,7 @@ class Situation:
         if not samples.isdecimal() or int(samples) >= int(needed):
             return ''
         why = 'nothing has been learned yet, so the error may rise'
-        return why if needed == '1' else f'{why}; learning begins with {needed} samples'
+        return why if needed == '1' else f'{why}; learning begins once there are {needed} samples'
 
     def unexplored(self) -> str:
         """Return a text if the arm does not explore although there is a learner, else ''.

@@ -40,7 +40,7 @@ BALANCED = 0.01
 #: treat the typical torque at a joint as at least this share of the largest typical torque at any
 #: joint
 LEAST_TORQUE = 1e-3
-SEARCHED = 200  # search equilibria from this many random postures
+SEARCHED = 200  # search for equilibria from this many random postures
 #: vary the tensions of a found equilibrium by this share (standard deviation) to get another one
 VARIATION = 0.1
 #: vary the torques by this share of the muscles' torques (standard deviation), as joint friction

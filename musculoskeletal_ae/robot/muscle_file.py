@@ -252,7 +252,7 @@ class MuscleFile(Strict, frozen=True):
             )
 
     def _check_actuation(self) -> None:
-        """Check that the file has no key that belongs to the other kind of muscle modules."""
+        """Check that the file has no key that only another `actuation` than its own uses."""
         is_position = self.actuation == 'position'
         if self.tension_source != 'sensor' and not is_position:
             raise ValueError(

@@ -108,10 +108,10 @@ class JointChannel:
 
     def reset(self) -> None:
         """Discard all readings, but remember whether the joint has a sensor."""
-        # Time of the last reading within the limits [s], this reading, the last usable reading
-        # [rad], and the time since which all readings have followed each other plausibly [s]; NaN
-        # before the first.
-        self._time = self._last = self._accepted = self._settling_since = math.nan
+        # All four are NaN before the first reading.
+        self._time = self._last = math.nan  # last reading within the limits: its time [s] and angle
+        self._accepted = math.nan  # last usable reading [rad]
+        self._settling_since = math.nan  # since when readings follow each other plausibly [s]
         self.series = _NONE
 
     def judge(self, time: float, value: float) -> JointReading:

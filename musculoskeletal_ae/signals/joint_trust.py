@@ -62,7 +62,7 @@ class JointTrust:
 
     @cached_property
     def is_used(self) -> Bools:
-        """Which joint sensors are used, (D,): not in doubt, and without impossible readings."""
+        """Which joint sensors are used, (D,): those whose trust is not in NOT_USED."""
         return np.array([each not in NOT_USED for each in self.trust], dtype=bool)
 
     @cached_property

@@ -74,7 +74,9 @@ def train(args: Namespace) -> None:
     model_folder = args.out.with_name(f'{args.out.stem}_model')
     for folder in (robot_folder, model_folder):
         if folder.exists():
-            raise MusculoskeletalError(f'{folder}: exists; remove it, or choose another --out')
+            raise MusculoskeletalError(
+                f'{folder} exists already; remove it, or choose another --out'
+            )
     train_on(args.device)
     robot = _imported(args, robot_folder)
     initial = train_on_model(robot, args)[0]

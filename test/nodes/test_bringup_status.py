@@ -65,7 +65,7 @@ def test_there_is_no_hint_with_a_network_that_has_learned():
 def test_the_hint_states_the_number_of_samples_required():
     situation = Situation('/left')
     situation.diagnosed(diagnostics('/left/learner', samples='3', samples_to_begin_with='20'))
-    assert 'learning begins with 20 samples' in situation.hint()
+    assert 'learning begins once there are 20 samples' in situation.hint()
     situation.diagnosed(diagnostics('/left/learner', samples='20', samples_to_begin_with='20'))
     assert situation.hint() == ''
 

@@ -75,7 +75,7 @@ def skeleton(robot: Robot, draw: Draw) -> tuple[Any, list[Any]]:
         problem = f'passive tendon {passive[0]!r} has no route'
         raise MusculoskeletalError(
             f'a MuJoCo model cannot be made from {robot.description.directory}: {problem}; use the '
-            'reality model.xml that import_robot wrote, or `kin`, and export with --into'
+            'model.xml that import_robot wrote as emulator model, or `kin`; export with --into'
         )
     model, names, links = kin.model, list(kin.model.names), draw.sizes.links
     spec.option.gravity = model.gravity.linear
@@ -157,7 +157,7 @@ def _add_springs(robot: Robot, springs: JointElasticity, spec: Any) -> None:
         if value <= 1e-9 * values[-1]:
             continue
         if vector @ springs.rest[coupled] < 0.0:
-            vector = -vector  # for MuJoCo, a spring length of −1 means that none is given
+            vector = -vector  # a rest length of −1 would mean to MuJoCo that none is given
         names = ', '.join(robot.joints[k] for k in coupled)
         tendon = spec.add_tendon(name=f'{SPRING} {len(spec.tendons)} of {names}')
         for k, share in zip(coupled, vector, strict=True):

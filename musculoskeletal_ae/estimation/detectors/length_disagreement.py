@@ -101,7 +101,7 @@ GAP_LEARNED = Largest(0.035, 0.016)
 #: Store a healthy message at this interval [s]. The stored messages show the usual difference
 #: between measured and computed lengths.
 HEALTHY_SPACING = 1.0
-HEALTHY_COUNT = 60  # keep at most this many healthy messages, from about a minute
+HEALTHY_COUNT = 60  # keep at most this many healthy messages; they span a minute
 ENOUGH = 5  # treat the usual difference as unknown with fewer healthy messages than this
 #: treat a message as healthy if no change Δ exceeds this multiple of its limit; the value is low,
 #: so that the usual difference does not follow a drift

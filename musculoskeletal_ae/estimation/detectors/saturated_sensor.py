@@ -39,8 +39,8 @@ VISITS = 2  # report a muscle once its reading has been clipped this often at th
 SAME = 2e-3  # treat two tension readings as the same value if they differ by less than this share
 #: record that a reading has been clipped again only after it has fallen by this share in between
 BELOW = 0.1
-#: forget a value, because the sensor does not saturate there, once the reading has been higher for
-#: this long [s]; a spike is shorter
+#: drop a suspected saturation value once readings have been higher for this long [s]; a spike is
+#: shorter
 BEYOND = 0.05
 #: Check a sensor only if more than this share of its readings, below the highest ones, differ from
 #: the reading before. Otherwise, a repeated reading is no sign of saturation.

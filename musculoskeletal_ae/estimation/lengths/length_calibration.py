@@ -89,8 +89,8 @@ class LengthCalibration:
         Args:
             robot: The nominal body.
             mae: The network; its isolated muscles are ignored.
-            posture: Positions of the joints at which the arm stands [rad or m], (D,); () if it
-                moves gently.
+            posture: Positions of the joints at which the arm stands still [rad or m], (D,); () if
+                it moves gently during the calibration.
 
         Raises:
             MusculoskeletalError: If there is no network, if the posture is not valid, or if no
