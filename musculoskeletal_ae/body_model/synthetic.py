@@ -19,9 +19,6 @@ SEARCHED = 40  # search equilibria from this many random postures
 #: let postures exceed the joint limits by this share of the range, because friction or contact can
 #: move a joint slightly beyond a limit
 MARGIN = 0.02
-#: draw this share of the postures near those of real samples: on straight lines through two of
-#: them, up to BEYOND times their distance outside, and with a deviation of SCATTER joint ranges
-NEAR_SHARE, BEYOND, SCATTER = 0.5, 0.3, 0.02
 
 
 class TrainingData(NamedTuple):
@@ -41,7 +38,6 @@ def synthetic_samples(
     noise: Array,
     count: int,
     rng: np.random.Generator,
-    postures: Array | None = None,
 ) -> TrainingData:
     """Draw random samples of a body with length noise and residual friction.
 
@@ -62,31 +58,21 @@ def synthetic_samples(
     variances of body and regression (`posture_regression`). From T and l, the network therefore
     estimates the weighted mean of both; from θ and T, it computes the lengths of the body.
 
-    A share NEAR_SHARE of θ_r, of those that are no equilibria, lies near `postures`. Robots use a
-    part of their joint ranges, and there the network then approaches its target in fewer training
-    steps.
-
     Args:
         body: The calibrated body.
         noise: σ of ε for each muscle [m], (M,).
         count: Number of samples.
         rng: The random generator.
-        postures: Postures of the real samples [rad], (N, D), or None.
     """
     robot = body.robot
     shape = count, robot.muscle_count
     theta = robot.random_postures(count, rng, MARGIN)
     tension = held_tensions(robot, count, rng)
-    equilibria = count // 2 if has_followers(robot) else 0
-    if equilibria:
+    if has_followers(robot):
+        equilibria = count // 2
         found = equilibrium_states(body.as_robot(), equilibria, rng, SEARCHED)
-        if found is None:
-            equilibria = 0
-        else:
+        if found is not None:
             theta[:equilibria], tension[:equilibria] = found
-    if postures is not None:
-        near = int(NEAR_SHARE * (count - equilibria))
-        theta[count - near :] = _near(robot, postures, near, rng)
     # Draw directions mostly near −1 and 1, where sliding leaves them most of the time.
     direction = np.sin(0.5 * np.pi * rng.uniform(-1.0, 1.0, shape))
     read = body.transmission.reading(tension, np.zeros(shape))
@@ -96,16 +82,6 @@ def synthetic_samples(
     estimate = body.estimated(theta, read, scattered)
     true, entered = State(estimate, tension, length), State(theta, tension, scattered)
     return TrainingData(entered.scaled(), true.scaled())
-
-
-def _near(robot: Robot, postures: Array, count: int, rng: np.random.Generator) -> Array:
-    """Draw random postures [rad] near given ones, (count, D)."""
-    one, other = postures[rng.integers(len(postures), size=(2, count))]
-    theta = one + rng.uniform(-BEYOND, 1.0 + BEYOND, (count, 1)) * (other - one)
-    span = robot.upper - robot.lower
-    theta += SCATTER * span * rng.standard_normal(theta.shape)
-    near: Array = np.clip(theta, robot.lower - MARGIN * span, robot.upper + MARGIN * span)
-    return near
 
 
 def held_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:

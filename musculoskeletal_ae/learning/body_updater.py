@@ -91,7 +91,7 @@ class BodyUpdater(Updater):
             self._trainer.restart()
         self._statistics_held = job.statistics_hold
         count = max(BATCH, job.steps * BATCH // USES)
-        data = synthetic_samples(self.body, fit.noise, count, self._rng, fit.theta)
+        data = synthetic_samples(self.body, fit.noise, count, self._rng)
         self._mix_in_real(data, replace(observed, theta=fit.theta), fit)
         if job.healthy.learned is not None:
             self._mix_in_moving(data, job.healthy.learned, fit.noise)

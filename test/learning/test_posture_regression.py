@@ -113,16 +113,6 @@ def test_a_muscle_that_no_sample_contains_is_no_input_of_the_regression(arm26, s
     assert np.isfinite(body.estimated(theta, tension, with_slack(length))).all()
 
 
-def test_half_of_the_synthetic_postures_lie_near_those_of_real_samples(arm26, stage):
-    body = fitted(arm26, stage.observations(60))
-    near = np.array([[0.1, -1.0], [0.2, -0.8]])
-    for postures in (near, near[:1]):
-        data = synthetic_samples(body, np.zeros(6), 400, np.random.default_rng(0), postures)
-        theta = data.entered[:, :2] / scale_vector(2, 6)[:2]
-        is_near = np.linalg.norm(theta - near.mean(axis=0), axis=1) < 0.4
-        assert 0.5 <= is_near.mean() < 0.7
-
-
 def test_synthetic_samples_have_the_combined_estimate_as_target(arm26, stage):
     observed = stage.observations(60)
     body = fitted(arm26, replace(observed, length=with_slack(observed.length)))
