@@ -56,6 +56,12 @@ def add_initial(parser: Parser) -> None:
     parser.add_argument('--initial', type=Path, metavar='FILE', help=text)
 
 
+def add_folder(parser: Parser, default: Path) -> None:
+    """Add `--folder`, which keeps the networks that individuals have learned."""
+    text = 'folder that keeps the learned networks'
+    parser.add_argument('--folder', type=Path, metavar='DIR', default=default, help=text)
+
+
 def initial_network(robot: Robot, file: Path | None) -> Mae:
     """Return the network that `--initial` names, or train that of the geometric model."""
     return initial_mae(robot) if file is None else checkpoint.load(file, robot)

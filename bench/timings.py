@@ -290,8 +290,8 @@ class TorchLengths:
         angles, tensions = torch.tensor(theta, requires_grad=True), torch.tensor(tension)
         values = torch.cat((angles, tensions, torch.zeros_like(tensions)), dim=1)
         mask = torch.zeros(len(theta), dtype=torch.long)
-        restored = self._network((values * self._scale).float(), mask) / self._scale
-        length = restored[:, -self._muscles :]
+        reconstructed = self._network((values * self._scale).float(), mask) / self._scale
+        length = reconstructed[:, -self._muscles :]
 
         def pullback(gradient: Array) -> Array:
             by_angles = torch.autograd.grad(length, angles, torch.tensor(gradient))[0]

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.learned_arm import initial, learned_arm
+from bench.learned_arm import add_folder, initial, learned_arm
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import Controller
@@ -228,13 +228,7 @@ def main(argv: list[str]) -> int:
     parser = Parser('wiring', 'Exchanges muscles, or reverses a sign, in a live driver.')
     parser.add_robot()
     parser.add_seeds((0, 1, 2, 3, 4))
-    parser.add_argument(
-        '--folder',
-        type=Path,
-        metavar='DIR',
-        default=Path('bench_wiring'),
-        help='folder that keeps the learned networks',
-    )
+    add_folder(parser, Path('bench_wiring'))
     parser.add_workers()
     args = parser.parse_args(argv)
     robot, outcomes = Robot.load(args.robot), Counter[str]()

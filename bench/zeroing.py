@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.learned_arm import initial, learned_arm
+from bench.learned_arm import add_folder, initial, learned_arm
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
@@ -167,13 +167,7 @@ def main(argv: list[str]) -> int:
     parser = Parser('zeroing', 'Tests length calibration after power-on.')
     parser.add_robot()
     parser.add_seeds((0, 1, 2, 3, 4))
-    parser.add_argument(
-        '--folder',
-        type=Path,
-        metavar='DIR',
-        default=Path('bench_zeroing'),
-        help='folder that keeps the learned networks',
-    )
+    add_folder(parser, Path('bench_zeroing'))
     parser.add_out('FILE', 'JSON file for the results', is_optional=True)
     parser.add_workers()
     args = parser.parse_args(argv)

@@ -17,8 +17,9 @@ for another reason, as slack tendons let them. The regression learns from the sa
     θ_est = θ_body + v_body / (v_body + v_regression(l, T)) (θ_regression(l, T) − θ_body)
 
 v_body is the mean squared error of the body at samples that are left out, and v_regression the
-predictive variance. If the body explains the lengths, v_body is a hundredth of v_regression, and
-the body decides. It also decides far from all samples, because v_regression is large there.
+predictive variance. Away from the samples, it counts on a joint to vary by at least
+LEAST_ANGLE_SPREAD. If the body explains the lengths, v_body is a hundredth of v_regression, and the
+body decides. It also decides far from all samples, because v_regression is large there.
 
 The network learns to estimate θ_est from synthetic samples (`synthetic`). From θ and T, however, it
 computes the lengths of the body, which the regression does not change.
@@ -118,10 +119,8 @@ class PostureRegression:
         """
         inputs = np.hstack([length[:, self.muscles], tension[:, self.muscles]])
         inputs, result = (inputs - self.mean) / self.scale, theta[:, self.joints]
-        pairs, (own, tensions) = (
-            Pairs.of(inputs, self.inputs),
-            np.split(np.square(inputs), 2, axis=1),
-        )
+        pairs = Pairs.of(inputs, self.inputs)
+        own, tensions = np.split(np.square(inputs), 2, axis=1)
         size, size_of_tensions = own.sum(axis=1), tensions.sum(axis=1)
         least = np.maximum(self.angle_spread, LEAST_ANGLE_SPREAD)
         for d, (logarithms, root) in enumerate(zip(self.logarithms, self.roots, strict=True)):
@@ -203,10 +202,11 @@ def _learned(
     angle_mean, angle_spread = theta.mean(axis=0), theta.std(axis=0)
     scaled, targets = (inputs - mean) / scale, (theta - angle_mean) / angle_spread
     pairs, noise, rows = Pairs.of(scaled, scaled), weight.max() / weight, judging(len(scaled))
-    judged = pairs if len(rows) == len(scaled) else Pairs.of(scaled[rows], scaled[rows])
+    judged = scaled[rows]
+    judged_pairs = Pairs.of(judged, judged)
     logarithms, roots, weights = list[Array](), list[Array](), list[Array]()
     for start, target in zip(starts, targets.T, strict=True):
-        evidence = _Evidence(judged, target[rows], noise[rows])
+        evidence = _Evidence(judged_pairs, target[rows], noise[rows])
         logarithms.append(_likeliest(evidence, start if len(scaled) >= FEW_SAMPLES else None))
         roots.append(cholesky(_covariance(pairs, noise, logarithms[-1]), lower=True))
         weights.append(cho_solve((roots[-1], True), target))

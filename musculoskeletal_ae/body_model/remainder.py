@@ -310,7 +310,7 @@ def _likeliest(
 
 
 def judging(count: int) -> Ints:
-    """Return the indices of the samples from which an evidence is computed, at most JUDGING."""
+    """Return the indices of the samples whose evidence decides on constants, at most JUDGING."""
     return np.linspace(0, count - 1, min(count, JUDGING)).astype(int)
 
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The supervisor: decides what the arm does, when it stops and when it may continue.
 
-The *activity* is what the arm does, or will do after a
-stop. The *stop state* determines whether the arm may do this. `TRANSITIONS` is the complete table
-of changes of the stop state; no other code changes it. Activity and stop state together give the
-mode that users see. In addition, the supervisor remembers whether an exploration was interrupted or
-refused, and the causes of the present stop.
+The *activity* is what the arm does, or will do after a stop. The *stop state* determines whether
+the arm may do this. `TRANSITIONS` is the complete table of changes of the stop state; no other code
+changes it. Activity and stop state together give the mode that users see. In addition, the
+supervisor remembers whether an exploration was interrupted or refused, and the causes of the
+present stop.
 """
 
 from __future__ import annotations

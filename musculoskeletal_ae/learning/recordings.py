@@ -9,7 +9,6 @@ represents the body that was fitted to all samples (`convergence`).
 """
 
 import math
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -254,7 +253,8 @@ def learn(
 def _decide(estimator: Estimator, mae: Mae, now: float) -> None:
     """Let the estimator decide on a network; without any, it uses even one that is rejected."""
     with suppress(CheckpointError):  # `rejected` is called
-        deque(estimator.networks.propose(mae, lambda: now), maxlen=0)
+        for _ in estimator.networks.propose(mae, lambda: now):
+            pass
     if estimator.mae is None:
         estimator.use(mae)
 

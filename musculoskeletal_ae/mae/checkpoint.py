@@ -146,7 +146,7 @@ class Metadata(Strict, frozen=True):
             depth = len(sizes) // 2
             for i, (into, out) in enumerate(pairwise(sizes)):
                 stack = 'encoder' if i < depth else 'decoder'
-                if i == depth:  # the decoder also reads its base's part of z
+                if i == depth:  # the decoder also reads the latent units of its base group
                     into = len(latents[g])
                 layer = g * depth + i % depth
                 shapes[f'{stack}.{layer}.weight'] = out, into

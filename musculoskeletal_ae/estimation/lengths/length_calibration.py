@@ -36,7 +36,7 @@ from musculoskeletal_ae.signals.wiring import WiringJudgement, judge
 ENOUGH_WITH_ANGLES = 20.0  # with joint sensors, require gentle motion for this long [s]
 ENOUGH = 38.0  # without joint sensors, require gentle motion for this long [s]
 STANDING = 1.0  # require the arm to stand still in a posture stated by the user for this long [s]
-#: begin the first fit after this time [s], and all fits of a standing arm at this interval
+#: begin the first fit after this time [s]; fit a standing arm anew each time it has passed again
 FIRST_FIT = 0.5
 FIT_INTERVAL = 2.0  # begin later fits of a moving arm at this interval [s]
 #: Do one piece of a fit, which takes 1 to 2 ms, for every PIECE_TIME [s] since the last message.

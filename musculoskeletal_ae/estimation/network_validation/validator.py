@@ -196,10 +196,7 @@ class CheckpointValidator:
         if self.mae is None or self.mae.covariance is None or not self.messages.are_enough:
             return ''
         in_use = self.mae.without(self.body.isolated)
-        mae = mae.without(self.body.isolated)
-        check = AgreementCheck(
-            self._robot, self.postures, self.messages, in_use, self.body.isolated
-        )
+        mae, check = mae.without(self.body.isolated), self._agreement_check(in_use)
         if (text := check.worse_angle(mae)) is not None:
             return text
         errors, before = self.message_errors(mae), self.message_errors(in_use)
@@ -288,11 +285,12 @@ class CheckpointValidator:
         """
         if self.mae is None:
             return []
-        in_use = self.mae.without(self.body.isolated)
-        check = AgreementCheck(
-            self._robot, self.postures, self.messages, in_use, self.body.isolated
-        )
-        return check.comparisons(mae)
+        return self._agreement_check(self.mae.without(self.body.isolated)).comparisons(mae)
+
+    def _agreement_check(self, in_use: Mae) -> AgreementCheck:
+        """Return the comparison of other networks with the one in use, without isolated muscles."""
+        isolated = self.body.isolated
+        return AgreementCheck(self._robot, self.postures, self.messages, in_use, isolated)
 
     def with_detector(self, mae: Mae, now: float) -> Mae:
         """Return a network with a calibrated anomaly detector, if one is available.
