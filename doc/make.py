@@ -11,6 +11,7 @@
   of conditions in `reference/diagnostics.md`
 - `images/elastic_unit.png`: the series elastic element; `images/muscles.png`: an arm
 - the charts of the results in `results/`
+- `config/nodes.yaml`: all parameters with their defaults
 """
 
 import ast
@@ -30,6 +31,7 @@ import pages
 from musculoskeletal_ae.experiments import plots, robustness, sensors
 from musculoskeletal_ae.experiments.results import individuals, read
 from musculoskeletal_ae.experiments.study import Measured
+from musculoskeletal_ae.nodes.declared_parameters import yaml_text
 from musculoskeletal_ae.robot.drawing import draw_arm
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -426,6 +428,7 @@ def draw_results() -> None:
 
 
 if __name__ == '__main__':
+    (FOLDER.parent / 'config' / 'nodes.yaml').write_text(yaml_text(), encoding='utf-8')
     for page, make in PAGES.items():
         (FOLDER / 'reference' / page).write_text(make(), encoding='utf-8')
     for document in DOCUMENTS:

@@ -16,7 +16,7 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import whole
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, MuscleReadings
 from musculoskeletal_ae.view import body
 from musculoskeletal_ae.view.body import MARKS, DrawnState
 from musculoskeletal_ae.view.controls import Controls, with_buttons
@@ -162,6 +162,7 @@ class Page:
     def _muscles(self, readings: MuscleReadings) -> list[dict[str, Any]]:
         """Return the template variables of each muscle's bar."""
         tension, temperature = readings.tension, readings.temperature
+        texts = [_texts(each.name, each.of(readings), each.unit) for each in QUANTITIES]
         columns = {
             'rgb': map(
                 tuple, body.colours(self._robot, np.nan_to_num(tension), self.scene.kinds).tolist()
@@ -171,6 +172,7 @@ class Page:
             'name': self._robot.muscles,
             'mark': [MARKS[kind] for kind in self.scene.kinds],
             'kind': [DrawnState(kind).name.lower() for kind in self.scene.kinds],
+            'readings': map(', '.join, zip(*texts, strict=True)),
             'pull': [whole(each, 'N') for each in tension],
             'warm': [whole(each, '°C') for each in temperature],
         }
@@ -220,3 +222,8 @@ class Page:
         """Send the requests for the values that visitors have finished entering; see `Controls`."""
         if self.controls is not None:
             self.controls.send_entries()
+
+
+def _texts(name: str, values: Array, unit: str) -> list[str]:
+    """Return a text for each value of a quantity; a value that is not measured is a dash."""
+    return [f'{name} –' if np.isnan(each) else f'{name} {each:.3g} {unit}' for each in values]

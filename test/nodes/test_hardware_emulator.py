@@ -15,7 +15,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.ros.messages import LATCHED, array_message
-from musculoskeletal_ae.signals.muscle_readings import read_muscle_states
+from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, read_muscle_states
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def drive(graph, command, condition, what):
 def test_the_emulator_publishes_the_topics_of_a_robot(arm, arm26):
     message = arm.next('muscle_states')
     assert [(d.label, d.size, d.stride) for d in message.layout.dim] == [
-        ('quantity', 3, 18),
+        ('quantity', len(QUANTITIES), 6 * len(QUANTITIES)),
         ('muscle', 6, 6),
     ]
     read = reading(arm, arm26)

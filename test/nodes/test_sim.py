@@ -21,7 +21,7 @@ from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.sim import SimNode
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros.messages import LATCHED, array_message
-from musculoskeletal_ae.signals.muscle_readings import read_muscle_states
+from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, read_muscle_states
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 
@@ -64,7 +64,7 @@ def held_command(mae, arm26):
 def test_the_simulator_rests_at_the_tension_bias_before_a_command(arm, arm26, core):
     message = arm.next('sim/muscle_states')
     assert [(d.label, d.size, d.stride) for d in message.layout.dim] == [
-        ('quantity', 3, 18),
+        ('quantity', len(QUANTITIES), 6 * len(QUANTITIES)),
         ('muscle', 6, 6),
     ]
     read = read_muscle_states(message, arm26)

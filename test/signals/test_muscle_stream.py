@@ -63,19 +63,19 @@ def test_a_sound_message_becomes_a_sample_with_the_length_offset_removed():
 
 @pytest.mark.parametrize('isolated', [(), (1,)])
 def test_an_optional_quantity_is_one_entry_of_the_table(monkeypatch, isolated):
-    voltage = Quantity('V', 'impossible voltage', lambda _: (5.0, 60.0), Presence.OPTIONAL)
-    monkeypatch.setattr(MuscleReadings, 'voltage', voltage, raising=False)
-    voltage.__set_name__(MuscleReadings, 'voltage')
-    monkeypatch.setattr(muscle_readings, 'QUANTITIES', (*QUANTITIES, voltage))
+    humidity = Quantity('%', 'impossible humidity', lambda _: (0.0, 100.0), Presence.OPTIONAL)
+    monkeypatch.setattr(MuscleReadings, 'humidity', humidity, raising=False)
+    humidity.__set_name__(MuscleReadings, 'humidity')
+    monkeypatch.setattr(muscle_readings, 'QUANTITIES', (*QUANTITIES, humidity))
     stream = MuscleStream(ROBOT, HEALTHY.with_isolated(isolated))
-    volts = np.full(M, 24.0)
-    read = reading(resting()).replace(voltage=volts)
+    percent = np.full(M, 24.0)
+    read = reading(resting()).replace(humidity=percent)
     sample = stream.take(message(read.rows), 0.0)
-    np.testing.assert_array_equal(sample.newest.voltage, volts)
+    np.testing.assert_array_equal(sample.newest.humidity, percent)
     for lacking in (resting(), reading(resting()).rows):
-        assert np.isnan(stream.take(message(lacking), 0.1).newest.voltage).all()
-    with pytest.raises(RejectionError, match=r'impossible voltage: .* 90 V, legal: 5 to 60 V'):
-        stream.take(message(read.replace(voltage=90.0).rows), 0.2)
+        assert np.isnan(stream.take(message(lacking), 0.1).newest.humidity).all()
+    with pytest.raises(RejectionError, match=r'impossible humidity: .* 190 %, legal: 0 to 100 %'):
+        stream.take(message(read.replace(humidity=190.0).rows), 0.2)
     with pytest.raises(RejectionError, match='wrong length'):
         stream.take(message(resting()[:2]), 0.3)
 
