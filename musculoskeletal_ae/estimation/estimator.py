@@ -320,14 +320,12 @@ class Estimator:
 
         Raises:
             MusculoskeletalError: If the readings of the suspect muscle still contradict the rest of
-                the arm (`repair_check`), or if length offsets were revoked and no joint sensors
-                confirm the lengths. The anomaly then stays.
+                the arm (`repair_check`), or if length offsets were revoked, which only a length
+                calibration ends. The anomaly then stays.
         """
         self._check_suspect(tuple(isolating))
         if self.body.offsets.revoked:
-            if not self.health.joints.agrees:
-                raise MusculoskeletalError(f'{self.cause}; {self.advice}')
-            self._note(Evidence.AGREES)
+            raise MusculoskeletalError(f'{self.cause}; {self.advice}')
         self.health.accept(range(self.robot.muscle_count))
         self.mounting.reset()
         self._clear(self.suspects.clear(self.body.isolated))
