@@ -326,7 +326,7 @@ class Estimator:
         self._check_suspect(tuple(isolating))
         if self.body.offsets.revoked:
             raise MusculoskeletalError(f'{self.cause}; {self.advice}')
-        self.health.accept(range(self.robot.muscle_count))
+        self.health.heat.accept(*range(self.robot.muscle_count))
         self.mounting.reset()
         self._clear(self.suspects.clear(self.body.isolated))
 
@@ -626,7 +626,7 @@ class Estimator:
             dt=dt,
         )
         if verdict is not None:
-            self.health.accept([muscle])
+            self.health.heat.accept(muscle)
             self._clear(self.suspects.conclude(verdict, self.body.isolated, now))
 
     def _clear(self, isolated: tuple[int, ...]) -> None:
