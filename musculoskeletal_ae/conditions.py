@@ -201,14 +201,6 @@ class ConditionKind(Enum):
         'messages come too slowly',
         (Step.CHECK_RATE,),
     )
-    ACCELEROMETERS_UNCLEAR = Declaration(
-        'accelerometers_unclear',
-        'learner',
-        'warn',
-        '`imu` has more publishers than there are links of which messages arrive',
-        'imu is not used, because it has more publishers than links',
-        (Step.CHECK_IMU,),
-    )
 
     # -- emulated arm ---------------------------------------------------------------------------
 

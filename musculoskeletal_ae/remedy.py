@@ -66,7 +66,6 @@ class Step(Enum):
     )
     CHECK_COOLING = 'check_cooling', 'check what heats the named motors, and their cooling'
     CHECK_TENDON = 'check_tendon', 'check tendon and length sensor of the named muscle'
-    CHECK_IMU = 'check_imu', 'check the publishers of imu and the link that each one names'
     CHECK_CHECKPOINT = 'check_checkpoint', 'check that the checkpoint belongs to this arm'
     CHECK_DRIVER = 'check_driver', 'check that the driver is running'
     CHECK_RATE = 'check_rate', 'check the rate at which the driver publishes'

@@ -39,7 +39,6 @@ PLACES = {
     Kind.SILENT_TOPIC: ['nodes/test_controller_stops.py: test_a_lost_driver_stops_the_arm',
                         'mishap: messages pause for 5 s'],
     Kind.SLOW_TOPIC: [f'{HERE}: test_a_topic_that_is_fast_enough_again'],
-    Kind.ACCELEROMETERS_UNCLEAR: ['nodes/test_sources.py: test_two_publishers_of_one_link'],
     Kind.EMULATION_DIVERGED: ['nodes/test_hardware_emulator.py: test_an_impossible_wrench'],
     Kind.MODULES_IN_SAFE_STATE: [f'{HERE}: test_modules_leave_their_safe_state'],
     Kind.EMULATED_FAULT: ['nodes/test_hardware_emulator.py: test_a_muscle_is_ruptured_and'],

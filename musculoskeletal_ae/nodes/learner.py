@@ -7,8 +7,7 @@ accepted_checkpoint and rejected_checkpoint are the estimator's answers.
 """
 
 import math
-import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 from diagnostic_msgs.msg import KeyValue
@@ -16,7 +15,6 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.trainer import TrainerProcess
@@ -29,9 +27,7 @@ from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.parameters import naming_parameter
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.ros.messages import LATCHED, SENSOR, bytes_message, serve
-from musculoskeletal_ae.ros.second_publishers import SEVERAL, LinkSensors, publishers_of
 
-IMU = 'imu'  # topic on which accelerometers publish
 MOST_DIGITS = 15  # reject a version of a network with more digits
 POLL_PERIOD = 0.05  # look at this interval whether the training process has finished an update [s]
 #: assume at least this period of muscle_states when pairing them with joint angles [s]
@@ -72,8 +68,7 @@ class LearnerNode(Shell):
         if value('joint_source') == 'sensor':  # the estimator does not judge a camera
             self.follow_joint_trust(core.use_joint_trust)
         self.links = [frame.name for frame in body_frames(self.robot.kinematics.model)]
-        self.accelerometers = LinkSensors()
-        self.listen(Imu, IMU, self._take_imu, SENSOR)
+        self.listen(Imu, 'imu', self._take_imu, SENSOR)
         self.needed.add('muscle_states')
         self.follow_body(lambda: core.use_body(self.body))
         self.follow_muscle_messages(self._take_muscle_states)
@@ -124,9 +119,6 @@ class LearnerNode(Shell):
     def _take_imu(self, message: Imu) -> None:
         prefix = self.parameter('frame_prefix')
         link, acceleration = read_imu(message, self.links, prefix)
-        self.accelerometers.take(link, time.monotonic())
-        if self.accelerometers.problem:
-            raise MessageError(SEVERAL, self.accelerometers.problem)
         self.core.imu(self.now(), link, acceleration)
 
     def _take_muscle_states(self, message: Float64MultiArray, _: float, delay: float) -> None:
@@ -171,17 +163,6 @@ class LearnerNode(Shell):
     def clock_jumped_back(self) -> None:
         """Discard messages that have not become part of a sample yet."""
         self.core.reset()
-
-    def on_intruders(self, _: str) -> None:
-        """Check, ten times a second, whether too many nodes publish `imu`."""
-        publishers = publishers_of(self, self.full_name(IMU))
-        self.accelerometers.look(publishers, time.monotonic())
-
-    def conditions(self) -> Iterable[Condition]:
-        """Yield the conditions of the core, and why accelerometers are not used."""
-        yield from super().conditions()
-        if problem := self.accelerometers.problem:
-            yield ConditionKind.ACCELEROMETERS_UNCLEAR.condition(problem, [IMU])
 
     def destroy_node(self) -> None:
         """End the training process, then destroy the node."""

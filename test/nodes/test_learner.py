@@ -442,17 +442,6 @@ def test_learning_works_without_joint_sensors_and_with_an_accelerometer(host, gr
             return reason in reported if reason else learner.tilted
 
         graph.wait(taken, f'the result of the message with frame {frame!r}')
-    second = graph.node.create_publisher(Imu, 'imu', 10)
-    message.header.frame_id = 'forearm'
-
-    def is_refused():
-        publisher.publish(message)
-        second.publish(message)
-        graph.spin(0.1)
-        return 'imu: several publishers' in learner.node.rejected
-
-    graph.wait(is_refused, 'the refusal of two sensors of one link')
-    assert 'imu is not used' in learner.node.report().message
 
 
 def test_a_second_learner_in_the_same_directory_is_refused(host, state):
