@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `learner`: it learns, validates, saves, resumes, and ends with its processes."""
 
+import errno
 import os
-import shutil
 import signal
 import time
 from dataclasses import replace
@@ -20,6 +20,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.learning import state as states
 from musculoskeletal_ae.learning.state import NETWORK, NEWEST
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae import checkpoint
@@ -450,7 +451,7 @@ def test_a_second_learner_in_the_same_directory_is_refused(host, state):
         host(state_directory=state)
 
 
-def test_a_deleted_state_directory_is_reported_at_once_and_nothing_is_lost(host, state, graph):
+def test_a_full_disk_is_reported_at_once_and_nothing_is_lost(host, state, graph, monkeypatch):
     graph.listen(DiagnosticArray, '/diagnostics', 100)
     learner = host(state_directory=state)
     learner.learn(lambda: learner.samples >= 2, 'samples')
@@ -459,18 +460,23 @@ def test_a_deleted_state_directory_is_reported_at_once_and_nothing_is_lost(host,
         statuses = (s for m in graph.received['/diagnostics'] for s in m.status)
         return [s.level for s in statuses if s.name.startswith(graph.namespace)]
 
-    shutil.rmtree(state)
-    before = len(levels())
-    graph.wait(lambda: DiagnosticStatus.ERROR in levels()[before:], 'the error')
-    # The loss of the directory causes a report at once, but a regular report may precede it.
-    assert levels()[before:].index(DiagnosticStatus.ERROR) <= 1
-    learner.learn(lambda: learner.samples >= 4, 'samples meanwhile')
+    def full(*_):
+        raise OSError(errno.ENOSPC, 'No space left on device')
 
-    def is_over():
+    def goes_on(condition):
         learner.arm.step()
-        return levels()[-1] != DiagnosticStatus.ERROR
+        return condition()
 
-    graph.wait(is_over, 'the end of the error')
+    with monkeypatch.context() as patch:
+        patch.setattr(states, 'write_whole', full)
+        count, before = learner.samples, len(levels())
+        learner.learn(lambda: learner.samples > count, 'samples meanwhile')
+        graph.wait(
+            lambda: goes_on(lambda: DiagnosticStatus.ERROR in levels()[before:]), 'the error'
+        )
+    graph.wait(
+        lambda: goes_on(lambda: levels()[-1] != DiagnosticStatus.ERROR), 'the end of the error'
+    )
     count = learner.samples
     graph.end(learner.node)
     assert len(host(state_directory=state).node.core.samples) == count
