@@ -93,7 +93,7 @@ class Step(Enum):
     FREE_DISK = 'free_disk', 'make the state directory writable, with free space'
     LEARN_AFRESH = (
         'learn_afresh',
-        'discard the wrong samples of the learner: set its parameter fresh to true',
+        'discard the wrong samples of the learner: set its parameter checkpoint again',
         1,
     )
     RESET_EMULATOR = 'reset_emulator', 'call hardware_emulator/reset'

@@ -105,7 +105,7 @@ PLACES = {
         'nodes/test_learner.py: test_a_killed_learner_resumes_from_its_saved_state'],
     Kind.STATE_NOT_SAVED: ['learning/test_remedies.py: test_the_state_is_saved_after_space'],
     Kind.SENSOR_OFFSET_IMPOSSIBLE: [
-        'nodes/test_learner.py: test_a_fresh_start_drops_the_saved_state',
+        'nodes/test_learner.py: test_a_checkpoint_set_at_run_time_replaces_the_saved_state',
         'learning/test_sensor_offsets.py: test_an_update_with_an_impossible_sensor_offset'],
     Kind.LENGTHS_NOT_LEARNED: [
         'learning/test_wrong_offsets.py: test_nothing_is_learned_after_a_jump_of_lengths_until'],

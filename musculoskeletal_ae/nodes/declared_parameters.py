@@ -140,14 +140,12 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {  # all parameters of all nodes, 
         ),
         'relearn_muscles': Parameter(
             ('',),
-            'replaced or re-tied muscles to relearn when this is set, or when learner/relearn is '
-            'called',
+            'replaced or re-tied muscles that learner/relearn relearns',
             settable=True,
         ),
         'fresh': Parameter(
             False,
             'start from `checkpoint` instead of the saved samples and network',
-            settable=True,
         ),
         'state_directory': STATE_DIRECTORY,
     },

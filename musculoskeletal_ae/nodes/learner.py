@@ -19,7 +19,6 @@ from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.trainer import TrainerProcess
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.arrival import SPACING
 from musculoskeletal_ae.messages.message_reading import read_imu
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, REJECTED
@@ -57,11 +56,11 @@ class LearnerNode(Shell):
         self.sources.watch('mae_checkpoint')
         core = self.core
         self._begin()
-        # These setters replace what was learned, which cannot be undone. The function in the third
-        # argument therefore checks each value before any parameter is set.
-        self.parameters.on_change('fresh', core.replace, self._afresh)
+        self.muscles_to_relearn: tuple[int, ...] = ()  # value of the parameter relearn_muscles
+        self.parameters.follow('relearn_muscles', self._on_relearn_muscles)
+        # `replace` replaces what was learned, which cannot be undone. Therefore `load_checkpoint`
+        # checks the value before any parameter of a request is set.
         self.parameters.on_change('checkpoint', core.replace, self.load_checkpoint)
-        self.parameters.on_change('relearn_muscles', core.relearn, self.robot.muscle_indices)
         if topic := JOINT_TOPICS.get(value('joint_source')):
             self.needed.add(topic)
             self.follow_posture(topic, lambda theta: core.joints(self.now(), theta), some=True)
@@ -86,9 +85,6 @@ class LearnerNode(Shell):
         """Continue from the saved state, or begin with the network that `checkpoint` names.
 
         With `fresh`, the saved state is first discarded; a backup of it is kept.
-
-        The names in `relearn_muscles` are checked, but no muscle is relearned at the start. A
-        parameter file that sets `relearn_muscles` would otherwise cause this at every start.
         """
         if self.parameter('fresh'):
             self.core.replace(None)
@@ -98,21 +94,9 @@ class LearnerNode(Shell):
                 mae = self.load_checkpoint(self.parameter('checkpoint'))
             if mae is not None:
                 self.core.begin(mae)
-        with naming_parameter('relearn_muscles'):
-            self.robot.muscle_indices(self.parameter('relearn_muscles'))
 
-    def _afresh(self, value: bool) -> Mae | None:
-        """Prepare a new value of the parameter `fresh`.
-
-        If it is true, return the network of the parameter `checkpoint`, from which learning starts
-        again. If it is false, return None: nothing is to be done.
-        """
-        if not value:
-            return None
-        path = self.parameter('checkpoint')
-        if not path:
-            raise MusculoskeletalError('no `checkpoint` to start from; set that parameter first')
-        return self.load_checkpoint(path)
+    def _on_relearn_muscles(self, names: tuple[str, ...]) -> None:
+        self.muscles_to_relearn = tuple(self.robot.muscle_indices(names))
 
     # -- messages -------------------------------------------------------------------------------
 
@@ -147,13 +131,13 @@ class LearnerNode(Shell):
         return 'learning' if request.data else 'stopped; samples and network are kept'
 
     def _relearn(self, _: Trigger.Request) -> str:
-        names = self.parameter('relearn_muscles')
-        if not names:
+        if not self.muscles_to_relearn:
             raise MusculoskeletalError(
                 '`relearn_muscles` names no muscle; set that parameter first'
             )
-        self.core.relearn(self.robot.muscle_indices(names))
-        return f'relearning: {", ".join(names)}; other muscles are unchanged'
+        self.core.relearn(self.muscles_to_relearn)
+        names = self.robot.names(self.muscles_to_relearn)
+        return f'relearning: {names}; other muscles are unchanged'
 
     def _poll(self) -> None:
         data = self.core.poll(self.now())

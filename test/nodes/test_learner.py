@@ -275,7 +275,9 @@ def test_a_checkpoint_set_at_run_time_replaces_the_saved_state_and_keeps_a_backu
     assert learner.samples == 0
     graph.wait(lambda: len(graph.received['mae_checkpoint']) > before, 'the new network')
     assert (Path(state) / 'backup-1.state').exists()
-    assert graph.set_parameter('learner', 'fresh', True) == (True, '')
+    learner.learn(lambda: learner.samples >= 1, 'a sample')
+    assert graph.set_parameter('learner', 'checkpoint', trained_file) == (True, '')
+    assert learner.samples == 0  # setting the same value again starts afresh as well
 
 
 def test_a_fresh_start_drops_the_saved_state_and_keeps_a_backup(host, state):
@@ -298,16 +300,10 @@ def test_relearning_forgets_the_named_muscles_and_refuses_unknown_ones(host, gra
     assert not nameless.success
     assert 'set that parameter first' in nameless.message
     assert graph.set_parameter('learner', 'relearn_muscles', [arm26.muscles[1]])[0]
-    assert not any(each.known[1] for each in learner.node.core.samples.stored)
-    # Setting the parameter forgets the muscle in all samples. The service does so again, for
-    # samples that have arrived since then.
-    samples = learner.samples
-    learner.learn(lambda: learner.samples > samples, 'a sample')
-    assert any(each.known[1] for each in learner.node.core.samples.stored)
+    assert all(each.known[1] for each in learner.node.core.samples.stored)
     assert graph.call(Trigger, 'learner/relearn').success
     assert not any(each.known[1] for each in learner.node.core.samples.stored)
     assert all(each.known[0] for each in learner.node.core.samples.stored)
-    # At a start, the parameter forgets nothing until the service is called.
     learner.end()
     learner = host(state_directory=state, relearn_muscles=[arm26.muscles[2]])
     assert all(each.known[2] for each in learner.node.core.samples.stored)
@@ -323,16 +319,13 @@ def test_parameters_refused_together_change_nothing(host, arm26, trained_file, s
         parameters = [Parameter(name, value=value) for name, value in values.items()]
         return learner.node.set_parameters_atomically(parameters)
 
-    assert together(relearn_muscles=[arm26.muscles[1]]).successful
     learner.learn(lambda: learner.samples >= 2, 'samples')
     refused = together(relearn_muscles=[first], checkpoint='/nowhere')
     assert not refused.successful and '/nowhere' in refused.reason
     assert not together(checkpoint=trained_file, relearn_muscles=['tail']).successful
-    assert not together(fresh=True, checkpoint='').successful
+    assert not together(checkpoint=trained_file, fresh=True).successful  # only at the start
     assert learner.samples >= 2 and all(each.known.all() for each in core.samples.stored)
-    # Three parameters that are set together restart the learner once, and make only one backup of
-    # the earlier state.
-    assert together(relearn_muscles=[first], fresh=True, checkpoint=trained_file).successful
+    assert together(relearn_muscles=[first], checkpoint=trained_file).successful
     assert learner.samples == 0
     assert [backup.name for backup in Path(state).glob('backup-*')] == ['backup-1.state']
     assert together(checkpoint='').successful
