@@ -652,13 +652,6 @@ class ConditionKind(Enum):
         'the arm is not at its target',
         (Step.CHECK_LOAD,),
     )
-    TENSION_ABOVE_LIMIT = Declaration(
-        'tension_above_limit',
-        'controller',
-        'warn',
-        'a tension reading is above 1.1 × tension.limit',
-        'tension readings above 1.1 × tension.limit',
-    )
     TENSION_LIMITED_BY_HEAT = Declaration(
         'tension_limited_by_heat',
         'controller',
