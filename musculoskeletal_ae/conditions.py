@@ -414,7 +414,7 @@ class ConditionKind(Enum):
     )
     LENGTH_OFFSETS_UNKNOWN = Declaration(
         'length_offsets_unknown',
-        'estimator, controller',
+        'estimator',
         'warn',
         'the length offsets of muscles are unknown or have been revoked',
         'length offsets unknown',
