@@ -11,7 +11,7 @@
 The body state consists of the length offsets, the isolated muscles and the anomaly. Only the
 estimator creates a new body state, whenever one of these three changes, and its node publishes it.
 `length_trust.py` decides which length offsets are known, on the evidence of the other parts. During
-a length calibration, only the detectors that do not need lengths report findings. `suspects.py`
+a length calibration, only the detectors that do not need lengths report findings. `isolation.py`
 describes the sequence from a rupture to resuming.
 """
 
@@ -33,6 +33,7 @@ from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.further_loss import needed_muscles
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
+from musculoskeletal_ae.estimation.isolation import SuspectHandling
 from musculoskeletal_ae.estimation.joint_sensor_check import JointSensorCheck
 from musculoskeletal_ae.estimation.lengths.length_calibration import LengthCalibration
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthTrust
@@ -42,7 +43,6 @@ from musculoskeletal_ae.estimation.mounting import MountingCheck
 from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.estimation.repair_check import LARGEST_LEARNED, LARGEST_YOUNG, RepairCheck
 from musculoskeletal_ae.estimation.suspect_verification import LONGEST
-from musculoskeletal_ae.estimation.suspects import SuspectHandling
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
