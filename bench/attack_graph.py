@@ -47,7 +47,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.faults import KINDS, read_fault
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.declared_parameters import PARAMETERS
-from musculoskeletal_ae.nodes.situation import Situation
+from musculoskeletal_ae.nodes.reported_conditions import Situation
 from musculoskeletal_ae.process_signals import STOP
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros.messages import LATCHED, bytes_message

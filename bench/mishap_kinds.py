@@ -30,7 +30,7 @@ Rng = np.random.Generator
 #: never count these as false: they describe what a node itself does in consequence of something
 #: else, or only quote a reading or an estimate beyond its limits
 SELF = frozenset({
-    'tension_above_limit', 'implausible_estimate',
+    'implausible_estimate',
     'anomaly_detected', 'not_exploring', 'calibrating', 'learning_waits', 'gentle_only',
     'length_offsets_unknown', 'trajectory_slowed', 'nothing_to_learn', 'muscle_needed',
 })  # fmt: skip
@@ -49,7 +49,7 @@ REVOKED = frozenset({
 FROZEN = FAULTY | {'sensor_frozen'}
 MISSING = FAULTY | {'values_missing', 'implausible_muscle_states', 'readings_rejected'}
 TENSION_SENSOR = FAULTY | NOT_FOLLOWING | {
-    'sensor_saturated', 'slack_tendon', 'tension_above_limit', 'overload',
+    'sensor_saturated', 'slack_tendon', 'overload',
 }  # fmt: skip
 JOINT = frozenset({
     'joint_sensors_doubted', 'joint_readings_impossible', 'joint_readings_missing',
@@ -66,7 +66,7 @@ HEAT = frozenset({
     'tension_limited_by_heat', 'overheated', 'thermal_drift', 'module_changed',
 })  # fmt: skip
 OFF_TARGET = frozenset({
-    'away_from_target', 'torque_missing', 'out_of_reach', 'tension_above_limit', 'overload',
+    'away_from_target', 'torque_missing', 'out_of_reach', 'overload',
 })  # fmt: skip
 #: true symptoms of a base that is mounted in another direction
 MOUNTED = OFF_TARGET | {'other_mounting'}

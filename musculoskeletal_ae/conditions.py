@@ -201,14 +201,6 @@ class ConditionKind(Enum):
         'messages come too slowly',
         (Step.CHECK_RATE,),
     )
-    ACCELEROMETERS_UNCLEAR = Declaration(
-        'accelerometers_unclear',
-        'learner',
-        'warn',
-        '`imu` has more publishers than there are links of which messages arrive',
-        'imu is not used, because it has more publishers than links',
-        (Step.CHECK_IMU,),
-    )
 
     # -- emulated arm ---------------------------------------------------------------------------
 
@@ -422,7 +414,7 @@ class ConditionKind(Enum):
     )
     LENGTH_OFFSETS_UNKNOWN = Declaration(
         'length_offsets_unknown',
-        'estimator, controller',
+        'estimator',
         'warn',
         'the length offsets of muscles are unknown or have been revoked',
         'length offsets unknown',
@@ -659,13 +651,6 @@ class ConditionKind(Enum):
         'estimate',
         'the arm is not at its target',
         (Step.CHECK_LOAD,),
-    )
-    TENSION_ABOVE_LIMIT = Declaration(
-        'tension_above_limit',
-        'controller',
-        'warn',
-        'a tension reading is above 1.1 × tension.limit',
-        'tension readings above 1.1 × tension.limit',
     )
     TENSION_LIMITED_BY_HEAT = Declaration(
         'tension_limited_by_heat',

@@ -66,7 +66,6 @@ class Step(Enum):
     )
     CHECK_COOLING = 'check_cooling', 'check what heats the named motors, and their cooling'
     CHECK_TENDON = 'check_tendon', 'check tendon and length sensor of the named muscle'
-    CHECK_IMU = 'check_imu', 'check the publishers of imu and the link that each one names'
     CHECK_CHECKPOINT = 'check_checkpoint', 'check that the checkpoint belongs to this arm'
     CHECK_DRIVER = 'check_driver', 'check that the driver is running'
     CHECK_RATE = 'check_rate', 'check the rate at which the driver publishes'
@@ -94,7 +93,7 @@ class Step(Enum):
     FREE_DISK = 'free_disk', 'make the state directory writable, with free space'
     LEARN_AFRESH = (
         'learn_afresh',
-        'discard the wrong samples of the learner: set its parameter fresh to true',
+        'discard the wrong samples of the learner: set its parameter checkpoint again',
         1,
     )
     RESET_EMULATOR = 'reset_emulator', 'call hardware_emulator/reset'

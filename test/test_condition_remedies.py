@@ -39,7 +39,6 @@ PLACES = {
     Kind.SILENT_TOPIC: ['nodes/test_controller_stops.py: test_a_lost_driver_stops_the_arm',
                         'mishap: messages pause for 5 s'],
     Kind.SLOW_TOPIC: [f'{HERE}: test_a_topic_that_is_fast_enough_again'],
-    Kind.ACCELEROMETERS_UNCLEAR: ['nodes/test_sources.py: test_two_publishers_of_one_link'],
     Kind.EMULATION_DIVERGED: ['nodes/test_hardware_emulator.py: test_an_impossible_wrench'],
     Kind.MODULES_IN_SAFE_STATE: [f'{HERE}: test_modules_leave_their_safe_state'],
     Kind.EMULATED_FAULT: ['nodes/test_hardware_emulator.py: test_a_muscle_is_ruptured_and'],
@@ -106,7 +105,7 @@ PLACES = {
         'nodes/test_learner.py: test_a_killed_learner_resumes_from_its_saved_state'],
     Kind.STATE_NOT_SAVED: ['learning/test_remedies.py: test_the_state_is_saved_after_space'],
     Kind.SENSOR_OFFSET_IMPOSSIBLE: [
-        'nodes/test_learner.py: test_a_fresh_start_drops_the_saved_state',
+        'nodes/test_learner.py: test_a_checkpoint_set_at_run_time_replaces_the_saved_state',
         'learning/test_sensor_offsets.py: test_an_update_with_an_impossible_sensor_offset'],
     Kind.LENGTHS_NOT_LEARNED: [
         'learning/test_wrong_offsets.py: test_nothing_is_learned_after_a_jump_of_lengths_until'],

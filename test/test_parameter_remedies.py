@@ -16,7 +16,7 @@ from musculoskeletal_ae.estimation.lengths.length_calibration import stated_thet
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.training import train_on
 from musculoskeletal_ae.mujoco_version import check_mujoco
-from musculoskeletal_ae.nodes.declared_parameters import MOVED, PARAMETERS, check_names
+from musculoskeletal_ae.nodes.declared_parameters import PARAMETERS, check_names
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
@@ -77,21 +77,6 @@ def test_a_name_that_no_node_has_is_accepted_as_the_refusal_corrects_it():
         'only (.*) has one of this name',
         [lambda match: match[1]],
     )
-
-
-@pytest.mark.parametrize('name', MOVED)
-def test_a_parameter_that_has_moved_is_named_where_it_is_now(name):
-    """The files of motors are followed in test/robot, and the lines in test/emulator."""
-    check_remedy(
-        check_name,
-        name,
-        'state it in (?:the parameter `(.*)`|motors.yaml in the robot directory)',
-        [lambda match: match[1] or 'robot'],
-    )
-
-
-def check_name(name):
-    check_names([name])
 
 
 @pytest.mark.parametrize('name', ['arm26', 'musashi_left_arm', 'narrow'])

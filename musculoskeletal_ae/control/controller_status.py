@@ -79,7 +79,7 @@ def _doing(core: Controller) -> str:
 
 def conditions(core: Controller, now: float) -> tuple[Condition, ...]:
     """Return all conditions that the controller reports; `now` is as in `report`."""
-    return (*_stop(core, now), *_exploration(core), *_target(core), *_limits(core))
+    return (*_stop(core, now), *_exploration(core), *_target(core), *_heat(core))
 
 
 def _stop(core: Controller, now: float) -> Iterator[Condition]:
@@ -145,10 +145,8 @@ def _target(core: Controller) -> Iterator[Condition]:
         yield kind.AWAY_FROM_TARGET.condition(text, [robot.joints[joint]])
 
 
-def _limits(core: Controller) -> Iterator[Condition]:
-    """Yield which tensions are too high, or limited by heat."""
-    if tense := core.watchdog.overload.tense:
-        yield ConditionKind.TENSION_ABOVE_LIMIT.condition(', '.join(tense))
+def _heat(core: Controller) -> Iterator[Condition]:
+    """Yield which tensions are limited by heat."""
     if hot := _limited_by_heat(core):
         limits = ', '.join(f'{name} at most {tension:.0f} N' for name, tension in hot.items())
         muscles = [core.robot.muscles.index(name) for name in hot]

@@ -127,25 +127,19 @@ class Overload:
         since = np.where(tension > self._level, earliest, math.inf)
         self._since = np.where(np.isfinite(tension), since, self._since)
 
-    @property
-    def tense(self) -> list[str]:
-        """Names of the muscles with too much tension, each with the level that is exceeded."""
-        each = zip(self._robot.muscles, self._level, self._since, strict=True)
-        return [f'{name} (above {level:.0f} N)' for name, level, at in each if at < math.inf]
-
     def conditions(self, now: float) -> list[Condition]:
         """Return the stop condition of an overload that has lasted longer than OVERLOAD_TIME.
 
         The list is empty if there is no such overload.
         """
-        m = int(self._since.argmin())
         age = min(now - self._received_at, LONGEST_STEP)
-        if self._sent_at + age - self._since[m] <= OVERLOAD_TIME:
+        tense = np.flatnonzero(self._sent_at + age - self._since > OVERLOAD_TIME)
+        if not tense.size:
             return []
-        level = f'{self._level[m]:.0f} N for {OVERLOAD_TIME:g} s'
-        muscle = self._robot.muscles[m]
-        detail = f'tension of {muscle} above {level}'
-        return [ConditionKind.OVERLOAD.condition(detail, [muscle])]
+        muscles = [self._robot.muscles[m] for m in tense]
+        levels = (f'{self._robot.muscles[m]} above {self._level[m]:.0f} N' for m in tense)
+        detail = f'tension of {" and ".join(levels)} for {OVERLOAD_TIME:g} s'
+        return [ConditionKind.OVERLOAD.condition(detail, muscles)]
 
 
 class HeatLimit:

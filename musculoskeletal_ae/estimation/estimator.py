@@ -11,7 +11,7 @@
 The body state consists of the length offsets, the isolated muscles and the anomaly. Only the
 estimator creates a new body state, whenever one of these three changes, and its node publishes it.
 `length_trust.py` decides which length offsets are known, on the evidence of the other parts. During
-a length calibration, only the detectors that do not need lengths report findings. `suspects.py`
+a length calibration, only the detectors that do not need lengths report findings. `isolation.py`
 describes the sequence from a rupture to resuming.
 """
 
@@ -33,6 +33,7 @@ from musculoskeletal_ae.estimation.finding import Finding, Observation
 from musculoskeletal_ae.estimation.further_loss import needed_muscles
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
+from musculoskeletal_ae.estimation.isolation import SuspectHandling
 from musculoskeletal_ae.estimation.joint_sensor_check import JointSensorCheck
 from musculoskeletal_ae.estimation.lengths.length_calibration import LengthCalibration
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthTrust
@@ -42,7 +43,6 @@ from musculoskeletal_ae.estimation.mounting import MountingCheck
 from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.estimation.repair_check import LARGEST_LEARNED, LARGEST_YOUNG, RepairCheck
 from musculoskeletal_ae.estimation.suspect_verification import LONGEST
-from musculoskeletal_ae.estimation.suspects import SuspectHandling
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
@@ -320,15 +320,13 @@ class Estimator:
 
         Raises:
             MusculoskeletalError: If the readings of the suspect muscle still contradict the rest of
-                the arm (`repair_check`), or if length offsets were revoked and no joint sensors
-                confirm the lengths. The anomaly then stays.
+                the arm (`repair_check`), or if length offsets were revoked, which only a length
+                calibration ends. The anomaly then stays.
         """
         self._check_suspect(tuple(isolating))
         if self.body.offsets.revoked:
-            if not self.health.joints.agrees:
-                raise MusculoskeletalError(f'{self.cause}; {self.advice}')
-            self._note(Evidence.AGREES)
-        self.health.accept(range(self.robot.muscle_count))
+            raise MusculoskeletalError(f'{self.cause}; {self.advice}')
+        self.health.heat.accept(*range(self.robot.muscle_count))
         self.mounting.reset()
         self._clear(self.suspects.clear(self.body.isolated))
 
@@ -628,7 +626,7 @@ class Estimator:
             dt=dt,
         )
         if verdict is not None:
-            self.health.accept([muscle])
+            self.health.heat.accept(muscle)
             self._clear(self.suspects.conclude(verdict, self.body.isolated, now))
 
     def _clear(self, isolated: tuple[int, ...]) -> None:

@@ -3,17 +3,12 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable
 from dataclasses import dataclass
-
-import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.conditions import ConditionKind, Revokes
-from musculoskeletal_ae.estimation.estimate import Estimate, estimate
+from musculoskeletal_ae.estimation.estimate import Estimate
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
@@ -82,46 +77,6 @@ class Observation:
     command: Array | None = None
 
 
-def observe(
-    mae: Mae,
-    length: Array,
-    motor_tension: Array,
-    bone_tension: Array,
-    dt: float,
-    demand: Array | None = None,
-    state: State | None = None,
-    command: Array | None = None,
-) -> Observation:
-    """Return the observation of recorded readings, whose temperatures are unknown.
-
-    Args:
-        mae: The network; its isolated muscles are ignored.
-        length: Muscle lengths, with the length offsets removed [m], (M,).
-        motor_tension: Motor-side tensions [N], (M,).
-        bone_tension: Bone-side tensions [N], (M,).
-        dt: Time since the previous message [s].
-        demand: Tensions demanded of the modules [N], (M,), or None if they are unknown.
-        state: The state that the network reconstructs from the readings; None to compute it here.
-        command: Target lengths of the modules [m], (M,), or None without a length command.
-    """
-    unknown, usable = np.full(len(length), np.nan), np.ones(len(length), dtype=bool)
-    usable[list(mae.isolated)] = False
-    sample = MuscleSample(
-        time=math.nan,
-        length=length,
-        length_read=length,
-        tension_read=motor_tension,
-        motor_tension=motor_tension,
-        bone_tension=bone_tension,
-        sliding=unknown,
-        temperature=unknown,
-        usable=usable,
-        newest=MuscleReadings(length=length, tension=motor_tension),
-    )
-    estimated = estimate(mae, bone_tension, length, state)
-    return Observation(sample, estimated, demand, dt, command=command)
-
-
 class Detector:
     """Base class of the detectors, each of which looks for one sign of a fault.
 
@@ -134,9 +89,6 @@ class Detector:
 
     def reset(self) -> None:
         """Reset the detector, for example after a jump of the clock or a reset by the user."""
-
-    def accept(self, muscles: Iterable[int]) -> None:
-        """Consider these muscles (indices) healthy in their present state."""
 
     def read(
         self,

@@ -5,8 +5,6 @@ A new detector is one file in `estimation/detectors/` and one entry in the list 
 The estimator, offline learning (`train --from-bag`) and the experiments use the same list.
 """
 
-from collections.abc import Iterable
-
 from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.estimation.detectors.frozen_sensor import FrozenSensor
 from musculoskeletal_ae.estimation.detectors.length_disagreement import LengthDisagreement
@@ -66,12 +64,6 @@ class HealthMonitor:
         """Reset all detectors, for example after a jump of the clock or a reset by the user."""
         for detector in self._detectors:
             detector.reset()
-
-    def accept(self, muscles: Iterable[int]) -> None:
-        """Consider these muscles (indices) healthy in their present state."""
-        muscles = tuple(muscles)
-        for detector in self._detectors:
-            detector.accept(muscles)
 
     def read(self, readings: MuscleReadings, usable: Bools, now: float) -> Finding | None:
         """Check the raw readings of a message, even of a rejected one; return the first finding.

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rupture or switch off each muscle in turn, run the detector, and count its alarms."""
 
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -8,7 +9,8 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.emulator.modules import Arm
-from musculoskeletal_ae.estimation.finding import observe
+from musculoskeletal_ae.estimation.estimate import estimate
+from musculoskeletal_ae.estimation.finding import Observation
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.experiments.recording import (
     SAMPLE_TIME,
@@ -20,6 +22,8 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
+from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 PAYLOAD = 3.6  # let the arm grasp this mass, that of the paper's dumbbell (§IV-B) [kg]
 GRASPING = 60.0  # grasp or release the payload at this interval [s]
@@ -151,6 +155,46 @@ class DetectorOutput(NamedTuple):
     distance: Array  # distance d [healthy standard deviations], (N,)
     suspect: Ints  # index of the most suspect muscle, (N,)
     alarm: Bools  # whether the message completes a detection, (N,)
+
+
+def observe(
+    mae: Mae,
+    length: Array,
+    motor_tension: Array,
+    bone_tension: Array,
+    dt: float,
+    demand: Array | None = None,
+    state: State | None = None,
+    command: Array | None = None,
+) -> Observation:
+    """Return the observation of recorded readings, whose temperatures are unknown.
+
+    Args:
+        mae: The network; its isolated muscles are ignored.
+        length: Muscle lengths, with the length offsets removed [m], (M,).
+        motor_tension: Motor-side tensions [N], (M,).
+        bone_tension: Bone-side tensions [N], (M,).
+        dt: Time since the previous message [s].
+        demand: Tensions demanded of the modules [N], (M,), or None if they are unknown.
+        state: The state that the network reconstructs from the readings; None to compute it here.
+        command: Target lengths of the modules [m], (M,), or None without a length command.
+    """
+    unknown, usable = np.full(len(length), np.nan), np.ones(len(length), dtype=bool)
+    usable[list(mae.isolated)] = False
+    sample = MuscleSample(
+        time=math.nan,
+        length=length,
+        length_read=length,
+        tension_read=motor_tension,
+        motor_tension=motor_tension,
+        bone_tension=bone_tension,
+        sliding=unknown,
+        temperature=unknown,
+        usable=usable,
+        newest=MuscleReadings(length=length, tension=motor_tension),
+    )
+    estimated = estimate(mae, bone_tension, length, state)
+    return Observation(sample, estimated, demand, dt, command=command)
 
 
 def run_detector(

@@ -23,7 +23,7 @@ from typing import NamedTuple
 from uuid import uuid4
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.experiments import NAMES, kept, online_learning
+from musculoskeletal_ae.experiments import NAMES, online_learning, saved_results
 from musculoskeletal_ae.experiments.study import Measured, Study, round_numbers
 from musculoskeletal_ae.experiments.workers import WorkerKilledError, Workers
 from musculoskeletal_ae.presets.registry import PRESETS
@@ -174,10 +174,10 @@ def _result(study: Study, part: Part, failures: Mapping[Part, str]) -> Measured 
         return failures[part]
     file = _result_file(study, part)
     try:
-        result = kept.read(file)
+        result = saved_results.read(file)
         numbers, traces = (getattr(result, key, None) for key in Measured._fields)
         if not isinstance(numbers, dict) or not isinstance(traces, dict):
-            raise kept.unusable(file, 'expected numbers and traces')
+            raise saved_results.unusable(file, 'expected numbers and traces')
     except MusculoskeletalError as error:
         return _failed(part, error).failure
     return Measured(numbers, traces)

@@ -19,7 +19,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.experiments import kept
+from musculoskeletal_ae.experiments import saved_results
 from musculoskeletal_ae.experiments.recording import Recording
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
@@ -48,12 +48,13 @@ class Study:
     def remember(self, part: str, measure: Callable[[], Any]) -> Any:
         """Return the saved result of a part of the run; measure and save it first if needed.
 
-        The result is read from the file in both cases (`kept`), so a continued run cannot differ.
+        The result is read from the file (`saved_results`) in both cases, so a continued run cannot
+        differ.
         """
         file = self.folder / f'{part}.npz'
         if not file.is_file():
-            kept.write(file, measure())
-        return kept.read(file)
+            saved_results.write(file, measure())
+        return saved_results.read(file)
 
     @property
     def presets(self) -> tuple[str, ...]:
@@ -102,7 +103,7 @@ class Study:
     def save(self, seed: int, **arrays: Recording | State) -> None:
         """Save an individual's streams `exploring` and `held_out`, or the learner's `rests`."""
         for name, values in arrays.items():
-            kept.write(self._stream_file(seed, name), values)
+            saved_results.write(self._stream_file(seed, name), values)
 
     def stream(self, seed: int, name: str) -> Recording:
         """Load a saved stream of an individual: `exploring` or `held_out`."""
@@ -117,9 +118,11 @@ class Study:
 
     def _load(self, seed: int, name: str, fields: Sequence[str]) -> dict[str, Array]:
         file = self._stream_file(seed, name)
-        arrays = getattr(kept.read(file), '__dict__', {})
+        arrays = getattr(saved_results.read(file), '__dict__', {})
         if set(arrays) != set(fields):
-            raise kept.unusable(file, f'expected arrays with the names {", ".join(fields)}')
+            raise saved_results.unusable(
+                file, f'expected arrays with the names {", ".join(fields)}'
+            )
         return arrays
 
     def with_prefix(self, preset: str, numbers: Mapping[str, Any]) -> dict[str, Any]:
@@ -141,8 +144,8 @@ class Measured(NamedTuple):
 
     #: contents of result.json: nested dictionaries of finite numbers, text, lists or None
     numbers: dict[str, Any]
-    #: data of the plots, as `kept.read` returns them from a file: named tuples have become objects
-    #: with the same attributes, and tuples have become lists
+    #: data of the plots, as `saved_results.read` returns them from a file: named tuples have become
+    #: objects with the same attributes, and tuples have become lists
     traces: dict[str, Any]
 
 

@@ -170,10 +170,7 @@ class CheckpointKeeper:
         return None if self._state is None else self._state.load(self._samples)
 
     def store(self, changed: bool = True) -> None:
-        """Store samples and network on disk if they have `changed`.
-
-        If they have not, check that the files still exist. In both cases, a failed save is retried.
-        """
+        """Store samples and network on disk if they have `changed`; retry a failed save."""
         if self._state is not None:
             self._state.keep(self._samples, self.checkpoint, changed)
 

@@ -4,7 +4,7 @@
     l, T ─► plausible (`signals.muscle_stream`) ─┐
     θ ─► plausible and trusted (`joint_stream`) ─┤
     gravity ─────────────────────────────────────┴► paired by time (`pairing`)
-         ─► at rest (`rest`) ─► no anomaly near (`margin`) ─► new (`samples`)
+         ─► at rest (`rest`) ─► no anomaly near (`anomaly_margin`) ─► new (`samples`)
 
 Values of isolated muscles are replaced by 0 before messages are paired. A sample names the muscles
 that were isolated when it was taken.
@@ -181,8 +181,8 @@ class SampleCollector:
     def collect(self, paired: Paired[MuscleSample], now: float = math.nan) -> list[Sample]:
         """Use a message and its θ to detect rests; return the samples that were stored.
 
-        A message is used only after `margin` has held it back for some time. Messages during an
-        anomaly and shortly after it are ignored.
+        A message is used only after `anomaly_margin` has held it back for some time. Messages
+        during an anomaly and shortly after it are ignored.
 
         Args:
             paired: The message and its θ.

@@ -3,10 +3,10 @@
 
 A rest sample is the mean of θ, T and l over the messages of a rest: a time in which the arm does
 not move (`rest`), the length offsets are known, and no anomaly is detected shortly before or after
-(`margin`). Only new samples are kept (`collector`). A sample is new when θ or T differs from every
-stored one by more than a threshold (paper, §III-C). When the store is full, it drops the older of
-the two samples that are nearest to each other. The remaining samples then cover all postures and
-tensions so far, and the newest sample always stays.
+(`anomaly_margin`). Only new samples are kept (`collector`). A sample is new when θ or T differs
+from every stored one by more than a threshold (paper, §III-C). When the store is full, it drops the
+older of the two samples that are nearest to each other. The remaining samples then cover all
+postures and tensions so far, and the newest sample always stays.
 """
 
 from __future__ import annotations

@@ -29,7 +29,6 @@ NEWEST, PREVIOUS, LOCK = 'learner.state', 'previous.state', 'lock'  # files in t
 NETWORK = 'network.safetensors'  # file of the network of the last explicit save
 #: refuse a larger state file [bytes]; the states of the shipped arms are 100 times smaller
 LARGEST = 1 << 26
-CHECK_INTERVAL = 0.5  # check at this interval that the files still exist [s]
 RETRY_INTERVAL = 2.0  # after a failed save, try again after this time [s]
 
 
@@ -61,9 +60,8 @@ class StateStore:
         self._previous = self.directory / PREVIOUS
         self._lock: TextIO | None = None
         self._saved_samples: list[Sample] = []  # samples that are on disk
-        self._is_saved = False  # whether `_newest` should exist
         self._problem = ''  # why the last save failed
-        self._next_attempt = 0.0
+        self._next_attempt = 0.0  # do not retry a failed save before this time [s]
         try:
             self._open()
         except BlockingIOError as error:
@@ -148,18 +146,17 @@ class StateStore:
     def keep(self, samples: SampleStore, network: bytes | None, changed: bool = True) -> None:
         """Keep the state on disk: save it if it has `changed`, and retry a failed save (`trouble`).
 
-        Call this method often. If the state has not changed, the method only checks from time to
-        time that the files still exist.
+        Call this method often, because a failed save is retried by a later call.
         """
         now = time.monotonic()
-        if now < self._next_attempt and (self._problem or not changed):
+        if now < self._next_attempt or not (changed or self._problem):
             return
         try:
-            self._check_in_place()
-            if changed or self._problem:
-                self._save(samples, network)
+            if not self._is_in_place():
+                self.close()
+                self._open()
+            self._save(samples, network)
             self._problem = ''
-            self._next_attempt = now + CHECK_INTERVAL
         except OSError as error:
             self._problem = str(error)
             self._next_attempt = now + RETRY_INTERVAL
@@ -217,24 +214,20 @@ class StateStore:
         if reason:
             self._note_backup(reason, backup)
 
-    def _check_in_place(self) -> None:
-        """Check that the state is in place, or raise an OSError; open a closed directory."""
+    def _is_in_place(self) -> bool:
+        """Return whether the directory is open, and has not been deleted or replaced since then."""
         if self._lock is None:
-            self._open()
-            return
+            return False
         try:
             in_directory = (self.directory / LOCK).stat()
-            is_lock_there = os.path.samestat(os.fstat(self._lock.fileno()), in_directory)
         except FileNotFoundError:
-            is_lock_there = False
-        if not is_lock_there or (self._is_saved and not self._newest.exists()):
-            self.close()
-            raise FileNotFoundError(f'{self._newest} was removed')
+            return False
+        return os.path.samestat(os.fstat(self._lock.fileno()), in_directory)
 
     def _save(self, samples: SampleStore, network: bytes | None) -> None:
         state = saved_state.collect(self._robot, samples, network)
         write_whole(self._newest, saved_state.to_bytes(state), self._previous)
-        self._saved_samples, self._is_saved = samples.all(), True
+        self._saved_samples = samples.all()
 
     def _write_backup(self, state: SavedState) -> Path:
         backup = self._free_name()

@@ -20,8 +20,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.messages.arrival import SILENCE
+from musculoskeletal_ae.nodes.reported_conditions import Situation, figures, nodes_in_graph
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
-from musculoskeletal_ae.nodes.situation import Situation, figures, nodes_in_graph
 from musculoskeletal_ae.options import CLOSED
 from musculoskeletal_ae.output import is_reader_gone
 from musculoskeletal_ae.report import (

@@ -138,14 +138,12 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {  # all parameters of all nodes, 
         ),
         'relearn_muscles': Parameter(
             ('',),
-            'replaced or re-tied muscles to relearn when this is set, or when learner/relearn is '
-            'called',
+            'replaced or re-tied muscles that learner/relearn relearns',
             settable=True,
         ),
         'fresh': Parameter(
             False,
             'start from `checkpoint` instead of the saved samples and network',
-            settable=True,
         ),
         'state_directory': STATE_DIRECTORY,
     },
@@ -171,17 +169,6 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {  # all parameters of all nodes, 
 #: executables that run several nodes in one process, and the names of these nodes
 COMBINED = {'combined': ('estimator', 'controller')}
 
-#: former parameters, and what replaces each of them
-MOVED = dict.fromkeys(
-    (
-        'motor_state_topic', 'motor_command_topic', 'motor_names', 'motor_command_order',
-        'spool_radius', 'motor_direction', 'motor_zero', 'tension_per_effort', 'effort_zero',
-    ),
-    'motors.yaml in the robot directory (doc/howto/ros2_control.md)',
-)  # fmt: skip
-MOVED |= dict.fromkeys(('ruptured_muscles', 'length_offset'), 'the parameter `faults`')
-MOVED |= dict.fromkeys(('joint_sensors', 'marker_pose_rate', 'imu_link'), 'the parameter `sensors`')
-
 #: parameters that rclpy declares for every node
 OF_RCLPY = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
 
@@ -202,9 +189,7 @@ def check_names(names: Iterable[str], node: str = '') -> None:
     for name in names:
         users = [user for user, table in PARAMETERS.items() if name in table]
         problem = ''
-        if name in MOVED:
-            problem = f'{name!r} is no parameter any more; state it in {MOVED[name]}'
-        elif name.split('.')[0] not in every:
+        if name.split('.')[0] not in every:
             legal = [key for one in own for key in PARAMETERS[one]] or every
             near = get_close_matches(name, legal, 1) or ['none, see doc/reference/parameters.md']
             problem = f'no node has a parameter {name!r}; nearest: {near[0]}'

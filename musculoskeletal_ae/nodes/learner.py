@@ -7,8 +7,7 @@ accepted_checkpoint and rejected_checkpoint are the estimator's answers.
 """
 
 import math
-import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 from diagnostic_msgs.msg import KeyValue
@@ -16,12 +15,10 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from std_srvs.srv import SetBool, Trigger
 
-from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.trainer import TrainerProcess
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.arrival import SPACING
 from musculoskeletal_ae.messages.message_reading import read_imu
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, REJECTED
@@ -29,9 +26,7 @@ from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.parameters import naming_parameter
 from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.ros.messages import LATCHED, SENSOR, bytes_message, serve
-from musculoskeletal_ae.ros.second_publishers import SEVERAL, LinkSensors, publishers_of
 
-IMU = 'imu'  # topic on which accelerometers publish
 MOST_DIGITS = 15  # reject a version of a network with more digits
 POLL_PERIOD = 0.05  # look at this interval whether the training process has finished an update [s]
 #: assume at least this period of muscle_states when pairing them with joint angles [s]
@@ -61,19 +56,18 @@ class LearnerNode(Shell):
         self.sources.watch('mae_checkpoint')
         core = self.core
         self._begin()
-        # These setters replace what was learned, which cannot be undone. The function in the third
-        # argument therefore checks each value before any parameter is set.
-        self.parameters.on_change('fresh', core.replace, self._afresh)
+        self.muscles_to_relearn: tuple[int, ...] = ()  # value of the parameter relearn_muscles
+        self.parameters.follow('relearn_muscles', self._on_relearn_muscles)
+        # `replace` replaces what was learned, which cannot be undone. Therefore `load_checkpoint`
+        # checks the value before any parameter of a request is set.
         self.parameters.on_change('checkpoint', core.replace, self.load_checkpoint)
-        self.parameters.on_change('relearn_muscles', core.relearn, self.robot.muscle_indices)
         if topic := JOINT_TOPICS.get(value('joint_source')):
             self.needed.add(topic)
             self.follow_posture(topic, lambda theta: core.joints(self.now(), theta), some=True)
         if value('joint_source') == 'sensor':  # the estimator does not judge a camera
             self.follow_joint_trust(core.use_joint_trust)
         self.links = [frame.name for frame in body_frames(self.robot.kinematics.model)]
-        self.accelerometers = LinkSensors()
-        self.listen(Imu, IMU, self._take_imu, SENSOR)
+        self.listen(Imu, 'imu', self._take_imu, SENSOR)
         self.needed.add('muscle_states')
         self.follow_body(lambda: core.use_body(self.body))
         self.follow_muscle_messages(self._take_muscle_states)
@@ -91,9 +85,6 @@ class LearnerNode(Shell):
         """Continue from the saved state, or begin with the network that `checkpoint` names.
 
         With `fresh`, the saved state is first discarded; a backup of it is kept.
-
-        The names in `relearn_muscles` are checked, but no muscle is relearned at the start. A
-        parameter file that sets `relearn_muscles` would otherwise cause this at every start.
         """
         if self.parameter('fresh'):
             self.core.replace(None)
@@ -103,30 +94,15 @@ class LearnerNode(Shell):
                 mae = self.load_checkpoint(self.parameter('checkpoint'))
             if mae is not None:
                 self.core.begin(mae)
-        with naming_parameter('relearn_muscles'):
-            self.robot.muscle_indices(self.parameter('relearn_muscles'))
 
-    def _afresh(self, value: bool) -> Mae | None:
-        """Prepare a new value of the parameter `fresh`.
-
-        If it is true, return the network of the parameter `checkpoint`, from which learning starts
-        again. If it is false, return None: nothing is to be done.
-        """
-        if not value:
-            return None
-        path = self.parameter('checkpoint')
-        if not path:
-            raise MusculoskeletalError('no `checkpoint` to start from; set that parameter first')
-        return self.load_checkpoint(path)
+    def _on_relearn_muscles(self, names: tuple[str, ...]) -> None:
+        self.muscles_to_relearn = tuple(self.robot.muscle_indices(names))
 
     # -- messages -------------------------------------------------------------------------------
 
     def _take_imu(self, message: Imu) -> None:
         prefix = self.parameter('frame_prefix')
         link, acceleration = read_imu(message, self.links, prefix)
-        self.accelerometers.take(link, time.monotonic())
-        if self.accelerometers.problem:
-            raise MessageError(SEVERAL, self.accelerometers.problem)
         self.core.imu(self.now(), link, acceleration)
 
     def _take_muscle_states(self, message: Float64MultiArray, _: float, delay: float) -> None:
@@ -155,13 +131,13 @@ class LearnerNode(Shell):
         return 'learning' if request.data else 'stopped; samples and network are kept'
 
     def _relearn(self, _: Trigger.Request) -> str:
-        names = self.parameter('relearn_muscles')
-        if not names:
+        if not self.muscles_to_relearn:
             raise MusculoskeletalError(
                 '`relearn_muscles` names no muscle; set that parameter first'
             )
-        self.core.relearn(self.robot.muscle_indices(names))
-        return f'relearning: {", ".join(names)}; other muscles are unchanged'
+        self.core.relearn(self.muscles_to_relearn)
+        names = self.robot.names(self.muscles_to_relearn)
+        return f'relearning: {names}; other muscles are unchanged'
 
     def _poll(self) -> None:
         data = self.core.poll(self.now())
@@ -171,17 +147,6 @@ class LearnerNode(Shell):
     def clock_jumped_back(self) -> None:
         """Discard messages that have not become part of a sample yet."""
         self.core.reset()
-
-    def on_intruders(self, _: str) -> None:
-        """Check, ten times a second, whether too many nodes publish `imu`."""
-        publishers = publishers_of(self, self.full_name(IMU))
-        self.accelerometers.look(publishers, time.monotonic())
-
-    def conditions(self) -> Iterable[Condition]:
-        """Yield the conditions of the core, and why accelerometers are not used."""
-        yield from super().conditions()
-        if problem := self.accelerometers.problem:
-            yield ConditionKind.ACCELEROMETERS_UNCLEAR.condition(problem, [IMU])
 
     def destroy_node(self) -> None:
         """End the training process, then destroy the node."""

@@ -19,7 +19,6 @@ that a second node runs:
 
 from __future__ import annotations
 
-import math
 import struct
 import time
 from collections import Counter, deque
@@ -63,9 +62,6 @@ TURNS = 3  # conclude from this many decreases within LOOKS checks that two node
 #: [s]; the graph keeps a killed node for only 20 s
 LEASE = 30.0
 NAMING = 1.0  # wait at most this long until the graph knows the node of a publisher [s]
-#: treat a link without messages for this time [s] as a link without a sensor; report that there are
-#: more publishers than sensors once this has lasted for the same time
-LINK_PATIENCE = 3.0
 #: name that the graph returns for a node of which it knows only a publisher
 UNNAMED = '_NODE_NAME_UNKNOWN_'
 #: name of such a node in messages to users
@@ -168,40 +164,6 @@ class Twins:
     def is_alone(self, now: float) -> bool:
         """Return whether no other node has reported under this name for NODE_SILENCE seconds."""
         return self._others.age(now) > NODE_SILENCE
-
-
-class LinkSensors:
-    """Detects that two nodes publish the sensor readings of the same link.
-
-    All sensors of this kind share a topic, and each message names its link. Each link may have one
-    sensor, and each sensor may have its own publisher. The topic must therefore not have more
-    publishers than there are links of which messages arrive.
-
-    Attributes:
-        problem: A text about the publishers if there are too many of them, else ''.
-    """
-
-    def __init__(self) -> None:
-        self.problem = ''
-        self._heard_at: dict[str, float] = {}  # time of the last message [s], by link
-        self._too_many_since = math.inf  # time since which there are too many publishers [s]
-
-    def take(self, link: str, now: float) -> None:
-        """Record that a message about a link arrived at `now` [s]."""
-        self._heard_at[link] = now
-
-    def look(self, publishers: Iterable[Publisher], now: float) -> None:
-        """Update `problem` from the publishers that the ROS graph shows at `now` [s]."""
-        nodes = sorted(each.node for each in publishers)
-        links = sorted(link for link, at in self._heard_at.items() if now - at <= LINK_PATIENCE)
-        self.problem = ''
-        if not links or len(nodes) <= len(links):
-            self._too_many_since = math.inf
-            return
-        self._too_many_since = min(self._too_many_since, now)
-        if now - self._too_many_since >= LINK_PATIENCE:
-            what = f'{" and ".join(nodes)} publish messages of {", ".join(links)} only'
-            self.problem = f'{what}; stop all but one publisher for each link'
 
 
 def full_name(namespace: str, name: str) -> str:

@@ -43,7 +43,7 @@ from musculoskeletal_ae.messages.message_reading import (
     read_posture,
 )
 from musculoskeletal_ae.messages.reception import Reception
-from musculoskeletal_ae.nodes.situation import PAGE, Arms, figures, nodes_in_graph
+from musculoskeletal_ae.nodes.reported_conditions import PAGE, Arms, figures, nodes_in_graph
 from musculoskeletal_ae.options import Parser, whole
 from musculoskeletal_ae.process_signals import STOP, Reaction, import_heavy
 from musculoskeletal_ae.report import Report

@@ -207,7 +207,7 @@ class Page:
         """List the arms of the ROS graph, unless there is only the one that the page shows.
 
         Args:
-            arms: One line about each (`nodes.situation.ArmSummary`).
+            arms: One line about each (`nodes.reported_conditions.ArmSummary`).
             shown: Namespace of the arm that the page shows.
         """
         is_single = all(arm.namespace == shown for arm in arms)

@@ -185,18 +185,17 @@ def test_a_stop_by_overheating_can_be_reset_once_the_module_is_cool():
     assert bench.cause == ''
 
 
-def test_a_tension_that_stays_above_its_limit_is_reported_at_once_and_releases_the_arm():
+def test_a_tension_that_stays_above_its_limit_releases_the_arm():
     bench = distorting(hold_time=5.0)
     tension = np.full(ROBOT.muscle_count, 60.0)
     bench.pull(tension)
-    tension[3] = 230.0
+    tension[[1, 3]] = 230.0
     bench.tension = tension
-    bench.step(3)  # the median filter needs three messages to pass the new tensions
-    assert f'above 1.1 × tension.limit: {ROBOT.muscles[3]} (above 220 N)' in bench.report().message
-    before = bench.step(round(OVERLOAD_TIME / DT) - 3)[-1]
+    before = bench.step(round(OVERLOAD_TIME / DT))[-1]
     assert bench.cause == ''
     after = bench.step(10)
-    overload = f'tension of {ROBOT.muscles[3]} above 220 N for 0.2 s'
+    first, second = ROBOT.muscles[1], ROBOT.muscles[3]
+    overload = f'tension of {first} above 220 N and {second} above 220 N for 0.2 s'
     assert bench.condition == f'overload, although the muscle is paid out: {overload}'
     assert (after[-1].value > before.value).any()  # paying out does not wait for hold_time
     bench.tension = None

@@ -6,8 +6,8 @@ from copy import deepcopy
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.estimation.finding import observe
 from musculoskeletal_ae.estimation.joint_sensor_check import JointSensorCheck
+from musculoskeletal_ae.experiments.detection import observe
 from musculoskeletal_ae.signals.joint_trust import SensorTrust
 
 DT = 0.5

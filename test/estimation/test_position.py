@@ -10,8 +10,8 @@ from exact_mae import rest_readings
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.detectors.module_following import FAULTY, PositionFollowing
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME, StretchedTendon
-from musculoskeletal_ae.estimation.finding import observe
 from musculoskeletal_ae.estimation.suspect_verification import Outcome, PositionLaw, Verification
+from musculoskeletal_ae.experiments.detection import observe
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 

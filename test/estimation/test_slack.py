@@ -10,8 +10,8 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME, SLACK_LENGTH
 from musculoskeletal_ae.estimation.estimator import Estimator
-from musculoskeletal_ae.estimation.finding import observe
 from musculoskeletal_ae.estimation.health import HealthMonitor
+from musculoskeletal_ae.experiments.detection import observe
 
 DT = 0.01
 MUSCLE = 2

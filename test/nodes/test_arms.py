@@ -13,7 +13,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.nodes.situation import Arms
+from musculoskeletal_ae.nodes.reported_conditions import Arms
 from musculoskeletal_ae.ros.diagnostics import NODE_SILENCE
 from nodes.test_bringup_status import OPERATOR, SLACK, diagnostics
 

@@ -23,7 +23,7 @@ from musculoskeletal_ae.conditions import (
     to_json,
 )
 from musculoskeletal_ae.nodes import bringup_status
-from musculoskeletal_ae.nodes.situation import Situation, figures
+from musculoskeletal_ae.nodes.reported_conditions import Situation, figures
 from musculoskeletal_ae.remedy import Step, sentence
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `learner`: it learns, validates, saves, resumes, and ends with its processes."""
 
+import errno
 import os
-import shutil
 import signal
 import time
 from dataclasses import replace
@@ -20,6 +20,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.learning import state as states
 from musculoskeletal_ae.learning.state import NETWORK, NEWEST
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae import checkpoint
@@ -274,7 +275,9 @@ def test_a_checkpoint_set_at_run_time_replaces_the_saved_state_and_keeps_a_backu
     assert learner.samples == 0
     graph.wait(lambda: len(graph.received['mae_checkpoint']) > before, 'the new network')
     assert (Path(state) / 'backup-1.state').exists()
-    assert graph.set_parameter('learner', 'fresh', True) == (True, '')
+    learner.learn(lambda: learner.samples >= 1, 'a sample')
+    assert graph.set_parameter('learner', 'checkpoint', trained_file) == (True, '')
+    assert learner.samples == 0  # setting the same value again starts afresh as well
 
 
 def test_a_fresh_start_drops_the_saved_state_and_keeps_a_backup(host, state):
@@ -297,16 +300,10 @@ def test_relearning_forgets_the_named_muscles_and_refuses_unknown_ones(host, gra
     assert not nameless.success
     assert 'set that parameter first' in nameless.message
     assert graph.set_parameter('learner', 'relearn_muscles', [arm26.muscles[1]])[0]
-    assert not any(each.known[1] for each in learner.node.core.samples.stored)
-    # Setting the parameter forgets the muscle in all samples. The service does so again, for
-    # samples that have arrived since then.
-    samples = learner.samples
-    learner.learn(lambda: learner.samples > samples, 'a sample')
-    assert any(each.known[1] for each in learner.node.core.samples.stored)
+    assert all(each.known[1] for each in learner.node.core.samples.stored)
     assert graph.call(Trigger, 'learner/relearn').success
     assert not any(each.known[1] for each in learner.node.core.samples.stored)
     assert all(each.known[0] for each in learner.node.core.samples.stored)
-    # At a start, the parameter forgets nothing until the service is called.
     learner.end()
     learner = host(state_directory=state, relearn_muscles=[arm26.muscles[2]])
     assert all(each.known[2] for each in learner.node.core.samples.stored)
@@ -322,16 +319,13 @@ def test_parameters_refused_together_change_nothing(host, arm26, trained_file, s
         parameters = [Parameter(name, value=value) for name, value in values.items()]
         return learner.node.set_parameters_atomically(parameters)
 
-    assert together(relearn_muscles=[arm26.muscles[1]]).successful
     learner.learn(lambda: learner.samples >= 2, 'samples')
     refused = together(relearn_muscles=[first], checkpoint='/nowhere')
     assert not refused.successful and '/nowhere' in refused.reason
     assert not together(checkpoint=trained_file, relearn_muscles=['tail']).successful
-    assert not together(fresh=True, checkpoint='').successful
+    assert not together(checkpoint=trained_file, fresh=True).successful  # only at the start
     assert learner.samples >= 2 and all(each.known.all() for each in core.samples.stored)
-    # Three parameters that are set together restart the learner once, and make only one backup of
-    # the earlier state.
-    assert together(relearn_muscles=[first], fresh=True, checkpoint=trained_file).successful
+    assert together(relearn_muscles=[first], checkpoint=trained_file).successful
     assert learner.samples == 0
     assert [backup.name for backup in Path(state).glob('backup-*')] == ['backup-1.state']
     assert together(checkpoint='').successful
@@ -442,17 +436,6 @@ def test_learning_works_without_joint_sensors_and_with_an_accelerometer(host, gr
             return reason in reported if reason else learner.tilted
 
         graph.wait(taken, f'the result of the message with frame {frame!r}')
-    second = graph.node.create_publisher(Imu, 'imu', 10)
-    message.header.frame_id = 'forearm'
-
-    def is_refused():
-        publisher.publish(message)
-        second.publish(message)
-        graph.spin(0.1)
-        return 'imu: several publishers' in learner.node.rejected
-
-    graph.wait(is_refused, 'the refusal of two sensors of one link')
-    assert 'imu is not used' in learner.node.report().message
 
 
 def test_a_second_learner_in_the_same_directory_is_refused(host, state):
@@ -461,7 +444,7 @@ def test_a_second_learner_in_the_same_directory_is_refused(host, state):
         host(state_directory=state)
 
 
-def test_a_deleted_state_directory_is_reported_at_once_and_nothing_is_lost(host, state, graph):
+def test_a_full_disk_is_reported_at_once_and_nothing_is_lost(host, state, graph, monkeypatch):
     graph.listen(DiagnosticArray, '/diagnostics', 100)
     learner = host(state_directory=state)
     learner.learn(lambda: learner.samples >= 2, 'samples')
@@ -470,18 +453,23 @@ def test_a_deleted_state_directory_is_reported_at_once_and_nothing_is_lost(host,
         statuses = (s for m in graph.received['/diagnostics'] for s in m.status)
         return [s.level for s in statuses if s.name.startswith(graph.namespace)]
 
-    shutil.rmtree(state)
-    before = len(levels())
-    graph.wait(lambda: DiagnosticStatus.ERROR in levels()[before:], 'the error')
-    # The loss of the directory causes a report at once, but a regular report may precede it.
-    assert levels()[before:].index(DiagnosticStatus.ERROR) <= 1
-    learner.learn(lambda: learner.samples >= 4, 'samples meanwhile')
+    def full(*_):
+        raise OSError(errno.ENOSPC, 'No space left on device')
 
-    def is_over():
+    def goes_on(condition):
         learner.arm.step()
-        return levels()[-1] != DiagnosticStatus.ERROR
+        return condition()
 
-    graph.wait(is_over, 'the end of the error')
+    with monkeypatch.context() as patch:
+        patch.setattr(states, 'write_whole', full)
+        count, before = learner.samples, len(levels())
+        learner.learn(lambda: learner.samples > count, 'samples meanwhile')
+        graph.wait(
+            lambda: goes_on(lambda: DiagnosticStatus.ERROR in levels()[before:]), 'the error'
+        )
+    graph.wait(
+        lambda: goes_on(lambda: levels()[-1] != DiagnosticStatus.ERROR), 'the end of the error'
+    )
     count = learner.samples
     graph.end(learner.node)
     assert len(host(state_directory=state).node.core.samples) == count

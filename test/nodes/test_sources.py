@@ -20,11 +20,9 @@ from musculoskeletal_ae.ros.diagnostics import NODE_SILENCE
 from musculoskeletal_ae.ros.messages import LATCHED, array_message, joint_message
 from musculoskeletal_ae.ros.second_publishers import (
     LEASE,
-    LINK_PATIENCE,
     NAMING,
     UNNAMED,
     Authorship,
-    LinkSensors,
     Publisher,
     Twins,
     full_name,
@@ -110,22 +108,6 @@ def test_a_repeated_estimate_grows_old(graph, arm26, trained_file):
         )
 
     graph.wait(is_stale, 'the data to become stale')
-
-
-def test_two_publishers_of_one_link_are_noticed_but_two_links_are_not():
-    sensors, publishers = LinkSensors(), [Publisher('/a', b'1'), Publisher('/b', b'2')]
-    seconds = np.arange(0.0, 2.0 * LINK_PATIENCE, 0.1)
-    for now in seconds:
-        sensors.take('hand', now)
-        sensors.take('forearm', now)
-        sensors.look(publishers, now)
-        assert sensors.problem == ''
-    for now in seconds + 100.0:
-        sensors.take('hand', now)
-        sensors.look(publishers, now)
-    assert sensors.problem.startswith('/a and /b publish messages of hand only')
-    sensors.look(publishers[:1], 200.0)
-    assert sensors.problem == ''
 
 
 def strange_body(count):

@@ -163,11 +163,6 @@ class LengthDisagreement(Detector):
         self._has_usual = self._used & (np.count_nonzero(np.isfinite(gap), axis=0) >= ENOUGH)
         self._usual[self._has_usual] = np.nanmedian(gap[:, self._has_usual], axis=0)
 
-    @property
-    def agrees(self) -> bool:
-        """Whether the lengths agree with the measured posture; False without joint sensors."""
-        return self.gap is not None and self._excess(self.gap) <= 1.0
-
     def step(self, observation: Observation) -> Finding | None:
         """Report lengths if they have contradicted the joint sensors for more than 1 s.
 

@@ -6,8 +6,6 @@ A changed module is a finding only if its winding is hot. A cool module that has
 in /diagnostics, and the arm is not stopped.
 """
 
-from collections.abc import Iterable
-
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
 from musculoskeletal_ae.signals.heat import Heat
@@ -22,10 +20,6 @@ class ThermalDrift(Detector):
 
     def __init__(self, heat: Heat) -> None:
         self._heat = heat
-
-    def accept(self, muscles: Iterable[int]) -> None:
-        """Consider the modules of these muscles (indices) healthy in their present state."""
-        self._heat.accept(*muscles)
 
     def step(self, observation: Observation) -> Finding | None:  # noqa: ARG002
         """Report a module with changed thermal constants and a hot winding, or return None."""

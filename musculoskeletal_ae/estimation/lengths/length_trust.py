@@ -7,7 +7,7 @@ offsets if the declaration of its kind says so (`conditions.py`). The estimator 
 on `body_state`, and all other nodes follow it.
 
     start ── ASSUMED ───────────────────► KNOWN ── a finding that revokes offsets ──► REVOKED
-    start ── NOT_CALIBRATED, RESTARTED ─► UNKNOWN ── CALIBRATED ─► KNOWN ◄── AGREES ── REVOKED
+    start ── NOT_CALIBRATED, RESTARTED ─► UNKNOWN ── CALIBRATED ─► KNOWN
     any ──── CALIBRATING ───────────────► UNKNOWN
     KNOWN ── MOVED, then CONFIRMED ─────► KNOWN
 
@@ -38,7 +38,6 @@ class Evidence(Enum):
     RESTARTED = 'not calibrated since the estimator was restarted'
     CALIBRATING = 'being calibrated'
     CALIBRATED = 'calibrated'
-    AGREES = 'confirmed by the joint sensors'
     MOVED = 'changed while the muscle was repaired; not checked yet'
     CONFIRMED = 'checked after the repair of the muscle'
 
@@ -51,7 +50,7 @@ class Transition(NamedTuple):
 
 
 _ANY, _UNKNOWN = frozenset(Trust), frozenset({Trust.UNKNOWN})
-_KNOWN, _REVOKED = frozenset({Trust.KNOWN}), frozenset({Trust.REVOKED})
+_KNOWN = frozenset({Trust.KNOWN})
 
 #: change the trust in an offset in this way by each kind of evidence; ASSUMED is missing, because
 #: it is the evidence at the start and is never taken later
@@ -60,7 +59,6 @@ TRANSITIONS = {
     Evidence.RESTARTED: Transition(_ANY, Trust.UNKNOWN),
     Evidence.CALIBRATING: Transition(_ANY, Trust.UNKNOWN),
     Evidence.CALIBRATED: Transition(_UNKNOWN, Trust.KNOWN),
-    Evidence.AGREES: Transition(_REVOKED, Trust.KNOWN),
     Evidence.MOVED: Transition(_KNOWN, Trust.KNOWN),
     Evidence.CONFIRMED: Transition(_KNOWN, Trust.KNOWN),
 }

@@ -25,8 +25,7 @@ consequences:
                             which the sensor saturates.
     lengths_jumped          concern several muscles, none of which is isolated. The length offsets
     lengths_disagree        become unreliable, and the finding stays latched until the next length
-    muscles_exchanged       calibration, or until a reset while joint sensors agree with the
-                            lengths.
+    muscles_exchanged       calibration.
     length_jump             concern one muscle, which is isolated and verified like any other. If
     length_disagrees        it is not isolated, its length offset alone becomes unreliable, and the
                             finding stays latched as for several muscles.

@@ -5,8 +5,8 @@ import pytest
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Finding
+from musculoskeletal_ae.estimation.isolation import ACQUITTALS, WITHIN, SuspectHandling
 from musculoskeletal_ae.estimation.suspect_verification import Outcome, VerificationVerdict
-from musculoskeletal_ae.estimation.suspects import ACQUITTALS, WITHIN, SuspectHandling
 
 DISTANCE = Finding(1, ConditionKind.RESIDUAL_DISTANCE, 'd = 9')
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.experiments import kept
+from musculoskeletal_ae.experiments import saved_results
 from musculoskeletal_ae.experiments.recording import Motion
 
 
@@ -15,8 +15,10 @@ def test_values_are_read_back_as_they_were(tmp_path):
     rng, file = np.random.default_rng(0), tmp_path / 'part.npz'
     motion = Motion(rng.normal(size=(3, 2)), rng.normal(size=(3, 6)).astype(np.float32))
     share = float(rng.uniform())
-    kept.write(file, {'motions': {'arm': motion}, 'laps': [(np.arange(3), None, 'a')], 'x': share})
-    read = kept.read(file)
+    saved_results.write(
+        file, {'motions': {'arm': motion}, 'laps': [(np.arange(3), None, 'a')], 'x': share}
+    )
+    read = saved_results.read(file)
     np.testing.assert_array_equal(read['motions']['arm'].theta, motion.theta)
     assert read['motions']['arm'].tension.dtype == np.float32
     ((numbers, nothing, text),) = read['laps']
@@ -27,7 +29,7 @@ def test_values_are_read_back_as_they_were(tmp_path):
 @pytest.mark.parametrize('value', [{1: 'a'}, [np.array([None])], {'a': object()}])
 def test_what_would_need_pickle_is_not_written(tmp_path, value):
     with pytest.raises(TypeError):
-        kept.write(tmp_path / 'part.npz', value)
+        saved_results.write(tmp_path / 'part.npz', value)
 
 
 class Code:
@@ -52,4 +54,4 @@ def test_other_files_are_refused_and_their_code_is_not_run(tmp_path, kind):
         else:
             np.savez(stream, document=np.array('{"module": "os"}'))
     with pytest.raises(MusculoskeletalError, match=r'part.npz is no kept part.*remove it'):
-        kept.read(file)
+        saved_results.read(file)
