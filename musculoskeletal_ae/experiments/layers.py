@@ -37,7 +37,6 @@ from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.mae.initial_training import completed
 from musculoskeletal_ae.mae.training import OUTPUTS, pair_errors
 from musculoskeletal_ae.mae.units import Mask
-from musculoskeletal_ae.paper.initial_training import random_states
 from musculoskeletal_ae.presets.paper import PaperPreset
 from musculoskeletal_ae.presets.preset import PAPER_PRESET
 
@@ -107,7 +106,7 @@ def _learn(study: Study, seed: int, hidden: tuple[int, ...], training: int) -> d
     steps = QUICK_STEPS if study.quick else preset.initial_steps(robot)
     network = preset.train_initial(robot, training, steps, None)
     initial = completed(robot, network, PAPER_PRESET, training, steps)
-    test = random_states(robot, TEST_STATES, np.random.default_rng([0, 2]))
+    test = preset.training_states(robot, TEST_STATES, np.random.default_rng([0, 2]))
     norms = np.reshape([error.norm for error in pair_errors(initial, test)], (len(Mask), -1))
     keys = [f'model_{name}_{unit}'.lower() for name, unit, _ in OUTPUTS]
     numbers = dict(zip(keys, norms.mean(axis=0).tolist(), strict=True))

@@ -52,15 +52,13 @@ from musculoskeletal_ae.learning.collector import SENSOR
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.scheduler import STEPS
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.mae.default_training import overload_states
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, to_mae
 from musculoskeletal_ae.mae.training import OUTPUTS, pair_errors
 from musculoskeletal_ae.mae.units import Mask, State, scale_vector
-from musculoskeletal_ae.paper.initial_training import random_states
 from musculoskeletal_ae.presets.preset import DEFAULT, PAPER_PRESET
-from musculoskeletal_ae.presets.registry import PRESETS
+from musculoskeletal_ae.presets.registry import PRESETS, preset_named
 from musculoskeletal_ae.signals.friction import FrictionDirection
 
 #: after each update, evaluate only every tenth message of the held-out motion, to save time
@@ -76,8 +74,6 @@ QUICK_STEPS = {PAPER_PRESET: 600, DEFAULT: 300}
 NOTE_EVERY = 25  # record the training errors after every 25th mini-batch
 #: test a network of the initial training on this many states of the geometric model
 TEST_STATES = 1000
-#: draw these states as the initial training of each preset draws its states
-STATES = {PAPER_PRESET: random_states, DEFAULT: overload_states}
 COLOURS = {PAPER_PRESET: plots.AS_PRINTED, 'default': plots.AFTER}
 
 #: function that returns the θ [rad] (D,) that the learner receives, or None. Its arguments are the
@@ -149,7 +145,7 @@ def explore(loop: ClosedLoop, learner: Learner, duration: float) -> Iterator[tup
 def train_initial(study: Study, preset: str) -> None:
     """Train a preset's network on the geometric model; save it and its errors during training."""
     robot, rows = study.robot, list[list[float]]()
-    test = STATES[preset](robot, TEST_STATES, np.random.default_rng([0, 2]))
+    test = preset_named(preset).training_states(robot, TEST_STATES, np.random.default_rng([0, 2]))
 
     def note(step: int, _: float, network: Network, batch: Array) -> None:
         if step % NOTE_EVERY:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.mae.mae import Mae
     from musculoskeletal_ae.mae.network import Network
     from musculoskeletal_ae.mae.training import Progress
+    from musculoskeletal_ae.mae.units import State
     from musculoskeletal_ae.motion.explored_postures import ExplorationStep
     from musculoskeletal_ae.motion.methods import LengthMethod
     from musculoskeletal_ae.robot.robot import Robot
@@ -36,6 +37,12 @@ class DefaultPreset:
         from musculoskeletal_ae.mae.default_training import default_steps, divided
 
         return default_steps(divided(robot)[0])
+
+    def training_states(self, robot: Robot, count: int, rng: np.random.Generator) -> State:
+        """Return random states, some of which exceed the tension limit."""
+        from musculoskeletal_ae.mae.default_training import overload_states
+
+        return overload_states(robot, count, rng)
 
     def train_initial(
         self, robot: Robot, seed: int, steps: int, progress: Progress | None

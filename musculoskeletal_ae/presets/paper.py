@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.mae.mae import Mae
     from musculoskeletal_ae.mae.network import Network
     from musculoskeletal_ae.mae.training import Progress
+    from musculoskeletal_ae.mae.units import State
     from musculoskeletal_ae.motion.explored_postures import ExplorationStep
     from musculoskeletal_ae.motion.methods import LengthMethod
     from musculoskeletal_ae.robot.robot import Robot
@@ -41,6 +42,12 @@ class PaperPreset:
     def initial_steps(self, robot: Robot) -> int:  # noqa: ARG002
         """Return the paper's number of mini-batches, which is the same for any body (§III-B)."""
         return INITIAL_STEPS
+
+    def training_states(self, robot: Robot, count: int, rng: np.random.Generator) -> State:
+        """Return random states with tensions up to T_max (§III-B)."""
+        from musculoskeletal_ae.paper.initial_training import random_states
+
+        return random_states(robot, count, rng)
 
     def train_initial(
         self, robot: Robot, seed: int, steps: int, progress: Progress | None

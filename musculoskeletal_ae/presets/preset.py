@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.mae.mae import Mae
     from musculoskeletal_ae.mae.network import Network
     from musculoskeletal_ae.mae.training import Progress
+    from musculoskeletal_ae.mae.units import State
     from musculoskeletal_ae.motion.explored_postures import ExplorationStep
     from musculoskeletal_ae.motion.methods import LengthMethod
     from musculoskeletal_ae.robot.robot import Robot
@@ -49,6 +50,9 @@ class Preset(Protocol):
 
     def initial_steps(self, robot: Robot) -> int:
         """Return the number of mini-batches of initial training for a robot."""
+
+    def training_states(self, robot: Robot, count: int, rng: np.random.Generator) -> State:
+        """Return `count` random states of the geometric model, drawn as for initial training."""
 
     def train_initial(
         self, robot: Robot, seed: int, steps: int, progress: Progress | None
