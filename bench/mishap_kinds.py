@@ -67,6 +67,7 @@ HEAT = frozenset({
 })  # fmt: skip
 OFF_TARGET = frozenset({
     'away_from_target', 'torque_missing', 'out_of_reach', 'tension_above_limit', 'overload',
+    'load_changed',
 })  # fmt: skip
 #: true symptoms of a base that is mounted in another direction
 MOUNTED = OFF_TARGET | {'other_mounting'}
