@@ -111,7 +111,8 @@ class HoldingCheck:
             pull: Bone-side tensions [N], (M,); None if they are unknown.
             dt: Time since the last call [s].
         """
-        if target is None or not np.array_equal(target, self._target):
+        before = self._target
+        if target is None or before is None or not np.array_equal(target, before):
             self._begin_rest(target)
         if theta is not None and pull is not None and target is not None:
             self._step_load(theta, pull, dt)
