@@ -66,7 +66,7 @@ HEAT = frozenset({
     'tension_limited_by_heat', 'overheated', 'thermal_drift', 'module_changed',
 })  # fmt: skip
 OFF_TARGET = frozenset({
-    'away_from_target', 'torque_missing', 'out_of_reach', 'overload',
+    'away_from_target', 'torque_missing', 'out_of_reach', 'overload', 'load_changed',
 })  # fmt: skip
 #: true symptoms of a base that is mounted in another direction
 MOUNTED = OFF_TARGET | {'other_mounting'}

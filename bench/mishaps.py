@@ -22,7 +22,8 @@ lets healthy arms explore for some hours instead; every warning or error of thei
 
 The table states for each mishap and emulator model:
 
-- true: how often a true statement was made within GOAL seconds of the first effect
+- true: how often a true statement was made within GOAL seconds of the first effect; a statement
+  that was there before the mishap began does not count
 - after: the median time from the first effect to the first true statement
 - false: the number of different false statements until the mishap was mended
 - well: how often the arm explored again, without any condition and with a true error of at most
@@ -110,7 +111,8 @@ explores again without any condition, or when the patience of the operator ends.
 | highest tension, in multiples of `tension.limit` | {worst} | – |
 
 - **true**: cases with a true statement within {goal} s of the first effect, of those that need a
-  statement. A case needs none if the mishap is harmless, or had no effect within {longest} s.
+  statement. A statement that was there before the mishap began does not count. A case needs
+  none if the mishap is harmless, or had no effect within {longest} s.
 - **after**: median time from the first effect to the first true statement. Most mishaps have an
   effect at once. Wrong readings have one from {angle} rad, {length} mm or {tension} N on, a module
   when its tension differs from the demanded one by {tension} N, and a turned base when it has
@@ -156,6 +158,9 @@ class Course:
         self._cooled_for = 0.0  # time for which the operator has waited for motors to cool [s]
         self._errors: list[float] | None = None  # true errors of the estimate [rad]
         self.present: list[Statement] = []
+        #: statements that were there before the mishap began, and have not been absent since; they
+        #: do not state the mishap
+        self._earlier: frozenset[tuple[str, str]] = frozenset()
 
     # -- time -----------------------------------------------------------------------------------
 
@@ -185,6 +190,7 @@ class Course:
         lab, now = self.lab, self.lab.now
         found = statements(lab.estimator, lab.controller, lab.learner, now)
         self.present = troubles(found)
+        self._earlier &= {(each.owner, each.identifier) for each in self.present}
         if self.present or not self._explores:
             self.quiet_since = now
         is_over = self.mended_at is not None and now - self.mended_at > LOOK
@@ -192,7 +198,8 @@ class Course:
             judged = judge(each, self.mishap, self.case)
             what = f'{each.owner} {each.identifier} {" ".join(sorted(each.subjects))}'.strip()
             self.stated.setdefault(what, [round(now - self.started_at, 2), judged, each.text[:200]])
-            if judged == 'true' and self.true_at is None:
+            is_earlier = (each.owner, each.identifier) in self._earlier
+            if judged == 'true' and self.true_at is None and not is_earlier:
                 self.true_at, self.first_true = now, each.text
             if judged == 'false' and not is_over:
                 key = f'{each.owner} {each.identifier}'
@@ -239,6 +246,7 @@ class Course:
         self.begun_at = self.started_at = self.lab.now
         self.advised_at = self.true_at = None
         self.first_true = ''
+        self._earlier = frozenset((each.owner, each.identifier) for each in self.present)
         self.case = self.mishap.begin(self.lab, rng)
         self._wait_for_advice()
         self._follow_advice(self.lab.now + self.mishap.patience)

@@ -652,6 +652,16 @@ class ConditionKind(Enum):
         'the arm is not at its target',
         (Step.CHECK_LOAD,),
     )
+    LOAD_CHANGED = Declaration(
+        'load_changed',
+        'controller',
+        'warn',
+        'while the arm rests after a motion, the external torque has changed by more than three '
+        'times the residual torque of the healthy moving arm, and no payload in the hand explains '
+        'the change',
+        'the load on the resting arm has changed',
+        (Step.CHECK_LOAD,),
+    )
     TENSION_LIMITED_BY_HEAT = Declaration(
         'tension_limited_by_heat',
         'controller',

@@ -97,6 +97,8 @@ PLACES = {
     Kind.TARGET_CLAMPED: ['control/test_target.py: test_another_target_ends_what_is_wrong'],
     Kind.TORQUE_MISSING: ['control/test_target.py: test_another_target_ends_what_is_wrong'],
     Kind.OUT_OF_REACH: ['control/test_target.py: test_another_target_ends_what_is_wrong'],
+    Kind.LOAD_CHANGED: ['mishap: mounted upside down',
+                        'control/test_holding.py: test_a_base_turned_under_a_resting_arm'],
     Kind.AWAY_FROM_TARGET: ['mishap: payload of 3.6 kg while holding',
                             'control/test_holding.py: test_an_arm_away_from_its_target'],
     Kind.TENSION_LIMITED_BY_HEAT: ['mishap: motor is hot'],

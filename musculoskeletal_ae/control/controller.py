@@ -236,6 +236,7 @@ class Controller:
             self.robot = robot
             self._use_parts()
         self.activities.follower.use_network(mae)
+        self.holding.use(mae)
         if self.activities.entered is self.activities.ramped_target:
             self.activities.ramps.solve_again()
 
@@ -561,7 +562,7 @@ class Controller:
                 self.stop(ConditionKind.COMMAND_NOT_FINITE)
         if not self.supervisor.is_running:
             limited = self._limited(self._stopped(present, dt), dt)
-        self.holding.step(self._held_posture, self.estimate, step.dt)
+        self.holding.step(self._held_posture, self.estimate, self._bone_tension, step.dt)
         if self._awaited_samples:
             return None  # the modules may have paid out; the last command would jerk the arm
         return limited or self.limiter.command
@@ -578,6 +579,13 @@ class Controller:
         is_holding = activity in (Activity.HOLDING, Activity.TORQUE) and self.supervisor.is_running
         has_arrived = is_holding and control is not None and control.has_arrived
         return target.theta if has_arrived and not target.effort.any() else None
+
+    @property
+    def _bone_tension(self) -> Array | None:
+        """Bone-side tensions [N], (M,), 0 for isolated muscles; None if they are not known."""
+        if self.sample is None or not self.robot.tension_source.is_known:
+            return None
+        return self.sample.bone_tension * self.sample.usable
 
     def _desired(self, dt: float) -> Command | None:
         """Return the command of the present activity, or None if there is none.

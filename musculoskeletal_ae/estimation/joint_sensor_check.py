@@ -64,7 +64,7 @@ NEWEST = 48  # judge this many of the newest messages, by all messages before th
 #: Judge a sensor by its deviation x in three windows. Each has a number of newest messages, the
 #: smallest limit of the median of |x| [rad], and the limit in healthy spreads; the larger limit
 #: applies. The short window finds large errors fast; the long window averages over more postures.
-WINDOWS = ((6, 0.12, 7.0), (24, 0.07, 3.0), (NEWEST, 0.06, 2.2))
+WINDOWS = ((6, 0.12, 7.0), (12, 0.08, 4.7), (24, 0.07, 3.0), (NEWEST, 0.06, 2.2))
 #: Trust a doubted sensor again once the median of its deviation |x| is below AGREEING_LIMIT [rad]
 #: or AGREEING_SPREADS healthy spreads, whichever is larger: over the newest AGREEING messages,
 #: and also over the newer half of them.
