@@ -24,7 +24,6 @@ from mujoco import rollout
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.command import Command, msc_compensation
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.modules import STEP
@@ -38,6 +37,7 @@ from musculoskeletal_ae.mae.network import Network, from_mae
 from musculoskeletal_ae.mae.training import random_states
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, scale_vector, visible
 from musculoskeletal_ae.motion import methods as control
+from musculoskeletal_ae.motion.activities import Command, msc_compensation
 from musculoskeletal_ae.motion.methods import first_command, stiffness_command
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.paper import control as paper

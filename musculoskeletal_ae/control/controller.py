@@ -31,11 +31,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.awake_clock import PAUSE, AwakeClock
 from musculoskeletal_ae.conditions import ORDER, Action, Condition, ConditionKind
 from musculoskeletal_ae.control import controller_status
-from musculoskeletal_ae.control.activities import ActivityControl, Inputs
-from musculoskeletal_ae.control.command import LENGTH, TENSION, Command, Pull
 from musculoskeletal_ae.control.holding import HoldingCheck
 from musculoskeletal_ae.control.limiter import CommandLimiter
-from musculoskeletal_ae.control.method_choice import by_follower, check_settings
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stop_commands import SafeStop
 from musculoskeletal_ae.control.supervisor import Activity, Supervisor
@@ -43,6 +40,13 @@ from musculoskeletal_ae.control.watchdog import Watchdog
 from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
+from musculoskeletal_ae.motion.activities import (
+    LENGTH,
+    TENSION,
+    ActivityControl,
+    Command,
+    Inputs,
+)
 from musculoskeletal_ae.motion.calibrating import Calibrating, gentle_limit
 from musculoskeletal_ae.motion.exploration import Exploration, Exploring
 from musculoskeletal_ae.motion.follower import Follower
@@ -128,7 +132,7 @@ class Activities:
     def of(self, activity: Activity, settings: Settings) -> ActivityControl | None:
         """Return the object that implements an activity; None for `IDLE`."""
         if activity in (Activity.HOLDING, Activity.MOVING):
-            return self.follower if by_follower(settings) else self.ramped_target
+            return self.follower if settings.is_by_follower else self.ramped_target
         others: dict[Activity, ActivityControl] = {
             Activity.EXPLORING: self.exploring,
             Activity.CALIBRATING: self.calibrating,
@@ -177,7 +181,7 @@ class Controller:
                 step ticks it. None to create one.
         """
         self.robot, self.settings = robot, settings or Settings()
-        check_settings(robot, self.settings)
+        self.settings.check_fit(robot)
         self.mae: Mae | None = None
         self.stream = MuscleStream(robot, window=WINDOW)
         self.sample: MuscleSample | None = None
@@ -214,7 +218,7 @@ class Controller:
         Raises:
             ParameterError: If the joint stiffness or the method does not fit the robot.
         """
-        check_settings(self.robot, settings)
+        settings.check_fit(self.robot)
         before, units = self.settings, self.robot.units
         is_stiffer = settings.desired_stiffness(units) != before.desired_stiffness(units)
         self.settings = settings
@@ -378,7 +382,7 @@ class Controller:
             goal, reason = self.planner.reachable(self.mae, self.estimate, goal, nearest)
         clamped = tuple(n for n, a, b in zip(robot.joints, theta, goal) if a != b)
         self.target_state = Target(effort, goal, clamped, reason, APPROACHES)
-        if not (self.supervisor.is_running and by_follower(self.settings) and self._is_ready):
+        if not (self.supervisor.is_running and self.settings.is_by_follower and self._is_ready):
             self._hold()  # the arm moves to the target as soon as it may move
             return
         try:
@@ -642,11 +646,11 @@ class Controller:
         # Without a stop cause, all inputs are available.
         assert self.mae is not None and self.sample is not None and self.estimate is not None
         sample = self.sample
-        pull = Pull(sample.motor_tension * sample.usable, sample.bone_tension * sample.usable)
         return Inputs(
             mae=self.mae,
             sample=sample,
-            pull=pull,
+            motor_tension=sample.motor_tension * sample.usable,
+            bone_tension=sample.bone_tension * sample.usable,
             theta=self.estimate,
             length=self.limiter.last(LENGTH, sample).value,
             tension=self.limiter.last(TENSION, sample).value,

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.control.command import LENGTH
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import ArmReadings
@@ -18,6 +17,7 @@ from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.activities import LENGTH
 from musculoskeletal_ae.motion.exploration import Exploration
 from musculoskeletal_ae.motion.explored_postures import ExplorationStep
 from musculoskeletal_ae.motion.methods import first_command

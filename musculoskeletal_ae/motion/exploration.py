@@ -12,8 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.activities import ActivityControl, Inputs
-from musculoskeletal_ae.control.command import Command
+from musculoskeletal_ae.motion.activities import ActivityControl, Command, Inputs
 from musculoskeletal_ae.motion.explored_postures import ExplorationStep
 from musculoskeletal_ae.motion.ramps import Goal, LengthRamps
 from musculoskeletal_ae.presets.registry import preset_named

@@ -20,11 +20,9 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.activities import ActivityControl, Inputs
-from musculoskeletal_ae.control.command import LENGTH, Command
-from musculoskeletal_ae.control.method_choice import length_methods
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.activities import LENGTH, ActivityControl, Command, Inputs
 from musculoskeletal_ae.motion.feedback import depends_on_limit
 from musculoskeletal_ae.motion.methods import Solution
 from musculoskeletal_ae.robot.robot import Robot
@@ -157,7 +155,7 @@ class LengthRamps:
 
     def _begin(self, goal: Goal, inputs: Inputs) -> None:
         actuation = self._robot.actuation
-        self._tension = inputs.pull.motor if goal.tension is None else goal.tension
+        self._tension = inputs.motor_tension if goal.tension is None else goal.tension
         if goal.method == SECOND and not actuation.knows_tension:
             goal = goal._replace(method=FIRST)
         self._goal, self._limit = goal, inputs.limit
@@ -169,7 +167,7 @@ class LengthRamps:
         self._remaining = max(goal.duration, self._ramp.duration)
 
     def _solve(self, goal: Goal, mae: Mae, tension: Array) -> Solution:
-        robot, method = self._robot, length_methods(self._settings)[goal.method]
+        robot, method = self._robot, self._settings.length_methods[goal.method]
         if method.takes_tension:
             tension = np.minimum(tension, self._limit)
         torque = robot.kinematics.holding_torque(goal.theta) + goal.effort
@@ -221,7 +219,7 @@ class RampedTarget(ActivityControl):
 
     def _goals(self) -> list[Goal]:
         chosen = self._settings
-        method = length_methods(chosen).get(chosen.method)
+        method = chosen.length_methods.get(chosen.method)
         if self._target is None or method is None:
             return []
         # T_const of method `first` is T_bias.

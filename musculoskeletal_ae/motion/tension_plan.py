@@ -11,11 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.activities import Inputs
-from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.motion.assumed_friction import FRICTION, tendon_friction
+from musculoskeletal_ae.motion.activities import Inputs, msc_compensation
 from musculoskeletal_ae.motion.feedback import (
     CORRECTION,
     Shift,
@@ -23,6 +21,7 @@ from musculoskeletal_ae.motion.feedback import (
     largest_support,
 )
 from musculoskeletal_ae.motion.methods import Solution, stiffness_command
+from musculoskeletal_ae.motion.reach import FRICTION, tendon_friction
 from musculoskeletal_ae.motion.slowness import SHARE
 from musculoskeletal_ae.motion.trajectory import Trajectory
 from musculoskeletal_ae.robot.robot import Robot

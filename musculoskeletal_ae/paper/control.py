@@ -24,9 +24,9 @@ Its argument T is T_const or T_current, whichever the equation of the method con
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import TENSION_SCALE, Mask
+from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.motion.methods import LengthMethod, Solution
 from musculoskeletal_ae.paper.constants import (
     CONTROL_CANDIDATES,

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.motion import follower
+from musculoskeletal_ae.motion.activities import LENGTH, TENSION
 from musculoskeletal_ae.motion.feedback import REPLAN
 from musculoskeletal_ae.robot.robot import Robot
 

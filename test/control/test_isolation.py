@@ -12,7 +12,6 @@ from readings import reading
 from robots import write_robot
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import APPROACHES
 from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.control.stop_commands import LARGEST_RISE, PAYING_OUT
@@ -21,10 +20,10 @@ from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION, TouchStatistics
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion import reach
-from musculoskeletal_ae.motion.assumed_friction import FRICTION
+from musculoskeletal_ae.motion.activities import LENGTH, TENSION
 from musculoskeletal_ae.motion.feedback import SUPPORT
 from musculoskeletal_ae.motion.planner import Planner
-from musculoskeletal_ae.motion.reach import lacking
+from musculoskeletal_ae.motion.reach import FRICTION, lacking
 from musculoskeletal_ae.motion.slowness import slowness
 from musculoskeletal_ae.motion.tension_plan import TURNING
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory

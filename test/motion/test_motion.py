@@ -16,7 +16,6 @@ from exact_mae import ExactMae, rest_readings
 from nominal_body import nominal_arm
 
 from musculoskeletal_ae.control import controller_status
-from musculoskeletal_ae.control.command import LENGTH
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
@@ -24,6 +23,7 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion import hand as hand_motion
+from musculoskeletal_ae.motion.activities import LENGTH
 from musculoskeletal_ae.motion.feedback import CORRECTION, SUPPORT
 from musculoskeletal_ae.motion.hand import HAND_SPEED, Hand
 from musculoskeletal_ae.motion.methods import StiffnessModel

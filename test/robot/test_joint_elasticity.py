@@ -12,7 +12,6 @@ from robots import read_muscles, write_muscles, write_robot
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.fit import fit_body
 from musculoskeletal_ae.body_model.posture_model import Bent, PostureModel, Unknowns
-from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.design.checks import check_robot
@@ -31,6 +30,7 @@ from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
+from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.motion.methods import StiffnessModel
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from robots import write_robot
 
-from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.design.checks import check_robot
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
@@ -17,6 +16,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescription
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
+from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
