@@ -28,17 +28,17 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.joint_stops import LARGEST_OFFSET
+from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.conditions import Condition
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.calibration import Reservoir, uncalibrated
 from musculoskeletal_ae.learning.checkpoint_keeper import CheckpointKeeper
 from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR, SampleCollector
-from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.learning.joint_history import JointHistory
 from musculoskeletal_ae.learning.learner_status import learner_conditions, learner_report
 from musculoskeletal_ae.learning.offset_history import HELD_TIME, OffsetHistory
-from musculoskeletal_ae.learning.samples import Sample, SampleStore
-from musculoskeletal_ae.learning.scheduler import LEAST_BLIND, STEPS, UpdateScheduler
+from musculoskeletal_ae.learning.samples import SampleStore
+from musculoskeletal_ae.learning.scheduler import LEAST_BLIND, STEPS, Update, UpdateScheduler
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.arrival import Arrival

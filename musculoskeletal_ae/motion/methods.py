@@ -18,7 +18,8 @@ below the length by |l_comp|. `stiffness` chooses T for a joint stiffness (`stif
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -80,28 +81,18 @@ class Solution(NamedTuple):
     stiffness: JointStiffness | None = None
 
 
-class LengthCommand(Protocol):
-    """Interface of the functions that compute one length command for a target."""
-
-    def __call__(
-        self, robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array, /
-    ) -> Solution:
-        """Return the length command and the tension that it should produce.
-
-        Args:
-            robot: The body, in which isolated muscles have no tension.
-            mae: The network.
-            theta: Target posture θ_target [rad], (D,).
-            torque: Torque that the muscles should exert there, τ_target [N·m], (D,).
-            tension: T_const, or the measured T at the start of the movement [N], (M,).
-        """
+#: Function that computes the length command for a target, and the tension that it should produce.
+#: Its arguments are the body, in which isolated muscles have no tension, the network, the target
+#: posture θ_target [rad], (D,), the torque that the muscles should exert there, τ_target [N·m],
+#: (D,), and T_const, or the measured T at the start of the movement [N], (M,).
+LengthCommand = Callable[[Robot, Mae, Array, Array, Array], Solution]
 
 
 class LengthMethod(NamedTuple):
     """A control method that ramps to one length command and holds it.
 
     Attributes:
-        command: Function that computes l_target from a target posture, a torque and tensions.
+        command: Function that computes l_target.
         takes_tension: Whether the tensions that are passed to `command` are those that the muscles
             should exert. If so, the caller limits them before it calls `command`.
         follows_first: Whether the arm first moves to the target by the method `first`.

@@ -99,7 +99,7 @@ def test_preset_paper_lowers_the_printed_loss(trained):
     tension = np.full(6, 100.0)
     terms = paper.control_loss(robot, mae, theta, torque, tension)
     start = mae.encode(Mask.THETA_TENSION, theta, tension)
-    end = descend(mae, start, terms, paper.SEARCH)
+    end = descend(mae, start, terms, *paper.SEARCH)
     assert Loss(terms)(mae.decode_scaled(end)) < 0.5 * Loss(terms)(mae.decode_scaled(start))
     solution = paper.proposed(robot, mae, theta, torque, tension)
     np.testing.assert_allclose(solution.tension, mae.decode(end).tension)
