@@ -40,6 +40,9 @@ from musculoskeletal_ae.robot.tension import (
 # third programme would change the tension by well under a newton.
 SOLVES = 2
 
+FIRST = 'first'  # name of the length method that uses the given tension T_const
+SECOND = 'second'  # name of the length method that uses the measured tension T
+
 # The following constants are those of the method `stiffness`.
 
 # Raise T_low above T_bias by the largest of these margins that is feasible [N]. An external force
@@ -101,6 +104,25 @@ class LengthMethod(NamedTuple):
     command: LengthCommand
     takes_tension: bool = False
     follows_first: bool = False
+
+
+class Goal(NamedTuple):
+    """A posture, and the method that converts it into lengths.
+
+    Attributes:
+        method: One of the preset's length methods.
+        theta: Target posture θ_target [rad], (D,).
+        effort: Torque in addition to gravity compensation [N·m], (D,).
+        duration: Duration of the movement [s].
+        tension: T_const [N], (M,); None to use T_current at the start of the goal. For the method
+            `second`, a step of the exploration states the tension that the geometric model expects.
+    """
+
+    method: str
+    theta: Array
+    effort: Array
+    duration: float
+    tension: Array | None = None
 
 
 def first_command(robot: Robot, mae: Mae, theta: Array, tension: Array) -> Array:

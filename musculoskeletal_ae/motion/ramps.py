@@ -15,8 +15,6 @@ measurements, `second` would raise the tension without bound.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
@@ -24,15 +22,13 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.activities import LENGTH, ActivityControl, Command, Inputs
 from musculoskeletal_ae.motion.feedback import depends_on_limit
-from musculoskeletal_ae.motion.methods import Solution
+from musculoskeletal_ae.motion.methods import FIRST, SECOND, Goal, Solution
 from musculoskeletal_ae.robot.robot import Robot
 
 # Ramp the command during this fraction of a movement's duration. In the remaining time, the arm
 # comes to rest and provides a rest sample.
 RAMP_SHARE = 0.6
 PEAK = 1.5  # peak speed of a ramp, as a multiple of its mean speed
-FIRST = 'first'  # name of the length method that uses the given tension T_const
-SECOND = 'second'  # name of the length method that uses the measured tension T
 
 
 class Ramp:
@@ -57,24 +53,6 @@ class Ramp:
         self._elapsed += dt
         u = 1.0 if self.done else self._elapsed / self.duration
         return self._start + (3.0 - 2.0 * u) * u * u * (self._goal - self._start)
-
-
-class Goal(NamedTuple):
-    """A posture, and the method that converts it into lengths.
-
-    Attributes:
-        method: One of the preset's length methods.
-        theta: Target posture θ_target [rad], (D,).
-        effort: Torque in addition to gravity compensation [N·m], (D,).
-        duration: Duration of the movement [s].
-        tension: T_const [N], (M,); None to use T_current at the start of the goal.
-    """
-
-    method: str
-    theta: Array
-    effort: Array
-    duration: float
-    tension: Array | None = None
 
 
 class LengthRamps:
