@@ -50,10 +50,10 @@ from musculoskeletal_ae.motion.activities import (
 from musculoskeletal_ae.motion.calibrating import Calibrating, gentle_limit
 from musculoskeletal_ae.motion.exploration import Exploration, Exploring
 from musculoskeletal_ae.motion.follower import Follower
-from musculoskeletal_ae.motion.planner import Plan, Planner
+from musculoskeletal_ae.motion.planner import Planner
 from musculoskeletal_ae.motion.ramps import LengthRamps, RampedTarget
 from musculoskeletal_ae.motion.torque import GravityCompensation, TorqueControl
-from musculoskeletal_ae.motion.trajectory import Setpoint
+from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly, BodyState
@@ -408,8 +408,8 @@ class Controller:
             self._follow(self.planner.to_rest(start))
         else:
             lag = self.activities.follower.winches.lag
-            plan = self.planner.through(mae, start, points, max(-delay, 0.0), lag)
-            self._follow(plan, max(delay, 0.0))
+            trajectory = self.planner.through(mae, start, points, max(-delay, 0.0), lag)
+            self._follow(trajectory, delay=max(delay, 0.0))
 
     def pose(self, pose: pin.SE3, whole: bool, now: float) -> None:
         """Move the end effector to a pose in the root link's frame.
@@ -427,7 +427,7 @@ class Controller:
         if progress.is_moving and self.planner.is_under_way(pose, whole, progress.latest):
             self.planner.repeat_pose(now)
             return
-        self._follow(self.planner.to_pose(mae, start, pose, whole, now))
+        self._follow(*self.planner.to_pose(mae, start, pose, whole, now))
 
     def twist(self, twist: Array) -> None:
         """Move the end effector at a given velocity for `hand.TWIST_TIMEOUT` seconds.
@@ -716,22 +716,23 @@ class Controller:
         assert state.theta is not None
         start, mae = self._ready()
         lag = self.activities.follower.winches.lag
-        plan = self.planner.to_posture(mae, start, state.theta, duration, lag)
-        self._begin(plan, 0.0, state.effort)
+        trajectory = self.planner.to_posture(mae, start, state.theta, duration, lag)
+        self._begin(trajectory, 0.0, state.effort)
 
-    def _follow(self, plan: Plan, delay: float = 0.0) -> None:
+    def _follow(
+        self, trajectory: Trajectory, unreachable_reason: str = '', delay: float = 0.0
+    ) -> None:
         """Follow a requested trajectory after `delay` [s]; its end becomes the target."""
         nothing = np.zeros(self.robot.joint_count)
-        end = plan.trajectory.end
-        self.target_state = Target(nothing, end, (), plan.unreachable_reason)
-        self._begin(plan, delay, nothing)
+        self.target_state = Target(nothing, trajectory.end, (), unreachable_reason)
+        self._begin(trajectory, delay, nothing)
 
-    def _begin(self, plan: Plan, delay: float, effort: Array) -> None:
+    def _begin(self, trajectory: Trajectory, delay: float, effort: Array) -> None:
         follower = self.activities.follower
         if follower.progress.trajectory is None and delay > 0.0:
             start, _ = self._ready()
-            follower.follow(self.planner.to_rest(start).trajectory)
-        follower.follow(plan.trajectory, delay)
+            follower.follow(self.planner.to_rest(start))
+        follower.follow(trajectory, delay)
         follower.exert(effort)
         self.supervisor.on_request(Activity.MOVING)
 

@@ -333,7 +333,7 @@ def test_a_motion_is_slow_enough_for_the_torque_of_the_muscles(lost, limit, dura
                 planner.to_posture(mae, rest, goal, duration, lag),
                 planner.through(mae, rest, fast.points, 0.0, lag),
             ]
-            for planned, *_ in plans:
+            for planned in plans:
                 np.testing.assert_array_equal(planned.end, goal)
                 assert lack(planned) < 0.25 * lack(fast)
     assert hard >= 3
