@@ -152,7 +152,7 @@ class Follower(ActivityControl):
 
         None without a trajectory.
         """
-        return None if self.progress.trajectory is None else self.plan.tension.missing_torque
+        return None if self.progress.trajectory is None else self.plan.missing_torque
 
     # -- the activity ---------------------------------------------------------------------------
 

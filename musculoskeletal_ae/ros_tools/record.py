@@ -263,18 +263,18 @@ def _work(options: Namespace, arguments: list[str]) -> int:
         bag = options.recover
         target = options.out or bag.with_name(f'{bag.stem}_recovered')
         try:
-            recovered = recover(bag, target, options.compression)
+            count, left_out, damaged = recover(bag, target, options.compression)
         except KeyboardInterrupt as stop:
             incomplete = f'{target} is incomplete; remove it, and repeat the command'
             raise KeyboardInterrupt(incomplete) from stop
-        print(f'{recovered.message_count} messages recovered to {target}')
+        print(f'{count} messages recovered to {target}')
         problems = []
-        if recovered.damaged:
+        if damaged:
             problems.append(
-                f'{", ".join(recovered.damaged)} is damaged: messages that cannot be read are '
+                f'{", ".join(damaged)} is damaged: messages that cannot be read are '
                 'missing, and others may be wrong, because sqlite3 has no checksums'
             )
-        if left_out := recovered.left_out:
+        if left_out:
             problems.append(f'topics that are not in CDR were not recovered: {", ".join(left_out)}')
         for problem in problems:
             print(f'warning: {bag}: {problem}', file=sys.stderr)
