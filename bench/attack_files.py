@@ -150,7 +150,8 @@ class Reader:
 
     def __init__(self, folder: Path) -> None:
         """Write the valid files, of which damaged copies are read later."""
-        from musculoskeletal_ae.learning.samples import Sample, SampleStore
+        from musculoskeletal_ae.body_model.observations import Sample
+        from musculoskeletal_ae.learning.samples import SampleStore
         from musculoskeletal_ae.learning.state import NEWEST, StateStore
         from musculoskeletal_ae.mae import checkpoint
         from musculoskeletal_ae.mae.initial_training import initial_mae

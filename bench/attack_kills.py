@@ -18,8 +18,9 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.learning.trainer import TrainerProcess
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.robot.robot import Robot

@@ -36,6 +36,7 @@ from bench.regression import BASELINES
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.body_fit import BodyFit
 from musculoskeletal_ae.body_model.covariance import ellipsoids
+from musculoskeletal_ae.body_model.observations import Observations
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.online_learning import teach
@@ -44,9 +45,9 @@ from musculoskeletal_ae.gauss_newton import minimise_each
 from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.convergence import STEPS, until_converged
-from musculoskeletal_ae.learning.job import Job, Update
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.samples import CAPACITY, Observations
+from musculoskeletal_ae.learning.samples import CAPACITY
+from musculoskeletal_ae.learning.scheduler import Job, Update
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser, whole

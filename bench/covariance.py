@@ -42,8 +42,8 @@ from musculoskeletal_ae.experiments.recording import (
 from musculoskeletal_ae.experiments.workers import workers
 from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.collector import NONE, SENSOR
-from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.scheduler import Job
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.exploration import Exploration

@@ -25,7 +25,7 @@ from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.simulation.load import Load
+from musculoskeletal_ae.simulation.load import LoadTree
 from musculoskeletal_ae.tables.table import Table
 
 INITIAL_STEPS = 1000
@@ -163,7 +163,7 @@ class Statics:
         robot = self._robot.with_elasticity(
             JointElasticity(np.exp(spring) * np.eye(2), np.zeros(2), np.zeros(2))
         )
-        load, eye = Load(robot.kinematics), np.eye(2)
+        load, eye = LoadTree.of(robot.kinematics).load, np.eye(2)
         wrench = np.tile([0.0, 0.0, -9.81 * share * run.load, 0.0, 0.0, 0.0], (len(run.length), 1))
         length = np.exp(scale) * run.length
         theta = np.zeros_like(run.theta)

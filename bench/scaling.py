@@ -32,6 +32,7 @@ from bench.learned_arm import initial, learned_arm
 from bench.limbs import BODIES, write_body
 from bench.timings import microseconds
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.body_model.observations import Observations
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.experiments import plots
 from musculoskeletal_ae.experiments.least_squares import oracle_errors
@@ -43,9 +44,8 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.calibration import Healthy
-from musculoskeletal_ae.learning.job import Job
-from musculoskeletal_ae.learning.samples import CAPACITY, Observations
-from musculoskeletal_ae.learning.scheduler import STEPS
+from musculoskeletal_ae.learning.samples import CAPACITY
+from musculoskeletal_ae.learning.scheduler import STEPS, Job
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import one_thread, random_states
 from musculoskeletal_ae.motion.methods import proposed

@@ -33,9 +33,8 @@ from musculoskeletal_ae.experiments.recording import (
     estimation_error,
     record,
 )
-from musculoskeletal_ae.learning.job import Job
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.scheduler import STEPS
+from musculoskeletal_ae.learning.scheduler import STEPS, Job
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser

@@ -24,7 +24,6 @@ from mujoco import rollout
 from torch import Tensor
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.command import Command, msc_compensation
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.modules import STEP
@@ -38,6 +37,7 @@ from musculoskeletal_ae.mae.network import Network, from_mae
 from musculoskeletal_ae.mae.training import random_states
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, scale_vector, visible
 from musculoskeletal_ae.motion import methods as control
+from musculoskeletal_ae.motion.activities import Command, msc_compensation
 from musculoskeletal_ae.motion.methods import first_command, stiffness_command
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.paper import control as paper
@@ -248,8 +248,8 @@ def eager_proposed_paper(
         # Gᵀ (D, M), for tensions that are scaled by TENSION_SCALE
         jacobian = (lengths[1:] - lengths[0]) / step / TENSION_SCALE
         z, aim, load = latent[0], _tensor(theta), _tensor(torque)
-        count = paper.SEARCH.candidates
-        steps = paper.SEARCH.largest_step * torch.arange(count) / count
+        largest, count, epochs = paper.SEARCH
+        steps = largest * torch.arange(count) / count
 
     def loss(y: Tensor) -> Tensor:
         pull = y[..., joints : joints + muscles]
@@ -260,7 +260,7 @@ def eager_proposed_paper(
             + torque_weight * TORQUE_UNITS * (load + pull @ jacobian.T).norm(dim=-1)
         )
 
-    for _ in range(paper.SEARCH.epochs):
+    for _ in range(epochs):
         leaf = z.clone().requires_grad_()
         gradient = torch.autograd.grad(loss(network.decode(leaf)), leaf)[0]
         with torch.no_grad():

@@ -40,7 +40,7 @@ def _run_node(name: str) -> int:
         print(_node_help(name))
         return 0
     try:
-        status = int(import_module('musculoskeletal_ae.ros.running').run(name))
+        status = int(import_module('musculoskeletal_ae.nodes.running').run(name))
     finally:
         STOP.ignore()
     _end_process(status)

@@ -8,12 +8,25 @@ A format is a class derived from `Strict`, with ranges and lengths in its annota
 import re
 import reprlib
 from collections.abc import Callable, Iterator
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
-from msgspec import Struct, inspect
+from msgspec import Meta, Struct, inspect
 
 T = TypeVar('T')
+
+# Types of values in files of a robot directory, with their legal ranges.
+
+#: refuse a number beyond ± this [SI units], because it is certainly a mistake
+LARGEST = 1e8
+LONGEST_LIST = 1000  # refuse a longer list, such as of muscles, route points or joints
+
+Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Meta(gt=0.0, le=LARGEST)]
+NotNegative = Annotated[float, Meta(ge=0.0, le=LARGEST)]
+Vector = tuple[Number, Number, Number]
+Name = Annotated[str, Meta(min_length=1, max_length=200)]
+Names = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=LONGEST_LIST)]
 
 #: Matches, for example, "Expected `float`, got `str` - at `$.muscles[3].stiffness`".
 _MESSAGE = re.compile(

@@ -10,10 +10,9 @@ from exact_mae import ExactMae, rest_readings
 from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.control.activities import Inputs
-from musculoskeletal_ae.control.command import LENGTH, Pull, unchanging
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.motion.activities import LENGTH, Inputs, unchanging
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
@@ -53,7 +52,8 @@ def inputs(mae, theta, limit, robot=ROBOT, dt=DT, tension=None):
     return Inputs(
         mae=mae,
         sample=now,
-        pull=Pull(tension, tension),
+        motor_tension=tension,
+        bone_tension=tension,
         theta=theta,
         length=unchanging(robot, LENGTH, now).value,
         tension=tension,

@@ -17,11 +17,11 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.emulator.kin.arm import STOP_STIFFNESS, EmulatedArm
 from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
 from musculoskeletal_ae.simulation.simulation import Simulation

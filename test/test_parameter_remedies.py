@@ -9,7 +9,6 @@ from remedies import check_remedy, members
 from robots import write_robot
 
 from musculoskeletal_ae import options
-from musculoskeletal_ae.control.method_choice import check_settings
 from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.control.stop_memory import StopMemory
 from musculoskeletal_ae.estimation.lengths.length_calibration import stated_theta
@@ -123,11 +122,11 @@ def test_the_methods_that_a_refusal_names_are_accepted(source, preset):
     own, refusals = Robot(description), 0
     for method in METHODS:
         try:
-            check_settings(own, Settings(method=method, preset=preset))
+            Settings(method=method, preset=preset).check_fit(own)
         except MusculoskeletalError as refused:
             refusals += 1
             for legal in re.search('legal.*: (.*)$', str(refused))[1].split(', '):
-                check_settings(own, Settings(method=legal, preset=preset))
+                Settings(method=legal, preset=preset).check_fit(own)
     assert refusals
 
 

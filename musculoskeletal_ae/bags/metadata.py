@@ -8,7 +8,7 @@ of a bag take times and counts from the storage files instead.
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from msgspec import Meta, Struct, convert, yaml
 from rosbags.interfaces import (
@@ -31,14 +31,6 @@ SUFFIXES = ('.mcap', '.db3')  # read files with these suffixes if metadata.yaml 
 
 _NO_TIME = (1 << 63) - 1  # write this start time [ns] for a bag without messages, as rosbag2 does
 _FOREVER = QosTime(9223372036, 854775807)  # QoS duration of a deadline that never passes
-
-
-class Contents(NamedTuple):
-    """Contents of a bag directory according to its metadata.yaml."""
-
-    files: list[Path]
-    message_count: int | None  # None if unknown
-    problem: str  # why the list of files may be incomplete; '' if it is complete
 
 
 class _Information(Struct):
@@ -140,10 +132,14 @@ def _topic_entry(topic: BagTopic, type_hash: str) -> Mapping[str, Any]:
     return {'topic_metadata': metadata, 'message_count': topic.message_count}
 
 
-def read_metadata(directory: Path) -> Contents:
+def read_metadata(directory: Path) -> tuple[list[Path], int | None, str]:
     """Read from metadata.yaml which storage files a bag has.
 
     If metadata.yaml is missing or invalid, all storage files in the directory are returned.
+
+    Returns:
+        The files, the number of their messages or None if it is unknown, and why the list of files
+        may be incomplete, or '' if it is complete.
 
     Raises:
         BagError: If there are no storage files, or rosbag2 compressed the files or messages.
@@ -157,7 +153,7 @@ def read_metadata(directory: Path) -> Contents:
             problem = f'has neither a readable {FILE} nor mcap or sqlite3 files'
             raise BagError(directory, problem, NAME_A_BAG) from error
         problem = f'{FILE} cannot be used ({error}); reading all files of the directory'
-        return Contents(files, None, problem)
+        return files, None, problem
     information = metadata.rosbag2_bagfile_information
     mode = information.compression_mode or 'none'
     if mode.lower() != 'none':
@@ -167,7 +163,7 @@ def read_metadata(directory: Path) -> Contents:
         )
         raise BagError(directory, problem, f'{CONVERT}, without this compression')
     names = dict.fromkeys(Path(name).name for name in information.relative_file_paths)
-    return Contents([directory / name for name in names], information.message_count, '')
+    return [directory / name for name in names], information.message_count, ''
 
 
 def _unusable(_: Path, problem: str) -> ValueError:

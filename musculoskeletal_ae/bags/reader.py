@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from musculoskeletal_ae.bags import mcap_file, message_types, sqlite3_file
-from musculoskeletal_ae.bags.metadata import FILE, Contents, read_metadata
+from musculoskeletal_ae.bags.metadata import FILE, read_metadata
 from musculoskeletal_ae.bags.storage import (
     CONVERT_ROS1,
     LATEST,
@@ -54,14 +54,14 @@ class Bag:
             BagError: If the recording is damaged, or the path does not name a recording.
         """
         path = Path(path)
-        contents = read_metadata(path) if path.is_dir() else Contents([path], None, '')
-        bag = cls(path, [_open_file(file) for file in contents.files])
-        for file in bag.files:
-            for topic in file.topics.values():
-                add_topic(bag.topics, topic, file.path)
-        reasons = [contents.problem, *(file.unfinished for file in bag.files)]
-        if contents.message_count not in (None, bag.message_count):
-            counts = f'{contents.message_count} messages; there are {bag.message_count}'
+        files, count, problem = read_metadata(path) if path.is_dir() else ([path], None, '')
+        bag = cls(path, [_open_file(file) for file in files])
+        for opened in bag.files:
+            for topic in opened.topics.values():
+                add_topic(bag.topics, topic, opened.path)
+        reasons = [problem, *(opened.unfinished for opened in bag.files)]
+        if count not in (None, bag.message_count):
+            counts = f'{count} messages; there are {bag.message_count}'
             reasons.append(f'{FILE} counts {counts}')
         bag.unfinished = [reason for reason in reasons if reason]
         return bag

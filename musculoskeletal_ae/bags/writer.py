@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
 
 from mcap.records import Schema
 from mcap.writer import CompressionType, Writer
@@ -166,16 +165,14 @@ class BagWriter:
             raise BagError(self.directory, problem, 'choose another directory') from error
 
 
-class Recovered(NamedTuple):
-    """Result of a recovery: the number of saved messages, and what could not be saved."""
-
-    message_count: int  # number of messages in the new bag
-    left_out: list[str]  # topics that were left out because their messages are not in CDR
-    damaged: list[str]  # files with messages that cannot be read
-
-
-def recover(path: Path, target: Path, compression: str = 'zstd') -> Recovered:
+def recover(
+    path: Path, target: Path, compression: str = 'zstd'
+) -> tuple[int, list[str], list[str]]:
     """Recover a recording: write all readable messages to a new, finished bag.
+
+    Returns:
+        The number of messages in the new bag, the topics that were left out because their messages
+        are not in CDR, and the files with messages that cannot be read.
 
     Raises:
         BagError: If no message can be read, or a bag cannot be read or written.
@@ -191,7 +188,7 @@ def recover(path: Path, target: Path, compression: str = 'zstd') -> Recovered:
             for message in bag.messages(writer.topics):
                 writer.write(message.topic, message.log_time, message.publish_time, message.data)
     left_out = [name for name in bag.topics if name not in writer.topics]
-    return Recovered(writer.message_count, left_out, damaged)
+    return writer.message_count, left_out, damaged
 
 
 def _open_damaged(path: Path, folder: Path) -> tuple[Bag, list[str]]:
@@ -202,7 +199,7 @@ def _open_damaged(path: Path, folder: Path) -> tuple[Bag, list[str]]:
     try:
         return Bag.open(path), []
     except BagError:
-        files = metadata.read_metadata(path).files if path.is_dir() else [path]
+        files = metadata.read_metadata(path)[0] if path.is_dir() else [path]
         damaged = []
         for file in files:
             if sqlite3_file.is_damaged(file):

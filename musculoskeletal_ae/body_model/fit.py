@@ -21,6 +21,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody, Poses
+from musculoskeletal_ae.body_model.observations import Observations
 from musculoskeletal_ae.body_model.posture_regression import learned_regressions
 from musculoskeletal_ae.body_model.postures import FIRST_NOISE, fit_jointly
 from musculoskeletal_ae.body_model.priors import PRIOR, REOPENED, MusclePrior
@@ -33,7 +34,6 @@ from musculoskeletal_ae.gauss_newton import (
     minimise,
     noise_and_weight,
 )
-from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.mae import Mae
 
 ROUNDS = 30  # end the fit of one muscle after this many Gauss–Newton iterations

@@ -23,7 +23,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.body_model import springs
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
-from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.body_model.observations import Observations
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
 
 DIFFERENCE = 1e-6  # differentiate numerically with this step [rad]

@@ -29,20 +29,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
-from scipy.optimize import minimize
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.body_model.remainder import FEW_SAMPLES, LEAST_SAMPLES, judging, squares
+from musculoskeletal_ae.body_model.remainder import (
+    FEW_SAMPLES,
+    LEAST_SAMPLES,
+    judging,
+    likeliest,
+    squares,
+)
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
     from musculoskeletal_ae.body_model.fit import FittedBody
+    from musculoskeletal_ae.body_model.observations import Observations
     from musculoskeletal_ae.body_model.remainder import LeftOut
-    from musculoskeletal_ae.learning.samples import Observations
     from musculoskeletal_ae.robot.groups import Group
     from musculoskeletal_ae.robot.robot import Robot
 
@@ -206,27 +212,17 @@ def _learned(
     judged_pairs = Pairs.of(judged, judged)
     logarithms, roots, weights = list[Array](), list[Array](), list[Array]()
     for start, target in zip(starts, targets.T, strict=True):
-        evidence = _Evidence(judged_pairs, target[rows], noise[rows])
-        logarithms.append(_likeliest(evidence, start if len(scaled) >= FEW_SAMPLES else None))
+        evidence = partial(_evidence, judged_pairs, target[rows], noise[rows])
+        if start is None or len(scaled) < FEW_SAMPLES:
+            logarithms.append(likeliest(evidence, STARTS, ROUNDS, BOUNDS))
+        else:
+            logarithms.append(likeliest(evidence, [start], FEW_ROUNDS, BOUNDS))
         roots.append(cholesky(_covariance(pairs, noise, logarithms[-1]), lower=True))
         weights.append(cho_solve((roots[-1], True), target))
     return PostureRegression(
         joints, muscles, mean, scale, angle_mean, angle_spread, body_variance,
         np.array(logarithms), scaled, tuple(roots), np.array(weights),
     )  # fmt: skip
-
-
-def _likeliest(evidence: _Evidence, start: Array | None) -> Array:
-    """Return the logarithms with the largest evidence, (6,); `start` is the last result."""
-    starts, rounds = (STARTS, ROUNDS) if start is None else ((start,), FEW_ROUNDS)
-    found = [
-        minimize(
-            evidence, each, jac=True, method='L-BFGS-B', bounds=BOUNDS, options={'maxiter': rounds}
-        )
-        for each in starts
-    ]
-    logarithms: Array = min(found, key=lambda result: result.fun).x
-    return logarithms
 
 
 def _kernel(distance: Array, product: Array, logarithms: Array) -> Array:
@@ -245,40 +241,44 @@ def _covariance(pairs: Pairs, noise: Array, logarithms: Array) -> Array:
     return covariance
 
 
-class _Evidence:
-    """Computes the negative logarithm of the evidence and its derivatives by six logarithms."""
+def _evidence(
+    pairs: Pairs, targets: Array, noises: Array, logarithms: Array
+) -> tuple[float, Array]:
+    """Return the negative logarithm of the evidence and its derivatives by six logarithms.
 
-    def __init__(self, pairs: Pairs, targets: Array, noise: Array) -> None:
-        self._pairs, self._targets, self._noise = pairs, targets, noise
-
-    def __call__(self, logarithms: Array) -> tuple[float, Array]:
-        deviation = (logarithms - USUAL) / SPREAD
-        rough, noise, line, parabola, width, factor = np.exp(2.0 * logarithms)
-        covariance = _covariance(self._pairs, self._noise, logarithms)
-        try:
-            root = cholesky(covariance, lower=True, check_finite=False)
-        except LinAlgError:
-            return 1e12, np.zeros(len(logarithms))
-        inverse = cho_solve((root, True), np.eye(len(root)), check_finite=False)
-        weights = inverse @ self._targets
-        value = 0.5 * float(self._targets @ weights + deviation @ deviation)
-        value += float(np.log(np.diag(root)).sum())
-        slope = inverse - np.outer(weights, weights)
-        d, p = self._pairs.scaled(logarithms)
-        relative = 1.0 / (1.0 + 0.5 * d / width)
-        by_distance = -0.5 * rough / width * np.square(relative)
-        by_product = line + 2.0 * parabola * p
-        distance_of_tensions, product_of_tensions = self._pairs.of_tensions
-        by_tension = by_distance * distance_of_tensions + by_product * product_of_tensions
-        gradient = [
-            (slope * rough * relative).sum(),
-            noise * (np.diag(slope) @ self._noise),
-            line * (slope * p).sum(),
-            parabola * (slope * np.square(p)).sum(),
-            -(slope * by_distance * d).sum(),
-            factor * (slope * by_tension).sum(),
-        ]
-        return value, np.array(gradient) + deviation / SPREAD
+    Args:
+        pairs: The pairs of samples.
+        targets: What the regression should yield for each sample, (N,).
+        noises: Variances of the samples in units of σ², (N,).
+        logarithms: Logarithms of the hyperparameters, (6,).
+    """
+    deviation = (logarithms - USUAL) / SPREAD
+    rough, noise, line, parabola, width, factor = np.exp(2.0 * logarithms)
+    covariance = _covariance(pairs, noises, logarithms)
+    try:
+        root = cholesky(covariance, lower=True, check_finite=False)
+    except LinAlgError:
+        return 1e12, np.zeros(len(logarithms))
+    inverse = cho_solve((root, True), np.eye(len(root)), check_finite=False)
+    weights = inverse @ targets
+    value = 0.5 * float(targets @ weights + deviation @ deviation)
+    value += float(np.log(np.diag(root)).sum())
+    slope = inverse - np.outer(weights, weights)
+    d, p = pairs.scaled(logarithms)
+    relative = 1.0 / (1.0 + 0.5 * d / width)
+    by_distance = -0.5 * rough / width * np.square(relative)
+    by_product = line + 2.0 * parabola * p
+    distance_of_tensions, product_of_tensions = pairs.of_tensions
+    by_tension = by_distance * distance_of_tensions + by_product * product_of_tensions
+    gradient = [
+        (slope * rough * relative).sum(),
+        noise * (np.diag(slope) @ noises),
+        line * (slope * p).sum(),
+        parabola * (slope * np.square(p)).sum(),
+        -(slope * by_distance * d).sum(),
+        factor * (slope * by_tension).sum(),
+    ]
+    return value, np.array(gradient) + deviation / SPREAD
 
 
 def _body_errors(

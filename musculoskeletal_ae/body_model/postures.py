@@ -34,6 +34,7 @@ from scipy.linalg import solve_triangular
 
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.body_model.joint_stops import Stops
+from musculoskeletal_ae.body_model.observations import Observations
 from musculoskeletal_ae.body_model.posture_model import Bent, PostureModel, Residuals, Unknowns
 from musculoskeletal_ae.body_model.priors import GroupPrior
 from musculoskeletal_ae.gauss_newton import (
@@ -47,7 +48,6 @@ from musculoskeletal_ae.gauss_newton import (
     noise_and_weight,
     student,
 )
-from musculoskeletal_ae.learning.samples import Observations
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody

@@ -30,7 +30,7 @@ predicted from all other samples.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -39,8 +39,8 @@ from scipy.linalg import LinAlgError, cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.body_model.observations import Observations
 from musculoskeletal_ae.gauss_newton import FREEDOM, student
-from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.robot import Robot
 
 if TYPE_CHECKING:
@@ -270,14 +270,18 @@ def group_remainder(
         scale[len(joints) :] = np.inf  # ignore the tensions
     crossed = robot.routes.crossed[np.ix_(muscles, joints)]
     inputs = np.hstack([lengths.theta, lengths.tension]) / scale
+
+    def evidence(lengths: Lengths) -> _Evidence:
+        return _Evidence(lengths.part(judging(len(lengths.theta))), scale, crossed)
+
     is_few = len(inputs) < FEW_SAMPLES
     if start is None or is_few:
         known = [] if start is None else [start]
-        start = _likeliest(lengths, scale, crossed, [*known, *STARTS], ROUNDS)
+        start = likeliest(evidence(lengths), [*known, *STARTS], ROUNDS, BOUNDS)
     starts, rounds = ([start, *STARTS], ROUNDS) if is_few else ([start], FEW_ROUNDS)
     left_out = _solved(lengths, inputs, crossed, start)
     lengths = lengths._replace(weight=_robust_weights(lengths.weight, left_out, start))
-    logarithms = _likeliest(lengths, scale, crossed, starts, rounds)
+    logarithms = likeliest(evidence(lengths), starts, rounds, BOUNDS)
     weights, error, variance = _solved(lengths, inputs, crossed, logarithms)
     correlation = _correlation(np.where(lengths.weight > 0.0, error / np.sqrt(variance), 0.0))
     mean_noise = np.diag(_variances(lengths.weight.mean(axis=1), logarithms))
@@ -291,17 +295,23 @@ def group_remainder(
     return group, LeftOut(rows, error, variance, lengths.weight)
 
 
-def _likeliest(
-    lengths: Lengths, scale: Array, crossed: Bools, starts: Sequence[Array], rounds: int
+def likeliest(
+    evidence: Callable[[Array], tuple[float, Array]],
+    starts: Sequence[Array],
+    rounds: int,
+    bounds: Sequence[tuple[float, float]],
 ) -> Array:
     """Return the logarithms of the hyperparameters with the largest evidence, (6,).
 
-    A search of at most `rounds` iterations begins at each of `starts`.
+    Args:
+        evidence: Returns the negative logarithm of the evidence, and its derivatives, (6,).
+        starts: Logarithms at which a search begins, (6,) each.
+        rounds: Largest number of iterations of each search.
+        bounds: Lowest and highest value of each logarithm.
     """
-    evidence = _Evidence(lengths.part(judging(len(lengths.theta))), scale, crossed)
     found = [
         minimize(
-            evidence, each, jac=True, method='L-BFGS-B', bounds=BOUNDS, options={'maxiter': rounds}
+            evidence, each, jac=True, method='L-BFGS-B', bounds=bounds, options={'maxiter': rounds}
         )
         for each in starts
     ]

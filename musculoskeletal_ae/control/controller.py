@@ -31,11 +31,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.awake_clock import PAUSE, AwakeClock
 from musculoskeletal_ae.conditions import ORDER, Action, Condition, ConditionKind
 from musculoskeletal_ae.control import controller_status
-from musculoskeletal_ae.control.activities import ActivityControl, Inputs
-from musculoskeletal_ae.control.command import LENGTH, TENSION, Command, Pull
 from musculoskeletal_ae.control.holding import HoldingCheck
 from musculoskeletal_ae.control.limiter import CommandLimiter
-from musculoskeletal_ae.control.method_choice import by_follower, check_settings
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stop_commands import SafeStop
 from musculoskeletal_ae.control.supervisor import Activity, Supervisor
@@ -43,13 +40,20 @@ from musculoskeletal_ae.control.watchdog import Watchdog
 from musculoskeletal_ae.exceptions import MessageError, RobotDescriptionError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
+from musculoskeletal_ae.motion.activities import (
+    LENGTH,
+    TENSION,
+    ActivityControl,
+    Command,
+    Inputs,
+)
 from musculoskeletal_ae.motion.calibrating import Calibrating, gentle_limit
 from musculoskeletal_ae.motion.exploration import Exploration, Exploring
 from musculoskeletal_ae.motion.follower import Follower
-from musculoskeletal_ae.motion.planner import Plan, Planner
+from musculoskeletal_ae.motion.planner import Planner
 from musculoskeletal_ae.motion.ramps import LengthRamps, RampedTarget
 from musculoskeletal_ae.motion.torque import GravityCompensation, TorqueControl
-from musculoskeletal_ae.motion.trajectory import Setpoint
+from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly, BodyState
@@ -128,7 +132,7 @@ class Activities:
     def of(self, activity: Activity, settings: Settings) -> ActivityControl | None:
         """Return the object that implements an activity; None for `IDLE`."""
         if activity in (Activity.HOLDING, Activity.MOVING):
-            return self.follower if by_follower(settings) else self.ramped_target
+            return self.follower if settings.is_by_follower else self.ramped_target
         others: dict[Activity, ActivityControl] = {
             Activity.EXPLORING: self.exploring,
             Activity.CALIBRATING: self.calibrating,
@@ -177,7 +181,7 @@ class Controller:
                 step ticks it. None to create one.
         """
         self.robot, self.settings = robot, settings or Settings()
-        check_settings(robot, self.settings)
+        self.settings.check_fit(robot)
         self.mae: Mae | None = None
         self.stream = MuscleStream(robot, window=WINDOW)
         self.sample: MuscleSample | None = None
@@ -214,7 +218,7 @@ class Controller:
         Raises:
             ParameterError: If the joint stiffness or the method does not fit the robot.
         """
-        check_settings(self.robot, settings)
+        settings.check_fit(self.robot)
         before, units = self.settings, self.robot.units
         is_stiffer = settings.desired_stiffness(units) != before.desired_stiffness(units)
         self.settings = settings
@@ -379,7 +383,7 @@ class Controller:
             goal, reason = self.planner.reachable(self.mae, self.estimate, goal, nearest)
         clamped = tuple(n for n, a, b in zip(robot.joints, theta, goal) if a != b)
         self.target_state = Target(effort, goal, clamped, reason, APPROACHES)
-        if not (self.supervisor.is_running and by_follower(self.settings) and self._is_ready):
+        if not (self.supervisor.is_running and self.settings.is_by_follower and self._is_ready):
             self._hold()  # the arm moves to the target as soon as it may move
             return
         try:
@@ -405,8 +409,8 @@ class Controller:
             self._follow(self.planner.to_rest(start))
         else:
             lag = self.activities.follower.winches.lag
-            plan = self.planner.through(mae, start, points, max(-delay, 0.0), lag)
-            self._follow(plan, max(delay, 0.0))
+            trajectory = self.planner.through(mae, start, points, max(-delay, 0.0), lag)
+            self._follow(trajectory, delay=max(delay, 0.0))
 
     def pose(self, pose: pin.SE3, whole: bool, now: float) -> None:
         """Move the end effector to a pose in the root link's frame.
@@ -424,7 +428,7 @@ class Controller:
         if progress.is_moving and self.planner.is_under_way(pose, whole, progress.latest):
             self.planner.repeat_pose(now)
             return
-        self._follow(self.planner.to_pose(mae, start, pose, whole, now))
+        self._follow(*self.planner.to_pose(mae, start, pose, whole, now))
 
     def twist(self, twist: Array) -> None:
         """Move the end effector at a given velocity for `hand.TWIST_TIMEOUT` seconds.
@@ -650,11 +654,11 @@ class Controller:
         # Without a stop cause, all inputs are available.
         assert self.mae is not None and self.sample is not None and self.estimate is not None
         sample = self.sample
-        pull = Pull(sample.motor_tension * sample.usable, sample.bone_tension * sample.usable)
         return Inputs(
             mae=self.mae,
             sample=sample,
-            pull=pull,
+            motor_tension=sample.motor_tension * sample.usable,
+            bone_tension=sample.bone_tension * sample.usable,
             theta=self.estimate,
             length=self.limiter.last(LENGTH, sample).value,
             tension=self.limiter.last(TENSION, sample).value,
@@ -720,22 +724,23 @@ class Controller:
         assert state.theta is not None
         start, mae = self._ready()
         lag = self.activities.follower.winches.lag
-        plan = self.planner.to_posture(mae, start, state.theta, duration, lag)
-        self._begin(plan, 0.0, state.effort)
+        trajectory = self.planner.to_posture(mae, start, state.theta, duration, lag)
+        self._begin(trajectory, 0.0, state.effort)
 
-    def _follow(self, plan: Plan, delay: float = 0.0) -> None:
+    def _follow(
+        self, trajectory: Trajectory, unreachable_reason: str = '', delay: float = 0.0
+    ) -> None:
         """Follow a requested trajectory after `delay` [s]; its end becomes the target."""
         nothing = np.zeros(self.robot.joint_count)
-        end = plan.trajectory.end
-        self.target_state = Target(nothing, end, (), plan.unreachable_reason)
-        self._begin(plan, delay, nothing)
+        self.target_state = Target(nothing, trajectory.end, (), unreachable_reason)
+        self._begin(trajectory, delay, nothing)
 
-    def _begin(self, plan: Plan, delay: float, effort: Array) -> None:
+    def _begin(self, trajectory: Trajectory, delay: float, effort: Array) -> None:
         follower = self.activities.follower
         if follower.progress.trajectory is None and delay > 0.0:
             start, _ = self._ready()
-            follower.follow(self.planner.to_rest(start).trajectory)
-        follower.follow(plan.trajectory, delay)
+            follower.follow(self.planner.to_rest(start))
+        follower.follow(trajectory, delay)
         follower.exert(effort)
         self.supervisor.on_request(Activity.MOVING)
 

@@ -56,14 +56,14 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.command import (
+from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.motion.activities import (
     LENGTH,
     TENSION,
     Command,
     msc_compensation,
     unchanging,
 )
-from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.robot.model_errors import LARGEST
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_readings import MuscleReadings

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +14,12 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.messages.arrival import INTERRUPTION
 from musculoskeletal_ae.parameters import PRESET, naming_parameter, parameters_of, settable
+from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.joint_units import SLIDE, JointUnits
+
+if TYPE_CHECKING:
+    from musculoskeletal_ae.motion.methods import LengthMethod
+    from musculoskeletal_ae.robot.robot import Robot
 
 UNREACHABLE = ('refuse', 'nearest')  # legal values of the setting `unreachable`
 METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness', 'float')
@@ -129,3 +136,46 @@ class Settings:
             legal = f'{len(most)} numbers of at least 0, at most {ends} [N·m/rad or N/m], or []'
             raise MusculoskeletalError(f'{list(values)}; legal: {legal}')
         return units.to_stiffness(np.array(values))
+
+    def check_fit(self, robot: Robot) -> None:
+        """Check that the desired stiffness fits the robot's joints, and the method its modules.
+
+        Raises:
+            ParameterError: If one of them does not fit; the text names the reason and the legal
+                values.
+        """
+        with naming_parameter('joint_stiffness'):
+            self.desired_stiffness(robot.units)
+        with naming_parameter('method'):
+            self._check_method(robot)
+
+    def _check_method(self, robot: Robot) -> None:
+        """Check that the robot's muscle modules measure the tensions that the method needs."""
+        if robot.tension_source.is_current and self.method in BY_TENSION:
+            legal = tuple(method for method in METHODS if method not in BY_TENSION)
+            raise MusculoskeletalError(
+                f'{self.method!r} requires measured tensions, but tension_source in '
+                'muscles.yaml is `current`: the friction of a resting drive hides the force of a '
+                f'hand; legal: {", ".join(legal)}'
+            )
+        if robot.tension_source.is_known:
+            return
+        legal = preset_named(self.preset).methods_without_tension
+        if self.method not in legal:
+            raise MusculoskeletalError(
+                f'{self.method!r} requires tensions, but tension_source in muscles.yaml is '
+                f'`none`; legal with preset {self.preset!r}: {", ".join(legal)}'
+            )
+
+    @property
+    def length_methods(self) -> Mapping[str, LengthMethod]:
+        """The control methods of the preset that command lengths, by name."""
+        return preset_named(self.preset).length_methods()
+
+    @property
+    def is_by_follower(self) -> bool:
+        """Whether the `Follower` moves the arm to targets with the control method.
+
+        All other methods ramp the lengths (`LengthRamps`) or command tensions (`TorqueControl`).
+        """
+        return self.method not in (*BY_TENSION, *self.length_methods)

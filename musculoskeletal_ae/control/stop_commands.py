@@ -21,9 +21,9 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.command import LENGTH, TENSION, Command
 from musculoskeletal_ae.control.limiter import CommandLimiter
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.motion.activities import LENGTH, TENSION, Command
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 

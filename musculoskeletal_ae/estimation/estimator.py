@@ -37,7 +37,6 @@ from musculoskeletal_ae.estimation.isolation import SuspectHandling
 from musculoskeletal_ae.estimation.joint_sensor_check import JointSensorCheck
 from musculoskeletal_ae.estimation.lengths.length_calibration import LengthCalibration
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthTrust
-from musculoskeletal_ae.estimation.marker import posture_of_marker
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
 from musculoskeletal_ae.estimation.mounting import MountingCheck
 from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
@@ -49,6 +48,7 @@ from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.messages.arrival import INTERRUPTION, LONGEST_STEP, SILENCE, SPACING
 from musculoskeletal_ae.remedy import REPAIR, Step, sentence
 from musculoskeletal_ae.report import Report
+from musculoskeletal_ae.robot.inverse_kinematics import posture_of_marker
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 from musculoskeletal_ae.signals.joint_stream import JointStream

@@ -172,16 +172,13 @@ def follow(
     )
 
 
-class Approach(NamedTuple):
-    """How fast, and how closely, the arm approached one target of `proposed`."""
+def approach(loop: ClosedLoop, goal: Array, duration: float) -> tuple[float, float]:
+    """Send a target θ [rad] (D,), and observe the arm for `duration` [s].
 
-    #: time until the arm stays within WITHIN of the target, at most SETTLING_TIME [s]
-    settling: float
-    distance: float  # distance ‖θ_target − θ‖ after the time ARRIVING [rad]
-
-
-def approach(loop: ClosedLoop, goal: Array, duration: float) -> Approach:
-    """Send a target θ [rad] (D,), and observe the arm for `duration` [s]."""
+    Returns:
+        The time until the arm stays within WITHIN of the target, at most SETTLING_TIME [s], and the
+        distance ‖θ_target − θ‖ at the end [rad].
+    """
     loop.target(goal)
     distances = list[float]()
     for _ in range(round(duration / SAMPLE_TIME)):
@@ -189,7 +186,7 @@ def approach(loop: ClosedLoop, goal: Array, duration: float) -> Approach:
         distances.append(float(np.linalg.norm(loop.arm.theta - goal)))
     beyond = np.array(distances[: round(SETTLING_TIME / SAMPLE_TIME)]) > WITHIN
     settled_at = beyond.nonzero()[0].max(initial=-1) + 1
-    return Approach(SAMPLE_TIME * float(settled_at), distances[-1])
+    return SAMPLE_TIME * float(settled_at), distances[-1]
 
 
 def arrivals(loop: ClosedLoop, goals: Array, duration: float) -> dict[str, float]:
@@ -198,10 +195,9 @@ def arrivals(loop: ClosedLoop, goals: Array, duration: float) -> dict[str, float
     Returns:
         Statistics of settling times, distances and missed targets, by key in result.json.
     """
-    approaches = [approach(loop, goal, duration) for goal in goals]
-    distances = np.array([each.distance for each in approaches])
+    settling, distances = np.array([approach(loop, goal, duration) for goal in goals]).T
     return {
-        'settle_s': float(np.mean([each.settling for each in approaches])),
+        'settle_s': float(settling.mean()),
         'distance_rad': float(distances.mean()),
         'distance_median_rad': float(np.median(distances)),
         'approaches': len(distances),

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
-from musculoskeletal_ae.control.command import LENGTH
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.faults import ArmReadings
@@ -18,9 +17,9 @@ from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.activities import LENGTH
 from musculoskeletal_ae.motion.exploration import Exploration
-from musculoskeletal_ae.motion.explored_postures import ExplorationStep
-from musculoskeletal_ae.motion.methods import first_command
+from musculoskeletal_ae.motion.methods import Goal, first_command
 from musculoskeletal_ae.motion.ramps import RAMP_SHARE
 from musculoskeletal_ae.presets.preset import PAPER_PRESET
 from musculoskeletal_ae.signals.body_state import Anomaly
@@ -174,7 +173,7 @@ class ClosedLoop:
 def record(
     arm: Arm,
     mae: Mae,
-    stream: int | Iterable[ExplorationStep],
+    stream: int | Iterable[Goal],
     duration: float,
     script: Script | None = None,
 ) -> Recording:
@@ -206,6 +205,7 @@ def record(
     for step in Exploration(robot, stream, PAPER_PRESET) if isinstance(stream, int) else stream:
         if planned >= duration - 1e-9:
             break
+        assert step.tension is not None  # each step of the exploration states one
         start, goal = command, first_command(robot, mae, step.theta, step.tension)
         planned += step.duration
         for tick in range(round(step.duration / SAMPLE_TIME)):

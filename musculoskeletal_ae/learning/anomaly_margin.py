@@ -9,8 +9,8 @@ anomaly, messages are ignored for the same time.
 from collections import deque
 from typing import NamedTuple
 
+from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
-from musculoskeletal_ae.learning.samples import Sample
 
 #: Hold back at most this many messages, which bounds the memory if the clock stands still. Even at
 #: 1 kHz, fewer messages than this arrive within DETECTION_DELAY.

@@ -26,8 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.body_model.observations import Observations, Sample
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE, NORM
-from musculoskeletal_ae.learning.samples import Observations, Sample, SampleStore
+from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, anomaly, residuals
 

@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.body_model.observations import NOTHING, Sample
 from musculoskeletal_ae.learning.anomaly_margin import AnomalyMargin
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.rest import REST_TIME, RestDetector
-from musculoskeletal_ae.learning.samples import NOTHING, Sample, SampleStore
+from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.learning.slow_moments import SlowMoments
 from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.robot.robot import Robot

@@ -21,7 +21,7 @@ import numpy as np
 
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.synthetic import synthetic_samples
-from musculoskeletal_ae.learning.job import Update
+from musculoskeletal_ae.learning.scheduler import Update
 from musculoskeletal_ae.mae.units import scale_vector
 
 STEPS = 400  # train for this many steps in each update

@@ -28,17 +28,16 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.joint_stops import LARGEST_OFFSET
+from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.conditions import Condition
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.learning.calibration import Reservoir, uncalibrated
 from musculoskeletal_ae.learning.checkpoint_keeper import CheckpointKeeper
 from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR, SampleCollector
-from musculoskeletal_ae.learning.job import Update
-from musculoskeletal_ae.learning.joint_history import JointHistory
 from musculoskeletal_ae.learning.learner_status import learner_conditions, learner_report
-from musculoskeletal_ae.learning.offset_history import HELD_TIME, OffsetHistory
-from musculoskeletal_ae.learning.samples import Sample, SampleStore
-from musculoskeletal_ae.learning.scheduler import LEAST_BLIND, STEPS, UpdateScheduler
+from musculoskeletal_ae.learning.sample_history import HELD_TIME, JointHistory, OffsetHistory
+from musculoskeletal_ae.learning.samples import SampleStore
+from musculoskeletal_ae.learning.scheduler import LEAST_BLIND, STEPS, Update, UpdateScheduler
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.arrival import Arrival
@@ -188,7 +187,7 @@ class Learner:
     def _use_known_offsets(self) -> None:
         """Use length offsets that the estimator has just declared known.
 
-        Samples that were taken under wrong offsets are dropped or corrected (`offset_history`).
+        Samples that were taken under wrong offsets are dropped or corrected (`sample_history`).
         """
         before = self.offset_history.corrected
         self.offset_history.use(self.body.offsets.offset)
@@ -233,7 +232,7 @@ class Learner:
 
         Isolated muscles are not learned. While the length offsets are unknown, or an anomaly is
         present, learning pauses. Samples that were taken under wrong length offsets are dropped or
-        corrected (`offset_history`); all others are kept.
+        corrected (`sample_history`); all others are kept.
         """
         before, offsets = self.body, body.offsets
         self.collector.use_body(body)
@@ -251,7 +250,7 @@ class Learner:
         """Use another trust in the joint sensors: learn nothing from sensors in doubt.
 
         Their angles since the beginning of the doubt are removed from the samples, and are put back
-        if the user confirms the sensors (`joint_history`).
+        if the user confirms the sensors (`sample_history`).
 
         Args:
             trust: The trust, with times on the clock of the messages.

@@ -18,15 +18,15 @@ from numpy.typing import ArrayLike
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.bags.storage import LONGEST_PAUSE
 from musculoskeletal_ae.bags.streams import Pairs
+from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.exceptions import CheckpointError
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.collector import SampleCollector
 from musculoskeletal_ae.learning.convergence import STEPS, until_converged
-from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.samples import Sample, SampleStore
-from musculoskeletal_ae.learning.scheduler import LEAST_INTERVAL
+from musculoskeletal_ae.learning.samples import SampleStore
+from musculoskeletal_ae.learning.scheduler import LEAST_INTERVAL, Update
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly

@@ -20,7 +20,7 @@ from operator import itemgetter
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.samples import NOTHING, Sample
+from musculoskeletal_ae.body_model.observations import NOTHING, Sample
 
 REST_TIME = 0.3  # conclude that the arm rests after it has been still for this long [s]
 JOINT_RATE = 0.02  # conclude that the arm moves if a joint is faster than this [rad/s]

@@ -8,9 +8,10 @@ import msgspec
 import numpy as np
 
 from musculoskeletal_ae.arrays import Bools
+from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.exceptions import CheckpointError, StateError
-from musculoskeletal_ae.learning.samples import Sample, SampleStore, StoredSample
+from musculoskeletal_ae.learning.samples import SampleStore, StoredSample
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot

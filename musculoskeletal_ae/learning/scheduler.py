@@ -3,12 +3,19 @@
 
 An update begins when there are new data and enough samples, and the last update began at least
 `LEAST_INTERVAL` ago. The caller supplies all times from its clock, which may jump backward.
+
+`Job` contains the inputs of an update, and `Update` its result. The node exchanges both with its
+training process.
 """
 
 import math
+from typing import NamedTuple
 
-from musculoskeletal_ae.learning.calibration import Reservoir, uncalibrated
-from musculoskeletal_ae.learning.job import Job, Update
+import numpy as np
+
+from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.body_model.observations import Observations
+from musculoskeletal_ae.learning.calibration import Healthy, Reservoir, uncalibrated
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae.mae import Mae
 
@@ -18,6 +25,40 @@ STEPS = 50
 LEAST_INTERVAL = 1.0
 #: require this many samples for the first update of an arm without joint sensors
 LEAST_BLIND = 20
+
+
+class Job(NamedTuple):
+    """A job for the training process: everything that an update of the network needs."""
+
+    observed: Observations  # the samples, oldest first
+    healthy: Healthy  # messages of the healthy arm, with which the anomaly detector is calibrated
+    #: whether the statistics of the anomaly detector are valid for the present arm; not after a
+    #: muscle has been changed
+    statistics_hold: bool
+    steps: int  # number of training steps of preset `default`
+    isolated: tuple[int, ...] = ()  # indices of the muscles that the messages do not describe
+
+
+class Update(NamedTuple):
+    """The result of one update: the trained network, and what the update has found."""
+
+    mae: Mae  # the trained network
+    loss: float  # training loss
+    #: σ of the part of each length that the body does not explain [m], (M,)
+    noise: Array = np.empty(0)
+    #: index of a muscle whose newest samples contradict the fitted body, and the number of these
+    #: newest samples; at most one entry
+    changed: tuple[tuple[int, int], ...] = ()
+    #: mean 2-norms of θ_est − θ at the newest samples, over the revolute and over the prismatic
+    #: joints (`JointUnits.mean_errors`), with θ_est of the network before the update [rad], (2,)
+    errors: Array = np.full(2, np.nan)
+    seconds: float = 0.0  # duration of the update [s]
+    #: root mean square over the samples of what the constants of the body model cannot express, for
+    #: each length [m], (M,); empty if the preset fits no body
+    remainder: Array = np.empty(0)
+    #: estimated joint-sensor offsets z [rad], (D,); empty if the preset estimates none
+    sensor_offset: Array = np.empty(0)
+    unchanged: str = ''  # why the network was not trained; '' if it was
 
 
 class UpdateScheduler:

@@ -16,7 +16,8 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.samples import MOMENT_ARM, NOTHING, Sample
+from musculoskeletal_ae.body_model.observations import NOTHING, Sample
+from musculoskeletal_ae.learning.samples import MOMENT_ARM
 
 PERIOD = 1.0  # learn the slowest moment of each interval of this duration [s]
 MOMENT = 0.1  # average the readings of a moment over this duration [s]

@@ -17,10 +17,11 @@ import time
 from pathlib import Path
 from typing import TextIO
 
+from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.exceptions import StateError
 from musculoskeletal_ae.files import locked, read_bytes, write_whole
 from musculoskeletal_ae.learning import saved_state
-from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.learning.saved_state import SavedState
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot

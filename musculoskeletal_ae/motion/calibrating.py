@@ -6,10 +6,15 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.activities import ActivityControl, Inputs
-from musculoskeletal_ae.control.command import LENGTH, Command, msc_compensation
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.exceptions import InfeasibleError
+from musculoskeletal_ae.motion.activities import (
+    LENGTH,
+    ActivityControl,
+    Command,
+    Inputs,
+    msc_compensation,
+)
 from musculoskeletal_ae.motion.ramps import Ramp
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import TensionProgramme
@@ -87,7 +92,7 @@ class Calibrating(ActivityControl):
         posture. If none does, the step whose end misses the least holding torque is chosen.
         """
         robot, mae, theta = self._robot, inputs.mae, inputs.theta
-        tension = inputs.pull.motor
+        tension = inputs.motor_tension
         limits = robot.tension.bias, gentle_limit(robot)
         best, best_tension, least_missing = theta, tension, np.inf
         for goal in robot.random_postures(GOALS, self._rng, -INSIDE):

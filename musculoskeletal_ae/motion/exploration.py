@@ -12,10 +12,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.activities import ActivityControl, Inputs
-from musculoskeletal_ae.control.command import Command
-from musculoskeletal_ae.motion.explored_postures import ExplorationStep
-from musculoskeletal_ae.motion.ramps import Goal, LengthRamps
+from musculoskeletal_ae.motion.activities import ActivityControl, Command, Inputs
+from musculoskeletal_ae.motion.methods import FIRST, Goal
+from musculoskeletal_ae.motion.ramps import LengthRamps
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -35,7 +34,7 @@ class Exploration:
         """Use another preset, or a robot with other isolated muscles, for the next steps."""
         self._robot, self._draw = robot, preset_named(preset).exploration()
 
-    def __iter__(self) -> Iterator[ExplorationStep]:
+    def __iter__(self) -> Iterator[Goal]:
         while True:
             yield from self._draw(self._robot, self._rng)
 
@@ -45,7 +44,7 @@ class Exploring(ActivityControl):
 
     def __init__(self, exploration: Exploration, ramps: LengthRamps) -> None:
         self.stream, self.ramps = exploration, ramps
-        self._steps: Iterator[ExplorationStep] | None = None
+        self._steps: Iterator[Goal] | None = None
         self._theta: Array | None = None  # present target [rad], (D,)
 
     def enter(self, inputs: Inputs) -> None:
@@ -61,11 +60,10 @@ class Exploring(ActivityControl):
         """
         assert self._steps is not None
         if self.ramps.is_over_after(inputs.dt):
-            step = next(self._steps)
-            self._theta = step.theta
-            constant = step.tension if step.method == 'first' else None
-            effort = np.zeros_like(step.theta)
-            self.ramps.pursue([Goal(step.method, step.theta, effort, step.duration, constant)])
+            goal = next(self._steps)
+            self._theta = goal.theta
+            # All other methods use the present tension.
+            self.ramps.pursue([goal if goal.method == FIRST else goal._replace(tension=None)])
         return self.ramps.step(inputs)
 
     def leave(self) -> None:

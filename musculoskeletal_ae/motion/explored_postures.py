@@ -3,7 +3,6 @@
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import NamedTuple
 
 import numpy as np
 
@@ -37,17 +36,6 @@ LEAST_STIFFNESS = 0.05
 BALANCED = 1e-3  # count a posture as held if it lacks at most this share of the largest torque
 SMALL = 1e-9  # divide torques by at least this, to avoid a division by zero [N·m]
 PRESSES = 10  # draw this many random T_const, and use the one that presses most strongly
-
-
-class ExplorationStep(NamedTuple):
-    """One step of the exploration: a target posture, and the command that leads to it."""
-
-    method: str  # length method of the preset: 'first' or 'second'
-    theta: Array  # target posture θ_target [rad], (D,)
-    #: T_const of the method `first` [N], (M,). For the method `second`, which uses the present
-    #: tension instead, this is the tension that the geometric model expects.
-    tension: Array
-    duration: float  # duration of the step [s]
 
 
 def posture_at_limits(robot: Robot, rng: np.random.Generator, share: float = AT_LIMITS) -> Array:

@@ -22,8 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.command import Pull
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.activities import Inputs
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
@@ -160,19 +160,16 @@ class RestFeedback:
         """The present shift of the held posture."""
         return Shift(self.correction, self.supported)
 
-    def step(
-        self, error: Array, jacobian: Array, pull: Pull, limit: Array, gain: float, dt: float
-    ) -> bool:
-        """Integrate the errors over dt [s] if the arm rests; return whether this was done.
+    def step(self, error: Array, jacobian: Array, inputs: Inputs, gain: float) -> bool:
+        """Integrate the errors since the last step if the arm rests; return whether this was done.
 
         Args:
             error: Posture error θ_target − θ_estimated [rad], (D,).
             jacobian: Muscle Jacobian G at the target [m/rad], (M, D).
-            pull: Tensions of the muscles.
-            limit: Highest tension that may be planned [N], (M,).
+            inputs: Tensions, their limit, and the time since the last step.
             gain: Integral gain [1/s]; 0 for no feedback.
-            dt: Time since the last call [s].
         """
+        dt, limit = inputs.dt, inputs.limit
         self._rested += dt
         if self._rested <= SETTLING or gain == 0.0:
             return False
@@ -185,14 +182,14 @@ class RestFeedback:
             actuation, bias = self._robot.actuation, self._robot.tension.bias
             lowest, largest = actuation.kept_tension, actuation.largest_relief
             change = gain * self._unsolved
-            share = change / actuation.tension_per_length(pull.motor)
+            share = change / actuation.tension_per_length(inputs.motor_tension)
             self._unsolved = 0.0
             helps = is_off & (np.abs(self.correction) < CORRECTION)
             goal = np.where(helps, self.correction, 0.0)
             self.supported = self.supported + change * (goal - self.supported)
-            bone = np.clip(pull.bone, lowest, limit)
+            bone = np.clip(inputs.bone_tension, lowest, limit)
             least = least_tension(jacobian, -jacobian.T @ bone, bias, limit).tension
-            motor = np.clip(pull.motor, lowest, limit)
+            motor = np.clip(inputs.motor_tension, lowest, limit)
             needless = np.where(motor > least, motor - least, np.minimum(bone - least, 0.0))
             self.relief = np.clip(self.relief + share * needless, -largest, largest)
         return True

@@ -11,7 +11,7 @@ muscle lengths,
     l_target = l + l_comp(T e^{μ s}) + λ dl/dt
 
 Tendon friction: the motor-side tension is T e^{μ s}. Here s is the direction in which the tendon
-slides, and μ is learned or a typical value (`motion/assumed_friction.py`).
+slides, and μ is learned or a typical value (`reach.tendon_friction`).
 
 Joint stops: f is the torque of the stops of those joints whose desired angle is at a limit
 (`robot/tension.py`). Paths of an arm with isolated muscles may lead along a stop (`reach`).
@@ -41,10 +41,9 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.activities import ActivityControl, Inputs
-from musculoskeletal_ae.control.command import LENGTH, Command
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.activities import LENGTH, ActivityControl, Command, Inputs
 from musculoskeletal_ae.motion.feedback import MotionFeedback, RestFeedback
 from musculoskeletal_ae.motion.progress import Progress
 from musculoskeletal_ae.motion.ramps import Ramp
@@ -153,7 +152,7 @@ class Follower(ActivityControl):
 
         None without a trajectory.
         """
-        return None if self.progress.trajectory is None else self.plan.tension.missing_torque
+        return None if self.progress.trajectory is None else self.plan.missing_torque
 
     # -- the activity ---------------------------------------------------------------------------
 
@@ -176,7 +175,7 @@ class Follower(ActivityControl):
             return None
         if progress.is_moving:
             sample = inputs.sample
-            self.winches.step(sample.length, inputs.pull.motor, sent, dt, sample.delay)
+            self.winches.step(sample.length, inputs.motor_tension, sent, dt, sample.delay)
         else:  # at rest, the measurements contain only noise and do not determine λ
             self.winches.forget()
         if progress.advance(dt):
@@ -222,8 +221,7 @@ class Follower(ActivityControl):
         if is_new := self._held is None:
             self._motion_feedback.continue_at_rest()
         before, gain = feedback.shift, 0.0 if plan.is_stiff else FEEDBACK_GAIN
-        error, limit = self.progress.error, inputs.limit
-        feedback.step(error, plan.jacobian, inputs.pull, limit, gain, inputs.dt)
+        feedback.step(self.progress.error, plan.jacobian, inputs, gain)
         if is_new or not np.array_equal(before, feedback.shift):
             self._held = plan.step(trajectory, self.progress.time, feedback.shift, 0.0, inputs)
         assert self._held is not None

@@ -18,14 +18,15 @@ below the length by |l_comp|. `stiffness` chooses T for a joint stiffness (`stif
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.robot import stiffness as robot_stiffness
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import (
@@ -38,6 +39,9 @@ from musculoskeletal_ae.robot.tension import (
 # Solve this many quadratic programmes, each with G at the tension that the previous one found. A
 # third programme would change the tension by well under a newton.
 SOLVES = 2
+
+FIRST = 'first'  # name of the length method that uses the given tension T_const
+SECOND = 'second'  # name of the length method that uses the measured tension T
 
 # The following constants are those of the method `stiffness`.
 
@@ -80,28 +84,18 @@ class Solution(NamedTuple):
     stiffness: JointStiffness | None = None
 
 
-class LengthCommand(Protocol):
-    """Interface of the functions that compute one length command for a target."""
-
-    def __call__(
-        self, robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array, /
-    ) -> Solution:
-        """Return the length command and the tension that it should produce.
-
-        Args:
-            robot: The body, in which isolated muscles have no tension.
-            mae: The network.
-            theta: Target posture θ_target [rad], (D,).
-            torque: Torque that the muscles should exert there, τ_target [N·m], (D,).
-            tension: T_const, or the measured T at the start of the movement [N], (M,).
-        """
+#: Function that computes the length command for a target, and the tension that it should produce.
+#: Its arguments are the body, in which isolated muscles have no tension, the network, the target
+#: posture θ_target [rad], (D,), the torque that the muscles should exert there, τ_target [N·m],
+#: (D,), and T_const, or the measured T at the start of the movement [N], (M,).
+LengthCommand = Callable[[Robot, Mae, Array, Array, Array], Solution]
 
 
 class LengthMethod(NamedTuple):
     """A control method that ramps to one length command and holds it.
 
     Attributes:
-        command: Function that computes l_target from a target posture, a torque and tensions.
+        command: Function that computes l_target.
         takes_tension: Whether the tensions that are passed to `command` are those that the muscles
             should exert. If so, the caller limits them before it calls `command`.
         follows_first: Whether the arm first moves to the target by the method `first`.
@@ -110,6 +104,25 @@ class LengthMethod(NamedTuple):
     command: LengthCommand
     takes_tension: bool = False
     follows_first: bool = False
+
+
+class Goal(NamedTuple):
+    """A posture, and the method that converts it into lengths.
+
+    Attributes:
+        method: One of the preset's length methods.
+        theta: Target posture θ_target [rad], (D,).
+        effort: Torque in addition to gravity compensation [N·m], (D,).
+        duration: Duration of the movement [s].
+        tension: T_const [N], (M,); None to use T_current at the start of the goal. For the method
+            `second`, a step of the exploration states the tension that the geometric model expects.
+    """
+
+    method: str
+    theta: Array
+    effort: Array
+    duration: float
+    tension: Array | None = None
 
 
 def first_command(robot: Robot, mae: Mae, theta: Array, tension: Array) -> Array:

@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plans trajectories that the arm can follow, from target postures, poses and twists.
 
-The methods that plan return a `Plan`, or raise a MessageError with the reason. All plans except
-those of `to_rest` are slowed to the speed of the muscle modules. They stay within the joint limits,
-with the tolerance `trajectory.BEYOND`. Plans of `to_pose` and `by_twist` end in a holdable posture.
-Plans of `through` are checked for this only if a muscle is isolated. `to_posture` does not check
-the target: its caller does so with `reachable`.
+The methods that plan return a trajectory, or raise a MessageError with the reason. All trajectories
+except those of `to_rest` are slowed to the speed of the muscle modules. They stay within the joint
+limits, with the tolerance `trajectory.BEYOND`. Those of `to_pose` and `by_twist` end in a holdable
+posture. Those of `through` are checked for this only if a muscle is isolated. `to_posture` does not
+check the target: its caller does so with `reachable`.
 """
 
 from __future__ import annotations
 
 from contextlib import suppress
-from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -33,18 +32,6 @@ from musculoskeletal_ae.robot.robot import Robot
 #: held against a joint stop exceeds the limit by less than this.
 TOLERANCE = 0.01
 SAME = 1e-6  # treat two poses as equal below this relative difference
-
-
-class Plan(NamedTuple):
-    """A trajectory that the arm can follow.
-
-    Attributes:
-        trajectory: The trajectory, slowed to a speed that the muscle modules can follow.
-        unreachable_reason: Why the trajectory does not end at the requested target, or ''.
-    """
-
-    trajectory: Trajectory
-    unreachable_reason: str = ''
 
 
 class Planner:
@@ -70,7 +57,7 @@ class Planner:
 
     def to_posture(
         self, mae: Mae, start: Setpoint, theta: Array, duration: float, lag: float
-    ) -> Plan:
+    ) -> Trajectory:
         """Plan a motion to rest at θ [rad], (D,).
 
         With isolated muscles, the motion avoids postures that are not holdable (`reach.way`).
@@ -86,11 +73,11 @@ class Planner:
         way = reach.way(self._robot, mae, start.theta, theta)
         planned = self._within_limits(mae, Trajectory.to(start, way, duration))
         slower = exertion_slowness(self._robot, mae, planned, lag)
-        return Plan(planned if slower == 1.0 else self._within_limits(mae, planned.scaled(slower)))
+        return planned if slower == 1.0 else self._within_limits(mae, planned.scaled(slower))
 
     def through(
         self, mae: Mae, start: Setpoint, points: TrajectoryPoints, passed: float, lag: float
-    ) -> Plan:
+    ) -> Trajectory:
         """Plan a motion through points.
 
         Args:
@@ -108,13 +95,15 @@ class Planner:
         # would leave the joint limits, keep the faster one, from which the arm may then deviate.
         with suppress(MessageError):
             planned = self._slowed(mae, planned.scaled(slower)) if slower > 1.0 else planned
-        return Plan(planned)
+        return planned
 
-    def to_rest(self, start: Setpoint) -> Plan:
+    def to_rest(self, start: Setpoint) -> Trajectory:
         """Plan to come to rest within `trajectory.STOPPING` seconds from the setpoint `start`."""
-        return Plan(Trajectory.stopping(start, self._robot))
+        return Trajectory.stopping(start, self._robot)
 
-    def to_pose(self, mae: Mae, start: Setpoint, pose: pin.SE3, whole: bool, now: float) -> Plan:
+    def to_pose(
+        self, mae: Mae, start: Setpoint, pose: pin.SE3, whole: bool, now: float
+    ) -> tuple[Trajectory, str]:
         """Plan to bring the end effector to a pose in the root link's frame.
 
         Args:
@@ -123,12 +112,15 @@ class Planner:
             pose: Target pose of the end effector.
             whole: True to reach position and orientation, False for the position alone.
             now: Time at which the pose was received [s].
+
+        Returns:
+            The trajectory, and why it does not end at the pose, or ''.
         """
         theta, problem = self._hand.posture(mae, pose, whole, start.theta, self.takes_nearest)
         towards = self._hand.towards(start, theta, now)
         planned = self._within_limits(mae, towards)
         self._last_pose = pose, whole, planned
-        return Plan(planned, problem and f'{problem}; the arm goes to the nearest posture')
+        return planned, problem and f'{problem}; the arm goes to the nearest posture'
 
     def is_under_way(self, pose: pin.SE3, whole: bool, followed: Trajectory | None) -> bool:
         """Return whether `followed` was planned for this pose, `whole` or its position only."""
@@ -142,7 +134,7 @@ class Planner:
         """Record that the last pose was received again at `now` [s], so that its path continues."""
         self._hand.again(now)
 
-    def by_twist(self, mae: Mae, start: Setpoint, twist: Array) -> Plan:
+    def by_twist(self, mae: Mae, start: Setpoint, twist: Array) -> Trajectory:
         """Plan to move the end effector for `hand.TWIST_TIMEOUT` seconds.
 
         Args:
@@ -150,7 +142,7 @@ class Planner:
             start: Setpoint from which the motion starts.
             twist: Linear [m/s] and angular [rad/s] velocity, (6,).
         """
-        return Plan(self._within_limits(mae, self._hand.moved(mae, start, twist)))
+        return self._within_limits(mae, self._hand.moved(mae, start, twist))
 
     def reachable(self, mae: Mae, start: Array, theta: Array, nearest: bool) -> tuple[Array, str]:
         """Return θ if the muscles can hold it, else the nearest holdable posture.

@@ -15,26 +15,20 @@ measurements, `second` would raise the tension without bound.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.activities import ActivityControl, Inputs
-from musculoskeletal_ae.control.command import LENGTH, Command
-from musculoskeletal_ae.control.method_choice import length_methods
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.motion.activities import LENGTH, ActivityControl, Command, Inputs
 from musculoskeletal_ae.motion.feedback import depends_on_limit
-from musculoskeletal_ae.motion.methods import Solution
+from musculoskeletal_ae.motion.methods import FIRST, SECOND, Goal, Solution
 from musculoskeletal_ae.robot.robot import Robot
 
 # Ramp the command during this fraction of a movement's duration. In the remaining time, the arm
 # comes to rest and provides a rest sample.
 RAMP_SHARE = 0.6
 PEAK = 1.5  # peak speed of a ramp, as a multiple of its mean speed
-FIRST = 'first'  # name of the length method that uses the given tension T_const
-SECOND = 'second'  # name of the length method that uses the measured tension T
 
 
 class Ramp:
@@ -59,24 +53,6 @@ class Ramp:
         self._elapsed += dt
         u = 1.0 if self.done else self._elapsed / self.duration
         return self._start + (3.0 - 2.0 * u) * u * u * (self._goal - self._start)
-
-
-class Goal(NamedTuple):
-    """A posture, and the method that converts it into lengths.
-
-    Attributes:
-        method: One of the preset's length methods.
-        theta: Target posture θ_target [rad], (D,).
-        effort: Torque in addition to gravity compensation [N·m], (D,).
-        duration: Duration of the movement [s].
-        tension: T_const [N], (M,); None to use T_current at the start of the goal.
-    """
-
-    method: str
-    theta: Array
-    effort: Array
-    duration: float
-    tension: Array | None = None
 
 
 class LengthRamps:
@@ -157,7 +133,7 @@ class LengthRamps:
 
     def _begin(self, goal: Goal, inputs: Inputs) -> None:
         actuation = self._robot.actuation
-        self._tension = inputs.pull.motor if goal.tension is None else goal.tension
+        self._tension = inputs.motor_tension if goal.tension is None else goal.tension
         if goal.method == SECOND and not actuation.knows_tension:
             goal = goal._replace(method=FIRST)
         self._goal, self._limit = goal, inputs.limit
@@ -169,7 +145,7 @@ class LengthRamps:
         self._remaining = max(goal.duration, self._ramp.duration)
 
     def _solve(self, goal: Goal, mae: Mae, tension: Array) -> Solution:
-        robot, method = self._robot, length_methods(self._settings)[goal.method]
+        robot, method = self._robot, self._settings.length_methods[goal.method]
         if method.takes_tension:
             tension = np.minimum(tension, self._limit)
         torque = robot.kinematics.holding_torque(goal.theta) + goal.effort
@@ -221,7 +197,7 @@ class RampedTarget(ActivityControl):
 
     def _goals(self) -> list[Goal]:
         chosen = self._settings
-        method = length_methods(chosen).get(chosen.method)
+        method = chosen.length_methods.get(chosen.method)
         if self._target is None or method is None:
             return []
         # T_const of method `first` is T_bias.

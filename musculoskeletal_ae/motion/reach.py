@@ -33,7 +33,6 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.motion.assumed_friction import tendon_friction
 from musculoskeletal_ae.motion.feedback import largest_support
 from musculoskeletal_ae.motion.trajectory import Setpoint
 from musculoskeletal_ae.robot.robot import Robot
@@ -52,6 +51,8 @@ SPACING = 0.15  # evaluate postures of an edge that are at most this far apart [
 #: assume full tendon friction for muscles whose length changes by much more than this with the
 #: angle [m/rad]; less friction for other muscles, because their sliding direction is uncertain
 CERTAIN = 0.005
+#: assume this tendon friction μ if a network has learned none: typical of hand-built arms
+FRICTION = 0.05
 
 
 def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
@@ -104,6 +105,11 @@ def way(robot: Robot, mae: Mae, start: Array, theta: Array) -> Array:
         return theta[None]
     path = Roadmap(robot, cost, start, theta, direct).cheapest_path()
     return _shortened(path, cost)[1:]
+
+
+def tendon_friction(robot: Robot, mae: Mae) -> Array:
+    """Return the tendon friction μ that plans assume, (M,): the learned one, or `FRICTION`."""
+    return np.full(robot.muscle_count, FRICTION) if mae.touch is None else mae.touch.friction
 
 
 class ReachLimits:

@@ -6,16 +6,12 @@ The module `follower` states the equations.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.activities import Inputs
-from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.motion.assumed_friction import FRICTION, tendon_friction
+from musculoskeletal_ae.motion.activities import Inputs, msc_compensation
 from musculoskeletal_ae.motion.feedback import (
     CORRECTION,
     Shift,
@@ -23,6 +19,7 @@ from musculoskeletal_ae.motion.feedback import (
     largest_support,
 )
 from musculoskeletal_ae.motion.methods import Solution, stiffness_command
+from musculoskeletal_ae.motion.reach import FRICTION, tendon_friction
 from musculoskeletal_ae.motion.slowness import SHARE
 from musculoskeletal_ae.motion.trajectory import Trajectory
 from musculoskeletal_ae.robot.robot import Robot
@@ -86,48 +83,28 @@ class Stiffening:
         return self._near
 
 
-class PlannedTension(NamedTuple):
-    """The tensions of one setpoint.
-
-    Attributes:
-        bone: Bone-side tension T [N], (M,).
-        motor: Motor-side tension T e^{μ s} [N], (M,).
-        missing_torque: Torque that no tensions within their limits provide [N·m], (D,).
-    """
-
-    bone: Array
-    motor: Array
-    missing_torque: Array
-
-    @classmethod
-    def at_bias(cls, robot: Robot) -> PlannedTension:
-        """Return the tensions that apply before the first setpoint: T_bias for every muscle."""
-        bias = robot.tension.bias.copy()
-        return cls(bias, bias, np.zeros(robot.joint_count))
-
-
 class TensionPlan:
     """Computes tensions and lengths for the successive setpoints of a trajectory.
 
     Attributes:
         effort: Torque in addition to inverse dynamics [N·m], (D,).
-        tension: The tensions of the last setpoint.
+        bone_tension: Bone-side tension T of the last setpoint [N], (M,); T_bias before the first.
+        motor_tension: Motor-side tension T e^{μ s} of the last setpoint [N], (M,).
+        missing_torque: Torque that no tensions within their limits provide there [N·m], (D,).
         jacobian: Muscle Jacobian G at the last setpoint [m/rad], (M, D).
     """
 
     def __init__(self, robot: Robot, settings: Settings) -> None:
         self._robot, self._settings = robot, settings
         self.effort: Array = np.zeros(robot.joint_count)
-        self.tension = PlannedTension.at_bias(robot)
         self.jacobian: Array = np.zeros((robot.muscle_count, robot.joint_count))
         #: torque k by which tensions support each radian of a shift [N·m/rad], (D,)
         self._support: Array | float = 0.0
         self._limit: Array = robot.tension.limit  # tension limit of the present plan [N], (M,)
         #: friction coefficient μ of each tendon, (M,)
         self._friction: Array = np.full(robot.muscle_count, FRICTION)
-        #: sliding state s of each tendon: 1 after winding in, −1 after paying out, (M,)
-        self._sliding: Array = np.zeros(robot.muscle_count)
         self._stiffening = Stiffening(robot, settings)
+        self.reset()
 
     def use(self, robot: Robot, settings: Settings) -> None:
         """Use another robot description and other settings from the next step on."""
@@ -141,8 +118,11 @@ class TensionPlan:
 
     def reset(self) -> None:
         """Discard the plan: all muscles are at T_bias again, and no sliding direction is known."""
-        self.tension = PlannedTension.at_bias(self._robot)
-        self._sliding = np.zeros(self._robot.muscle_count)
+        self.bone_tension: Array = self._robot.tension.bias.copy()
+        self.motor_tension: Array = self.bone_tension
+        self.missing_torque: Array = np.zeros(self._robot.joint_count)
+        #: sliding state s of each tendon: 1 after winding in, −1 after paying out, (M,)
+        self._sliding: Array = np.zeros(self._robot.muscle_count)
         self._stiffening.reset()
 
     @property
@@ -157,7 +137,7 @@ class TensionPlan:
 
     def adopt_limit(self, limit: Array) -> bool:
         """Return whether a tension limit [N], (M,), requires a new plan; adopt the limit if so."""
-        is_other = depends_on_limit(self.tension.motor, self._limit, limit)
+        is_other = depends_on_limit(self.motor_tension, self._limit, limit)
         if is_other:
             self._limit = limit
         return is_other
@@ -176,7 +156,7 @@ class TensionPlan:
         """
         robot, mae, dt = self._robot, inputs.mae, inputs.dt
         at = trajectory.sample(time + 0.5 * dt)
-        self.jacobian = jacobian = mae.muscle_jacobian(at.theta, self.tension.bone)
+        self.jacobian = jacobian = mae.muscle_jacobian(at.theta, self.bone_tension)
         speed = jacobian @ at.velocity
         self._sliding = slid(self._sliding, -np.tanh(speed / TURNING), speed * dt)
         torque = robot.kinematics.inverse_dynamics(*at) + self.effort
@@ -195,10 +175,10 @@ class TensionPlan:
             if missing_torque.any():  # report only what is missing without the feedback
                 without_feedback = least_tension(jacobian, torque, *limits, near, stops)
                 missing_torque = without_feedback.missing_torque
-            self.tension = PlannedTension(tension, tension * loss, missing_torque)
+            self.bone_tension, self.motor_tension = tension, tension * loss
+            self.missing_torque = missing_torque
         else:
-            assumed = actuation.assumed_tension
-            self.tension = PlannedTension(assumed, assumed, self.tension.missing_torque)
+            self.bone_tension = self.motor_tension = actuation.assumed_tension
         return self.length(mae, at.theta + shift.length) + lag * speed
 
     def length(self, mae: Mae, theta: Array) -> Array:
@@ -206,5 +186,5 @@ class TensionPlan:
 
         The arm rests at the posture `theta` [rad], (D,).
         """
-        length = mae.lengths(theta, self.tension.bone)
-        return length + msc_compensation(self._robot, self.tension.motor)
+        length = mae.lengths(theta, self.bone_tension)
+        return length + msc_compensation(self._robot, self.motor_tension)

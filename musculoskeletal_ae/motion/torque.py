@@ -6,9 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.activities import ActivityControl, Inputs
-from musculoskeletal_ae.control.command import TENSION, Command
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.motion.activities import TENSION, ActivityControl, Command, Inputs
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension, supporting_stops
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.command import msc_compensation
+from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.robot.robot import Robot
 
 #: measure the lag only at muscles that move faster than this [m/s], because noise hides it in slow

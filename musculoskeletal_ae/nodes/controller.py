@@ -24,9 +24,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from musculoskeletal_ae.bags.topics import topics_with
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.control import controller_status
-from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.method_choice import check_settings
 from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
 from musculoskeletal_ae.control.stop_memory import BEFORE, StopMemory
 from musculoskeletal_ae.estimation.suspect_verification import LONGEST
@@ -40,6 +38,7 @@ from musculoskeletal_ae.messages.message_reading import (
     read_twist,
     without_orientation,
 )
+from musculoskeletal_ae.motion.activities import LENGTH, TENSION
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import naming_parameter, parameters_of
@@ -133,7 +132,7 @@ class ControllerNode(Shell):
     def _settings(self) -> Settings:
         """Return the settings from the parameters, after a check that the robot permits them."""
         settings = Settings(**{name: self.parameter(name) for name in parameters_of(Settings)})
-        check_settings(self.robot, settings)
+        settings.check_fit(self.robot)
         with naming_parameter('method'):
             self._check_driver(settings.method)
         return settings

@@ -49,6 +49,7 @@ from musculoskeletal_ae.messages.message_reading import (
 from musculoskeletal_ae.messages.reception import SHOWN, Reception
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, CheckpointQueue
 from musculoskeletal_ae.nodes.declared_parameters import check_names
+from musculoskeletal_ae.nodes.node_parameters import NodeParameters
 from musculoskeletal_ae.remedy import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
@@ -56,7 +57,6 @@ from musculoskeletal_ae.ros.diagnostics import MANY_REPORTS, PERIOD, Diagnostics
 from musculoskeletal_ae.ros.executor import parameter_overrides
 from musculoskeletal_ae.ros.messages import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.ros.needed_topics import NeededTopics
-from musculoskeletal_ae.ros.node_parameters import NodeParameters
 from musculoskeletal_ae.ros.second_publishers import (
     AUTHORS,
     CLOCK,

@@ -24,9 +24,9 @@ Its argument T is T_const or T_current, whichever the equation of the method con
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import TENSION_SCALE, Mask
+from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.motion.methods import LengthMethod, Solution
 from musculoskeletal_ae.paper.constants import (
     CONTROL_CANDIDATES,
@@ -36,11 +36,11 @@ from musculoskeletal_ae.paper.constants import (
     JOINT_STEP,
     TORQUE_UNITS,
 )
-from musculoskeletal_ae.paper.latent_descent import StepSearch, Term, descend
+from musculoskeletal_ae.paper.latent_descent import Term, descend
 from musculoskeletal_ae.robot.robot import Robot
 
 #: search for step sizes in the descent of method `proposed` with these constants
-SEARCH = StepSearch(CONTROL_LARGEST_STEP, CONTROL_CANDIDATES, CONTROL_EPOCHS)
+SEARCH = CONTROL_LARGEST_STEP, CONTROL_CANDIDATES, CONTROL_EPOCHS  # of `descend`
 
 
 def geometric(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array) -> Solution:  # noqa: ARG001
@@ -73,7 +73,7 @@ def proposed(robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array
     states a missing torque of 0 even if the planned tensions do not produce τ_target.
     """
     terms = control_loss(robot, mae, theta, torque, tension)
-    z = descend(mae, mae.encode(Mask.THETA_TENSION, theta, tension), terms, SEARCH)
+    z = descend(mae, mae.encode(Mask.THETA_TENSION, theta, tension), terms, *SEARCH)
     calculated = mae.decode(z)
     length = calculated.length + msc_compensation(robot, calculated.tension)
     return Solution(length, calculated.tension, np.zeros(robot.joint_count))

@@ -16,7 +16,8 @@ from collections.abc import Callable
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.motion.explored_postures import ExplorationStep, explored_posture
+from musculoskeletal_ae.motion.explored_postures import explored_posture
+from musculoskeletal_ae.motion.methods import FIRST, SECOND, Goal
 from musculoskeletal_ae.paper.constants import DURATIONS
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -36,7 +37,7 @@ def three_steps(
     rng: np.random.Generator,
     posture: Callable[[Robot, np.random.Generator], Array] = random_posture,
     constant_tension: Callable[[Robot, Array, np.random.Generator], Array] = random_tension,
-) -> tuple[ExplorationStep, ExplorationStep, ExplorationStep]:
+) -> tuple[Goal, Goal, Goal]:
     """Draw a random holdable posture, and return the three steps of exploration at this posture.
 
     Args:
@@ -50,9 +51,9 @@ def three_steps(
     """
     bias = np.full(robot.muscle_count, robot.tension.bias)
     theta, holding = explored_posture(robot, lambda: posture(robot, rng))
-    constant = constant_tension(robot, theta, rng)
+    constant, no_effort = constant_tension(robot, theta, rng), np.zeros_like(theta)
     return (
-        ExplorationStep('first', theta, bias, DURATIONS[0]),
-        ExplorationStep('second', theta, holding, DURATIONS[1]),
-        ExplorationStep('first', theta, constant, DURATIONS[2]),
+        Goal(FIRST, theta, no_effort, DURATIONS[0], bias),
+        Goal(SECOND, theta, no_effort, DURATIONS[1], holding),
+        Goal(FIRST, theta, no_effort, DURATIONS[2], constant),
     )

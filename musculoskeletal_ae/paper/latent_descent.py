@@ -31,14 +31,6 @@ class Term(NamedTuple):
     target: Array  # b_k: target of this quantity, (rows,)
 
 
-class StepSearch(NamedTuple):
-    """Constants of the search for a step size in the descent (equation 11 of the paper)."""
-
-    largest_step: float  # γ_max: all step sizes are below this
-    candidates: int  # N: number of step sizes in each iteration; C_batch in the paper's list
-    epochs: int  # C_epoch: number of iterations
-
-
 class Loss:
     """The loss L, a weighted sum of terms.
 
@@ -72,11 +64,27 @@ class Loss:
         return slope @ self._matrix
 
 
-def descend(mae: Mae, z: Array, terms: Sequence[Term], search: StepSearch) -> Array:
-    """Return the latent vector z (D+M,) that minimises the loss of `terms`, starting from `z`."""
+def descend(
+    mae: Mae,
+    z: Array,
+    terms: Sequence[Term],
+    largest_step: float,
+    candidate_count: int,
+    epochs: int,
+) -> Array:
+    """Return the latent vector z (D+M,) that minimises the loss of `terms`, starting from `z`.
+
+    Args:
+        mae: The network that decodes z.
+        z: The latent vector at the start, (D+M,).
+        terms: The terms of the loss.
+        largest_step: γ_max: all step sizes are below this.
+        candidate_count: N: number of step sizes in each iteration; C_batch in the paper's list.
+        epochs: C_epoch: number of iterations.
+    """
     loss = Loss(terms)
-    steps = search.largest_step * np.arange(search.candidates)[:, None] / search.candidates
-    for _ in range(search.epochs):
+    steps = largest_step * np.arange(candidate_count)[:, None] / candidate_count
+    for _ in range(epochs):
         y, pullback = mae.decode_scaled.with_pullback(z)
         gradient = pullback(loss.gradient(y))
         candidates = z - steps * (gradient / (np.sqrt(gradient @ gradient) + TINY))

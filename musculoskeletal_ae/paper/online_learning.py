@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.learning.job import Job, Update
+from musculoskeletal_ae.learning.scheduler import Job, Update
 from musculoskeletal_ae.learning.updater import Updater
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import from_mae

@@ -35,13 +35,13 @@ from musculoskeletal_ae.paper.constants import (
     TORQUE_WEIGHT,
 )
 from musculoskeletal_ae.paper.control import muscle_jacobian, torque_term
-from musculoskeletal_ae.paper.latent_descent import StepSearch, Term, descend
+from musculoskeletal_ae.paper.latent_descent import Term, descend
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT, ArmState
-from musculoskeletal_ae.simulation.load import Load
+from musculoskeletal_ae.simulation.load import LoadTree
 
 #: search for step sizes in the descent of both simulations with these constants
-SEARCH = StepSearch(SIMULATION_LARGEST_STEP, SIMULATION_CANDIDATES, SIMULATION_EPOCHS)
+SEARCH = SIMULATION_LARGEST_STEP, SIMULATION_CANDIDATES, SIMULATION_EPOCHS  # of `descend`
 
 
 class LatentSimulation:
@@ -53,7 +53,7 @@ class LatentSimulation:
     def use(self, mae: Mae, robot: Robot) -> None:
         """Use another network, and a robot that states which muscles are isolated now."""
         self._mae, self._robot = mae, robot.with_elasticity(mae.elasticity)
-        self._load = Load(self._robot.kinematics)
+        self._load = LoadTree.of(self._robot.kinematics).load
 
     def step(
         self,
@@ -100,7 +100,7 @@ class LatentSimulation:
         else:
             terms.append(Term(POSTURE_WEIGHT, row[forced], fixed[forced]))
             z = mae.encode(Mask.THETA_LENGTH, theta=theta, length=length)
-        state = mae.decode(descend(mae, z, terms, SEARCH))
+        state = mae.decode(descend(mae, z, terms, *SEARCH))
         least = robot.actuation.kept_tension
         return (
             np.clip(state.theta, robot.lower, robot.upper),

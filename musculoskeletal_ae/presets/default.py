@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.mae.network import Network
     from musculoskeletal_ae.mae.training import Progress
     from musculoskeletal_ae.mae.units import State
-    from musculoskeletal_ae.motion.explored_postures import ExplorationStep
-    from musculoskeletal_ae.motion.methods import LengthMethod
+    from musculoskeletal_ae.motion.methods import Goal, LengthMethod
     from musculoskeletal_ae.robot.robot import Robot
     from musculoskeletal_ae.simulation.simulation import SimulatedBody
 
@@ -83,7 +82,7 @@ class DefaultPreset:
 
         return {name: method for name, method in METHODS.items() if name != 'proposed'}
 
-    def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[ExplorationStep]]:
+    def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Goal]]:
         """Return a function that draws the paper's three steps.
 
         In the targets, some joints are at their limits. The tensions of the third step press these

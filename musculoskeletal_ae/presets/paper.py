@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.mae.network import Network
     from musculoskeletal_ae.mae.training import Progress
     from musculoskeletal_ae.mae.units import State
-    from musculoskeletal_ae.motion.explored_postures import ExplorationStep
-    from musculoskeletal_ae.motion.methods import LengthMethod
+    from musculoskeletal_ae.motion.methods import Goal, LengthMethod
     from musculoskeletal_ae.robot.robot import Robot
     from musculoskeletal_ae.simulation.simulation import SimulatedBody
 
@@ -75,7 +74,7 @@ class PaperPreset:
 
         return METHODS
 
-    def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[ExplorationStep]]:
+    def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Goal]]:
         """Return the function that draws the three steps of random motion (§IV-A)."""
         from musculoskeletal_ae.paper.exploration import three_steps
 

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.mae.network import Network
     from musculoskeletal_ae.mae.training import Progress
     from musculoskeletal_ae.mae.units import State
-    from musculoskeletal_ae.motion.explored_postures import ExplorationStep
-    from musculoskeletal_ae.motion.methods import LengthMethod
+    from musculoskeletal_ae.motion.methods import Goal, LengthMethod
     from musculoskeletal_ae.robot.robot import Robot
     from musculoskeletal_ae.simulation.simulation import SimulatedBody
 
@@ -80,7 +79,7 @@ class Preset(Protocol):
         All other methods follow trajectories or command tensions.
         """
 
-    def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[ExplorationStep]]:
+    def exploration(self) -> Callable[[Robot, np.random.Generator], Iterable[Goal]]:
         """Return a function that draws the next steps of exploration.
 
         Its arguments are the robot and a random generator.

@@ -23,8 +23,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.files import read_yaml
 from musculoskeletal_ae.robot.directories import find_robot
-from musculoskeletal_ae.robot.entry_types import LONGEST_LIST, Name, Names, Number
-from musculoskeletal_ae.schema import Strict, convert
+from musculoskeletal_ae.schema import LONGEST_LIST, Name, Names, Number, Strict, convert
 
 FILE = 'motors.yaml'
 ARRAY = 'std_msgs/msg/Float64MultiArray'

@@ -14,17 +14,17 @@ import numpy as np
 from msgspec import UNSET, Meta, UnsetType, field
 
 from musculoskeletal_ae.exceptions import printable
-from musculoskeletal_ae.robot.entry_types import (
+from musculoskeletal_ae.robot.joint_tree import MOST_TERMS
+from musculoskeletal_ae.schema import (
     LONGEST_LIST,
     Name,
     Names,
     NotNegative,
     Number,
     Positive,
+    Strict,
     Vector,
 )
-from musculoskeletal_ae.robot.joint_tree import MOST_TERMS
-from musculoskeletal_ae.schema import Strict
 
 STIFFNESS, POSITION = 'stiffness', 'position'  # values of `actuation`
 MOST_POWER = 12  # refuse a higher power than this in the length of a passive tendon

@@ -5,6 +5,8 @@ import math
 import sys
 import time
 from argparse import Namespace
+from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
 from copy import copy
 from datetime import datetime
@@ -18,7 +20,6 @@ from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPo
 from rclpy.subscription import Subscription
 from rosbags.interfaces import Qos
 
-from musculoskeletal_ae.bags.losses import Losses
 from musculoskeletal_ae.bags.metadata import offered_qos
 from musculoskeletal_ae.bags.topics import Topic, topics_with
 from musculoskeletal_ae.bags.writer import COMPRESSIONS, BagWriter, recover
@@ -44,6 +45,46 @@ DRAIN_TIME = 0.5  # after Ctrl-C, spend at most this time on messages that have 
 #: wait this long for publishers to be discovered before a recording is announced [s]
 DISCOVERY_TIME = 0.5
 CONNECTION_TIME = 2.0  # wait at most this long for connections to the discovered publishers [s]
+#: ignore these sequence numbers, which come from middleware that does not number messages
+UNNUMBERED = 0, (1 << 64) - 1
+
+
+class Losses:
+    """Counts the messages of each topic that were published, but not received.
+
+    Every publisher numbers its own messages, so a lost message leaves a gap in the sequence
+    numbers. A message does not name its publisher. Gaps are therefore only counted while a topic
+    has a single publisher.
+    """
+
+    def __init__(self) -> None:
+        self.lost: Counter[str] = Counter()  # messages by topic, without topics that lost none
+        self._last: dict[str, int] = {}  # newest sequence number by topic
+        self._gaps: Counter[str] = Counter()  # missing numbers by topic since the last `settle`
+
+    def note(self, topic: str, number: int) -> None:
+        """Note the sequence number of a received message."""
+        if number in UNNUMBERED:
+            return
+        # A restarted publisher begins with a small number again, which gives no positive gap.
+        gap = number - self._last.get(topic, number) - 1
+        if gap > 0:
+            self._gaps[topic] += gap
+        self._last[topic] = number
+
+    def settle(self, publishers: Callable[[str], int]) -> None:
+        """Add the messages that were missed since the last call to `lost`.
+
+        Gaps in the sequence numbers of a topic with several publishers are discarded, because each
+        publisher numbers its own messages.
+
+        Args:
+            publishers: Function that returns the number of publishers of a topic.
+        """
+        for topic, gap in self._gaps.items():
+            if publishers(topic) <= 1:
+                self.lost[topic] += gap
+        self._gaps.clear()
 
 
 class Record(Node):
@@ -263,18 +304,18 @@ def _work(options: Namespace, arguments: list[str]) -> int:
         bag = options.recover
         target = options.out or bag.with_name(f'{bag.stem}_recovered')
         try:
-            recovered = recover(bag, target, options.compression)
+            count, left_out, damaged = recover(bag, target, options.compression)
         except KeyboardInterrupt as stop:
             incomplete = f'{target} is incomplete; remove it, and repeat the command'
             raise KeyboardInterrupt(incomplete) from stop
-        print(f'{recovered.message_count} messages recovered to {target}')
+        print(f'{count} messages recovered to {target}')
         problems = []
-        if recovered.damaged:
+        if damaged:
             problems.append(
-                f'{", ".join(recovered.damaged)} is damaged: messages that cannot be read are '
+                f'{", ".join(damaged)} is damaged: messages that cannot be read are '
                 'missing, and others may be wrong, because sqlite3 has no checksums'
             )
-        if left_out := recovered.left_out:
+        if left_out:
             problems.append(f'topics that are not in CDR were not recovered: {", ".join(left_out)}')
         for problem in problems:
             print(f'warning: {bag}: {problem}', file=sys.stderr)

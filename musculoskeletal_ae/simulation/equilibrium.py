@@ -39,7 +39,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.groups import Group
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import REVERSAL
-from musculoskeletal_ae.simulation.load import Load, LoadTree, hold
+from musculoskeletal_ae.simulation.load import LoadTree, hold
 
 #: value of l_target for muscles without a command [m]; MSC then holds T_bias, and modules that
 #: follow positions hold their length
@@ -411,7 +411,7 @@ class QuasiStatics:
         self.slopes.fit(mae)
         robot = robot.with_elasticity(mae.elasticity)
         self._robot, elastic, self._mae = robot, robot.series_elastic, mae
-        self.tree = Load(robot.kinematics).tree
+        self.tree = LoadTree.of(robot.kinematics)
         # A noisy fit may return a slightly negative friction, which would drive the arm: use 0.
         friction = np.maximum(mae.friction, 0.0)
         bias, most = robot.tension.bias, robot.tension.max

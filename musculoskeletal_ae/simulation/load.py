@@ -20,6 +20,8 @@ The last axis of all arrays (…, N) is that of the arms, so that a core compute
 once.
 """
 
+from __future__ import annotations
+
 import math
 from typing import NamedTuple
 
@@ -56,6 +58,47 @@ class LoadTree(NamedTuple):
     springs: Array  # stiffness K of the joints' springs [N·m/rad], (D, D)
     preload: Array  # preload b of the joints' springs [N·m], (D,)
     passive: Passive  # passive tendons of the joints
+
+    @classmethod
+    def of(cls, kinematics: Kinematics) -> LoadTree:
+        """Return the joints and bodies of a robot."""
+        kin, model = kinematics, kinematics.model
+        effector = model.frames[kin.end_effector_frame]
+        joint = int(effector.parentJoint)
+        mass = np.array([inertia.mass for inertia in model.inertias])
+        return cls(
+            parent=kin.tree.parent,
+            master=kin.tree.theta_index,
+            terms=kin.tree.terms,
+            slides=kin.tree.prismatic,
+            placement=kin.tree.placements,
+            first=kin.tree.first,
+            second=kin.tree.second,
+            axis=kin.tree.local_axis,
+            mass=mass,
+            carried=mass @ kin.tree.descends_from,
+            centre=np.array([inertia.lever for inertia in model.inertias]),
+            gravity=np.array(model.gravity.linear),
+            carries=kin.tree.descends_from[joint].copy(),
+            effector_joint=joint,
+            effector=np.array(effector.placement.translation),
+            springs=np.ascontiguousarray(kin.elasticity.stiffness),
+            preload=kin.elasticity.preload.copy(),
+            passive=kin.elasticity.tendons.arrays,
+        )
+
+    def load(self, theta: Array, wrench: Array | None = None) -> tuple[Array, Array]:
+        """Return the load [N·m] (N, D) and its gradient [N·m/rad] (N, D, D).
+
+        Args:
+            theta: Joint angles θ [rad], (N, D).
+            wrench: Wrench on the end effectors in axes of the root link [N, N·m], (N, 6), or None.
+        """
+        wrench = np.zeros((len(theta), 6)) if wrench is None else wrench
+        theta, wrench = np.ascontiguousarray(theta.T), np.ascontiguousarray(wrench.T)
+        load, gradient = np.empty_like(theta), np.empty((len(theta), *theta.shape))
+        hold(self, theta, wrench, load, gradient)
+        return load.T, gradient.transpose(2, 0, 1)
 
 
 @njit(cache=True)
@@ -191,46 +234,3 @@ def hold(tree: LoadTree, theta: Array, wrench: Array, load: Array, gradient: Arr
                     if j != k:
                         gradient[master, other, n] -= slope
             j = tree.parent[j]
-
-
-class Load:
-    """Computes the torques that hold N arms against weight, springs and a wrench."""
-
-    def __init__(self, kinematics: Kinematics) -> None:
-        kin, model = kinematics, kinematics.model
-        effector = model.frames[kin.end_effector_frame]
-        joint = int(effector.parentJoint)
-        mass = np.array([inertia.mass for inertia in model.inertias])
-        self.tree = LoadTree(
-            parent=kin.tree.parent,
-            master=kin.tree.theta_index,
-            terms=kin.tree.terms,
-            slides=kin.tree.prismatic,
-            placement=kin.tree.placements,
-            first=kin.tree.first,
-            second=kin.tree.second,
-            axis=kin.tree.local_axis,
-            mass=mass,
-            carried=mass @ kin.tree.descends_from,
-            centre=np.array([inertia.lever for inertia in model.inertias]),
-            gravity=np.array(model.gravity.linear),
-            carries=kin.tree.descends_from[joint].copy(),
-            effector_joint=joint,
-            effector=np.array(effector.placement.translation),
-            springs=np.ascontiguousarray(kin.elasticity.stiffness),
-            preload=kin.elasticity.preload.copy(),
-            passive=kin.elasticity.tendons.arrays,
-        )
-
-    def __call__(self, theta: Array, wrench: Array | None = None) -> tuple[Array, Array]:
-        """Return the load [N·m] (N, D) and its gradient [N·m/rad] (N, D, D).
-
-        Args:
-            theta: Joint angles θ [rad], (N, D).
-            wrench: Wrench on the end effectors in axes of the root link [N, N·m], (N, 6), or None.
-        """
-        wrench = np.zeros((len(theta), 6)) if wrench is None else wrench
-        theta, wrench = np.ascontiguousarray(theta.T), np.ascontiguousarray(wrench.T)
-        load, gradient = np.empty_like(theta), np.empty((len(theta), *theta.shape))
-        hold(self.tree, theta, wrench, load, gradient)
-        return load.T, gradient.transpose(2, 0, 1)

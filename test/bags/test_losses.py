@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`record` counts the messages that it has missed."""
 
-from musculoskeletal_ae.bags.losses import UNNUMBERED, Losses
+from musculoskeletal_ae.ros_tools.record import UNNUMBERED, Losses
 
 
 def counted(numbers, publishers=1):

@@ -17,11 +17,11 @@ from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, rule
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import METHODS
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.motion.activities import LENGTH, TENSION
 from musculoskeletal_ae.signals.body_state import Anomaly, LengthOffsets
 
 DT, SMALL = 0.01, 1e-9

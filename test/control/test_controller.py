@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.motion import follower
+from musculoskeletal_ae.motion.activities import LENGTH, TENSION
 from musculoskeletal_ae.motion.feedback import REPLAN
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -280,12 +280,12 @@ def test_a_hot_muscle_hands_its_load_to_others_and_is_reported():
     planned = []
     for step in range(300):
         if step == 75:
-            strongest = int(np.argmax(core.activities.follower.plan.tension.bone))
+            strongest = int(np.argmax(core.activities.follower.plan.bone_tension))
             temperature[strongest] = 84.0
         core.take(reading([length, tension, temperature]), 0.04 * step)
         core.estimated(theta, 0.04 * step)
         core.step(0.04 * step)
-        planned.append(core.activities.follower.plan.tension.bone)
+        planned.append(core.activities.follower.plan.bone_tension)
     limit = core.watchdog.heat.planned[strongest]
     assert limit < planned[74][strongest]
     assert planned[-1][strongest] <= limit + REPLAN
@@ -411,7 +411,7 @@ def test_a_new_network_keeps_the_correction_of_rest_feedback():
 def test_methods_stiffness_and_second_do_not_correct_a_push(chosen):
     bench = settled(150, first_duration=0.5, second_duration=0.5, **chosen)
     if chosen['method'] == 'stiffness':  # let the sensors read the tensions that it demands
-        bench.tension = bench.follower.plan.tension.bone
+        bench.tension = bench.follower.plan.bone_tension
     still = bench.step(100)[-1].value
     bench.theta = REST + 0.05
     bench.core.estimated(bench.theta, bench.now)

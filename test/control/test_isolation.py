@@ -12,7 +12,6 @@ from readings import reading
 from robots import write_robot
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.control.command import LENGTH, TENSION
 from musculoskeletal_ae.control.controller import APPROACHES
 from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.control.stop_commands import LARGEST_RISE, PAYING_OUT
@@ -21,10 +20,10 @@ from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION, TouchStatistics
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion import reach
-from musculoskeletal_ae.motion.assumed_friction import FRICTION
+from musculoskeletal_ae.motion.activities import LENGTH, TENSION
 from musculoskeletal_ae.motion.feedback import SUPPORT
 from musculoskeletal_ae.motion.planner import Planner
-from musculoskeletal_ae.motion.reach import lacking
+from musculoskeletal_ae.motion.reach import FRICTION, lacking
 from musculoskeletal_ae.motion.slowness import slowness
 from musculoskeletal_ae.motion.tension_plan import TURNING
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
@@ -334,7 +333,7 @@ def test_a_motion_is_slow_enough_for_the_torque_of_the_muscles(lost, limit, dura
                 planner.to_posture(mae, rest, goal, duration, lag),
                 planner.through(mae, rest, fast.points, 0.0, lag),
             ]
-            for planned, *_ in plans:
+            for planned in plans:
                 np.testing.assert_array_equal(planned.end, goal)
                 assert lack(planned) < 0.25 * lack(fast)
     assert hard >= 3

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from musculoskeletal_ae.arrays import median_of_rows
-from musculoskeletal_ae.control.command import LENGTH, TENSION, Command, unchanging
 from musculoskeletal_ae.control.limiter import CommandLimiter
 from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.motion.activities import LENGTH, TENSION, Command, unchanging
 from musculoskeletal_ae.robot.model_errors import LARGEST
 from musculoskeletal_ae.robot.robot import Robot
 

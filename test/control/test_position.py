@@ -14,13 +14,13 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from readings import reading
 
-from musculoskeletal_ae.control.command import LENGTH, TENSION, Command
 from musculoskeletal_ae.control.limiter import CommandLimiter
 from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.control.stop_commands import PAYING_OUT, SafeStop
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.experiments.recording import ClosedLoop
+from musculoskeletal_ae.motion.activities import LENGTH, TENSION, Command
 from musculoskeletal_ae.motion.methods import first_command, proposed
 from musculoskeletal_ae.robot.description import SPEED_DEFAULT, with_modules
 from musculoskeletal_ae.robot.robot import Robot

@@ -4,10 +4,10 @@
 import numpy as np
 from control_bench import sample
 
-from musculoskeletal_ae.control.command import LENGTH, TENSION, Command
 from musculoskeletal_ae.control.limiter import CommandLimiter
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stop_commands import SafeStop
+from musculoskeletal_ae.motion.activities import LENGTH, TENSION, Command
 from musculoskeletal_ae.robot.robot import Robot
 
 ROBOT = Robot.load('arm26')

@@ -10,7 +10,6 @@ from readings import reading
 from robots import write_robot
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.control.command import LENGTH
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.emulator.reality import make_arm
@@ -19,6 +18,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescription
 from musculoskeletal_ae.experiments.recording import ClosedLoop
 from musculoskeletal_ae.learning.collector import NONE
 from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.motion.activities import LENGTH
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import LengthOffsets

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from musculoskeletal_ae.control.command import msc_compensation
+from musculoskeletal_ae.motion.activities import msc_compensation
 
 
 def to_mid_range(robot, tension):

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.experiments import online_learning
 from musculoskeletal_ae.experiments.online_learning import (
@@ -24,7 +25,6 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.experiments.sensors import SIGHTED, sighted
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.samples import Sample
 from musculoskeletal_ae.presets.registry import PRESETS
 
 

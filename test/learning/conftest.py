@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.body_model.observations import Observations, Sample
 from musculoskeletal_ae.body_model.priors import PRIOR
 from musculoskeletal_ae.body_model.remainder import Remainder
 from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.calibration import Healthy
-from musculoskeletal_ae.learning.job import Job
-from musculoskeletal_ae.learning.samples import Observations, Sample, SampleStore
+from musculoskeletal_ae.learning.samples import SampleStore
+from musculoskeletal_ae.learning.scheduler import Job
 from musculoskeletal_ae.robot.robot import Robot
 
 

@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 
+from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
 from musculoskeletal_ae.learning.calibration import (
     GLITCH_SHARE,
@@ -14,7 +15,6 @@ from musculoskeletal_ae.learning.calibration import (
     Reservoir,
     calibrate,
 )
-from musculoskeletal_ae.learning.samples import Sample
 from musculoskeletal_ae.mae.residuals import residuals
 
 from .conftest import Stage, job

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.learning.job import Update
 from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.scheduler import Update
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.residuals import TouchStatistics

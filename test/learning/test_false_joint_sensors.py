@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.learning.joint_history import JointHistory
+from musculoskeletal_ae.learning.sample_history import JointHistory
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.joint_trust import JointTrust, SensorTrust
 

@@ -10,11 +10,12 @@ from musculoskeletal_ae.body_model.body_fit import BodyFit
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.covariance import drive_covariance
 from musculoskeletal_ae.body_model.fit import fit_to_network
+from musculoskeletal_ae.body_model.observations import Observations, Sample
 from musculoskeletal_ae.control.limiter import CONFIDENCE
 from musculoskeletal_ae.emulator.kin.individual import Individual
 from musculoskeletal_ae.exceptions import CheckpointError, StateError
 from musculoskeletal_ae.learning import saved_state
-from musculoskeletal_ae.learning.samples import Observations, Sample, SampleStore
+from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.robot.description import with_modules

@@ -12,9 +12,9 @@ from learning.conftest import Stage, drawn_body
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.covariance import ellipsoids, estimate_covariance
 from musculoskeletal_ae.body_model.fit import fit_body
+from musculoskeletal_ae.body_model.observations import Observations
 from musculoskeletal_ae.body_model.posture_model import Bent, PostureModel, Unknowns
 from musculoskeletal_ae.experiments.least_squares import on_calibrated_body
-from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.robot.robot import Robot
 
 

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from readings import reading as message
 
+from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.collector import SampleCollector
 from musculoskeletal_ae.learning.rest import RestDetector
-from musculoskeletal_ae.learning.samples import Sample, SampleStore
+from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.body_state import Anomaly, LengthOffsets
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import RejectionError

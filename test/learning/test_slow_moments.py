@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from musculoskeletal_ae.learning.samples import Sample
+from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.learning.slow_moments import MOMENT, SlowMoments
 
 

@@ -5,9 +5,9 @@ import numpy as np
 
 from musculoskeletal_ae.body_model.body_fit import BodyFit
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
+from musculoskeletal_ae.body_model.observations import Observations
 from musculoskeletal_ae.body_model.synthetic import synthetic_samples
 from musculoskeletal_ae.emulator.kin.individual import Individual
-from musculoskeletal_ae.learning.samples import Observations
 from musculoskeletal_ae.mae.units import scale_vector
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot

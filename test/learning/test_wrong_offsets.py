@@ -9,7 +9,7 @@ import pytest
 from learning.test_learner import Arm, IdleTrainer
 from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.offset_history import OffsetHistory
+from musculoskeletal_ae.learning.sample_history import OffsetHistory
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.body_state import LengthOffsets, Trust
 

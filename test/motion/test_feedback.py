@@ -6,7 +6,7 @@ import pytest
 from exact_mae import ExactMae
 from robots import write_robot
 
-from musculoskeletal_ae.control.command import Pull
+from musculoskeletal_ae.motion.activities import Inputs
 from musculoskeletal_ae.motion.feedback import (
     CORRECTION,
     DEADBAND,
@@ -44,8 +44,19 @@ def holding(robot, desired=0.0):
 
 def step(feedback, robot, error, tension, gain=GAIN, motor=None, dt=DT):
     limit = np.full(robot.muscle_count, robot.tension.limit)
-    pull = Pull(tension if motor is None else motor, tension)
-    return feedback.step(error, jacobian(robot), pull, limit, gain, dt)
+    nothing = np.zeros(robot.muscle_count)
+    inputs = Inputs(
+        mae=None,
+        sample=None,
+        motor_tension=tension if motor is None else motor,
+        bone_tension=tension,
+        theta=np.zeros(robot.joint_count),
+        length=nothing,
+        tension=nothing,
+        limit=limit,
+        dt=dt,
+    )
+    return feedback.step(error, jacobian(robot), inputs, gain)
 
 
 def test_feedback_waits_until_the_arm_has_settled(robot):

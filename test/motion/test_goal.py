@@ -8,9 +8,7 @@ import pytest
 from control_bench import DT, OTHER, REST, ROBOT, Bench
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.exceptions import MessageError
-from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
-from musculoskeletal_ae.motion.goal import (
+from musculoskeletal_ae.control.goal import (
     BEYOND_GOAL,
     BEYOND_PATH,
     INVALID,
@@ -18,6 +16,8 @@ from musculoskeletal_ae.motion.goal import (
     FollowedGoal,
     read_tolerances,
 )
+from musculoskeletal_ae.exceptions import MessageError
+from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 
 FREE = np.full(2, np.inf)
 TIGHT = np.array([0.05, np.inf])

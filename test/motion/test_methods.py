@@ -12,13 +12,13 @@ from exact_mae import ExactMae
 from nominal_body import posture_table
 
 from bench.timings import eager_proposed, eager_proposed_paper
-from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.motion import methods
+from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.motion.explored_postures import holdable_postures
 from musculoskeletal_ae.motion.methods import first_command
 from musculoskeletal_ae.paper import control as paper
@@ -99,7 +99,7 @@ def test_preset_paper_lowers_the_printed_loss(trained):
     tension = np.full(6, 100.0)
     terms = paper.control_loss(robot, mae, theta, torque, tension)
     start = mae.encode(Mask.THETA_TENSION, theta, tension)
-    end = descend(mae, start, terms, paper.SEARCH)
+    end = descend(mae, start, terms, *paper.SEARCH)
     assert Loss(terms)(mae.decode_scaled(end)) < 0.5 * Loss(terms)(mae.decode_scaled(start))
     solution = paper.proposed(robot, mae, theta, torque, tension)
     np.testing.assert_allclose(solution.tension, mae.decode(end).tension)

@@ -16,7 +16,6 @@ from exact_mae import ExactMae, rest_readings
 from nominal_body import nominal_arm
 
 from musculoskeletal_ae.control import controller_status
-from musculoskeletal_ae.control.command import LENGTH
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
@@ -24,6 +23,7 @@ from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion import hand as hand_motion
+from musculoskeletal_ae.motion.activities import LENGTH
 from musculoskeletal_ae.motion.feedback import CORRECTION, SUPPORT
 from musculoskeletal_ae.motion.hand import HAND_SPEED, Hand
 from musculoskeletal_ae.motion.methods import StiffnessModel
@@ -65,7 +65,7 @@ def test_a_trajectory_is_followed_and_its_end_held_by_the_least_tension(bench):
     sent += moved(bench, 200)
     assert {command.kind for command in sent} == {LENGTH}
     assert bench.report().message == 'holding'
-    held = bench.follower.plan.tension.bone
+    held = bench.follower.plan.bone_tension
     torque = ROBOT.kinematics.holding_torque(OTHER)
     np.testing.assert_allclose(-ROBOT.routes.muscle_jacobian(OTHER).T @ held, torque, atol=0.3)
     assert np.abs(np.diff(values(sent), axis=0)).max() <= 0.3 * DT + 1e-9
@@ -159,13 +159,13 @@ def test_a_posture_is_held_by_the_same_tensions_after_a_pause_of_the_controller(
     bench.configure(target_duration=0.5)
     bench.target(OTHER, (2.0, 0.0))
     moved(bench, 200)
-    held = bench.follower.plan.tension.bone
+    held = bench.follower.plan.bone_tension
     assert held.max() > 1.5 * ROBOT.tension.bias[0]
     bench.now += 2.0
     moved(bench, 100)
     # The arm has come to rest. Its tensions may differ by the tendon friction, whose direction is
     # unknown at rest.
-    np.testing.assert_allclose(bench.follower.plan.tension.bone, held, rtol=0.25)
+    np.testing.assert_allclose(bench.follower.plan.bone_tension, held, rtol=0.25)
 
 
 @pytest.mark.parametrize('duration', [1.2, 5.0, 30.0])
@@ -208,12 +208,12 @@ def test_a_target_of_proposed_is_followed_like_a_trajectory_and_exerts_its_effor
     bench.configure(target_duration=0.5)
     bench.target(OTHER)
     moved(bench, 200)
-    plain = bench.follower.plan.tension.bone
+    plain = bench.follower.plan.bone_tension
     assert bench.core.is_following
     bench.target(OTHER, (1.0, 0.0))
     moved(bench, 200)
     np.testing.assert_allclose(bench.follower.progress.desired.theta, OTHER)
-    more = ROBOT.routes.muscle_jacobian(OTHER).T @ (plain - bench.follower.plan.tension.bone)
+    more = ROBOT.routes.muscle_jacobian(OTHER).T @ (plain - bench.follower.plan.bone_tension)
     np.testing.assert_allclose(more, [1.0, 0.0], atol=0.05)
     bench.target(ROBOT.upper + 1.0)
     bench.step()
@@ -297,7 +297,7 @@ def test_a_desired_stiffness_is_kept_during_a_trajectory_and_at_its_end(bench):
     for steps, desired in ((50, 1000.0), (40, 1000.0), (200, 1000.0), (100, 1.0)):
         bench.configure(joint_stiffness=(desired, 0.0))
         sent += moved(bench, steps)
-        tension = follower.plan.tension.bone
+        tension = follower.plan.bone_tension
         model = StiffnessModel.read(ROBOT, bench.mae, follower.progress.desired.theta, tension)
         planned = model.joint_stiffness(tension)[0, 0]
         _, lowest, highest = follower.plan.solution.stiffness
@@ -341,7 +341,7 @@ def test_rest_feedback_pushes_in_every_direction_until_the_arm_has_arrived(time)
     bench = Bench(mae)
 
     def support():
-        tension = bench.follower.plan.tension.bone
+        tension = bench.follower.plan.bone_tension
         torque = -mae.muscle_jacobian(REST, tension).T @ tension
         return torque - ROBOT.kinematics.holding_torque(REST)
 

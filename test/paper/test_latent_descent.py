@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 
-from musculoskeletal_ae.paper.latent_descent import Loss, StepSearch, Term, descend
+from musculoskeletal_ae.paper.latent_descent import Loss, Term, descend
 from musculoskeletal_ae.robot.robot import Robot
 
 RNG = np.random.default_rng(0)
@@ -32,7 +32,7 @@ def test_a_step_is_the_best_of_n_and_the_loss_never_rises(trained):
     z = RNG.normal(size=robot.joint_count + robot.muscle_count)
     sizes, losses = [], [Loss(terms)(mae.decode_scaled(z))]
     for _ in range(20):
-        moved = descend(mae, z, terms, StepSearch(0.5, 10, 1))
+        moved = descend(mae, z, terms, 0.5, 10, 1)
         sizes.append(np.linalg.norm(moved - z))
         losses.append(Loss(terms)(mae.decode_scaled(moved)))
         z = moved

@@ -14,7 +14,7 @@ from musculoskeletal_ae.design.checks import check_robot
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.stiffness import muscle_hessian
-from musculoskeletal_ae.simulation.load import Load
+from musculoskeletal_ae.simulation.load import LoadTree
 
 ANGLES = np.array([-0.5, 0.1, 0.2])  # angles of bend, lift and swing [rad]
 COUPLED = {'joint': 'finger', 'master': 'bend', 'ratio': -0.5, 'offset': 0.2}
@@ -49,7 +49,7 @@ def test_quantities_of_coupled_joints_are_derivatives_with_respect_to_theta(robo
         np.testing.assert_allclose(kin.holding_torque(theta), gravity, atol=1e-6)
         gradient = slopes(kin.holding_torque, theta)
         np.testing.assert_allclose(kin.holding_gradient(theta), gradient, atol=1e-5)
-        load, load_slope = Load(kin)(theta[None])
+        load, load_slope = LoadTree.of(kin).load(theta[None])
         np.testing.assert_allclose(load[0], kin.holding_torque(theta), atol=1e-9)
         np.testing.assert_allclose(load_slope[0], gradient, atol=1e-5)
         lengths = slopes(robot.routes.absolute_lengths, theta)

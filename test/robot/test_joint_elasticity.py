@@ -11,8 +11,8 @@ from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.fit import fit_body
+from musculoskeletal_ae.body_model.observations import Observations
 from musculoskeletal_ae.body_model.posture_model import Bent, PostureModel, Unknowns
-from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.design.checks import check_robot
@@ -27,16 +27,16 @@ from musculoskeletal_ae.exporting.exported_mjcf import export
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.calibration import Healthy
-from musculoskeletal_ae.learning.job import Job
-from musculoskeletal_ae.learning.samples import Observations
+from musculoskeletal_ae.learning.scheduler import Job
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
+from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.motion.methods import StiffnessModel
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
-from musculoskeletal_ae.simulation.load import Load
+from musculoskeletal_ae.simulation.load import LoadTree
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 #: entries of joint_elasticity: the spring of `bend` opposes the muscle that bends; the springs of
@@ -90,7 +90,7 @@ def test_the_torque_of_springs_is_the_slope_of_their_energy(springy):
             row, turning, still
         )
         np.testing.assert_allclose(drag - springs, [0.8, 0.0, 0.0], atol=1e-9)
-    load, slope = Load(kin)(theta)
+    load, slope = LoadTree.of(kin).load(theta)
     np.testing.assert_allclose(load, kin.holding_torque(theta), atol=1e-9)
     np.testing.assert_allclose(slope[0], kin.holding_gradient(theta[0]), atol=1e-9)
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from robots import write_robot
 
-from musculoskeletal_ae.control.command import msc_compensation
 from musculoskeletal_ae.design.checks import check_robot
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
@@ -17,10 +16,11 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescription
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
+from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.robot.joint_elasticity import JointElasticity
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import holding_tension
-from musculoskeletal_ae.simulation.load import Load
+from musculoskeletal_ae.simulation.load import LoadTree
 
 #: a finger with one flexor, a return tendon that only pulls, one that also pushes and spans both
 #: joints, and a fixed tendon that is slack in a part of the range
@@ -119,7 +119,7 @@ def test_the_import_names_each_of_them_and_keeps_their_damping(imported):
 def test_all_solvers_use_the_same_torque_and_stiffness(finger):
     theta, step = finger.random_postures(20, np.random.default_rng(2)), 1e-6
     kin = finger.kinematics
-    load, slope = Load(kin)(theta)
+    load, slope = LoadTree.of(kin).load(theta)
     np.testing.assert_allclose(load, kin.holding_torque(theta), atol=1e-12)
     np.testing.assert_allclose(slope[3], kin.holding_gradient(theta[3]), atol=1e-9)
     turned = [theta[3] + sign * step * np.eye(2) for sign in (1.0, -1.0)]

@@ -7,7 +7,7 @@ import pytest
 
 from musculoskeletal_ae.robot.kinematics import Kinematics
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.simulation.load import Load
+from musculoskeletal_ae.simulation.load import LoadTree
 
 
 def sliding_tree():
@@ -41,12 +41,12 @@ def test_the_load_is_the_gravity_of_pinocchio_less_the_wrench(kinematics):
     rng = np.random.default_rng(0)
     theta = rng.uniform(kinematics.lower, kinematics.upper, (20, len(kinematics.lower)))
     wrench = rng.normal(0.0, 20.0, (20, 6))
-    load, _ = Load(kinematics)(theta, wrench)
+    load, _ = LoadTree.of(kinematics).load(theta, wrench)
     for i in range(20):
         jacobian = kinematics.end_effector_jacobian(theta[i])
         expected = kinematics.holding_torque(theta[i]) - jacobian.T @ wrench[i]
         np.testing.assert_allclose(load[i], expected, atol=1e-9)
-    alone, _ = Load(kinematics)(theta)
+    alone, _ = LoadTree.of(kinematics).load(theta)
     np.testing.assert_allclose(alone, kinematics.holding_torque(theta), atol=1e-9)
 
 
@@ -54,7 +54,7 @@ def test_the_slope_of_the_load_is_its_derivative(kinematics):
     rng = np.random.default_rng(0)
     theta = rng.uniform(kinematics.lower, kinematics.upper, (20, len(kinematics.lower)))
     wrench = np.hstack([rng.normal(0.0, 20.0, (20, 3)), np.zeros((20, 3))])
-    load = Load(kinematics)
+    load = LoadTree.of(kinematics).load
     _, slope = load(theta, wrench)
     for k, offset in enumerate(1e-6 * np.eye(theta.shape[1])):
         change = load(theta + offset, wrench)[0] - load(theta - offset, wrench)[0]

@@ -1,15 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The common interface of all activities of the arm."""
+"""The common interface of all activities of the arm: what each one reads and commands."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
+import numpy as np
+
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.command import Command, Pull
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot import actuation
+from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
+
+LENGTH, TENSION = actuation.LENGTH, actuation.TENSION
+
+
+class Command(NamedTuple):
+    """A command to the muscle modules.
+
+    Attributes:
+        kind: `LENGTH` or `TENSION`.
+        value: Target length [m] or target tension [N] of each muscle, (M,).
+    """
+
+    kind: str
+    value: Array
 
 
 class Inputs(NamedTuple):
@@ -17,7 +34,10 @@ class Inputs(NamedTuple):
 
     mae: Mae
     sample: MuscleSample  # the newest muscle states
-    pull: Pull
+    #: present tension T of each muscle, 0 for isolated ones; with a missing or faulty sensor, an
+    #: assumed value [N], (M,)
+    motor_tension: Array
+    bone_tension: Array  # the same at the bone-side end, after tendon friction [N], (M,)
     theta: Array  # the estimated posture [rad], (D,)
     length: Array  # last length command, or a command that keeps the present tensions [m], (M,)
     tension: Array  # last tension command, or a command that keeps the present tensions [N], (M,)
@@ -63,3 +83,28 @@ class ActivityControl(ABC):
     def new_target(self) -> Array | None:
         """Posture [rad], (D,), that replaces the target; None if the target does not change."""
         return None
+
+
+def msc_compensation(robot: Robot, tension: Array) -> Array:
+    """Return the difference l_target − l with which muscle stiffness control exerts a tension.
+
+        l_comp(T) = −(T − T_bias) / K_stiff              (paper, §III-E, eq. 6)
+
+    Args:
+        robot: Provides T_bias and K_stiff of the muscle modules.
+        tension: The tension T [N], (..., M).
+
+    Returns:
+        The difference l_comp [m], (..., M); zero at T_bias, negative above it. Zero for modules
+        that follow positions, since their K_stiff is infinite.
+    """
+    return -(tension - robot.tension.bias) / robot.stiffness
+
+
+def unchanging(robot: Robot, kind: str, sample: MuscleSample) -> Command:
+    """Return a command that keeps the present tensions; `kind` is `LENGTH` or `TENSION`."""
+    tension = np.maximum(sample.motor_tension, robot.tension.bias)
+    if kind == TENSION:
+        return Command(TENSION, tension)
+    length = robot.actuation.unchanging_length(sample.length, sample.motor_tension)
+    return Command(LENGTH, length)

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tracks the length offsets of samples, and drops or corrects samples taken under wrong offsets.
+"""Drops or corrects samples that were taken under wrong length offsets or with false joint sensors.
+
+`OffsetHistory` tracks the length offsets of samples.
 
 A finding may revoke the offsets, because lengths have jumped or disagree with the joint sensors.
 The finding comes some time after the fault. Therefore the samples of the last seconds are held
@@ -12,6 +14,14 @@ Offsets may also have been wrong from the start, for example after a bad calibra
 certain if a new calibration gives different offsets although no length has jumped and no message
 was missed: the muscle modules cannot have lost their position then. Samples taken under the wrong
 offsets are corrected.
+
+`JointHistory` removes the angles of joint sensors from samples while the estimator does not use the
+sensors. The estimator doubts a sensor some time after its fault, and publishes when the doubt
+begins (`signals/joint_trust.py`). Samples of the doubtful time then lose the angle of this joint.
+They keep tensions, lengths and the other angles. What happens next depends on the estimator:
+
+    trusted again        the sensor was false in the meantime, so these angles stay unknown
+    confirmed by user    the doubt was wrong, so the samples get their angles back
 """
 
 from __future__ import annotations
@@ -20,6 +30,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.samples import SampleStore
+from musculoskeletal_ae.signals.joint_trust import JointTrust, SensorTrust
 from musculoskeletal_ae.signals.limits import LIMITS
 
 #: conclude that length offsets have changed only if two calibrations differ by more than this [m]
@@ -84,3 +95,32 @@ class OffsetHistory:
         if size > CALIBRATION_SPREAD or self._is_revoked:
             self._is_continuous = True
         self._offset, self._is_revoked = offset, False
+
+
+class JointHistory:
+    """Removes angles from the samples of one store, and puts them back.
+
+    Attributes:
+        given_up: Number of angles that were removed from samples and have not been put back.
+    """
+
+    def __init__(self, samples: SampleStore, joint_count: int) -> None:
+        """Start with sensors that are all trusted."""
+        self._samples = samples
+        self._trust = JointTrust.full(joint_count)
+        #: angles that were removed [rad], by number of the sample, for each unused joint
+        self._removed: dict[int, dict[int, float]] = {}
+        self.given_up = 0
+
+    def use(self, trust: JointTrust) -> tuple[int, ...]:
+        """Use another trust: remove or put back angles; return the newly unused joints."""
+        before, self._trust = self._trust, trust
+        new = tuple(j for j in trust.unused if before.is_used[j])
+        for j in new:
+            self._removed[j] = self._samples.remove_angles(j, trust.since[j])
+            self.given_up += len(self._removed[j])
+        for j in [j for j in self._removed if trust.is_used[j]]:
+            removed = self._removed.pop(j)
+            if trust.trust[j] is SensorTrust.CONFIRMED and before.trust[j] is SensorTrust.DOUBTED:
+                self.given_up -= self._samples.set_angles(j, removed)
+        return new
