@@ -274,8 +274,7 @@ measured {commit}).
 
 ## Models that were explored
 
-Where the error does not fall, a short exploration was not enough; in hands, moment arms are also as
-short as the errors that the learner expects in a description ([limitations](../limitations.md)).
+Where the error does not fall, a short exploration was not enough.
 A dash, if there is one, means that only the prospects were measured (`--prospects`).
 
 {table}

@@ -35,6 +35,7 @@ from musculoskeletal_ae.gauss_newton import (
     noise_and_weight,
 )
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.robot.model_errors import attachment_spread
 
 ROUNDS = 30  # end the fit of one muscle after this many Gauss–Newton iterations
 #: end the fit of one muscle if an iteration lowers the cost by less than this, per measured length
@@ -84,12 +85,12 @@ def fit_body(
     start = np.where(
         np.isnan(observed.theta), np.clip(guess, robot.lower, robot.upper), observed.theta
     )
-    priors = []
-    for m in range(len(body.layouts)):
-        prior = _prior(body, observed, m)
+    priors, attachments = [], attachment_spread(robot)
+    for m, attachment in enumerate(attachments.tolist()):
+        prior = _prior(body, observed, m, attachment)
         if prior_mean is not None:
             prior = prior._replace(mean=prior_mean[m])
-        priors.append(_reopened(body, replace(observed, theta=start), prior, m))
+        priors.append(_reopened(body, replace(observed, theta=start), prior, m, attachment))
     means, spreads = map(list, zip(*priors, strict=True))
     is_learned = prior_mean is not None
 
@@ -120,17 +121,17 @@ def fit_body(
     return fit
 
 
-def _prior(body: CalibratedBody, observed: Observations, m: int) -> MusclePrior:
+def _prior(body: CalibratedBody, observed: Observations, m: int, attachment: float) -> MusclePrior:
     """Return the prior of a muscle around the geometric model."""
     layout = body.layouts[m]
-    spread = PRIOR.spread(layout)
+    spread = PRIOR.spread(layout, attachment)
     # The prior of the offset describes the tendon before it crept, so widen it by the creep since.
     spread[layout.offset] = np.hypot(PRIOR.offset, PRIOR.creep * observed.age.max(initial=0.0))
     return MusclePrior(PRIOR.mean(layout), spread)
 
 
 def _reopened(
-    body: CalibratedBody, observed: Observations, prior: MusclePrior, m: int
+    body: CalibratedBody, observed: Observations, prior: MusclePrior, m: int, attachment: float
 ) -> MusclePrior:
     """Return a wide prior for muscle `m` if the muscle was changed, else return `prior`.
 
@@ -144,7 +145,7 @@ def _reopened(
     poses = body.poses(observed.theta)
     problem = MuscleFit(body, poses, observed, before, prior, LEAST_NOISE, m)
     body.parameters[m] = problem.run()
-    return MusclePrior(body.parameters[m], REOPENED.spread(body.layouts[m]))
+    return MusclePrior(body.parameters[m], REOPENED.spread(body.layouts[m], attachment))
 
 
 class MusclePoint(NamedTuple):
@@ -255,8 +256,9 @@ def fit_to_network(
     read = mae.transmission.reading(tension, np.zeros(shape))
     observed = Observations(theta, read, lengths, np.zeros(shape), everything)
     poses, priors = body.poses(theta), list[MusclePrior]()
-    for m, layout in enumerate(body.layouts):
-        mean, spread = PRIOR.mean(layout), PRIOR.spread(layout)
+    attachments = attachment_spread(robot).tolist()
+    for m, (layout, attachment) in enumerate(zip(body.layouts, attachments, strict=True)):
+        mean, spread = PRIOR.mean(layout), PRIOR.spread(layout, attachment)
         # The network's lengths contain no information about friction and drive, because its input
         # is T_end. Their prior means are therefore the values that were learned with the network.
         spread[layout.drive] = FIXED

@@ -27,7 +27,7 @@ LEAST_ANGLE_NOISE = 1e-6  # assume at least this standard deviation of a measure
 class Prior:
     """Means and standard deviations σ of the differences between a body and its geometric model."""
 
-    attachment: float = ATTACHMENT  # σ of each coordinate of each route point [m]
+    attachment: float = ATTACHMENT  # largest σ of each coordinate of each route point [m]
     elastic: float = ELASTIC  # σ of the logarithm of each elastic constant
     friction: float = 0.05  # σ of the tendon friction μ around `friction_mean`
     friction_mean: float = 0.05  # mean of the tendon friction μ
@@ -39,10 +39,15 @@ class Prior:
     #: mean of the drive friction as a share of T_limit
     drive_friction_mean: float = DRIVE_FRICTION_MEAN
 
-    def spread(self, layout: Layout) -> Array:
-        """Return the prior spread s of every parameter of a muscle."""
+    def spread(self, layout: Layout, attachment: float = ATTACHMENT) -> Array:
+        """Return the prior spread s of every parameter of a muscle.
+
+        Args:
+            layout: The muscle's parameters.
+            attachment: σ of its route points, from `attachment_spread` [m].
+        """
         spread = np.empty(layout.size)
-        spread[layout.attachment] = self.attachment
+        spread[layout.attachment] = min(self.attachment, attachment)
         spread[layout.elastic] = self.elastic
         spread[layout.friction] = self.friction
         spread[layout.offset], spread[layout.creep] = self.offset, self.creep

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 ARC = 9  # number of points that draw the arc of a wrapped tendon
 #: evaluate this many postures at once, which limits the memory to a few tens of megabytes
 CHUNK = 4096
+TYPICAL = 200  # average moment arms over this many postures
 MOST_SERIAL_CHUNKS = 4  # let two threads share the evaluation if there are more chunks than this
 
 
@@ -177,6 +178,19 @@ class Routes:
         """Indices of the segments of each branch."""
         gaps = np.flatnonzero(self.second[:-1] != self.first[1:]) + 1
         return list(np.split(np.arange(len(self.first)), gaps))
+
+    @cached_property
+    def typical_arms(self) -> Array:
+        """Root mean square moment arm of each muscle over the joint ranges [m], (M,).
+
+        The mean is taken over the joints that the muscle crosses.
+        """
+        low, high = self._kinematics.lower, self._kinematics.upper
+        theta = np.random.default_rng(0).uniform(low, high, (TYPICAL, len(low)))
+        crossed = np.maximum(self.crossed.sum(axis=1), 1)
+        squares = np.square(self.muscle_jacobian(theta)).sum(axis=2)
+        result: Array = np.sqrt(squares.mean(axis=0) / crossed)
+        return result
 
     @property
     def pieces_drawn(self) -> Ints:

@@ -38,7 +38,6 @@ MASS = 0.1  # multiply masses by random factors whose logarithm has this σ
 #: draw offsets of tension sensors with this σ, relative to T_bias: modules that keep a low tension
 #: have sensors that can measure it
 ZERO = 0.1
-POSTURES = 200  # average moment arms over this many postures
 
 
 def effects(robot: Robot) -> Effects:
@@ -54,18 +53,9 @@ def effects(robot: Robot) -> Effects:
     )
 
 
-def typical_arms(robot: Robot) -> Array:
-    """Return the root mean square moment arm of each muscle over the workspace [m], (M,)."""
-    theta = robot.random_postures(POSTURES, np.random.default_rng(0))
-    arms = robot.routes.muscle_jacobian(theta)
-    crossed = np.maximum(robot.routes.crossed.sum(axis=1), 1)
-    result: Array = np.sqrt((arms**2).sum(axis=2).mean(axis=0) / crossed)
-    return result
-
-
 def slack(robot: Robot, draw: Draw) -> Array:
     """Return a random error of each tendon's length [m], (M,): an offset of its length sensor."""
-    sigma = np.minimum(SLACK * typical_arms(robot), LONGEST)
+    sigma = np.minimum(SLACK * robot.routes.typical_arms, LONGEST)
     return sigma * draw.rng('slack').normal(size=len(sigma))
 
 
@@ -78,7 +68,7 @@ class Attachments:
         The tendons of `model` must have the names of the robot's muscles.
         """
         self._model, self._rest, self._rng = model, model.site_pos.copy(), draw.rng('attachment')
-        sigma = np.minimum(ATTACHMENT * typical_arms(robot), FARTHEST)
+        sigma = np.minimum(ATTACHMENT * robot.routes.typical_arms, FARTHEST)
         self._sites = [_sites(model, model.tendon(name).id) for name in robot.muscles]
         #: σ of each site [m]: the smallest σ of the muscles that pass through it
         self._sigma = np.zeros(model.nsite)
