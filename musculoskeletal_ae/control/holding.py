@@ -97,6 +97,7 @@ class HoldingCheck:
         self._spread = None
         if mae.touch is not None and mae.touch.calibrated:
             self._spread = mae.touch.spread
+        self._begin_rest(self._target)  # another network computes other torques
 
     def step(
         self, target: Array | None, theta: Array | None, pull: Array | None, dt: float

@@ -149,6 +149,14 @@ def test_slow_changes_of_a_long_rest_are_no_changed_load():
         assert not arm.rest(error=error)
 
 
+def test_another_network_that_computes_other_torques_is_no_changed_load():
+    arm = Resting()
+    assert not arm.rest()
+    arm.check.use(arm.mae)
+    assert not arm.rest(error=4.0)
+    assert arm.rest(180.0)
+
+
 def test_without_a_measured_residual_torque_no_changed_load_is_reported():
     arm = Resting(is_measured=False)
     assert not arm.rest() and not arm.rest(180.0)
