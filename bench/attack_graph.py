@@ -55,7 +55,7 @@ from musculoskeletal_ae.ros_tools.ros_tool import Spinner, message_class
 from musculoskeletal_ae.signals.muscle_readings import raw_muscle_states
 
 NODES = ('hardware_emulator', 'estimator', 'controller', 'learner', 'sim', 'bringup_status')
-RUN = 'import sys; from musculoskeletal_ae.ros import running; running.run(sys.argv.pop(1))'
+RUN = 'import sys; from musculoskeletal_ae.nodes import running; running.run(sys.argv.pop(1))'
 SERVICES = {
     'std_srvs/srv/Trigger': Trigger,
     'std_srvs/srv/SetBool': SetBool,

@@ -32,9 +32,8 @@ class Loop:
         self.estimator.use(mae)
         self.controller.use(mae)
         self.now, self.commands, self.pulls, self.has_joint_sensors = 0.0, [], [], True
-        middle = 0.5 * (ROBOT.lower + ROBOT.upper)
         self.run(0.5)
-        self.controller.target({n: (a, 0.0) for n, a in zip(ROBOT.joints, middle)})
+        self.approach()
         self.run(4.0)
         self.commands.clear()
         self.pulls.clear()
@@ -81,6 +80,24 @@ class Loop:
         if estimate is not None:
             self.controller.estimated(estimate.state.theta, self.now)
 
+    def approach(self):
+        """Request the middle of the joint ranges."""
+        middle = 0.5 * (ROBOT.lower + ROBOT.upper)
+        self.controller.target({n: (a, 0.0) for n, a in zip(ROBOT.joints, middle)})
+
+    def calibrate(self):
+        """Calibrate the revoked length offsets, as the advice says, and return to the target."""
+        self.estimator.calibrate_lengths()
+        self.controller.use_body(self.estimator.body)
+        assert self.controller.reset(self.now) is None
+        self.controller.explore(True)
+        for _ in range(40):
+            self.run(1.0)
+            if self.estimator.body.offsets.known:
+                break
+        self.approach()
+        self.run(4.0)
+
     def mend(self):
         """Repair the arm, and call the services that a user would call.
 
@@ -90,6 +107,8 @@ class Loop:
         self.arm.set_faults([])
         self.arm.reset(self.arm.theta)
         self.run(3.0)
+        if self.estimator.body.offsets.revoked:
+            self.calibrate()
         self.estimator.reset()
         self.controller.use_body(self.estimator.body)
         refused = self.controller.reset(self.now)

@@ -17,7 +17,6 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.controller import ControllerNode
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
@@ -220,9 +219,3 @@ def test_methods_that_command_tensions_are_refused(host):
     for method in ('tension', 'float'):
         result = controller.set_parameters([Parameter('method', value=method)])[0]
         assert not result.successful and f'{COMMANDS} follow lengths only' in result.reason
-
-
-@pytest.mark.parametrize('name', ['motor_names', 'spool_radius', 'motor_state_topic'])
-def test_a_parameter_file_that_still_connects_motors_ends_a_node_with_the_new_place(graph, name):
-    with pytest.raises(MusculoskeletalError, match=f'{name}.*motors.yaml in the robot directory'):
-        graph.host(EstimatorNode, robot='arm26', **{name: 'value'})
