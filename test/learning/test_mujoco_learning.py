@@ -25,9 +25,9 @@ EXAMPLE = Path(__file__).parents[2] / 'examples' / 'two_joint_arm.xml'
 
 
 def test_a_mujoco_file_is_imported_explored_learned_and_reported(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(convergence, 'MOST_UPDATES', 2)
+    monkeypatch.setattr(convergence, 'MOST_UPDATES', 1)
     out = tmp_path / 'arm.safetensors'
-    options = ['--mujoco', str(EXAMPLE), '--minutes', '0.7', '--quick', '--seed', '1']
+    options = ['--mujoco', str(EXAMPLE), '--minutes', '0.4', '--quick', '--seed', '1']
     assert main([*options, '--out', str(out)]) == 0
     printed = capsys.readouterr().out
     assert re.search(r'150 of 150 random postures can be held', printed)
@@ -48,9 +48,9 @@ def test_nothing_is_learned_from_an_emulated_arm_that_has_diverged(tmp_path, cap
         step(arm, duration)
 
     monkeypatch.setattr(ForeignArm, 'step', thrown)
-    monkeypatch.setattr(convergence, 'MOST_UPDATES', 2)
+    monkeypatch.setattr(convergence, 'MOST_UPDATES', 1)
     out = tmp_path / 'arm.safetensors'
-    options = ['--mujoco', str(EXAMPLE), '--minutes', '0.7', '--quick', '--seed', '1']
+    options = ['--mujoco', str(EXAMPLE), '--minutes', '0.4', '--quick', '--seed', '1']
     assert main([*options, '--out', str(out)]) == 0
     printed = capsys.readouterr()
     assert re.search(r'warning: the emulated arm has diverged: joint \w+ moves at', printed.err)
