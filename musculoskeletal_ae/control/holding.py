@@ -86,6 +86,7 @@ class HoldingCheck:
         self._target: Array | None = None  # posture at which the arm rests [rad], (D,)
         self._torque: Array = np.zeros(robot.joint_count)  # τ [N·m], (D,)
         self._reference: Array | None = None  # τ_0 [N·m], (D,); None early in a rest
+        self._is_new = False  # whether the network has been replaced since the last step
         self.load: Array = np.zeros(robot.joint_count)
         self.distance: Array | None = None
         self._away_time = 0.0  # time for which the arm has been away from its target [s]
@@ -97,7 +98,8 @@ class HoldingCheck:
         self._spread = None
         if mae.touch is not None and mae.touch.calibrated:
             self._spread = mae.touch.spread
-        self._begin_rest(self._target)  # another network computes other torques
+        self._contact.reset()
+        self._is_new = True
 
     def step(
         self, target: Array | None, theta: Array | None, pull: Array | None, dt: float
@@ -137,6 +139,11 @@ class HoldingCheck:
             return
         self._rested += dt
         torque = self._contact.step(theta, pull, dt).torque
+        if self._is_new and self._reference is not None:
+            # Another network computes another torque from the same load.
+            self._reference = self._reference + torque - self._torque
+            self._torque = torque
+        self._is_new = False
         self._torque = self._torque + dt / (dt + AVERAGING) * (torque - self._torque)
         if self._reference is None:
             if self._rested > REFERENCE:

@@ -149,11 +149,13 @@ def test_slow_changes_of_a_long_rest_are_no_changed_load():
         assert not arm.rest(error=error)
 
 
-def test_another_network_that_computes_other_torques_is_no_changed_load():
+def test_another_network_neither_hides_nor_makes_a_changed_load():
     arm = Resting()
     assert not arm.rest()
     arm.check.use(arm.mae)
     assert not arm.rest(error=4.0)
+    assert arm.rest(180.0, error=4.0)
+    arm.check.use(arm.mae)
     assert arm.rest(180.0)
 
 
