@@ -660,7 +660,7 @@ class ConditionKind(Enum):
         'times the residual torque of the healthy moving arm, and no payload in the hand explains '
         'the change',
         'the load on the resting arm has changed',
-        (Step.CHECK_LOAD,),
+        (Step.CHECK_LOAD, Step.CHANGE_TARGET),
     )
     TENSION_LIMITED_BY_HEAT = Declaration(
         'tension_limited_by_heat',

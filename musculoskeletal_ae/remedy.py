@@ -93,7 +93,7 @@ class Step(Enum):
     FREE_DISK = 'free_disk', 'make the state directory writable, with free space'
     LEARN_AFRESH = (
         'learn_afresh',
-        'discard the wrong samples of the learner: set its parameter checkpoint again',
+        'discard the wrong samples of the learner: set its parameter checkpoint anew, to a file',
         1,
     )
     RESET_EMULATOR = 'reset_emulator', 'call hardware_emulator/reset'

@@ -586,8 +586,12 @@ class Controller:
 
     @property
     def _bone_tension(self) -> Array | None:
-        """Bone-side tensions [N], (M,), 0 for isolated muscles; None if they are not known."""
-        if self.sample is None or not self.robot.tension_source.is_known:
+        """Bone-side tensions [N], (M,), 0 for isolated muscles; None if no sensor measures them.
+
+        The friction of a drive at rest leaves the tension of a motor current undetermined.
+        """
+        source = self.robot.tension_source
+        if self.sample is None or not source.is_known or source.is_current:
             return None
         return self.sample.bone_tension * self.sample.usable
 

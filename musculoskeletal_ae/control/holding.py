@@ -36,7 +36,7 @@ import math
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.contact import ContactEstimator
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion import reach
@@ -54,7 +54,8 @@ REFERENCE = 3.0  # begin the comparison after this time at rest [s], when the ar
 FOLLOWING = 30.0  # let the reference follow slow changes with this time constant [s]
 #: Report a changed load if the external torque of the resting arm has changed by more than this,
 #: in σ. On six individuals that had learned for 180 s (kin 1, 3, 4 and foreign 1, 2, 3), it changed
-#: by at most 1.7 in eight rests each. A turned base changed it by 3.4 to 6.0 on those of kin.
+#: by at most 1.7 in eight rests each. A turned base changed it by 3.4 to 6.0 on those of kin,
+#: 1 s after the turn.
 CHANGED = 3.0
 #: causes that a report lists unless the muscles evidently lack torque in this posture
 POSSIBLE_CAUSES = (
@@ -63,8 +64,8 @@ POSSIBLE_CAUSES = (
 )
 #: causes of a changed load that a report lists
 LOAD_CAUSES = (
-    'possible causes: a contact, a base that has been turned, or a muscle that pulls more or less '
-    'than its sensor reads'
+    'possible causes: a contact, a payload that is not in the first hand, a base that has been '
+    'turned, or a muscle that pulls more or less than its sensor reads'
 )
 
 
@@ -86,7 +87,10 @@ class HoldingCheck:
         self._target: Array | None = None  # posture at which the arm rests [rad], (D,)
         self._torque: Array = np.zeros(robot.joint_count)  # τ [N·m], (D,)
         self._reference: Array | None = None  # τ_0 [N·m], (D,); None early in a rest
-        self._is_new = False  # whether the network has been replaced since the last step
+        self._carried: Array = np.zeros(robot.joint_count)  # τ − τ_0 when τ_0 begins [N·m], (D,)
+        self._is_free: Bools = np.ones(
+            robot.joint_count, bool
+        )  # away from stops in this rest, (D,)
         self.load: Array = np.zeros(robot.joint_count)
         self.distance: Array | None = None
         self._away_time = 0.0  # time for which the arm has been away from its target [s]
@@ -98,8 +102,13 @@ class HoldingCheck:
         self._spread = None
         if mae.touch is not None and mae.touch.calibrated:
             self._spread = mae.touch.spread
-        self._contact.reset()
-        self._is_new = True
+        # Another network computes other torques from the same load.
+        carried, load = self._carried, self.load
+        if self._reference is not None:
+            carried = self._torque - self._reference
+        self._begin_rest(self._target)
+        if self._spread is not None:
+            self._carried, self.load = carried, load
 
     def step(
         self, target: Array | None, theta: Array | None, pull: Array | None, dt: float
@@ -131,7 +140,8 @@ class HoldingCheck:
         """Begin a rest at another target, or a motion (None): the load may be another one."""
         self._contact.reset()
         self._target, self._rested, self._reference = target, 0.0, None
-        self._torque = self.load = np.zeros(self._robot.joint_count)
+        self._torque = self.load = self._carried = np.zeros(self._robot.joint_count)
+        self._is_free = np.ones(self._robot.joint_count, bool)
 
     def _step_load(self, theta: Array, pull: Array, dt: float) -> None:
         """Update the load of the arm that rests at θ [rad], (D,), with tensions [N], (M,)."""
@@ -139,20 +149,17 @@ class HoldingCheck:
             return
         self._rested += dt
         torque = self._contact.step(theta, pull, dt).torque
-        if self._is_new and self._reference is not None:
-            # Another network computes another torque from the same load.
-            self._reference = self._reference + torque - self._torque
-            self._torque = torque
-        self._is_new = False
+        self._is_free &= torque != 0.0  # 0: a stop may be the only cause
         self._torque = self._torque + dt / (dt + AVERAGING) * (torque - self._torque)
         if self._reference is None:
             if self._rested > REFERENCE:
-                self._reference = self._torque
+                self._reference = self._torque - self._carried
             return
         kinematics, spread = self._robot.kinematics, self._spread
         of_hand = kinematics.model.gravity.linear @ kinematics.end_effector_jacobian(theta)[:3]
-        of_hand = np.where(torque == 0.0, 0.0, of_hand / spread)  # 0: a stop may be the only cause
-        change, square = (self._torque - self._reference) / spread, float(of_hand @ of_hand)
+        of_hand = self._is_free * of_hand / spread
+        change = self._is_free * (self._torque - self._reference) / spread
+        square = float(of_hand @ of_hand)
         if square > 0.0:
             before = max(float(of_hand @ (self._reference / spread)), 0.0)  # m_0, times `square`
             mass = max(float(of_hand @ change), -before) / square

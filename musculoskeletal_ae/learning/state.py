@@ -153,9 +153,7 @@ class StateStore:
         if now < self._next_attempt or not (changed or self._problem):
             return
         try:
-            if not self._is_in_place():
-                self.close()
-                self._open()
+            self._put_in_place()
             self._save(samples, network)
             self._problem = ''
         except OSError as error:
@@ -206,6 +204,7 @@ class StateStore:
             StateError: If the backup cannot be made.
         """
         try:
+            self._put_in_place()
             backup = self._write_backup(saved_state.collect(self._robot, samples, network))
         except OSError as error:
             raise StateError(
@@ -214,6 +213,12 @@ class StateStore:
             ) from error
         if reason:
             self._note_backup(reason, backup)
+
+    def _put_in_place(self) -> None:
+        """Open the directory again if it has been deleted or replaced."""
+        if not self._is_in_place():
+            self.close()
+            self._open()
 
     def _is_in_place(self) -> bool:
         """Return whether the directory is open, and has not been deleted or replaced since then."""

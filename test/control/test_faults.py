@@ -95,6 +95,7 @@ class Loop:
             self.run(1.0)
             if self.estimator.body.offsets.known:
                 break
+        assert self.estimator.body.offsets.known
         self.approach()
         self.run(4.0)
 

@@ -87,13 +87,14 @@ class Resting:
         self.check = HoldingCheck(ARM)
         self.check.use(self.mae)
 
-    def rest(self, turned=0.0, force=(0.0, 0.0, 0.0), error=0.0):
-        """Rest for 5 s, and return whether the check then reports another load.
+    def rest(self, turned=0.0, force=(0.0, 0.0, 0.0), error=0.0, seconds=5.0):
+        """Rest, and return whether the check then reports another load.
 
         Args:
             turned: Angle by which the base is turned about the x axis [°].
             force: Force on the hand [N], in the axes of the root link.
             error: Torque by which the learned body is wrong in this posture [N·m].
+            seconds: Time to rest [s].
         """
         kinematics, model = ARM.kinematics, pin.Model(ARM.kinematics.model)
         model.gravity.linear = pin.exp3(np.radians([turned, 0.0, 0.0])).T @ DOWN
@@ -102,7 +103,7 @@ class Resting:
         torque = torque - kinematics.end_effector_jacobian(POSTURE)[:3].T @ force + error
         jacobian = self.mae.muscle_jacobian(POSTURE, np.full(ARM.muscle_count, 60.0))
         pull = TensionProgramme(jacobian, torque, 10.0, 400.0).nearest(60.0)
-        for _ in range(round(5.0 / SELDOM)):
+        for _ in range(round(seconds / SELDOM)):
             self.check.step(POSTURE, POSTURE, pull, SELDOM)
         assert self.check.largest == 0.0
         return self.check.has_other_load
@@ -149,14 +150,23 @@ def test_slow_changes_of_a_long_rest_are_no_changed_load():
         assert not arm.rest(error=error)
 
 
-def test_another_network_neither_hides_nor_makes_a_changed_load():
+@pytest.mark.parametrize('seconds', [2.0, 2.9, 5.0])
+def test_another_network_neither_hides_nor_makes_a_changed_load(seconds):
     arm = Resting()
-    assert not arm.rest()
+    assert not arm.rest(seconds=seconds)
     arm.check.use(arm.mae)
     assert not arm.rest(error=4.0)
     assert arm.rest(180.0, error=4.0)
     arm.check.use(arm.mae)
     assert arm.rest(180.0)
+
+
+def test_a_network_that_has_not_measured_the_residual_torque_ends_the_report():
+    arm = Resting()
+    assert not arm.rest() and arm.rest(180.0)
+    arm.mae.touch = None
+    arm.check.use(arm.mae)
+    assert not arm.rest(180.0)
 
 
 def test_without_a_measured_residual_torque_no_changed_load_is_reported():

@@ -48,7 +48,7 @@ def test_absolute_sensors_keep_offsets_that_are_known_to_be_zero(memory, tmp_pat
     memory.note(revoked)
     assert_array_equal(found_later(tmp_path).offsets.offset, np.zeros(2))
     assert not found_later(tmp_path).offsets.known
-    memory.note(replace(HEALTHY, generation=3))  # joint sensors agree with the lengths again
+    memory.note(replace(HEALTHY, generation=3))  # calibrated
     found = found_later(tmp_path)
     assert (found.offsets.known, found.isolated, found.generation) == (True, (), 3)
 
