@@ -22,7 +22,8 @@ the load (`estimation/contact.py`); σ is the residual torque of the healthy mov
 the learned body cause a lasting τ_ext, which differs from posture to posture and is up to 4 σ on
 healthy arms of emulator model `foreign`. They change little while the arm rests, and slowly:
 feedback relieves tension, and the network learns. Therefore τ is compared with τ_0, which begins
-with τ after REFERENCE and then follows it slowly, except while the load has changed.
+with τ after REFERENCE and then follows it slowly, except while the load has changed. With another
+network, τ_0 begins anew, and τ − τ_0 continues from its last value.
 
 An arm may pick up a payload, or put it down. τ_hand is the torque of 1 kg in the hand, m_0 the mass
 that explains the most of τ_0, and m the mass that explains the most of the change. In a single
@@ -88,9 +89,8 @@ class HoldingCheck:
         self._torque: Array = np.zeros(robot.joint_count)  # τ [N·m], (D,)
         self._reference: Array | None = None  # τ_0 [N·m], (D,); None early in a rest
         self._carried: Array = np.zeros(robot.joint_count)  # τ − τ_0 when τ_0 begins [N·m], (D,)
-        self._is_free: Bools = np.ones(
-            robot.joint_count, bool
-        )  # away from stops in this rest, (D,)
+        # whether each joint has been away from its stops during this rest, (D,)
+        self._is_free: Bools = np.ones(robot.joint_count, bool)
         self.load: Array = np.zeros(robot.joint_count)
         self.distance: Array | None = None
         self._away_time = 0.0  # time for which the arm has been away from its target [s]
