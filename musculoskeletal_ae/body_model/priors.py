@@ -39,7 +39,7 @@ class Prior:
     #: mean of the drive friction as a share of T_limit
     drive_friction_mean: float = DRIVE_FRICTION_MEAN
 
-    def spread(self, layout: Layout, attachment: float = ATTACHMENT) -> Array:
+    def spread(self, layout: Layout, attachment: float) -> Array:
         """Return the prior spread s of every parameter of a muscle.
 
         Args:

@@ -33,6 +33,7 @@ from musculoskeletal_ae.conditions import ORDER, Action, Condition, ConditionKin
 from musculoskeletal_ae.control import controller_status
 from musculoskeletal_ae.control.holding import HoldingCheck
 from musculoskeletal_ae.control.limiter import CommandLimiter
+from musculoskeletal_ae.control.resting_load import RestingLoad
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.control.stop_commands import SafeStop
 from musculoskeletal_ae.control.supervisor import Activity, Supervisor
@@ -199,6 +200,7 @@ class Controller:
         self.limiter = CommandLimiter(robot, self.settings)
         self.stopping = SafeStop(robot, self.settings, self.limiter)
         self.holding = HoldingCheck(robot)
+        self.resting_load = RestingLoad(robot)
         self.sent_at = 0.0  # time of the last publication [s]; set by the caller
         self._estimate_problem = Persistence()
         self._jumped_at = math.inf  # time of the last jump of lengths [s]; ∞ before the first one
@@ -240,7 +242,7 @@ class Controller:
             self.robot = robot
             self._use_parts()
         self.activities.follower.use_network(mae)
-        self.holding.use(mae)
+        self.resting_load.use(mae)
         if self.activities.entered is self.activities.ramped_target:
             self.activities.ramps.solve_again()
 
@@ -566,7 +568,9 @@ class Controller:
                 self.stop(ConditionKind.COMMAND_NOT_FINITE)
         if not self.supervisor.is_running:
             limited = self._limited(self._stopped(present, dt), dt)
-        self.holding.step(self._held_posture, self.estimate, self._bone_tension, step.dt)
+        held = self._held_posture
+        self.holding.step(held, self.estimate, step.dt)
+        self.resting_load.step(held, self.estimate, self._bone_tension, step.dt)
         if self._awaited_samples:
             return None  # the modules may have paid out; the last command would jerk the arm
         return limited or self.limiter.command

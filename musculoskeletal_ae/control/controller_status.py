@@ -143,8 +143,8 @@ def _target(core: Controller) -> Iterator[Condition]:
     if joint is not None and core.mae is not None and core.estimate is not None:
         text = away_text(core.holding, robot, core.mae, core.estimate)
         yield kind.AWAY_FROM_TARGET.condition(text, [robot.joints[joint]])
-    if core.holding.has_other_load:
-        yield kind.LOAD_CHANGED.condition(core.holding.load_text)
+    if core.resting_load.has_changed:
+        yield kind.LOAD_CHANGED.condition(core.resting_load.text)
 
 
 def _heat(core: Controller) -> Iterator[Condition]:

@@ -114,8 +114,9 @@ class Goal(NamedTuple):
         theta: Target posture θ_target [rad], (D,).
         effort: Torque in addition to gravity compensation [N·m], (D,).
         duration: Duration of the movement [s].
-        tension: T_const [N], (M,); None to use T_current at the start of the goal. For the method
-            `second`, a step of the exploration states the tension that the geometric model expects.
+        tension: T_const of the method `first` [N], (M,); None to use T_current at the start of the
+            goal. The exploration also states a tension for `second`, which recordings of
+            experiments use: the one that the geometric model expects.
     """
 
     method: str

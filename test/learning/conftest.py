@@ -14,6 +14,7 @@ from musculoskeletal_ae.learning.body_updater import BodyUpdater
 from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.learning.scheduler import Job
+from musculoskeletal_ae.robot.model_errors import attachment_spread
 from musculoskeletal_ae.robot.robot import Robot
 
 
@@ -56,9 +57,10 @@ def drawn_body(robot, wrapping: int, seed: int, scale: float) -> CalibratedBody:
     """Return a body drawn from the prior, with wrapping but without creep."""
     body, rng = CalibratedBody(robot), np.random.default_rng(seed)
     body.remainder = Wrapping(robot, scale, wrapping)
+    spreads = attachment_spread(robot).tolist()
     for m, layout in enumerate(body.layouts):
         draw = np.insert(rng.standard_normal(layout.size - 1), layout.creep, 0.0)
-        body.parameters[m] = PRIOR.mean(layout) + scale * PRIOR.spread(layout) * draw
+        body.parameters[m] = PRIOR.mean(layout) + scale * PRIOR.spread(layout, spreads[m]) * draw
     return body
 
 
