@@ -31,7 +31,6 @@ import numpy as np
 from bench.learned_arm import initial, learned_arm
 from bench.limbs import BODIES, write_body
 from bench.timings import microseconds
-from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.observations import Observations
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.experiments import plots
@@ -48,7 +47,7 @@ from musculoskeletal_ae.learning.samples import CAPACITY
 from musculoskeletal_ae.learning.scheduler import STEPS, Job
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import one_thread, random_states
-from musculoskeletal_ae.motion.methods import proposed
+from musculoskeletal_ae.motion.tension_plan import plan_at_rest
 from musculoskeletal_ae.options import Parser, names
 from musculoskeletal_ae.robot.directories import find_robot
 from musculoskeletal_ae.robot.robot import Robot
@@ -94,18 +93,13 @@ def measure(body: str, folder: Path, minutes: float) -> Row:
     row['after'] = estimation_error(mae, held_out) / joint
     row['oracle'] = oracle_errors(arm, INDIVIDUAL, held_out)['oracle_rad'] / joint
     one = held_out.tension[0], held_out.length[0]
+    middle = 0.5 * (robot.lower + robot.upper)
     row['estimate'] = microseconds(lambda: mae.estimate(*one))
-    row['solve'] = microseconds(lambda: _solve(robot, mae))
+    row['solve'] = microseconds(lambda: plan_at_rest(robot, mae, middle))
     row['update'] = update_time(robot, mae, exploring)
     row['checkpoint'] = (folder / f'learned_{INDIVIDUAL}.safetensors').stat().st_size / 1e6
     row['memory'] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
     return row
-
-
-def _solve(robot: Robot, mae: Mae) -> Array:
-    theta, bias = 0.5 * (robot.lower + robot.upper), robot.tension.bias
-    torque = robot.kinematics.holding_torque(theta)
-    return proposed(robot, mae, theta, torque, bias, robot.tension.limit).length
 
 
 def update_time(robot: Robot, mae: Mae, exploring: Recording) -> float:

@@ -36,9 +36,9 @@ from musculoskeletal_ae.mae.mae import Mae, read_groups
 from musculoskeletal_ae.mae.network import Network, from_mae
 from musculoskeletal_ae.mae.training import random_states
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, scale_vector, visible
-from musculoskeletal_ae.motion import methods as control
 from musculoskeletal_ae.motion.activities import Command, msc_compensation
 from musculoskeletal_ae.motion.methods import first_command, stiffness_command
+from musculoskeletal_ae.motion.tension_plan import SOLVES, plan_at_rest
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.paper import control as paper
 from musculoskeletal_ae.paper.constants import CONTROL_WEIGHTS, TORQUE_UNITS
@@ -178,8 +178,8 @@ def control_rows(robot: Robot, mae: Mae, eager: Network) -> list[Row]:
     return [
         Row(
             'one step of method proposed, preset default',
-            lambda: control.proposed(robot, mae, theta, torque, tension, limit),
-            lambda: eager_proposed(robot, eager, theta, torque, tension),
+            lambda: plan_at_rest(robot, mae, theta).length(mae, theta),
+            lambda: eager_proposed(robot, eager, theta, torque),
         ),
         Row(
             'one step of method proposed, preset paper',
@@ -208,20 +208,19 @@ def _tensor(values: Array) -> Tensor:
     return torch.as_tensor(values, dtype=torch.float32)
 
 
-def eager_proposed(
-    robot: Robot, network: Network, theta: Array, torque: Array, tension: Array
-) -> Array:
-    """Return the target lengths l_target [m] of preset `default`, computed in plain torch.
+def eager_proposed(robot: Robot, network: Network, theta: Array, torque: Array) -> Array:
+    """Return the command of `plan_at_rest` [m], computed in plain torch.
 
-    The arguments are those of `control.proposed`.
+    θ [rad], (D,), is the posture, and `torque` holds it [N·m], (D,).
     """
     muscles = network.muscles
-    posture, bias = _tensor(theta), robot.tension.bias
+    tension = bias = robot.tension.bias
+    posture = _tensor(theta)
 
     def lengths(pull: Tensor, at: Tensor) -> Tensor:
         return network.decode(_enter(network, at[None], pull[None]))[0, -muscles:]
 
-    for _ in range(control.SOLVES):
+    for _ in range(SOLVES):
         at_posture = partial(lengths, _tensor(TENSION_SCALE * tension))
         slope = torch.autograd.functional.jacobian(at_posture, posture)
         jacobian = slope.numpy().astype(float) / LENGTH_SCALE

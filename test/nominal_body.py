@@ -19,6 +19,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion import methods
 from musculoskeletal_ae.motion.explored_postures import TRIES, holdable_postures
 from musculoskeletal_ae.motion.methods import stiffness_command
+from musculoskeletal_ae.motion.tension_plan import plan_at_rest
 from musculoskeletal_ae.paper.control import proposed as proposed_as_printed
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -48,7 +49,7 @@ def posture_table(robot: Robot, mae: Mae, paper: Mae, count: int) -> dict[str, A
     """
     arm = nominal_arm(robot)
     rows: dict[str, list[tuple[float, float, float]]] = {}
-    bias, limit = np.full(robot.muscle_count, robot.tension.bias), robot.tension.limit
+    bias = np.full(robot.muscle_count, robot.tension.bias)
     postures = robot.random_postures(TRIES, np.random.default_rng(5))
     for theta, least in holdable_postures(robot, postures, count):
         torque = robot.kinematics.holding_torque(theta)
@@ -63,7 +64,7 @@ def posture_table(robot: Robot, mae: Mae, paper: Mae, count: int) -> dict[str, A
         for name, command in {
             'bound: QP on the true body': bound,
             'QP on the true G, l from ①': methods.first_command(robot, mae, theta, least),
-            'proposed': methods.proposed(robot, mae, theta, torque, bias, limit).length,
+            'proposed': plan_at_rest(robot, mae, theta).length(mae, theta),
             'proposed, paper': proposed_as_printed(robot, paper, theta, torque, bias).length,
             'geometric': robot.muscle_lengths(theta, bias),
         }.items():

@@ -40,7 +40,7 @@ from musculoskeletal_ae.experiments.study import (
 )
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.explored_postures import TRIES, holdable_postures
-from musculoskeletal_ae.motion.methods import proposed
+from musculoskeletal_ae.motion.tension_plan import plan_at_rest
 from musculoskeletal_ae.presets.preset import PAPER_PRESET
 from musculoskeletal_ae.robot.tension import holding_tension
 
@@ -175,8 +175,8 @@ def _causes(
 ) -> dict[str, float]:
     """Return measures that show why `proposed` needs more than the least tension.
 
-    `proposed` first plans the tensions that hold each target. It then moves the same body, but
-    without tendon friction, to the target. Friction is why the arm itself needs still more tension.
+    `proposed` moves the same body, but without tendon friction, to each target. Friction is why the
+    arm itself needs still more tension.
 
     Returns:
         Three means. planned_to_bound: ratio of the planned ‖T‖ to the least ‖T‖ with which the true
@@ -186,11 +186,9 @@ def _causes(
     """
     robot, rows = frictionless.robot, []
     for theta in ended.target:
-        torque = robot.kinematics.holding_torque(theta)
-        bias = np.full(robot.muscle_count, robot.tension.bias)
-        plan = proposed(robot, mae, theta, torque, bias, robot.tension.limit)
         ClosedLoop(frictionless, mae).approach(theta, durations.end)
-        parts = plan.tension, frictionless.tension, frictionless.theta - theta
+        planned = plan_at_rest(robot, mae, theta).bone_tension
+        parts = planned, frictionless.tension, frictionless.theta - theta
         rows.append([np.linalg.norm(part) for part in parts])
     planned, tension, error = np.transpose(rows)
     return {

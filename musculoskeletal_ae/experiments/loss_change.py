@@ -33,7 +33,7 @@ from musculoskeletal_ae.experiments.study import (
     first_individual,
 )
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.motion.methods import proposed
+from musculoskeletal_ae.motion.tension_plan import plan_at_rest
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
@@ -130,7 +130,7 @@ def _command(robot: Robot, mae: Mae, theta: Array, preset: str) -> Array:
     method = preset_named(preset).length_methods().get('proposed')
     if method is not None:
         return method.command(robot, mae, theta, torque, start.tension).length
-    return proposed(robot, mae, theta, torque, start.tension, limits.limit).length
+    return plan_at_rest(robot, mae, theta).length(mae, theta)
 
 
 def _run_simulator(simulated: Simulation, robot: Robot, command: Array) -> Motion:

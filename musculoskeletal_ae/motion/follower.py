@@ -44,7 +44,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.activities import LENGTH, ActivityControl, Command, Inputs
-from musculoskeletal_ae.motion.feedback import MotionFeedback, RestFeedback
+from musculoskeletal_ae.motion.feedback import MotionFeedback, RestFeedback, Shift
 from musculoskeletal_ae.motion.progress import Progress
 from musculoskeletal_ae.motion.ramps import Ramp
 from musculoskeletal_ae.motion.tension_plan import TensionPlan
@@ -201,7 +201,11 @@ class Follower(ActivityControl):
         error = self.progress.error
         error = np.zeros_like(error) if self.plan.is_stiff else error
         shift = self._motion_feedback.step(error, self._is_held_back(inputs), inputs.dt)
-        return self.plan.step(trajectory, self.progress.time, shift, self.winches.lag, inputs)
+        return self._plan(trajectory, shift, self.winches.lag, inputs)
+
+    def _plan(self, trajectory: Trajectory, shift: Shift, lag: float, inputs: Inputs) -> Array:
+        time, step = self.progress.time, self.plan.step
+        return step(trajectory, time, shift, lag, inputs.mae, inputs.limit, inputs.dt)
 
     def _is_held_back(self, inputs: Inputs) -> bool:
         """Return whether the limiter did not let a muscle wind in as far as desired.
@@ -223,6 +227,6 @@ class Follower(ActivityControl):
         before, gain = feedback.shift, 0.0 if plan.is_stiff else FEEDBACK_GAIN
         feedback.step(self.progress.error, plan.jacobian, inputs, gain)
         if is_new or not np.array_equal(before, feedback.shift):
-            self._held = plan.step(trajectory, self.progress.time, feedback.shift, 0.0, inputs)
+            self._held = self._plan(trajectory, feedback.shift, 0.0, inputs)
         assert self._held is not None
         return self._held + feedback.relief

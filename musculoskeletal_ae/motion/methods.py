@@ -1,19 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Control methods that convert a target posture into muscle lengths: `proposed`, `stiffness`.
+"""Control methods that convert a target posture into muscle lengths, and joint stiffness.
 
-    proposed   l_target = ①(θ_target, T) + l_comp(T)
-               T = argmin ‖T‖²  subject to  τ_target + Gᵀ T = 0,  T_bias ≤ T ≤ T_limit
+Muscle stiffness control exerts T = T_bias + max(0, K_stiff (l − l_target)). A muscle that should
+exert the tension T at the posture θ therefore gets the length command
 
-①(θ, T) is the network's prediction of the muscle lengths. The method varies only T and evaluates
-the network at θ_target, so that no solution deviates from the target posture. Torque balance and
-tension limits are constraints and therefore take priority over the least tension. In a weighted sum
-of norms, ‖T‖ could outweigh the torque balance, and the arm would sag. The muscle Jacobian G
-depends on T, so the quadratic programme is solved a few times.
+    l_target = ①(θ, T) + l_comp(T)
 
-Muscle stiffness control exerts T = T_bias + max(0, K_stiff (l − l_target)). Therefore l_target lies
-below the length by |l_comp|. `stiffness` chooses T for a joint stiffness (`stiffness_command`).
-`tension` commands tensions instead of lengths (`torque`). The preset provides the methods
-`geometric`, `first` and `second` (`Preset.length_methods`).
+①(θ, T) is the network's prediction of the muscle lengths, and l_target lies below it by |l_comp|.
+`stiffness` chooses T for a joint stiffness (`stiffness_command`). `proposed` chooses the least
+tensions (`tension_plan`), and `tension` commands tensions instead of lengths (`torque`). The preset
+provides the methods `geometric`, `first` and `second` (`Preset.length_methods`).
 """
 
 from __future__ import annotations
@@ -30,15 +26,10 @@ from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.robot import stiffness as robot_stiffness
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import (
-    Exertion,
     TensionProgramme,
     least_tension,
     supporting_stops,
 )
-
-# Solve this many quadratic programmes, each with G at the tension that the previous one found. A
-# third programme would change the tension by well under a newton.
-SOLVES = 2
 
 FIRST = 'first'  # name of the length method that uses the given tension T_const
 SECOND = 'second'  # name of the length method that uses the measured tension T
@@ -49,6 +40,8 @@ SECOND = 'second'  # name of the length method that uses the measured tension T
 # can reduce a muscle's tension by this margin before it falls to T_bias, where the muscle is stiff
 # in one direction only.
 MARGINS = (40.0, 30.0, 20.0, 10.0, 0.0)
+#: without a nearby solution, search this many times, each with G at the tension found before
+ROUNDS = 2
 ITERATIONS = 6  # end the search for tensions of a desired stiffness after this many iterations
 # Weigh the distance from the initial tensions (at first the least tensions) by this, relative to
 # the stiffness error. A reachable stiffness is missed by about this share.
@@ -136,29 +129,6 @@ def first_command(robot: Robot, mae: Mae, theta: Array, tension: Array) -> Array
         tension: Tensions T that the commands should produce [N], (..., M).
     """
     return mae.lengths(theta, tension) + msc_compensation(robot, tension)
-
-
-def proposed(
-    robot: Robot, mae: Mae, theta: Array, torque: Array, tension: Array, limit: Array | float
-) -> Solution:
-    """Return the command of the method `proposed`: the least tensions that balance the torque.
-
-    Args:
-        robot: The body, in which isolated muscles have no tension.
-        mae: The network.
-        theta: Target posture θ_target [rad], (D,).
-        torque: τ_target = g(θ_target) + effort [N·m], (D,).
-        tension: T_current, from which the search starts [N], (M,).
-        limit: Highest tension that may be planned [N], scalar or (M,).
-    """
-    bias = robot.tension.bias
-    exertion = Exertion(np.clip(tension, bias, limit), np.zeros(robot.joint_count))
-    effort = torque - robot.kinematics.holding_torque(theta)
-    stops = supporting_stops(robot, theta, effort=effort)
-    for _ in range(SOLVES):
-        jacobian = mae.muscle_jacobian(theta, exertion.tension)
-        exertion = least_tension(jacobian, torque, bias, limit, stops=stops)
-    return Solution(first_command(robot, mae, theta, exertion.tension), *exertion)
 
 
 class StiffnessModel(NamedTuple):
@@ -271,7 +241,7 @@ def stiffness_command(
         tension, missing = least_tension(jacobian, torque, low, high, stops=stops)
         if not missing.any():
             break
-    rounds = SOLVES if near is None else 1
+    rounds = ROUNDS if near is None else 1
     tension = tension if near is None else near
     model = StiffnessModel.read(robot, mae, theta, tension)
     # If no tensions within their limits exert the torque, the stiffness cannot be chosen.

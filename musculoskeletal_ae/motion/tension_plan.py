@@ -11,7 +11,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.motion.activities import Inputs, msc_compensation
+from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.motion.feedback import (
     CORRECTION,
     Shift,
@@ -21,7 +21,7 @@ from musculoskeletal_ae.motion.feedback import (
 from musculoskeletal_ae.motion.methods import Solution, stiffness_command
 from musculoskeletal_ae.motion.reach import FRICTION, tendon_friction
 from musculoskeletal_ae.motion.slowness import SHARE
-from musculoskeletal_ae.motion.trajectory import Trajectory
+from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension, supporting_stops
 from musculoskeletal_ae.signals.friction import slid
@@ -29,6 +29,9 @@ from musculoskeletal_ae.signals.friction import slid
 #: plan full tendon friction for tendons that slide much faster than this [m/s], and less for slower
 #: ones, whose sliding direction is uncertain because of noise
 TURNING = 0.005
+#: plan a resting arm this many times, each with G at the tension of the plan before; a third plan
+#: would change the tension by well under a newton
+SOLVES = 2
 AHEAD = 0.2  # compute T_K at this interval, for the setpoint that is this time ahead [s]
 
 
@@ -143,7 +146,14 @@ class TensionPlan:
         return is_other
 
     def step(
-        self, trajectory: Trajectory, time: float, shift: Shift, lag: float, inputs: Inputs
+        self,
+        trajectory: Trajectory,
+        time: float,
+        shift: Shift,
+        lag: float,
+        mae: Mae,
+        limit: Array,
+        dt: float,
     ) -> Array:
         """Plan the next setpoint of a trajectory, and return its length command [m], (M,).
 
@@ -152,9 +162,11 @@ class TensionPlan:
             time: Time since the start of the trajectory [s].
             shift: Shift of θ by the feedback.
             lag: Time λ by which the muscle modules lag behind their commands [s].
-            inputs: What the activity may read at this control step.
+            mae: The network.
+            limit: Highest motor-side tension that may be planned [N], (M,).
+            dt: Time since the last setpoint [s].
         """
-        robot, mae, dt = self._robot, inputs.mae, inputs.dt
+        robot = self._robot
         at = trajectory.sample(time + 0.5 * dt)
         self.jacobian = jacobian = mae.muscle_jacobian(at.theta, self.bone_tension)
         speed = jacobian @ at.velocity
@@ -165,10 +177,9 @@ class TensionPlan:
         loss = np.exp(self._friction * self._sliding)
         near: Array | float = 0.0
         if self.is_stiff:
-            limit = inputs.limit
             near = self._stiffening.step(mae, trajectory, time, self.effort, limit, dt)
         if actuation.knows_tension:
-            limits = np.minimum(low, inputs.limit) / loss, inputs.limit / loss
+            limits = np.minimum(low, limit) / loss, limit / loss
             stops = supporting_stops(robot, at.theta, at.velocity, self.effort)
             supporting = torque + self._support * shift.torque
             tension, missing_torque = least_tension(jacobian, supporting, *limits, near, stops)
@@ -188,3 +199,16 @@ class TensionPlan:
         """
         length = mae.lengths(theta, self.bone_tension)
         return length + msc_compensation(self._robot, self.motor_tension)
+
+
+def plan_at_rest(robot: Robot, mae: Mae, theta: Array) -> TensionPlan:
+    """Return the plan by which method `proposed` holds the posture θ [rad], (D,), without feedback.
+
+    Its `length(mae, theta)` is the length command. The arm has not moved before, so that tendon
+    friction does not count.
+    """
+    plan, none = TensionPlan(robot, Settings()), np.zeros(robot.joint_count)
+    trajectory = Trajectory.to(Setpoint.resting(theta), theta, 1.0)
+    for _ in range(SOLVES):
+        plan.step(trajectory, 0.0, Shift(none, none), 0.0, mae, robot.tension.limit, 0.0)
+    return plan

@@ -21,7 +21,8 @@ from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.experiments.recording import ClosedLoop
 from musculoskeletal_ae.motion.activities import LENGTH, TENSION, Command
-from musculoskeletal_ae.motion.methods import first_command, proposed
+from musculoskeletal_ae.motion.methods import first_command
+from musculoskeletal_ae.motion.tension_plan import plan_at_rest
 from musculoskeletal_ae.robot.description import SPEED_DEFAULT, with_modules
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import slid
@@ -170,9 +171,8 @@ def test_the_length_command_is_the_length_itself():
     np.testing.assert_array_equal(
         first_command(ROBOT, mae, THETA, tension), mae.lengths(THETA, tension)
     )
-    torque = ROBOT.kinematics.holding_torque(THETA)
-    plan = proposed(ROBOT, mae, THETA, torque, ROBOT.tension.bias, LIMIT)
-    np.testing.assert_allclose(plan.length, mae.lengths(THETA, plan.tension))
+    plan = plan_at_rest(ROBOT, mae, THETA)
+    np.testing.assert_allclose(plan.length(mae, THETA), mae.lengths(THETA, plan.bone_tension))
 
 
 class WithJointSensors(ClosedLoop):

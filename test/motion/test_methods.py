@@ -4,8 +4,6 @@
 On the geometric model, the optimum is known.
 """
 
-from functools import partial
-
 import numpy as np
 import pytest
 from exact_mae import ExactMae
@@ -14,13 +12,12 @@ from nominal_body import posture_table
 from bench.timings import eager_proposed, eager_proposed_paper
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
-from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.mae.units import Mask
-from musculoskeletal_ae.motion import methods
 from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.motion.explored_postures import holdable_postures
 from musculoskeletal_ae.motion.methods import first_command
+from musculoskeletal_ae.motion.tension_plan import plan_at_rest
 from musculoskeletal_ae.paper import control as paper
 from musculoskeletal_ae.paper.latent_descent import Loss, descend
 from musculoskeletal_ae.robot.robot import Robot
@@ -41,48 +38,30 @@ def holdable(robot, seed):
 
 @pytest.mark.parametrize('seed', range(3))
 def test_with_an_exact_body_image_the_arm_settles_at_the_target_with_the_least_tension(robot, seed):
-    theta, torque, least = holdable(robot, seed)
-    bias = np.full(robot.muscle_count, robot.tension.bias)
-    solution = methods.proposed(robot, ExactMae(robot), theta, torque, bias, robot.tension.limit)
+    theta, _, least = holdable(robot, seed)
+    mae = ExactMae(robot)
+    plan = plan_at_rest(robot, mae, theta)
     arm = EmulatedArm(robot, 0, Individual(robot, 0, NOMINAL))
     arm.reset(theta + 0.1)
     for _ in range(150):
-        arm.command_length(solution.length)
+        arm.command_length(plan.length(mae, theta))
         arm.step(0.02)
     assert np.linalg.norm(arm.theta - theta) < 0.01
     # A tendon stretches in proportion to its length. The stretch reduces the torque of a muscle by
     # up to 0.5 %, so holding the posture takes more than the least tension of rigid tendons.
-    assert np.linalg.norm(solution.tension) == pytest.approx(np.linalg.norm(least), rel=0.02)
-    assert not solution.missing_torque.any()
+    assert np.linalg.norm(plan.bone_tension) == pytest.approx(np.linalg.norm(least), rel=0.02)
+    assert not plan.missing_torque.any()
 
 
 def test_no_other_tension_that_holds_the_posture_is_smaller(robot):
     theta, torque, _ = holdable(robot, 7)
     mae, limit = ExactMae(robot), robot.tension.limit
-    start = np.full(robot.muscle_count, 30.0)
-    solution = methods.proposed(robot, mae, theta, torque, start, limit)
-    jacobian = mae.muscle_jacobian(theta, solution.tension)
-    np.testing.assert_allclose(jacobian.T @ solution.tension, -torque, atol=0.02)
+    tension = plan_at_rest(robot, mae, theta).bone_tension
+    jacobian = mae.muscle_jacobian(theta, tension)
+    np.testing.assert_allclose(jacobian.T @ tension, -torque, atol=0.02)
     for desired in np.random.default_rng(0).uniform(30.0, limit, (10, robot.muscle_count)):
         other = TensionProgramme(jacobian, torque, robot.tension.bias, limit).nearest(desired)
-        assert np.linalg.norm(solution.tension) <= np.linalg.norm(other) + 0.1
-
-
-def test_torque_beyond_the_muscles_is_reported_and_tensions_stay_within_their_limits(robot):
-    theta, torque, _ = holdable(robot, 1)
-    limit = np.linspace(60.0, 120.0, robot.muscle_count)
-    solution = methods.proposed(robot, ExactMae(robot), theta, torque + 500.0, limit, limit)
-    assert (solution.tension >= 30.0 - 1e-6).all()
-    assert (solution.tension <= limit + 1e-6).all()
-    assert np.linalg.norm(solution.missing_torque) > 100.0
-
-
-def test_a_torque_that_is_not_finite_is_refused(robot):
-    theta, torque, _ = holdable(robot, 1)
-    torque[0] = np.nan
-    bias = np.full(robot.muscle_count, 30.0)
-    with pytest.raises(InfeasibleError, match='not finite'):
-        methods.proposed(robot, ExactMae(robot), theta, torque, bias, 200.0)
+        assert np.linalg.norm(tension) <= np.linalg.norm(other) + 0.1
 
 
 def test_the_length_command_makes_the_module_pull_with_the_planned_tension(robot):
@@ -113,16 +92,14 @@ def test_preset_paper_lowers_the_printed_loss(trained):
 def test_the_methods_agree_with_an_implementation_by_autograd(trained, seed):
     robot = Robot.load('arm26')
     theta, torque, _ = holdable(robot, seed)
-    tension = np.full(6, 40.0)
-    for preset, ours, theirs in (
-        ('default', partial(methods.proposed, limit=200.0), eager_proposed),
-        ('paper', paper.proposed, eager_proposed_paper),
-    ):
-        mae = trained[preset]
-        plain = theirs(robot, from_mae(mae), theta, torque, tension)
-        # Single precision causes differences of some micrometres, a wrong term some millimetres.
-        solution = ours(robot, mae, theta, torque, tension)
-        np.testing.assert_allclose(solution.length, plain, atol=1e-5)
+    tension, (mae, printed) = np.full(6, 40.0), (trained['default'], trained['paper'])
+    ours = plan_at_rest(robot, mae, theta).length(mae, theta)
+    plain = eager_proposed(robot, from_mae(mae), theta, torque)
+    # Single precision causes differences of some micrometres, a wrong term some millimetres.
+    np.testing.assert_allclose(ours, plain, atol=1e-5)
+    ours = paper.proposed(robot, printed, theta, torque, tension).length
+    plain = eager_proposed_paper(robot, from_mae(printed), theta, torque, tension)
+    np.testing.assert_allclose(ours, plain, atol=1e-5)
 
 
 def test_with_a_network_proposed_settles_nearer_than_first_and_near_the_least_tension(trained):
