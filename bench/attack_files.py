@@ -152,7 +152,7 @@ class Reader:
         """Write the valid files, of which damaged copies are read later."""
         from musculoskeletal_ae.body_model.observations import Sample
         from musculoskeletal_ae.learning.samples import SampleStore
-        from musculoskeletal_ae.learning.state import NEWEST, StateStore
+        from musculoskeletal_ae.learning.state_directory import NEWEST, StateStore
         from musculoskeletal_ae.mae import checkpoint
         from musculoskeletal_ae.mae.initial_training import initial_mae
         from musculoskeletal_ae.robot.robot import Robot
@@ -226,7 +226,7 @@ class Reader:
 
     def _state(self, trial: Path, rng: random.Random) -> Callable[[], object]:
         from musculoskeletal_ae.learning.samples import SampleStore
-        from musculoskeletal_ae.learning.state import NEWEST, PREVIOUS, StateStore
+        from musculoskeletal_ae.learning.state_directory import NEWEST, PREVIOUS, StateStore
 
         for name in rng.choice([(NEWEST,), (PREVIOUS,), (NEWEST, PREVIOUS)]):
             if rng.random() < 0.3:

@@ -43,8 +43,8 @@ from musculoskeletal_ae.experiments.online_learning import teach
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, HELD_OUT_STREAM, record
 from musculoskeletal_ae.gauss_newton import minimise_each
 from musculoskeletal_ae.learning.body_updater import BodyUpdater
-from musculoskeletal_ae.learning.calibration import Healthy
 from musculoskeletal_ae.learning.convergence import STEPS, until_converged
+from musculoskeletal_ae.learning.detector_calibration import Healthy
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import CAPACITY
 from musculoskeletal_ae.learning.scheduler import Job, Update

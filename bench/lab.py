@@ -38,7 +38,7 @@ from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
 from musculoskeletal_ae.exceptions import CheckpointError, MessageError
 from musculoskeletal_ae.experiments.recording import EXPLORATION_STREAM, SAMPLE_TIME
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.state import StateStore
+from musculoskeletal_ae.learning.state_directory import StateStore
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.signals.body_state import BodyState

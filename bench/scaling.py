@@ -42,7 +42,7 @@ from musculoskeletal_ae.experiments.recording import (
     record,
 )
 from musculoskeletal_ae.learning.body_updater import BodyUpdater
-from musculoskeletal_ae.learning.calibration import Healthy
+from musculoskeletal_ae.learning.detector_calibration import Healthy
 from musculoskeletal_ae.learning.samples import CAPACITY
 from musculoskeletal_ae.learning.scheduler import STEPS, Job
 from musculoskeletal_ae.mae.mae import Mae

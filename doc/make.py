@@ -95,7 +95,7 @@ MODULES = {
     'emulator/faults.py': ['ArmReadings'],
     'emulator/modules.py': ['Arm'],
     'driver/listening.py': ['Listening'],
-    'driver/winding.py': ['Winding'],
+    'driver/stiffness_motion_test.py': ['Winding'],
     'driver/verdict.py': ['Verdict', 'Fault'],
     'tables/table.py': ['Table'],
     'tables/csv_file.py': ['read_csv'],

@@ -11,7 +11,7 @@ offsets z and the corrections e = (α, β) of the joints' springs (`springs`), b
 that a user stated. u are directions of gravity in links that carry an IMU. Any of these
 measurements may be missing. ω are robust weights, and σ are standard deviations of the residuals.
 w̄ and s are prior means and prior spreads (`priors`). z̄ and s_z are derived from the joints' stops
-(`joint_stops`). `posture_model` explains the other symbols.
+(`sensor_offsets`). `posture_model` explains the other symbols.
 
 The problem can be solved because M > D. N rests give N (M − D) more length equations than there are
 angles, and N D torque equations. A joint that muscles push against its stop harder than friction
@@ -33,10 +33,10 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from musculoskeletal_ae.arrays import Array, Ints
-from musculoskeletal_ae.body_model.joint_stops import Stops
 from musculoskeletal_ae.body_model.observations import Observations
 from musculoskeletal_ae.body_model.posture_model import Bent, PostureModel, Residuals, Unknowns
 from musculoskeletal_ae.body_model.priors import GroupPrior
+from musculoskeletal_ae.body_model.sensor_offsets import Stops
 from musculoskeletal_ae.gauss_newton import (
     SMALL,
     Eliminated,

@@ -10,8 +10,8 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.calibrated_body import Layout
-from musculoskeletal_ae.body_model.joint_stops import sensor_zeros
 from musculoskeletal_ae.body_model.posture_model import PostureModel
+from musculoskeletal_ae.body_model.sensor_offsets import sensor_zeros
 from musculoskeletal_ae.robot.model_errors import ATTACHMENT, ELASTIC
 from musculoskeletal_ae.signals.friction import DRIVE_FRICTION_MEAN, DRIVE_SPREAD
 

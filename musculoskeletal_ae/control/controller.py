@@ -5,9 +5,9 @@
                                  causes ─► supervisor ┤─► limiter ─► command
                                             safe stop ┘
 
-The supervisor decides what the arm does (`supervisor`). One object for each activity
-computes the commands (`follower`, `ramps`, `torque`, `exploration`, `calibrating`). Every command
-passes the limiter before it is published.
+The supervisor decides what the arm does (`supervisor`). One object for each activity computes the
+commands (`follower`, `ramps`, `torque`, `exploration`, `calibration_motion`). Every command passes
+the limiter before it is published.
 
 Plans assume that isolated muscles have no tension, and the modules of isolated muscles are
 commanded to keep the tendons slack. While the estimator verifies a suspect, which is a muscle that
@@ -48,7 +48,7 @@ from musculoskeletal_ae.motion.activities import (
     Command,
     Inputs,
 )
-from musculoskeletal_ae.motion.calibrating import Calibrating, gentle_limit
+from musculoskeletal_ae.motion.calibration_motion import Calibrating, gentle_limit
 from musculoskeletal_ae.motion.exploration import Exploration, Exploring
 from musculoskeletal_ae.motion.follower import Follower
 from musculoskeletal_ae.motion.planner import Planner

@@ -39,7 +39,7 @@ the standard deviation σ_T of this tension, its limit is lowered by CONFIDENCE 
 tension does not exceed T_limit.
 
 T_limit is the smallest of `tension.limit`, the momentary limit from the temperature of the motors
-(`watchdog.HeatLimit`) and, while the length offsets are unknown, `calibrating.gentle_limit`.
+(`watchdog.HeatLimit`) and, while the length offsets are unknown, `calibration_motion.gentle_limit`.
 
 The rate limit applies to the change since the last published command, in every mode. Length and
 tension commands are compared by the tension that they demand of a module:

@@ -7,8 +7,8 @@
    far more numerous motion samples. Motion samples show effects that rest samples and the body
    model lack, such as tendon sliding.
 3. Train the network on these samples for a bounded number of steps.
-4. Compute the statistics of the residuals on healthy messages (`calibration`), and the expected
-   covariance of the estimation errors (`covariance`).
+4. Compute the statistics of the residuals on healthy messages (`detector_calibration`), and the
+   expected covariance of the estimation errors (`covariance`).
 
 The body can be fitted to few samples, because the geometric model and its tolerances are known. The
 network needs many samples, which are drawn from the body.

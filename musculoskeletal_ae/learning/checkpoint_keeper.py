@@ -22,7 +22,7 @@ import numpy as np
 
 from musculoskeletal_ae.exceptions import StateError
 from musculoskeletal_ae.learning.samples import SampleStore
-from musculoskeletal_ae.learning.state import StateStore
+from musculoskeletal_ae.learning.state_directory import StateStore
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot

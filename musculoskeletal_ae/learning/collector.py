@@ -20,7 +20,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.observations import NOTHING, Sample
 from musculoskeletal_ae.learning.anomaly_margin import AnomalyMargin
-from musculoskeletal_ae.learning.calibration import Reservoir
+from musculoskeletal_ae.learning.detector_calibration import Reservoir
 from musculoskeletal_ae.learning.rest import REST_TIME, RestDetector
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.learning.slow_moments import SlowMoments

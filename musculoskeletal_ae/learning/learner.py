@@ -27,13 +27,13 @@ from typing import Any
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.body_model.joint_stops import LARGEST_OFFSET
 from musculoskeletal_ae.body_model.observations import Sample
+from musculoskeletal_ae.body_model.sensor_offsets import LARGEST_OFFSET
 from musculoskeletal_ae.conditions import Condition
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.learning.calibration import Reservoir, uncalibrated
 from musculoskeletal_ae.learning.checkpoint_keeper import CheckpointKeeper
 from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR, SampleCollector
+from musculoskeletal_ae.learning.detector_calibration import Reservoir, uncalibrated
 from musculoskeletal_ae.learning.learner_status import learner_conditions, learner_report
 from musculoskeletal_ae.learning.sample_history import HELD_TIME, JointHistory, OffsetHistory
 from musculoskeletal_ae.learning.samples import SampleStore

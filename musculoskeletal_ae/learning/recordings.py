@@ -21,9 +21,9 @@ from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.exceptions import CheckpointError
-from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.collector import SampleCollector
 from musculoskeletal_ae.learning.convergence import STEPS, until_converged
+from musculoskeletal_ae.learning.detector_calibration import Reservoir
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.learning.scheduler import LEAST_INTERVAL, Update

@@ -15,7 +15,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.observations import Observations
-from musculoskeletal_ae.learning.calibration import Healthy, Reservoir, uncalibrated
+from musculoskeletal_ae.learning.detector_calibration import Healthy, Reservoir, uncalibrated
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae.mae import Mae
 

@@ -2,6 +2,7 @@
 """How the arm moves: from targets to the commands that `control/` checks.
 
 `planner` turns targets and hand poses into trajectories, and `follower` follows them; begin there.
-`methods` contains the equations from postures to commands. `ramps`, `torque`, `exploration` and
-`calibrating` are the other activities.
+`tension_plan` chooses the tensions along a trajectory. `ramps`, `torque`, `exploration` and
+`calibration_motion` are the other activities. `methods` has the equations of the paper's control
+methods and of the joint stiffness.
 """

@@ -3,8 +3,9 @@
 
 Each preset of settings has its own random steps (`Preset.exploration`). Preset `default` puts the
 targets of some joints at their limits, because the learner identifies joint-sensor offsets from
-joints at their stops (`body_model.joint_stops`). For each posture, this preset draws several random
-sets of tensions and uses the one that presses these joints most strongly against their stops.
+joints at their stops (`body_model.sensor_offsets`). For each posture, this preset draws several
+random sets of tensions and uses the one that presses these joints most strongly against their
+stops.
 """
 
 from collections.abc import Iterator

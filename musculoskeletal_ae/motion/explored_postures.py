@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts from which the presets compose the steps of the exploration (`Preset.exploration`)."""
+"""Draws the postures and tensions of the exploration.
+
+A preset composes its steps from these parts (`Preset.exploration`).
+"""
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -10,13 +13,9 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import InfeasibleError, RobotDescriptionError
 from musculoskeletal_ae.robot.description import shown
 from musculoskeletal_ae.robot.equilibrium_states import has_followers
+from musculoskeletal_ae.robot.joint_stops import AT_STOP, supporting_stops
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import (
-    AT_STOP,
-    holding_tension,
-    least_tension,
-    supporting_stops,
-)
+from musculoskeletal_ae.robot.tension import holding_tension, least_tension
 
 TRIES = 1000  # search at most this many random postures for holdable ones
 AT_LIMITS = 0.25  # place this fraction of each joint's random angles at one of its limits

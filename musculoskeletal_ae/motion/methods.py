@@ -24,12 +24,9 @@ from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.robot import stiffness as robot_stiffness
+from musculoskeletal_ae.robot.joint_stops import supporting_stops
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import (
-    TensionProgramme,
-    least_tension,
-    supporting_stops,
-)
+from musculoskeletal_ae.robot.tension import TensionProgramme, least_tension
 
 FIRST = 'first'  # name of the length method that uses the given tension T_const
 SECOND = 'second'  # name of the length method that uses the measured tension T

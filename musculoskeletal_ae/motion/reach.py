@@ -35,8 +35,9 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.feedback import largest_support
 from musculoskeletal_ae.motion.trajectory import Setpoint
+from musculoskeletal_ae.robot.joint_stops import AT_STOP, supporting_stops
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import AT_STOP, least_tension, supporting_stops
+from musculoskeletal_ae.robot.tension import least_tension
 
 NOTABLE = 0.05  # treat a posture as not holdable if it lacks more torque than this [N·m]
 HALVINGS = 6  # search for the last holdable posture of a path with this many bisection steps

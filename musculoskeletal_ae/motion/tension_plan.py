@@ -22,8 +22,9 @@ from musculoskeletal_ae.motion.methods import Solution, stiffness_command
 from musculoskeletal_ae.motion.reach import FRICTION, tendon_friction
 from musculoskeletal_ae.motion.slowness import SHARE
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
+from musculoskeletal_ae.robot.joint_stops import supporting_stops
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import least_tension, supporting_stops
+from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.signals.friction import slid
 
 #: plan full tendon friction for tendons that slide much faster than this [m/s], and less for slower

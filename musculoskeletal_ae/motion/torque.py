@@ -8,8 +8,9 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.motion.activities import TENSION, ActivityControl, Command, Inputs
+from musculoskeletal_ae.robot.joint_stops import supporting_stops
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import least_tension, supporting_stops
+from musculoskeletal_ae.robot.tension import least_tension
 
 # Gains of the method `tension`; K_p holds the arm near its target, and K_d damps its motion.
 POSITION_GAIN = 10.0  # gain K_p of the posture error [N·m/rad]

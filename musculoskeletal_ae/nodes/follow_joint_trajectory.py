@@ -8,7 +8,12 @@ from typing import Any
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.goal import INVALID, SUCCESSFUL, FollowedGoal, read_tolerances
+from musculoskeletal_ae.control.followed_goal import (
+    INVALID,
+    SUCCESSFUL,
+    FollowedGoal,
+    read_tolerances,
+)
 from musculoskeletal_ae.exceptions import MessageError
 
 NAME = 'follow_joint_trajectory'

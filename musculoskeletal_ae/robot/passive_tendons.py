@@ -12,6 +12,7 @@ Its length is a polynomial of the angles of its joints:
 
 For a tendon that only pulls, x_low is 0 or less than any length of the tendon.
 `JointElasticity` adds these torques to those of the springs at the joints.
+`passive_tendon_torque` computes them in compiled code.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ class PassiveTendons:
         rows = np.ascontiguousarray(theta.reshape(-1, theta.shape[-1]))
         torque, gradient = np.zeros(rows.shape), np.zeros((*rows.shape, rows.shape[1]))
         # Imported here, because help texts should not wait for the slow import of numba.
-        from musculoskeletal_ae.robot.passive_torque import hold_postures
+        from musculoskeletal_ae.robot.passive_tendon_torque import hold_postures
 
         hold_postures(self.arrays, rows, torque, gradient)
         return torque.reshape(theta.shape), gradient.reshape(*theta.shape, theta.shape[-1])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Muscle tensions that produce a joint torque, by quadratic programming, and the joint stops.
+"""Muscle tensions that produce a joint torque, by quadratic programming.
 
     hard:   min ‖T − T_desired‖²         subject to   −Gᵀ T = τ,   T_low ≤ T ≤ T_high
     soft:   min ‖τ + Gᵀ T‖² + ε ‖T‖²     subject to                T_low ≤ T ≤ T_high
@@ -8,7 +8,7 @@
 hard form produces exactly the torque τ. The soft form comes as near to τ as possible, with a small
 weight ε on the tensions.
 
-Where a joint is at a stop (`supporting_stops`), the stop provides a part f of the torque, which the
+Where a joint is at a stop (`joint_stops`), the stop provides a part f of the torque, which the
 programme chooses together with T:
 
     −Gᵀ T + f = τ,   0 ≤ f_j ≤ STOP_TORQUE at a lower stop,   −STOP_TORQUE ≤ f_j ≤ 0 at an upper one
@@ -36,12 +36,6 @@ from musculoskeletal_ae.robot.robot import Robot
 LEAST_GAP = 1e-8
 #: ε [(N·m/N)²]; with torques of some N·m and tensions of some hundred N, the second term is small
 SOFT_WEIGHT = 1e-7
-#: let a stop support a joint that is nearer to its limit than this [rad]; a joint with a target
-#: nearer than this may come to rest at the stop instead
-AT_STOP = 0.02
-LEAVING = 1e-3  # no stop supports a joint that is to move away from it faster than this [rad/s]
-#: no stop supports a joint that is to push away from it with more than this torque [N·m]
-PUSHING = 1e-3
 STOP_TORQUE = 100.0  # let a stop support a joint with at most this torque [N·m]
 
 
@@ -191,32 +185,6 @@ def least_tension(
         return Exertion(programme.nearest(desired), np.zeros(len(torque)))
     except InfeasibleError:
         return programme.compromise()
-
-
-def supporting_stops(
-    robot: Robot, theta: Array, velocity: Array | float = 0.0, effort: Array | float = 0.0
-) -> Array:
-    """Return the stops that support joints at θ, as the rows of a Jacobian (S, D).
-
-    A stop pushes its joint back with any torque, but does not pull it. It is therefore modelled as
-    a muscle that turns its joint away from the limit, and whose tension is the torque. A joint that
-    is to move or push away from its stop needs its muscles for that.
-
-    Args:
-        robot: The robot.
-        theta: Joint angles θ [rad], (D,) or (N, D). A stop supports a joint that is at the stop in
-            all N postures, for example in the present one and in its target.
-        velocity: Velocity θ̇ with which the joints are to move [rad/s], (D,).
-        effort: Torque that the joints are to exert beyond gravity and inertia [N·m], (D,).
-    """
-    postures = np.atleast_2d(theta)
-    velocity, effort = np.asarray(velocity), np.asarray(effort)
-    is_low = (postures < robot.lower + AT_STOP).all(axis=0)
-    is_high = (postures > robot.upper - AT_STOP).all(axis=0)
-    is_low &= (velocity < LEAVING) & (effort < PUSHING)
-    is_high &= (velocity > -LEAVING) & (effort > -PUSHING)
-    joints = np.eye(robot.joint_count)
-    return np.concatenate([-joints[is_low], joints[is_high]])
 
 
 @cache

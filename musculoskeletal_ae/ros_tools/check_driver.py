@@ -224,8 +224,8 @@ def _winding(robot: Robot, verdict: Verdict, options: Namespace) -> Any:
             muscles cannot be tested.
     """
     muscles = robot.muscle_indices(options.muscles or [])
-    winding: Any = import_heavy('musculoskeletal_ae.driver.winding').Winding
-    positioning = import_heavy('musculoskeletal_ae.driver.positioning').Positioning
+    winding: Any = import_heavy('musculoskeletal_ae.driver.stiffness_motion_test').Winding
+    positioning = import_heavy('musculoskeletal_ae.driver.position_motion_test').Positioning
     return robot.actuation.choose(winding, positioning)(verdict, muscles, options.tension)
 
 

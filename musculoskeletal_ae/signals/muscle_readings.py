@@ -7,6 +7,8 @@ knows that order. All other code takes a quantity by its name, such as `readings
 
     message ─► read_muscle_states ─► MuscleReadings ─► to_message ─► message
 
+`read_muscle_states` checks the form of one message; `muscle_stream` judges the readings.
+
 To add a quantity, add its entry to `MuscleReadings`. Messages may then have its row; its values are
 checked, emulated faults and recordings keep them, and `MuscleSample.newest` contains them.
 doc/explanation/architecture.md ("How to add …") lists the further steps for a quantity that the

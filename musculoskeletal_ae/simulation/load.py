@@ -30,8 +30,8 @@ from numba import njit
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.robot.kinematics import Kinematics
+from musculoskeletal_ae.robot.passive_tendon_torque import add_passive
 from musculoskeletal_ae.robot.passive_tendons import Passive
-from musculoskeletal_ae.robot.passive_torque import add_passive
 from musculoskeletal_ae.robot.wrapping import Vector, cross, dot, plus
 
 

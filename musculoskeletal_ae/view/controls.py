@@ -13,7 +13,8 @@ Requests of visitors call `act` in viser's threads, with the name of the request
     reset            no value
     end exploring    no value
 
-Any other name is that of a service, which is called without a value.
+Any other name is that of a service, which is called without a value. `ros_tools/view.py` carries
+the requests out.
 """
 
 from collections.abc import Callable, Iterable, Sequence

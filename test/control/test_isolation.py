@@ -28,13 +28,9 @@ from musculoskeletal_ae.motion.slowness import slowness
 from musculoskeletal_ae.motion.tension_plan import TURNING
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.actuation import DEPTH
+from musculoskeletal_ae.robot.joint_stops import AT_STOP, supporting_stops
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import (
-    AT_STOP,
-    TensionProgramme,
-    least_tension,
-    supporting_stops,
-)
+from musculoskeletal_ae.robot.tension import TensionProgramme, least_tension
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.simulation.simulation import Simulation
 

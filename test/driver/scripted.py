@@ -10,9 +10,9 @@ import numpy as np
 from readings import reading
 
 from musculoskeletal_ae.driver.listening import Listening
-from musculoskeletal_ae.driver.positioning import Positioning
+from musculoskeletal_ae.driver.position_motion_test import Positioning
+from musculoskeletal_ae.driver.stiffness_motion_test import Winding
 from musculoskeletal_ae.driver.verdict import Verdict
-from musculoskeletal_ae.driver.winding import Winding
 from musculoskeletal_ae.emulator.faults import ArmReadings, Faults
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.robot.robot import Robot

@@ -20,8 +20,8 @@ from driver.scripted import Driver, RecordedArm, array, joint_state, muscle_rows
 from musculoskeletal_ae.awake_clock import AwakeClock
 from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.driver.motion_test import ABOVE_BIAS, RUN_AWAY_TENSION
+from musculoskeletal_ae.driver.stiffness_motion_test import Winding
 from musculoskeletal_ae.driver.verdict import CHECKS, FAULTS, Verdict
-from musculoskeletal_ae.driver.winding import Winding
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.messages import message_reading
 from musculoskeletal_ae.robot.description import TensionRange, with_modules

@@ -44,9 +44,9 @@ from driver.test_faults import (
 )
 from driver.test_order import CYCLE, misordered
 from musculoskeletal_ae.driver.listening import TENSION_UNITS, UNITS, Listening
-from musculoskeletal_ae.driver.positioning import Positioning
+from musculoskeletal_ae.driver.position_motion_test import Positioning
+from musculoskeletal_ae.driver.stiffness_motion_test import Winding
 from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
-from musculoskeletal_ae.driver.winding import Winding
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.description import TensionRange, with_modules
 from musculoskeletal_ae.robot.motors import Motors, MotorTopics

@@ -25,7 +25,7 @@ from musculoskeletal_ae.estimation.network_validation.validator import (
     CheckpointValidator,
 )
 from musculoskeletal_ae.exceptions import GateError
-from musculoskeletal_ae.learning.calibration import Healthy, calibrate
+from musculoskeletal_ae.learning.detector_calibration import Healthy, calibrate
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.presets.registry import PRESETS
 from musculoskeletal_ae.robot.robot import Robot

@@ -11,7 +11,7 @@ from musculoskeletal_ae.body_model.observations import Observations, Sample
 from musculoskeletal_ae.body_model.priors import PRIOR
 from musculoskeletal_ae.body_model.remainder import Remainder
 from musculoskeletal_ae.learning.body_updater import BodyUpdater
-from musculoskeletal_ae.learning.calibration import Healthy
+from musculoskeletal_ae.learning.detector_calibration import Healthy
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.learning.scheduler import Job
 from musculoskeletal_ae.robot.model_errors import attachment_spread

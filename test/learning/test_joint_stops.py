@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.body_model.joint_stops import ROUGH_OFFSET, STOP_SPREAD, sensor_zeros
+from musculoskeletal_ae.body_model.sensor_offsets import ROUGH_OFFSET, STOP_SPREAD, sensor_zeros
 
 LOWER, UPPER = np.array([-0.4, -1.5, -0.8]), np.array([1.2, 0.1, 0.8])
 TRUE = np.array([0.05, -0.04, 0.0])  # offsets of the joint sensors [rad], which are to be found

@@ -14,7 +14,7 @@ from musculoskeletal_ae.body_model.observations import Observations, Sample
 from musculoskeletal_ae.control.limiter import CONFIDENCE
 from musculoskeletal_ae.emulator.kin.individual import Individual
 from musculoskeletal_ae.exceptions import CheckpointError, StateError
-from musculoskeletal_ae.learning import saved_state
+from musculoskeletal_ae.learning import state_format
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.residuals import TouchStatistics
@@ -143,7 +143,7 @@ def test_samples_of_tension_sensors_are_not_mixed_with_motor_currents():
     store = SampleStore()
     quiet = np.zeros(COUNT)
     store.add(Sample(np.zeros(2), quiet, quiet, quiet))
-    data = saved_state.to_bytes(saved_state.collect(SENSORS, store, None))
-    saved_state.from_bytes(data, SENSORS)
+    data = state_format.to_bytes(state_format.collect(SENSORS, store, None))
+    state_format.from_bytes(data, SENSORS)
     with pytest.raises(StateError, match="tension_source 'sensor'; this robot has 'current'"):
-        saved_state.from_bytes(data, ROBOT)
+        state_format.from_bytes(data, ROBOT)

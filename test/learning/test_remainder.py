@@ -12,7 +12,7 @@ from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.remainder import Remainder
 from musculoskeletal_ae.body_model.synthetic import synthetic_samples
 from musculoskeletal_ae.learning.body_updater import BodyUpdater
-from musculoskeletal_ae.learning.calibration import Healthy
+from musculoskeletal_ae.learning.detector_calibration import Healthy
 from musculoskeletal_ae.learning.scheduler import Job
 from musculoskeletal_ae.mae.units import scale_vector
 

@@ -9,15 +9,15 @@ import pytest
 from remedies import check_remedy, members
 
 from musculoskeletal_ae.exceptions import StateError
-from musculoskeletal_ae.learning import state as states
+from musculoskeletal_ae.learning import state_directory as states
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import SampleStore
-from musculoskeletal_ae.learning.state import NETWORK, StateStore
+from musculoskeletal_ae.learning.state_directory import NETWORK, StateStore
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 
 from .test_learner import IdleTrainer
-from .test_state import be_foreign, full_disk, no_pause, written
+from .test_state_directory import be_foreign, full_disk, no_pause, written
 
 assert no_pause  # a fixture
 SPACE = '[Ff]ree disk space or make .* writable'

@@ -9,8 +9,8 @@ from readings import reading as message
 
 from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
-from musculoskeletal_ae.learning.calibration import Reservoir
 from musculoskeletal_ae.learning.collector import SampleCollector
+from musculoskeletal_ae.learning.detector_calibration import Reservoir
 from musculoskeletal_ae.learning.rest import RestDetector
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.body_state import Anomaly, LengthOffsets

@@ -7,7 +7,7 @@ import pytest
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
-from musculoskeletal_ae.motion.calibrating import SPEED, gentle_limit
+from musculoskeletal_ae.motion.calibration_motion import SPEED, gentle_limit
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import LengthOffsets
 

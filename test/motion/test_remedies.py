@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from remedies import check_remedy, members
 
-from musculoskeletal_ae.control.goal import read_tolerances
+from musculoskeletal_ae.control.followed_goal import read_tolerances
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory

@@ -20,8 +20,8 @@ from std_srvs.srv import SetBool, Trigger
 
 from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.learning import state as states
-from musculoskeletal_ae.learning.state import NETWORK, NEWEST
+from musculoskeletal_ae.learning import state_directory as states
+from musculoskeletal_ae.learning.state_directory import NETWORK, NEWEST
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.controller import ControllerNode

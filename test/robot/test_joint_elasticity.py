@@ -26,7 +26,7 @@ from musculoskeletal_ae.exceptions import CheckpointError, InfeasibleError, Robo
 from musculoskeletal_ae.exporting.exported_mjcf import export
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.learning.body_updater import BodyUpdater
-from musculoskeletal_ae.learning.calibration import Healthy
+from musculoskeletal_ae.learning.detector_calibration import Healthy
 from musculoskeletal_ae.learning.scheduler import Job
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae

@@ -5,13 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from musculoskeletal_ae.exceptions import InfeasibleError
+from musculoskeletal_ae.robot.joint_stops import AT_STOP, supporting_stops
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.robot.tension import (
-    AT_STOP,
-    TensionProgramme,
-    least_tension,
-    supporting_stops,
-)
+from musculoskeletal_ae.robot.tension import TensionProgramme, least_tension
 
 LOW, HIGH = 30.0, 200.0
 

@@ -9,8 +9,8 @@ import pytest
 from driver.scripted import Driver
 from readings import reading
 
+from musculoskeletal_ae.driver.stiffness_motion_test import Winding
 from musculoskeletal_ae.driver.verdict import Verdict
-from musculoskeletal_ae.driver.winding import Winding
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.joint_sensors import (
     DEGREES,

@@ -31,7 +31,7 @@ from musculoskeletal_ae.emulator.kin.wrapping import Placed
 from musculoskeletal_ae.emulator.modules import STEP, Command, Modules, MuscleState
 from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.kinematics import joint_space_inertia
-from musculoskeletal_ae.robot.passive_torque import add_passive
+from musculoskeletal_ae.robot.passive_tendon_torque import add_passive
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
 

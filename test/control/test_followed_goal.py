@@ -8,7 +8,7 @@ import pytest
 from control_bench import DT, OTHER, REST, ROBOT, Bench
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.control.goal import (
+from musculoskeletal_ae.control.followed_goal import (
     BEYOND_GOAL,
     BEYOND_PATH,
     INVALID,

@@ -15,10 +15,10 @@ from robots import copy_robot, read_muscles, write_muscles
 from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.estimation.network_validation.validator import CheckpointValidator
 from musculoskeletal_ae.exceptions import GateError, StateError
-from musculoskeletal_ae.learning import state as states
+from musculoskeletal_ae.learning import state_directory as states
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.samples import SampleStore
-from musculoskeletal_ae.learning.state import LOCK, NEWEST, PREVIOUS, StateStore
+from musculoskeletal_ae.learning.state_directory import LOCK, NEWEST, PREVIOUS, StateStore
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.robot.robot import Robot

@@ -20,9 +20,9 @@ from typing import TextIO
 from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.exceptions import StateError
 from musculoskeletal_ae.files import locked, read_bytes, write_whole
-from musculoskeletal_ae.learning import saved_state
+from musculoskeletal_ae.learning import state_format
 from musculoskeletal_ae.learning.samples import SampleStore
-from musculoskeletal_ae.learning.saved_state import SavedState
+from musculoskeletal_ae.learning.state_format import SavedState
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -119,10 +119,10 @@ class StateStore:
                 self.not_used += f'; {used}'
         if state is None:
             return None
-        saved_state.restore_samples(state, self._robot, samples)
+        state_format.restore_samples(state, self._robot, samples)
         self._saved_samples = samples.all()
         try:
-            return saved_state.restore_network(state, self._robot)
+            return state_format.restore_network(state, self._robot)
         except StateError as error:
             self._note_backup(error, self._write_backup(state))
             self._save(samples, None)
@@ -133,7 +133,7 @@ class StateStore:
         if not file.exists():
             return None
         try:
-            return saved_state.from_bytes(read_bytes(file, _refuse, LARGEST), self._robot)
+            return state_format.from_bytes(read_bytes(file, _refuse, LARGEST), self._robot)
         except StateError as error:
             self._note_backup(f'{file}: {error}', file.rename(self._free_name()))
             return None
@@ -205,7 +205,7 @@ class StateStore:
         """
         try:
             self._put_in_place()
-            backup = self._write_backup(saved_state.collect(self._robot, samples, network))
+            backup = self._write_backup(state_format.collect(self._robot, samples, network))
         except OSError as error:
             raise StateError(
                 f'{self.directory}: no backup can be made ({error}); nothing was replaced. Free '
@@ -231,13 +231,13 @@ class StateStore:
         return os.path.samestat(os.fstat(self._lock.fileno()), in_directory)
 
     def _save(self, samples: SampleStore, network: bytes | None) -> None:
-        state = saved_state.collect(self._robot, samples, network)
-        write_whole(self._newest, saved_state.to_bytes(state), self._previous)
+        state = state_format.collect(self._robot, samples, network)
+        write_whole(self._newest, state_format.to_bytes(state), self._previous)
         self._saved_samples = samples.all()
 
     def _write_backup(self, state: SavedState) -> Path:
         backup = self._free_name()
-        write_whole(backup, saved_state.to_bytes(state))
+        write_whole(backup, state_format.to_bytes(state))
         return backup
 
     def _free_name(self) -> Path:

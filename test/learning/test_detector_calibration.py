@@ -6,7 +6,7 @@ import pytest
 
 from musculoskeletal_ae.body_model.observations import Sample
 from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
-from musculoskeletal_ae.learning.calibration import (
+from musculoskeletal_ae.learning.detector_calibration import (
     GLITCH_SHARE,
     LEAST_SAMPLES,
     LEAST_TIME,
