@@ -3,6 +3,6 @@
 
 `planner` turns targets and hand poses into trajectories, and `follower` follows them; begin there.
 `tension_plan` chooses the tensions along a trajectory. `ramps`, `torque`, `exploration` and
-`calibration_motion` are the other activities. `methods` has the equations of the paper's control
-methods and of the joint stiffness.
+`calibration_motion` are the other activities. `methods` describes methods that command
+lengths, and has the equations of the joint stiffness.
 """
