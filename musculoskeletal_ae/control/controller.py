@@ -602,8 +602,9 @@ class Controller:
     def _desired(self, dt: float) -> Command | None:
         """Return the command of the present activity, or None if there is none.
 
-        If the activity raises an exception, the arm stops. There is one exception to this rule: an
-        exploration that finds too few holdable postures ends without a stop.
+        If the activity raises an exception, the arm stops. There is one exception to this rule: if
+        the muscles can hold too few postures to explore, or cannot move the arm to the target, the
+        activity ends without a stop.
         """
         if self.estimate is None:  # wait for the next estimate, which a length calibration provides
             self.activities.leave()
@@ -616,14 +617,23 @@ class Controller:
         try:
             return self._slack(self._step(control, self._inputs(dt)))
         except RobotDescriptionError as error:  # too few postures are holdable to explore
-            self._request(Activity.IDLE)
             reason = str(error)
             if isolated := self.robot.names(self.robot.isolated):
                 reason = f'too few postures are holdable without {isolated}; {RESTORE}'
-            self.target_state.unreachable_reason = reason
+            self._give_up(reason)
+        except MessageError as error:  # no motion to the target is possible
+            self._give_up(str(error))
         except Exception as error:  # noqa: BLE001 (any exception has to stop the arm)
             self._note_fault(error)
         return None
+
+    def _give_up(self, reason: str) -> None:
+        """End the activity and forget the target, because the muscles cannot do what they should.
+
+        The tensions stay as they are.
+        """
+        self._request(Activity.IDLE)
+        self.target_state = Target(np.zeros(self.robot.joint_count), unreachable_reason=reason)
 
     def _note_fault(self, error: Exception) -> None:
         self.stop(ConditionKind.CONTROL_FAULT, f'{type(error).__name__}: {error}')

@@ -69,8 +69,12 @@ class Planner:
             duration: Shortest time for each segment of the path [s]. The motion takes longer if the
                 muscles cannot accelerate the arm enough.
             lag: Lag λ of the muscle modules [s].
+
+        Raises:
+            MessageError: If the muscles that are not isolated cannot move the arm there.
         """
         way = reach.way(self._robot, mae, start.theta, theta)
+        self._check_way(mae, np.vstack([start.theta, way]))
         planned = self._within_limits(mae, Trajectory.to(start, way, duration))
         slower = exertion_slowness(self._robot, mae, planned, lag)
         return planned if slower == 1.0 else self._within_limits(mae, planned.scaled(slower))
@@ -90,6 +94,7 @@ class Planner:
         points = self._clipped(points)
         planned = self._slowed(mae, Trajectory.through(start, points, passed))
         self.reachable(mae, start.theta, planned.end, nearest=False)
+        self._check_way(mae, planned.path[1])
         slower = exertion_slowness(self._robot, mae, planned, lag)
         # Slowing changes the path of a trajectory that starts in motion. If the slowed trajectory
         # would leave the joint limits, keep the faster one, from which the arm may then deviate.
@@ -119,6 +124,7 @@ class Planner:
         theta, problem = self._hand.posture(mae, pose, whole, start.theta, self.takes_nearest)
         towards = self._hand.towards(start, theta, now)
         planned = self._within_limits(mae, towards)
+        self._check_way(mae, planned.path[1])
         self._last_pose = pose, whole, planned
         return planned, problem and f'{problem}; the arm goes to the nearest posture'
 
@@ -168,14 +174,37 @@ class Planner:
         held, problem = reach.nearest_held(robot, mae, start, theta)
         if not problem:
             return theta, ''
-        isolated, verb = robot.names(robot.isolated), 'are' if len(robot.isolated) > 1 else 'is'
         problem = (
-            f'{problem}, because {isolated} {verb} isolated; nearest holdable posture: '
+            f'{problem}, {self._because_of_isolation}; nearest holdable posture: '
             f'{robot.posture_text(held)}'
         )
         if not nearest:
             raise MessageError('not holdable', problem)
         return held, f'{problem}; the arm goes to that posture instead'
+
+    def _check_way(self, mae: Mae, path: Array) -> None:
+        """Refuse a path [rad], (K, D), along which the muscles cannot move the arm.
+
+        Paths of an arm without isolated muscles are not checked.
+
+        Raises:
+            MessageError: If the path is refused.
+        """
+        robot = self._robot
+        if robot.used.all():
+            return
+        if missing := reach.lacking_on_way(robot, mae, path):
+            remedy = 'choose another target, or restore the muscle'
+            raise MessageError(
+                'not holdable',
+                f'on the way, the muscles lack {missing}, {self._because_of_isolation}; {remedy}',
+            )
+
+    @property
+    def _because_of_isolation(self) -> str:
+        robot = self._robot
+        verb = 'are' if len(robot.isolated) > 1 else 'is'
+        return f'because {robot.names(robot.isolated)} {verb} isolated'
 
     def _clipped(self, points: TrajectoryPoints) -> TrajectoryPoints:
         """Return the points clipped to the joint limits.

@@ -24,6 +24,8 @@ A joint that is at a stop at the start is also at this stop in some postures of 
 is evaluated only if the cheapest path contains it (lazy roadmap, Bohlin and Kavraki 2000). Until
 then, its cost is approximated from the postures at its ends.
 
+If the muscles cannot move the arm along the path found, the motion is refused (`lacking_on_way`).
+
 `slowness` slows the motion along the path until the muscles can accelerate the arm.
 """
 
@@ -39,6 +41,9 @@ from musculoskeletal_ae.robot.joint_stops import AT_STOP, supporting_stops
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
+#: Keep this share of SUPPORT σ, which is σ, in reserve when deciding whether muscles that are not
+#: isolated can move the arm along a path. σ contains friction and the errors of the learned body.
+MARGIN = 0.5
 NOTABLE = 0.05  # treat a posture as not holdable if it lacks more torque than this [N·m]
 HALVINGS = 6  # search for the last holdable posture of a path with this many bisection steps
 
@@ -62,11 +67,40 @@ def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
     jacobian = mae.muscle_jacobian(theta, limits.bias)
     stops = supporting_stops(robot, theta)
     exertion = least_tension(jacobian, torque, limits.bias, limits.limit, stops=stops)
-    lacks = np.abs(exertion.missing_torque)
+    return _text(robot, np.abs(exertion.missing_torque))
+
+
+def _text(robot: Robot, lacks: Array) -> str:
+    """Return a text on the largest of the lacking torques [N·m], (D,), or '' if it is small."""
     joint = int(lacks.argmax())
     if lacks[joint] <= NOTABLE:
         return ''
     return f'{robot.units[joint].torque_text(lacks[joint])} at joint {robot.joints[joint]}'
+
+
+def lacking_on_way(robot: Robot, mae: Mae, path: Array) -> str:
+    """Return a text on the largest torque that the muscles lack to move slowly along a path, or ''.
+
+    They may use all their tensions, but the torque MARGIN · SUPPORT σ in the direction of the
+    motion stays in reserve. Postures before the first holdable one do not count: an arm that has
+    fallen has to leave its posture.
+
+    Args:
+        robot: The robot; isolated muscles have no tension.
+        mae: The network in use.
+        path: Postures [rad], (K, D), that straight lines connect.
+    """
+    travelled = np.insert(np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum(), 0, 0.0)
+    marks = np.linspace(0.0, travelled[-1], int(travelled[-1] / SPACING) + 2)
+    postures = np.stack([np.interp(marks, travelled, angle) for angle in path.T], axis=1)
+    begin = 0
+    while begin < len(postures) - 1 and lacking(robot, mae, postures[begin]):
+        begin += 1
+    cost, worst = PathCost(robot, mae, 1.0, MARGIN), np.zeros(robot.joint_count)
+    for before, theta in pairwise(postures[begin:]):
+        (lacks,) = cost.lacks(theta[None], theta - before)
+        worst = max(worst, lacks, key=np.max)
+    return _text(robot, worst)
 
 
 def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Array, str]:
@@ -172,16 +206,23 @@ class PathCost:
     nor the joint stops provide.
     """
 
-    def __init__(self, robot: Robot, mae: Mae) -> None:
+    def __init__(self, robot: Robot, mae: Mae, used: float = USED, reserve: float = 1.0) -> None:
+        """Keep reserves: all but `used` of the tension range, and `reserve` · SUPPORT σ."""
         self._robot, self._mae = robot, mae
-        self._limits = ReachLimits(robot, mae)
+        self._limits = ReachLimits(robot, mae, used)
         #: torque of each joint that is kept in reserve if only this joint moves [N·m], (D,)
-        self._reserve = largest_support(mae)
+        self._reserve = reserve * largest_support(mae)
 
     def missing(self, postures: Array, direction: Array | None = None) -> Array:
-        """Return the largest missing torque m of each posture [N·m], (N,).
+        """Return the largest missing torque m of each posture [N·m], (N,), as `lacks` computes it.
 
         Missing torques up to NOTABLE count as 0.
+        """
+        m = self.lacks(postures, direction).max(axis=1)
+        return np.where(m > NOTABLE, m, 0.0)
+
+    def lacks(self, postures: Array, direction: Array | None = None) -> Array:
+        """Return the size of the missing torque of each joint in each posture [N·m], (N, D).
 
         Args:
             postures: Postures θ [rad], (N, D).
@@ -200,8 +241,7 @@ class PathCost:
             torque = robot.kinematics.holding_torque(theta) + reserve
             exertion = least_tension(jacobian, torque, *ends, stops=stops)
             torques.append(exertion.missing_torque)
-        m = np.abs(torques).max(axis=1)
-        return np.where(m > NOTABLE, m, 0.0)
+        return np.abs(torques)
 
     def of_edge(self, one: Array, other: Array) -> float:
         """Return the cost of the straight path between two postures θ [rad], (D,) each."""

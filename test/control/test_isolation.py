@@ -234,6 +234,41 @@ def test_the_report_says_what_keeps_a_fallen_arm_from_its_target():
     raise AssertionError(bench.report().message)
 
 
+#: without these muscles, arm26 can hold both postures, but cannot move from HERE to BEYOND
+TWO_LOST = [ROBOT.muscles.index(name) for name in ('deltoid_anterior', 'triceps_long')]
+HERE, BEYOND = np.array([0.29, -1.09]), np.array([-1.24, -1.9])
+
+
+def test_a_target_on_the_way_to_which_the_muscles_lack_torque_is_refused():
+    robot, bench = ROBOT.without(TWO_LOST), Bench()
+    assert not lacking(robot, bench.mae, HERE)
+    assert not lacking(robot, bench.mae, BEYOND)
+    bench.isolate(TWO_LOST)
+    bench.theta = HERE
+    bench.step()
+    there = TrajectoryPoints(np.arange(2), np.array([5.0]), BEYOND[None], None, None)
+    for request in (lambda: bench.target(BEYOND), lambda: bench.core.trajectory(there)):
+        with pytest.raises(MessageError, match='on the way, the muscles lack .* at joint elbow'):
+            request()
+    assert bench.core.target_state.theta is None
+
+
+def test_an_arm_that_cannot_move_to_its_target_any_more_says_so_and_does_not_stop():
+    bench = Bench(target_duration=2.0)
+    bench.theta = HERE
+    bench.step()
+    bench.target(BEYOND)
+    bench.step()
+    bench.stop()
+    bench.step(10)
+    bench.isolate(TWO_LOST)
+    assert bench.core.reset(bench.now) is None
+    bench.step(10)
+    assert bench.cause == ''
+    assert 'on the way, the muscles lack' in bench.report().message
+    assert bench.core.target_state.theta is None
+
+
 def test_a_path_avoids_postures_that_cannot_be_held():
     whole = Robot.load('musashi_left_arm')
     robot = whole.without([whole.muscles.index('pectoralis_major')])
