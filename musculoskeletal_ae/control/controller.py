@@ -73,9 +73,6 @@ REACTION_TIME = 1.0
 #: after a length calibration has begun, wait this long for its first estimate before the estimate
 #: counts as stale [s]; if messages arrive at 10 Hz, a calibration needs 3.5 s
 FIRST_ESTIMATE = 5.0
-#: after an arm with isolated muscles has fallen away from its trajectory, plan a new trajectory to
-#: the same target at most this many times, because it may fall again
-APPROACHES = 3
 
 
 @dataclass
@@ -88,15 +85,12 @@ class Target:
         clamped: Joints whose target was changed, because it was beyond the joint limits or because
             the posture was not holdable.
         unreachable_reason: Why the arm moves to a posture other than the requested one, or ''.
-        approaches_left: Number of times that an arm with isolated muscles may still start towards
-            the target again after it has fallen away from its trajectory.
     """
 
     effort: Array
     theta: Array | None = None
     clamped: tuple[str, ...] = ()
     unreachable_reason: str = ''
-    approaches_left: int = 0
 
 
 class Activities:
@@ -384,7 +378,7 @@ class Controller:
             nearest = self.planner.takes_nearest
             goal, reason = self.planner.reachable(self.mae, self.estimate, goal, nearest)
         clamped = tuple(n for n, a, b in zip(robot.joints, theta, goal) if a != b)
-        self.target_state = Target(effort, goal, clamped, reason, APPROACHES)
+        self.target_state = Target(effort, goal, clamped, reason)
         if not (self.supervisor.is_running and self.settings.is_by_follower and self._is_ready):
             self._hold()  # the arm moves to the target as soon as it may move
             return
@@ -644,8 +638,8 @@ class Controller:
         Depending on these properties, a trajectory starts, the target is replaced, or the
         supervisor learns that the motion has ended.
         """
-        if control.needs_trajectory:
-            self._approach_again()
+        if control.needs_trajectory and self.target_state.theta is not None:
+            self._approach(self.settings.first_duration)
         command = self.activities.step(control, inputs)
         if (theta := control.new_target) is not None:
             inside = np.clip(theta, self.robot.lower, self.robot.upper)
@@ -653,20 +647,6 @@ class Controller:
         if control.has_arrived:
             self.supervisor.on_arrival()
         return command
-
-    def _approach_again(self) -> None:
-        """Start a trajectory from the present posture to the target, if there is a target.
-
-        This is needed after a stop, after a change of method, and if an arm with isolated muscles
-        has fallen away from its trajectory. After a fall, the number of attempts is limited.
-        """
-        state, follower = self.target_state, self.activities.follower
-        if follower.progress.trajectory is None and state.theta is not None:
-            self._approach(self.settings.first_duration)
-        elif follower.progress.has_lost_path and state.approaches_left:
-            state.approaches_left -= 1
-            follower.leave()
-            self._approach(self.settings.target_duration or self.settings.first_duration)
 
     def _inputs(self, dt: float) -> Inputs:
         # Without a stop cause, all inputs are available.
@@ -792,7 +772,7 @@ class Controller:
             remedy = 'wait for the length calibration; if none is in progress, call estimator/zero'
             raise MessageError('length offsets are unknown', remedy)
         progress = self.activities.follower.progress
-        if progress.trajectory is not None and not progress.has_lost_path:
+        if progress.trajectory is not None and not progress.has_fallen:
             return progress.ahead(delay), self.mae
         inside = np.clip(self.estimate, self.robot.lower, self.robot.upper)
         return Setpoint.resting(inside), self.mae

@@ -40,7 +40,6 @@ from musculoskeletal_ae.experiments.recording import SAMPLE_TIME, ClosedLoop, ma
 from musculoskeletal_ae.experiments.study import Experiment, Measured, Plot, Rows, Study
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.explored_postures import TRIES
-from musculoskeletal_ae.motion.progress import FALLEN
 from musculoskeletal_ae.robot.tension import holding_tension
 
 #: evaluate only every tenth message of the held-out motion, because it is estimated very often
@@ -54,6 +53,7 @@ AFTERWARDS = 6.0  # then let the arm continue its activity for this time [s]
 #: further approaches if the arm falls
 LONGEST_APPROACH = 60
 SETTLING = 4  # count the arm as arrived after this time at rest [s]
+FALLEN = 0.2  # count the arm as fallen if a joint ends further than this away from its target [rad]
 STILL = 0.02  # count the arm as at rest if no joint moves more than this in a second [rad]
 HEALTHY_TIME = 18_000.0  # let healthy arms explore for this time, shared by the individuals [s]
 PUSH_EVERY = 10.0  # push the hand of a healthy arm at this interval [s]

@@ -135,11 +135,8 @@ class Follower(ActivityControl):
 
     @property
     def needs_trajectory(self) -> bool:
-        """Whether there is no trajectory, or the arm has fallen away from its trajectory.
-
-        A stop discards the trajectory. Only an arm with isolated muscles counts as fallen.
-        """
-        return self.progress.trajectory is None or self.progress.has_lost_path
+        """Whether there is no trajectory, because a stop has discarded it."""
+        return self.progress.trajectory is None
 
     @property
     def has_arrived(self) -> bool:
@@ -184,7 +181,7 @@ class Follower(ActivityControl):
             self.plan_anew()
         if self._held is None:
             progress.update_desired()
-        progress.compare(inputs.theta, dt)
+        progress.compare(inputs.theta)
         if progress.time < progress.trajectory.duration + SETTLING:
             length = self._moving(progress.trajectory, inputs)
         else:

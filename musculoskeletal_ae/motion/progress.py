@@ -9,14 +9,9 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.robot import Robot
 
-#: an arm with isolated muscles counts as fallen if it ends this far away from its goal [rad]
-FALLEN = 0.2
-#: an arm counts as fallen no earlier than this after the end of its trajectory, and its trajectory
-#: counts as lost once the error has exceeded LOST for this time [s]
-FALLING = 2.0
-#: the trajectory of an arm with isolated muscles counts as lost, and is planned again, if the error
-#: exceeds this for the time FALLING [rad]
-LOST = 0.4
+#: a new motion of an arm with isolated muscles starts from the estimated posture instead of the
+#: setpoint if a joint is further than this away from it [rad]: the arm has fallen
+FALLEN = 0.4
 
 
 class Progress:
@@ -29,7 +24,6 @@ class Progress:
             no other trajectory is due.
         time: Time since the start of the trajectory [s].
         over: Time since the end of the trajectory [s]; 0 before its end.
-        lost_time: Time [s] for which the error of some joint has been larger than LOST.
         desired: The present setpoint.
         error: Posture error, desired − estimated θ [rad], (D,).
     """
@@ -38,7 +32,7 @@ class Progress:
         self._robot = robot
         self.trajectory: Trajectory | None = None
         self.next: tuple[Trajectory, float] | None = None
-        self.time = self.over = self.lost_time = 0.0
+        self.time = self.over = 0.0
         self.desired = Setpoint.resting(np.zeros(robot.joint_count))
         self.error: Array = np.zeros(robot.joint_count)
 
@@ -49,7 +43,7 @@ class Progress:
     def begin(self, trajectory: Trajectory, time: float = 0.0) -> None:
         """Replace all trajectories by a trajectory that began `time` [s] ago."""
         self.trajectory, self.time, self.next = trajectory, time, None
-        self.over = self.lost_time = 0.0
+        self.over = 0.0
 
     def discard(self) -> None:
         """Discard all trajectories, so that the next motion has to be planned anew."""
@@ -82,15 +76,9 @@ class Progress:
         """Set `desired` to the present setpoint of the trajectory."""
         self.desired = self.ahead(0.0)
 
-    def compare(self, theta: Array, dt: float) -> None:
-        """Compare `desired` with the estimated θ [rad], (D,), dt [s] after the last comparison."""
+    def compare(self, theta: Array) -> None:
+        """Compare `desired` with the estimated θ [rad], (D,)."""
         self.error = self.desired.theta - theta
-        self.lost_time = self.lost_time + dt if self._largest_error > LOST else 0.0
-
-    @property
-    def _largest_error(self) -> float:
-        """Largest difference of a joint from its setpoint [rad]."""
-        return float(np.abs(self.error).max())
 
     @property
     def is_moving(self) -> bool:
@@ -100,22 +88,8 @@ class Progress:
 
     @property
     def has_fallen(self) -> bool:
-        """Whether an arm with isolated muscles has not stayed at the end of its trajectory.
-
-        This is the case if, FALLING seconds after the end, the error of a joint exceeds FALLEN.
-        """
-        is_at_rest = self.trajectory is not None and self.next is None and self.over > FALLING
-        return is_at_rest and not self._robot.used.all() and self._largest_error > FALLEN
-
-    @property
-    def has_lost_path(self) -> bool:
-        """Whether an arm with isolated muscles has fallen away from its trajectory.
-
-        This is the case during the motion if the error of a joint has exceeded LOST for FALLING
-        seconds, and after the motion if `has_fallen` is true.
-        """
-        is_lost = self.lost_time > FALLING and not self._robot.used.all()
-        return self.has_fallen or (is_lost and self.next is None)
+        """Whether an arm with isolated muscles is far away from its setpoint."""
+        return not self._robot.used.all() and bool((np.abs(self.error) > FALLEN).any())
 
     @property
     def latest(self) -> Trajectory | None:
