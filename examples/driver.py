@@ -67,8 +67,9 @@ class Bus:
         self.read_at = now
         reading = self.arm.sense()
         # If your modules have no temperature sensors, return NaN for each muscle instead.
-        length, tension, temperature = reading.muscles.to_message(self.robot.tension_source)
-        return -length / SPOOL, tension, temperature, reading.theta
+        muscles = reading.muscles
+        tension = self.robot.tension_source.to_message(muscles.tension)
+        return -muscles.length / SPOOL, tension, muscles.temperature, reading.theta
 
     def regulate(self, tension: np.ndarray) -> None:
         """Make every motor regulate its tendon to a tension [N] (M,)."""

@@ -327,7 +327,10 @@ class Listening:
                 published = (quantity.of(each)[m] for each in (usual, self._low, self._high))
                 value, low, high = distinct(*published)
                 what = self._of_source(quantity.name)
-                verdict.failed(what, m, value=f'{value}, possible {low} to {high},')
+                given = {'value': f'{value}, possible {low} to {high},'}
+                if quantity.presence is not Presence.REQUIRED:
+                    what, given = 'measured', {**given, 'quantity': what, 'unit': quantity.unit}
+                verdict.failed(what, m, **given)
         return False
 
     def _possible(self, readings: MuscleReadings) -> Bools:
