@@ -36,6 +36,7 @@ from musculoskeletal_ae.signals.body_state import ROWS, BodyState
 DEADLINE = 180.0  # longest wait on a loaded machine; then the test fails [s]
 PATIENCE = 600.0  # longest time until a process writes its next line or ends [s]
 LOOK = 0.05  # time between two checks of a condition [s]
+SELDOM = 0.5  # time between two checks of a condition that takes long to check [s]
 LEVELS = {DiagnosticStatus.OK: 'ok', DiagnosticStatus.WARN: 'warn', DiagnosticStatus.ERROR: 'error'}
 
 
@@ -325,6 +326,25 @@ class Graph:
         for node in (*self.hosted, self.node):
             node.destroy_node()
         rclpy.shutdown(context=self.context)
+
+
+def seldom(condition: Callable[[], Any]) -> Callable[[], Any]:
+    """Return a condition that is checked only every SELDOM seconds, and otherwise does not hold.
+
+    `Graph.wait` checks a condition after each message. If each check takes milliseconds, it would
+    occupy a core.
+    """
+    next_check = 0.0
+
+    def check() -> Any:
+        nonlocal next_check
+        if time.monotonic() < next_check:
+            return None
+        value = condition()
+        next_check = time.monotonic() + SELDOM
+        return value
+
+    return check
 
 
 def no_number_of(graph: Graph, robot: Robot, muscle: str) -> Callable[[], None]:

@@ -97,7 +97,7 @@ def test_after_the_kill_of_a_worker_only_a_part_whose_worker_is_killed_again_fai
 ):
     os.mkfifo(study.folder / 'fifo')
     monkeypatch.setattr(runner, '_measure', kill_at_body_change)
-    measured = run(study, 2)
+    measured = run(study, 2, names=NAMES[:2])
     told = measured['body_change'].pop(0)
     assert told.startswith('WorkerKilledError in body_change: ') and 'use fewer processes' in told
     assert all(isinstance(each, Measured) for rows in measured.values() for each in rows.values())

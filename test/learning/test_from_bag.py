@@ -19,7 +19,7 @@ from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.estimation import estimator
 from musculoskeletal_ae.estimation.finding import Finding
 from musculoskeletal_ae.estimation.health import HealthMonitor
-from musculoskeletal_ae.learning import recordings
+from musculoskeletal_ae.learning import convergence, recordings
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.recordings import error, learn
 from musculoskeletal_ae.mae.checkpoint import load
@@ -182,6 +182,7 @@ def test_progress_and_wrong_joint_sensors_are_reported(
         return initial
 
     monkeypatch.setattr(progress_bar, 'REPORT_INTERVAL', 0.0)
+    monkeypatch.setattr(convergence, 'MOST_UPDATES', 1)
     monkeypatch.setattr(model_training, 'initial_mae', trained)
     monkeypatch.setattr(recording_learning, 'read', lambda *_: recording)
     out = str(tmp_path / 'out.safetensors')

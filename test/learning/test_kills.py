@@ -1,11 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A learner that is killed loses nothing: the quick form of a part of `bench attack`."""
+"""A learner that is killed loses nothing: the quick form of a part of `bench attack`.
+
+Other tests check it in each run: test_state.py kills a learner at each step of saving, and
+test/nodes/test_learner.py a whole node.
+"""
+
+import pytest
 
 from bench.attack_kills import digest, grown, run, samples
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae import checkpoint
 
 
+@pytest.mark.thorough
 def test_a_killed_learner_loses_nothing(arm26, initial, tmp_path):
     file = tmp_path / 'initial.safetensors'
     checkpoint.save(initial, file)

@@ -24,21 +24,9 @@ from musculoskeletal_ae.tools.train import main
 EXAMPLE = Path(__file__).parents[2] / 'examples' / 'two_joint_arm.xml'
 
 
-def test_a_mujoco_file_is_imported_explored_learned_and_reported(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(convergence, 'MOST_UPDATES', 1)
-    out = tmp_path / 'arm.safetensors'
-    options = ['--mujoco', str(EXAMPLE), '--minutes', '0.4', '--quick', '--seed', '1']
-    assert main([*options, '--out', str(out)]) == 0
-    printed = capsys.readouterr().out
-    assert re.search(r'150 of 150 random postures can be held', printed)
-    before, after = re.search(r'held-out motion: (\S+) → (\S+) rad', printed).groups()
-    assert float(after) < float(before)
-    robot = Robot.load(tmp_path / 'arm_robot')
-    assert checkpoint.load(out, robot).joints == robot.joints
-    mujoco.MjModel.from_xml_path(str(tmp_path / 'arm_model' / EXAMPLE.name))
-
-
-def test_nothing_is_learned_from_an_emulated_arm_that_has_diverged(tmp_path, capsys, monkeypatch):
+def test_a_mujoco_file_is_imported_explored_and_learned_until_the_emulated_arm_diverges(
+    tmp_path, capsys, monkeypatch
+):
     step, steps = ForeignArm.step, Counter()
 
     def thrown(arm, duration):
@@ -53,10 +41,16 @@ def test_nothing_is_learned_from_an_emulated_arm_that_has_diverged(tmp_path, cap
     options = ['--mujoco', str(EXAMPLE), '--minutes', '0.4', '--quick', '--seed', '1']
     assert main([*options, '--out', str(out)]) == 0
     printed = capsys.readouterr()
+    # A busy computer checks fewer than 150 postures.
+    assert re.search(r'^(\d+) of \1 random postures can be held', printed.out, re.M)
     assert re.search(r'warning: the emulated arm has diverged: joint \w+ moves at', printed.err)
+    # Nothing is learned from the diverged arm, and what was learned before is kept.
     assert re.search(r'0\.333 min of exploration .*, [1-9]\d* samples', printed.out)
     before, after = re.search(r'held-out motion: (\S+) → (\S+) rad', printed.out).groups()
     assert float(after) < float(before)
+    robot = Robot.load(tmp_path / 'arm_robot')
+    assert checkpoint.load(out, robot).joints == robot.joints
+    mujoco.MjModel.from_xml_path(str(tmp_path / 'arm_model' / EXAMPLE.name))
 
 
 def test_a_finger_with_a_spring_return_explores_and_learns(tmp_path):
@@ -84,7 +78,7 @@ def test_a_model_that_its_muscles_cannot_hold_is_refused_before_any_training(tmp
     options = ['--mujoco', str(tmp_path / 'heavy.xml'), '--out', str(tmp_path / 'a.safetensors')]
     assert main(options) == 1
     streams = capsys.readouterr()
-    assert '0 of 150 random postures can be held: training is pointless' in streams.out
+    assert re.search(r'\b0 of \d+ random postures can be held: training is pointless', streams.out)
     assert 'the muscles cannot hold the arm' in streams.err
 
 

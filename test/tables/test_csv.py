@@ -11,9 +11,11 @@ import pytest
 
 from musculoskeletal_ae.learning import convergence
 from musculoskeletal_ae.mae.checkpoint import load
+from musculoskeletal_ae.process_signals import INTERRUPTED
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tables.csv_file import looks_like_a_sequence, read_csv
 from musculoskeletal_ae.tables.table import MARGIN, Table, TableError
+from musculoskeletal_ae.tools import recording_learning
 from musculoskeletal_ae.tools.train import main
 
 POSITIONS = 'shoulder', 'elbow'
@@ -232,14 +234,20 @@ def test_training_from_a_table_of_rests_with_unknown_zeros_lowers_the_held_out_e
     assert load(trained.out, arm26).joints == tuple(arm26.joints)
 
 
-def test_wrong_units_and_signs_are_named_before_the_training(arm26, trained, tmp_path, capsys):
+def test_wrong_units_and_signs_are_named_before_the_training(
+    arm26, trained, tmp_path, capsys, monkeypatch
+):
+    def interrupt(*_):  # as a user does after reading the warning
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(recording_learning, 'collect', interrupt)
     rows = readings(arm26, 60)
     degrees = rows * np.r_[np.full(2, 180.0 / np.pi), np.ones(12)]
     file = write(tmp_path / 'a.csv', headers(arm26), degrees)
     assert trained(file, '--estimate-zeros') == 1
     assert 'State their unit with --units' in capsys.readouterr().err
     rows[:, 3] *= -1.0
-    assert trained(write(file, headers(arm26), rows), '--estimate-zeros') == 0
+    assert trained(write(file, headers(arm26), rows), '--estimate-zeros') == INTERRUPTED
     expected = f'the length of {arm26.muscles[1]} has the wrong sign'
     assert expected in capsys.readouterr().err
 
