@@ -42,8 +42,9 @@ SETTLING = 15.0  # let the nodes run for this time before memory or a profile is
 #: CPU times [µs] of the first version that was measured (commit be0daee), by row of the table; the
 #: machine had two cores and was idle otherwise
 BEFORE_CORE = {
-    'estimate: θ, T, l from ②': 19.0, 'one step of method proposed, preset default': 380.0,
-    'one step of method proposed, preset paper': 530.0, 'simulation step': 150.0,
+    'estimate: θ, T, l from ②': 19.0,
+    'plan of a held posture, method proposed, preset default': 380.0,
+    'plan of a held posture, method proposed, preset paper': 530.0, 'simulation step': 150.0,
     f'simulation step, time per arm in a batch of {timings.MANY}': 6.7,
 }  # fmt: skip
 TORCH_BEFORE = 118.0  # time of the first row of BEFORE_CORE in eager torch on that machine [µs]

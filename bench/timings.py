@@ -177,12 +177,12 @@ def control_rows(robot: Robot, mae: Mae, eager: Network) -> list[Row]:
     limit, joints = robot.tension.limit, robot.joint_count
     return [
         Row(
-            'one step of method proposed, preset default',
+            'plan of a held posture, method proposed, preset default',
             lambda: plan_at_rest(robot, mae, theta).length(mae, theta),
             lambda: eager_proposed(robot, eager, theta, torque),
         ),
         Row(
-            'one step of method proposed, preset paper',
+            'plan of a held posture, method proposed, preset paper',
             lambda: paper.proposed(robot, mae, theta, torque, tension),
             lambda: eager_proposed_paper(robot, eager, theta, torque, tension),
         ),

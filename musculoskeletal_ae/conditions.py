@@ -638,7 +638,7 @@ class ConditionKind(Enum):
         'out_of_reach',
         'controller',
         'warn',
-        'the muscles cannot hold the target, or the hand cannot reach it',
+        'the muscles cannot hold the target or move the arm there, or the hand cannot reach it',
         'the target cannot be reached or held',
         (Step.CHANGE_TARGET,),
     )

@@ -51,7 +51,7 @@ from musculoskeletal_ae.motion.activities import (
 from musculoskeletal_ae.motion.calibration_motion import Calibrating, gentle_limit
 from musculoskeletal_ae.motion.exploration import Exploration, Exploring
 from musculoskeletal_ae.motion.follower import Follower
-from musculoskeletal_ae.motion.planner import Planner
+from musculoskeletal_ae.motion.planner import NOT_HOLDABLE, Planner
 from musculoskeletal_ae.motion.ramps import LengthRamps, RampedTarget
 from musculoskeletal_ae.motion.torque import GravityCompensation, TorqueControl
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
@@ -84,7 +84,8 @@ class Target:
         effort: Torque in addition to gravity compensation [N·m], (D,).
         clamped: Joints whose target was changed, because it was beyond the joint limits or because
             the posture was not holdable.
-        unreachable_reason: Why the arm moves to a posture other than the requested one, or ''.
+        unreachable_reason: Why the arm moves to another posture than the requested one, or has
+            forgotten its target, or ''.
     """
 
     effort: Array
@@ -615,8 +616,11 @@ class Controller:
             if isolated := self.robot.names(self.robot.isolated):
                 reason = f'too few postures are holdable without {isolated}; {RESTORE}'
             self._give_up(reason)
-        except MessageError as error:  # no motion to the target is possible
-            self._give_up(str(error))
+        except MessageError as error:
+            if error.reason == NOT_HOLDABLE:
+                self._give_up(str(error))
+            else:
+                self._note_fault(error)
         except Exception as error:  # noqa: BLE001 (any exception has to stop the arm)
             self._note_fault(error)
         return None
@@ -722,7 +726,10 @@ class Controller:
         assert state.theta is not None
         start, mae = self._ready()
         lag = self.activities.follower.winches.lag
-        trajectory = self.planner.to_posture(mae, start, state.theta, duration, lag)
+        trajectory, problem = self.planner.to_posture(mae, start, state.theta, duration, lag)
+        if problem:
+            state.theta = trajectory.end
+            state.unreachable_reason = f'{problem}; the arm goes as far as it can'
         self._begin(trajectory, 0.0, state.effort)
 
     def _follow(

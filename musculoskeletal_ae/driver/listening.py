@@ -327,10 +327,17 @@ class Listening:
                 published = (quantity.of(each)[m] for each in (usual, self._low, self._high))
                 value, low, high = distinct(*published)
                 what = self._of_source(quantity.name)
-                given = {'value': f'{value}, possible {low} to {high},'}
+                texts = {'value': f'{value}, possible {low} to {high},'}
                 if quantity.presence is not Presence.REQUIRED:
-                    what, given = 'measured', {**given, 'quantity': what, 'unit': quantity.unit}
-                verdict.failed(what, m, **given)
+                    what, texts = (
+                        'impossible value',
+                        {
+                            'quantity': quantity.name,
+                            'value': f'{value} {quantity.unit}; possible: {low} to {high}',
+                            'unit': quantity.unit,
+                        },
+                    )
+                verdict.failed(what, m, **texts)
         return False
 
     def _possible(self, readings: MuscleReadings) -> Bools:

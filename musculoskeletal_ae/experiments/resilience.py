@@ -49,11 +49,10 @@ MOVING = 12.0  # let the arm explore for this time before a fault [s]
 #: wait at most this long after a fault for the end of the first verification [s]
 LATEST_VERDICT = 10
 AFTERWARDS = 6.0  # then let the arm continue its activity for this time [s]
-#: wait at most this long for the arm to reach a target [s]; this allows for slow winches, and for
-#: further approaches if the arm falls
+#: wait at most this long for the arm to reach a target [s]; this allows for slow winches
 LONGEST_APPROACH = 60
 SETTLING = 4  # count the arm as arrived after this time at rest [s]
-FALLEN = 0.2  # count the arm as fallen if a joint ends further than this away from its target [rad]
+AWAY = 0.2  # count the arm as away from its target if a joint ends further than this from it [rad]
 STILL = 0.02  # count the arm as at rest if no joint moves more than this in a second [rad]
 HEALTHY_TIME = 18_000.0  # let healthy arms explore for this time, shared by the individuals [s]
 PUSH_EVERY = 10.0  # push the hand of a healthy arm at this interval [s]
@@ -187,7 +186,7 @@ def measure_reach(
                 approaches[-1].append(float(np.linalg.norm(before - theta)))
             distance = approaches[-1][-1]
             distances.append(distance)
-            if np.abs(before - theta).max() > FALLEN:
+            if np.abs(before - theta).max() > AWAY:
                 jacobian = loop.arm.individual.muscle_jacobian(before[None])[0]
                 holding_tension(reduced_robot, before, jacobian=jacobian)
         except MessageError:
@@ -294,7 +293,7 @@ def approaches(_: Study, rows: Rows) -> Plot:
     for seed, row in rows.items():
         for muscle, distances in row.traces['approaches'].items():
             for distance in distances:
-                is_away = distance[-1] > FALLEN
+                is_away = distance[-1] > AWAY
                 label = f'individual {seed} without {muscle}' if is_away else None
                 style = {'color': None, 'lw': 2.0} if is_away else {'color': plots.AFTER, 'lw': 0.8}
                 panel.plot(distance, label=label, **style)
@@ -302,7 +301,7 @@ def approaches(_: Study, rows: Rows) -> Plot:
     plots.tidy(panel, 'time [s]', '‖θ_target − θ‖ [rad]', legend=legend)
     caption = (
         'Distance from the target after the rupture of each muscle. Motions that end further than '
-        f'{FALLEN} rad away have a label.'
+        f'{AWAY} rad away have a label.'
     )
     return figure, caption
 

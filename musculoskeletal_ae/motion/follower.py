@@ -14,7 +14,7 @@ Tendon friction: the motor-side tension is T e^{μ s}. Here s is the direction i
 slides, and μ is learned or a typical value (`reach.tendon_friction`).
 
 Joint stops: f is the torque of the stops of those joints whose desired angle is at a limit
-(`robot/tension.py`). Paths of an arm with isolated muscles may lead along a stop (`reach`).
+(`robot/joint_stops.py`). Paths of an arm with isolated muscles may lead along a stop (`reach`).
 
 Lag of the muscle modules: a motor under muscle stiffness control (MSC) turns at
 dl/dt = (T − T_MSC)/(K_stiff λ). Therefore the command has to lead by λ dl/dt. A tendon that is
@@ -130,7 +130,8 @@ class Follower(ActivityControl):
         self._held = self._blend = None
 
     def _leave_rest(self) -> None:
-        if self._held is not None:  # in motion, the trajectories join without a new plan
+        # In motion, the trajectories join without a new plan, unless the arm has fallen.
+        if self._held is not None or self.progress.has_fallen:
             self.plan_anew()
 
     @property
@@ -201,8 +202,15 @@ class Follower(ActivityControl):
         return self._plan(trajectory, shift, self.winches.lag, inputs)
 
     def _plan(self, trajectory: Trajectory, shift: Shift, lag: float, inputs: Inputs) -> Array:
-        time, step = self.progress.time, self.plan.step
-        return step(trajectory, time, shift, lag, inputs.mae, inputs.limit, inputs.dt)
+        return self.plan.step(
+            trajectory,
+            self.progress.time,
+            shift,
+            lag=lag,
+            mae=inputs.mae,
+            limit=inputs.limit,
+            dt=inputs.dt,
+        )
 
     def _is_held_back(self, inputs: Inputs) -> bool:
         """Return whether the limiter did not let a muscle wind in as far as desired.

@@ -5,7 +5,8 @@ The methods that plan return a trajectory, or raise a MessageError with the reas
 except those of `to_rest` are slowed to the speed of the muscle modules. They stay within the joint
 limits, with the tolerance `trajectory.BEYOND`. Those of `to_pose` and `by_twist` end in a holdable
 posture. Those of `through` are checked for this only if a muscle is isolated. `to_posture` does not
-check the target: its caller does so with `reachable`.
+check the target: its caller does so with `reachable`. With isolated muscles, the whole way is
+checked, except that of `by_twist`.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ from musculoskeletal_ae.robot.robot import Robot
 #: limit. The points of a replayed motion are estimated postures, and the estimate of an arm that is
 #: held against a joint stop exceeds the limit by less than this.
 TOLERANCE = 0.01
+#: reason of a refused motion to a posture that the muscles cannot hold, or to which they cannot
+#: move the arm
+NOT_HOLDABLE = 'not holdable'
 SAME = 1e-6  # treat two poses as equal below this relative difference
 
 
@@ -57,10 +61,12 @@ class Planner:
 
     def to_posture(
         self, mae: Mae, start: Setpoint, theta: Array, duration: float, lag: float
-    ) -> Trajectory:
+    ) -> tuple[Trajectory, str]:
         """Plan a motion to rest at θ [rad], (D,).
 
-        With isolated muscles, the motion avoids postures that are not holdable (`reach.way`).
+        With isolated muscles, the motion avoids postures that are not holdable (`reach.way`). If
+        the muscles cannot move the arm along the whole way, the motion is refused, or ends on the
+        way if `takes_nearest`.
 
         Args:
             mae: The network in use.
@@ -70,14 +76,19 @@ class Planner:
                 muscles cannot accelerate the arm enough.
             lag: Lag λ of the muscle modules [s].
 
+        Returns:
+            The trajectory, and why it does not end at θ, or ''.
+
         Raises:
-            MessageError: If the muscles that are not isolated cannot move the arm there.
+            MessageError: If the motion is refused.
         """
-        way = reach.way(self._robot, mae, start.theta, theta)
-        self._check_way(mae, np.vstack([start.theta, way]))
-        planned = self._within_limits(mae, Trajectory.to(start, way, duration))
+        path = np.vstack([start.theta, reach.way(self._robot, mae, start.theta, theta)])
+        path, problem = self._passable(mae, path)
+        planned = self._within_limits(mae, Trajectory.to(start, path[1:], duration))
         slower = exertion_slowness(self._robot, mae, planned, lag)
-        return planned if slower == 1.0 else self._within_limits(mae, planned.scaled(slower))
+        if slower > 1.0:
+            planned = self._within_limits(mae, planned.scaled(slower))
+        return planned, problem
 
     def through(
         self, mae: Mae, start: Setpoint, points: TrajectoryPoints, passed: float, lag: float
@@ -90,11 +101,14 @@ class Planner:
             points: The points, with times relative to the same time 0.
             passed: Time elapsed since time 0 of the points [s].
             lag: Lag λ of the muscle modules [s].
+
+        Raises:
+            MessageError: If the motion is refused.
         """
         points = self._clipped(points)
         planned = self._slowed(mae, Trajectory.through(start, points, passed))
         self.reachable(mae, start.theta, planned.end, nearest=False)
-        self._check_way(mae, planned.path[1])
+        self._passable(mae, planned.path[1], nearest=False)
         slower = exertion_slowness(self._robot, mae, planned, lag)
         # Slowing changes the path of a trajectory that starts in motion. If the slowed trajectory
         # would leave the joint limits, keep the faster one, from which the arm may then deviate.
@@ -120,11 +134,15 @@ class Planner:
 
         Returns:
             The trajectory, and why it does not end at the pose, or ''.
+
+        Raises:
+            MessageError: If the motion is refused.
         """
         theta, problem = self._hand.posture(mae, pose, whole, start.theta, self.takes_nearest)
-        towards = self._hand.towards(start, theta, now)
+        path, lack = self._passable(mae, np.stack([start.theta, theta]))
+        problem = '; '.join(filter(None, (problem, lack)))
+        towards = self._hand.towards(start, path[-1], now)
         planned = self._within_limits(mae, towards)
-        self._check_way(mae, planned.path[1])
         self._last_pose = pose, whole, planned
         return planned, problem and f'{problem}; the arm goes to the nearest posture'
 
@@ -179,26 +197,37 @@ class Planner:
             f'{robot.posture_text(held)}'
         )
         if not nearest:
-            raise MessageError('not holdable', problem)
+            raise MessageError(NOT_HOLDABLE, problem)
         return held, f'{problem}; the arm goes to that posture instead'
 
-    def _check_way(self, mae: Mae, path: Array) -> None:
-        """Refuse a path [rad], (K, D), along which the muscles cannot move the arm.
+    def _passable(self, mae: Mae, path: Array, nearest: bool | None = None) -> tuple[Array, str]:
+        """Return the part of a path [rad], (K, D), along which the muscles can move the arm.
 
         Paths of an arm without isolated muscles are not checked.
 
+        Args:
+            mae: The network in use.
+            path: Postures that straight lines connect.
+            nearest: Whether to return a part of the path if the muscles cannot move the arm along
+                the rest; `takes_nearest` if None.
+
+        Returns:
+            The path or its first part, and why it is only a part, or ''.
+
         Raises:
-            MessageError: If the path is refused.
+            MessageError: If it is only a part, and `nearest` is false.
         """
         robot = self._robot
         if robot.used.all():
-            return
-        if missing := reach.lacking_on_way(robot, mae, path):
-            remedy = 'choose another target, or restore the muscle'
-            raise MessageError(
-                'not holdable',
-                f'on the way, the muscles lack {missing}, {self._because_of_isolation}; {remedy}',
-            )
+            return path, ''
+        part, missing = reach.passable(robot, mae, path)
+        if not missing:
+            return path, ''
+        problem = f'on the way, the muscles lack {missing}, {self._because_of_isolation}'
+        if not (self.takes_nearest if nearest is None else nearest):
+            remedy = 'choose another target, or call estimator/restore and send this one again'
+            raise MessageError(NOT_HOLDABLE, f'{problem}; {remedy}')
+        return part, problem
 
     @property
     def _because_of_isolation(self) -> str:

@@ -24,7 +24,7 @@ A joint that is at a stop at the start is also at this stop in some postures of 
 is evaluated only if the cheapest path contains it (lazy roadmap, Bohlin and Kavraki 2000). Until
 then, its cost is approximated from the postures at its ends.
 
-If the muscles cannot move the arm along the path found, the motion is refused (`lacking_on_way`).
+If the muscles cannot move the arm along the path found, the motion is refused (`passable`).
 
 `slowness` slows the motion along the path until the muscles can accelerate the arm.
 """
@@ -41,9 +41,9 @@ from musculoskeletal_ae.robot.joint_stops import AT_STOP, supporting_stops
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-#: Keep this share of SUPPORT σ, which is σ, in reserve when deciding whether muscles that are not
-#: isolated can move the arm along a path. σ contains friction and the errors of the learned body.
-MARGIN = 0.5
+#: keep σ, which is half of SUPPORT σ, in reserve when deciding whether the muscles that are not
+#: isolated can move the arm along a path
+RESERVE = 0.5
 NOTABLE = 0.05  # treat a posture as not holdable if it lacks more torque than this [N·m]
 HALVINGS = 6  # search for the last holdable posture of a path with this many bisection steps
 
@@ -67,48 +67,60 @@ def lacking(robot: Robot, mae: Mae, theta: Array) -> str:
     jacobian = mae.muscle_jacobian(theta, limits.bias)
     stops = supporting_stops(robot, theta)
     exertion = least_tension(jacobian, torque, limits.bias, limits.limit, stops=stops)
-    return _text(robot, np.abs(exertion.missing_torque))
+    return _torque_text(robot, np.abs(exertion.missing_torque))
 
 
-def _text(robot: Robot, lacks: Array) -> str:
-    """Return a text on the largest of the lacking torques [N·m], (D,), or '' if it is small."""
-    joint = int(lacks.argmax())
-    if lacks[joint] <= NOTABLE:
+def _torque_text(robot: Robot, missing: Array) -> str:
+    """Return a text on the largest of the missing torques [N·m], (D,), or '' if it is small."""
+    joint = int(missing.argmax())
+    if missing[joint] <= NOTABLE:
         return ''
-    return f'{robot.units[joint].torque_text(lacks[joint])} at joint {robot.joints[joint]}'
+    return f'{robot.units[joint].torque_text(missing[joint])} at joint {robot.joints[joint]}'
 
 
-def lacking_on_way(robot: Robot, mae: Mae, path: Array) -> str:
-    """Return a text on the largest torque that the muscles lack to move slowly along a path, or ''.
+def passable(robot: Robot, mae: Mae, path: Array) -> tuple[Array, str]:
+    """Return the part of a path along which the muscles can move the arm, and what they then lack.
 
-    They may use all their tensions, but the torque MARGIN · SUPPORT σ in the direction of the
-    motion stays in reserve. Postures before the first holdable one do not count: an arm that has
-    fallen has to leave its posture.
+    The arm moves slowly. The muscles may use all their tensions, but the torque RESERVE · SUPPORT σ
+    in the direction of the motion stays in reserve. Postures before the first holdable one do not
+    count: an arm that has fallen has to leave its posture.
 
     Args:
         robot: The robot; isolated muscles have no tension.
         mae: The network in use.
         path: Postures [rad], (K, D), that straight lines connect.
+
+    Returns:
+        The path, or its first part, which may have the length 0; a text on the largest missing
+        torque, or ''.
     """
     travelled = np.insert(np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum(), 0, 0.0)
     marks = np.linspace(0.0, travelled[-1], int(travelled[-1] / SPACING) + 2)
     postures = np.stack([np.interp(marks, travelled, angle) for angle in path.T], axis=1)
     begin = 0
-    while begin < len(postures) - 1 and lacking(robot, mae, postures[begin]):
+    while begin < len(postures) - 2 and lacking(robot, mae, postures[begin]):
         begin += 1
-    cost, worst = PathCost(robot, mae, 1.0, MARGIN), np.zeros(robot.joint_count)
-    for before, theta in pairwise(postures[begin:]):
-        (lacks,) = cost.lacks(theta[None], theta - before)
-        worst = max(worst, lacks, key=np.max)
-    return _text(robot, worst)
+    cost = PathCost(robot, mae, 1.0, RESERVE)
+    missing = np.concatenate(
+        [
+            cost.missing_torques(theta[None], theta - before)
+            for before, theta in pairwise(postures[begin:])
+        ]
+    )
+    worst = missing[missing.max(axis=1).argmax()]
+    if not (problem := _torque_text(robot, worst)):
+        return path, ''
+    last = begin + int((missing.max(axis=1) > NOTABLE).argmax())
+    inner = path[1:][travelled[1:] < marks[last]]
+    return np.vstack([path[:1], inner, postures[last]]), problem
 
 
 def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Array, str]:
     """Return a holdable posture on the straight path from `start` to θ [rad], (D,).
 
     If θ is not holdable, a bisection between `start` and θ looks for the last holdable posture
-    before θ. The bisection does not check `start` itself, and returns it if it finds no holdable
-    posture.
+    before θ, to which the muscles can also move an arm with isolated muscles. The bisection does
+    not check `start` itself, and returns it if it finds no such posture.
 
     Returns:
         The posture, and a text on the missing torque at θ, or '' if θ is holdable.
@@ -119,7 +131,10 @@ def nearest_held(robot: Robot, mae: Mae, start: Array, theta: Array) -> tuple[Ar
     low, high = 0.0, 1.0
     for _ in range(HALVINGS):
         share = 0.5 * (low + high)
-        is_holdable = not lacking(robot, mae, start + share * (theta - start))
+        posture = start + share * (theta - start)
+        is_holdable = not lacking(robot, mae, posture)
+        if is_holdable and not robot.used.all():
+            is_holdable = not passable(robot, mae, np.stack([start, posture]))[1]
         low, high = (share, high) if is_holdable else (low, share)
     return start + low * (theta - start), f'at the target, the muscles lack {missing}'
 
@@ -207,21 +222,28 @@ class PathCost:
     """
 
     def __init__(self, robot: Robot, mae: Mae, used: float = USED, reserve: float = 1.0) -> None:
-        """Keep reserves: all but `used` of the tension range, and `reserve` · SUPPORT σ."""
+        """Describe how much the arm keeps in reserve along paths.
+
+        Args:
+            robot: The robot; isolated muscles have no tension.
+            mae: The network in use.
+            used: Usable fraction of the tension range above T_bias.
+            reserve: Torque in reserve, as a multiple of SUPPORT σ.
+        """
         self._robot, self._mae = robot, mae
         self._limits = ReachLimits(robot, mae, used)
         #: torque of each joint that is kept in reserve if only this joint moves [N·m], (D,)
         self._reserve = reserve * largest_support(mae)
 
     def missing(self, postures: Array, direction: Array | None = None) -> Array:
-        """Return the largest missing torque m of each posture [N·m], (N,), as `lacks` computes it.
+        """Return the largest of `missing_torques` in each posture, m [N·m], (N,).
 
         Missing torques up to NOTABLE count as 0.
         """
-        m = self.lacks(postures, direction).max(axis=1)
+        m = self.missing_torques(postures, direction).max(axis=1)
         return np.where(m > NOTABLE, m, 0.0)
 
-    def lacks(self, postures: Array, direction: Array | None = None) -> Array:
+    def missing_torques(self, postures: Array, direction: Array | None = None) -> Array:
         """Return the size of the missing torque of each joint in each posture [N·m], (N, D).
 
         Args:

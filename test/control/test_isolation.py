@@ -243,10 +243,57 @@ def test_a_target_on_the_way_to_which_the_muscles_lack_torque_is_refused():
     bench.theta = HERE
     bench.step()
     there = TrajectoryPoints(np.arange(2), np.array([5.0]), BEYOND[None], None, None)
-    for request in (lambda: bench.target(BEYOND), lambda: bench.core.trajectory(there)):
+    pose = ROBOT.kinematics.end_effector_pose(BEYOND)
+    for request in (
+        lambda: bench.target(BEYOND),
+        lambda: bench.core.trajectory(there),
+        lambda: bench.core.pose(pose, False, bench.now),
+    ):
         with pytest.raises(MessageError, match=r'on the way, the muscles lack .* at joint elbow'):
             request()
     assert bench.core.target_state.theta is None
+
+
+def test_with_unreachable_nearest_the_arm_goes_as_far_as_the_muscles_can_move_it():
+    bench = Bench(unreachable='nearest')
+    bench.isolate(TWO_LOST)
+    bench.theta = HERE
+    bench.step()
+    bench.target(BEYOND)
+    goal = bench.core.target_state.theta
+    assert 0.1 < np.linalg.norm(goal - HERE) < np.linalg.norm(BEYOND - HERE) - 0.1
+    np.testing.assert_array_equal(bench.follower.progress.trajectory.end, goal)
+    bench.step()
+    assert 'on the way, the muscles lack' in bench.report().message
+    bench.configure(unreachable='refuse')
+    bench.target(goal)
+
+
+def test_the_residual_torque_of_the_healthy_arm_stays_in_reserve_on_the_way():
+    for spread in (0.01, 20.0):
+        mae = ExactMae(ROBOT)
+        mae.touch = TouchStatistics(mae.friction, np.full(2, spread), LEAST_MOTION)
+        bench = Bench(mae)
+        bench.isolate([LOST])
+        bench.theta = REST
+        bench.step()
+        if spread < 1.0:
+            bench.target(THERE)
+            continue
+        with pytest.raises(MessageError, match='on the way, the muscles lack'):
+            bench.target(THERE)
+
+
+def test_a_motion_of_an_arm_that_falls_is_not_repeated():
+    bench = Bench(target_duration=0.2)
+    bench.dt = SELDOM
+    bench.isolate([LOST])
+    bench.theta = REST  # where the arm stays
+    bench.step()
+    bench.target(THERE)
+    first = bench.follower.progress.trajectory
+    bench.step(200)
+    assert bench.follower.progress.trajectory is first
 
 
 def test_an_arm_that_cannot_move_to_its_target_any_more_says_so_and_does_not_stop():
@@ -357,7 +404,7 @@ def test_a_motion_is_slow_enough_for_the_torque_of_the_muscles(lost, limit, dura
             hard += 1
             planner = Planner(robot, settings)
             plans = [
-                planner.to_posture(mae, rest, goal, duration, lag),
+                planner.to_posture(mae, rest, goal, duration, lag)[0],
                 planner.through(mae, rest, fast.points, 0.0, lag),
             ]
             for planned in plans:

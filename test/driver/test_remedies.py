@@ -641,7 +641,7 @@ HEARD = {
     'temperature unit': Heard(
         publishing(scaled(1, 1, 10)), 'publish °C', [to_unit(TEMPERATURE, 'tenths of °C')]
     ),
-    'measured': Heard(
+    'impossible value': Heard(
         publishing(of_muscle(BICEPS, TEMPERATURE, lambda _: 850.0)),
         'publish °C, or NaN if it is not measured',
         [lambda driver, _: then(driver, 'publish',

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A learner that is killed loses nothing: the quick form of a part of `bench attack`.
 
-Other tests check it in each run: test_state.py kills a learner at each step of saving, and
-test/nodes/test_learner.py a whole node.
+Other tests check it in each run: test_state_directory.py simulates a kill at each step of saving,
+and test/nodes/test_learner.py kills a whole node.
 """
 
 import pytest

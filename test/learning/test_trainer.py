@@ -79,7 +79,7 @@ def test_a_training_process_that_cannot_start_dies_or_hangs_is_replaced_and_its_
         patch.setattr(trainers, 'PATIENCE', 0.3)
         process._patience = 0.3
         # The job is larger than the buffer of a pipe, so sending it to a suspended process blocks.
-        process.submit(job(stage.store(4), stage.messages(2000), steps=1))
+        process.submit(job(stage.store(4), stage.messages(20_000), steps=1))
         assert answer(process) is None
     assert 'did not answer in time' in process.trouble
     assert not is_running(first)

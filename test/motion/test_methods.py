@@ -10,14 +10,18 @@ from exact_mae import ExactMae
 from nominal_body import posture_table
 
 from bench.timings import eager_proposed, eager_proposed_paper
+from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
+from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.mae.network import from_mae
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.motion.explored_postures import holdable_postures
+from musculoskeletal_ae.motion.feedback import Shift
 from musculoskeletal_ae.motion.methods import first_command
-from musculoskeletal_ae.motion.tension_plan import plan_at_rest
+from musculoskeletal_ae.motion.tension_plan import TensionPlan, plan_at_rest
+from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.paper import control as paper
 from musculoskeletal_ae.paper.latent_descent import Loss, descend
 from musculoskeletal_ae.robot.robot import Robot
@@ -62,6 +66,30 @@ def test_no_other_tension_that_holds_the_posture_is_smaller(robot):
     for desired in np.random.default_rng(0).uniform(30.0, limit, (10, robot.muscle_count)):
         other = TensionProgramme(jacobian, torque, robot.tension.bias, limit).nearest(desired)
         assert np.linalg.norm(tension) <= np.linalg.norm(other) + 0.1
+
+
+def planned(robot, theta, effort, limit):
+    """Return a plan of `proposed` at a posture [rad], (D,), with an additional torque [N·m]."""
+    plan, none = TensionPlan(robot, Settings()), np.zeros(robot.joint_count)
+    plan.effort = none + effort
+    rest = Trajectory.to(Setpoint.resting(theta), theta, 1.0)
+    plan.step(rest, 0.0, Shift(none, none), 0.0, ExactMae(robot), limit, 0.01)
+    return plan
+
+
+def test_torque_beyond_the_muscles_is_reported_and_tensions_stay_within_their_limits(robot):
+    theta, _, _ = holdable(robot, 1)
+    limit = np.linspace(60.0, 120.0, robot.muscle_count)
+    plan = planned(robot, theta, 500.0, limit)
+    assert (plan.bone_tension >= 30.0 - 1e-6).all()
+    assert (plan.bone_tension <= limit + 1e-6).all()
+    assert np.linalg.norm(plan.missing_torque) > 100.0
+
+
+def test_a_torque_that_is_not_finite_is_refused(robot):
+    theta, _, _ = holdable(robot, 1)
+    with pytest.raises(InfeasibleError, match='not finite'):
+        planned(robot, theta, np.nan, robot.tension.limit)
 
 
 def test_the_length_command_makes_the_module_pull_with_the_planned_tension(robot):
