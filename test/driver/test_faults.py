@@ -18,6 +18,7 @@ from readings import reading
 
 from driver.scripted import Driver, RecordedArm, array, joint_state, muscle_rows, record
 from musculoskeletal_ae.awake_clock import AwakeClock
+from musculoskeletal_ae.driver import listening
 from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.driver.motion_test import ABOVE_BIAS, RUN_AWAY_TENSION
 from musculoskeletal_ae.driver.stiffness_motion_test import Winding
@@ -30,6 +31,12 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
 from musculoskeletal_ae.signals import motor_interface, muscle_readings
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
+from musculoskeletal_ae.signals.muscle_readings import (
+    QUANTITIES,
+    MuscleReadings,
+    Presence,
+    Quantity,
+)
 
 ROBOT = Robot.load('arm26')
 POSITION = Robot(with_modules(ROBOT.description, actuation='position'))
@@ -1017,3 +1024,18 @@ def test_each_fault_of_a_driver_that_follows_positions_is_detected(fault):
     setattr(driver, where, value)
     verdict = driver.wind((BICEPS,))
     assert what in {fault.name for fault in verdict.faults}, str(verdict)
+
+
+def test_an_optional_quantity_is_judged_by_its_entry_in_the_table(monkeypatch):
+    humidity = Quantity('%', 'impossible humidity', lambda _: (0.0, 100.0), Presence.OPTIONAL)
+    monkeypatch.setattr(MuscleReadings, 'humidity', humidity, raising=False)
+    humidity.__set_name__(MuscleReadings, 'humidity')
+    for module in (muscle_readings, listening):
+        monkeypatch.setattr(module, 'QUANTITIES', (*QUANTITIES, humidity))
+    row = np.full(M, 40.0)
+    assert not heard(publish=lambda rows: np.vstack([rows, row])).faults
+    row[BICEPS] = 190.0
+    (fault,) = heard(publish=lambda rows: np.vstack([rows, row])).faults
+    assert fault.muscles == (BICEPS,)
+    assert fault.observation == 'its humidity is 190 %; possible: 0 to 100 %'
+    assert fault.change == 'publish %, or NaN if it is not measured'
