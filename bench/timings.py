@@ -37,8 +37,8 @@ from musculoskeletal_ae.mae.network import Network, from_mae
 from musculoskeletal_ae.mae.training import random_states
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, Mask, scale_vector, visible
 from musculoskeletal_ae.motion.activities import Command, msc_compensation
-from musculoskeletal_ae.motion.methods import first_command, stiffness_command
-from musculoskeletal_ae.motion.tension_plan import SOLVES, plan_at_rest
+from musculoskeletal_ae.motion.methods import SOLVES, first_command, stiffness_command
+from musculoskeletal_ae.motion.tension_plan import plan_at_rest
 from musculoskeletal_ae.options import Parser
 from musculoskeletal_ae.paper import control as paper
 from musculoskeletal_ae.paper.constants import CONTROL_WEIGHTS, TORQUE_UNITS

@@ -134,7 +134,10 @@ class RestingLoad:
 
     @property
     def text(self) -> str:
-        """Change at the joint where it is largest, and its possible causes; '' while unknown."""
+        """A text: the joint whose torque has changed most, by how much, and possible causes.
+
+        The text is empty while σ is unknown.
+        """
         if self._spread is None:
             return ''
         joint, robot = int(np.abs(self.change).argmax()), self._robot

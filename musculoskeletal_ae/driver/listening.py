@@ -326,18 +326,12 @@ class Listening:
             for m in np.flatnonzero(~is_possible).tolist():
                 published = (quantity.of(each)[m] for each in (usual, self._low, self._high))
                 value, low, high = distinct(*published)
-                what = self._of_source(quantity.name)
-                texts = {'value': f'{value}, possible {low} to {high},'}
-                if quantity.presence is not Presence.REQUIRED:
-                    what, texts = (
-                        'impossible value',
-                        {
-                            'quantity': quantity.name,
-                            'value': f'{value} {quantity.unit}; possible: {low} to {high}',
-                            'unit': quantity.unit,
-                        },
-                    )
-                verdict.failed(what, m, **texts)
+                if quantity.presence is Presence.REQUIRED:
+                    what = self._of_source(quantity.name)
+                    verdict.failed(what, m, value=f'{value}, possible {low} to {high},')
+                else:
+                    texts = {'value': value, 'low': low, 'high': high, 'unit': quantity.unit}
+                    verdict.failed('impossible value', m, quantity=quantity.name, **texts)
         return False
 
     def _possible(self, readings: MuscleReadings) -> Bools:

@@ -31,14 +31,16 @@ from musculoskeletal_ae.robot.tension import TensionProgramme, least_tension
 FIRST = 'first'  # name of the length method that uses the given tension T_const
 SECOND = 'second'  # name of the length method that uses the measured tension T
 
+#: solve this many quadratic programmes for one posture, each with G at the tension that the
+#: previous one found; a third would change the tension by well under a newton
+SOLVES = 2
+
 # The following constants are those of the method `stiffness`.
 
 # Raise T_low above T_bias by the largest of these margins that is feasible [N]. An external force
 # can reduce a muscle's tension by this margin before it falls to T_bias, where the muscle is stiff
 # in one direction only.
 MARGINS = (40.0, 30.0, 20.0, 10.0, 0.0)
-#: without a nearby solution, search this many times, each with G at the tension found before
-ROUNDS = 2
 ITERATIONS = 6  # end the search for tensions of a desired stiffness after this many iterations
 # Weigh the distance from the initial tensions (at first the least tensions) by this, relative to
 # the stiffness error. A reachable stiffness is missed by about this share.
@@ -238,7 +240,7 @@ def stiffness_command(
         tension, missing = least_tension(jacobian, torque, low, high, stops=stops)
         if not missing.any():
             break
-    rounds = ROUNDS if near is None else 1
+    rounds = SOLVES if near is None else 1
     tension = tension if near is None else near
     model = StiffnessModel.read(robot, mae, theta, tension)
     # If no tensions within their limits exert the torque, the stiffness cannot be chosen.

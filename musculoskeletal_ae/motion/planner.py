@@ -83,7 +83,7 @@ class Planner:
             MessageError: If the motion is refused.
         """
         path = np.vstack([start.theta, reach.way(self._robot, mae, start.theta, theta)])
-        path, problem = self._passable(mae, path)
+        path, problem = self._passable(mae, path, self.takes_nearest)
         planned = self._within_limits(mae, Trajectory.to(start, path[1:], duration))
         slower = exertion_slowness(self._robot, mae, planned, lag)
         if slower > 1.0:
@@ -139,7 +139,8 @@ class Planner:
             MessageError: If the motion is refused.
         """
         theta, problem = self._hand.posture(mae, pose, whole, start.theta, self.takes_nearest)
-        path, lack = self._passable(mae, np.stack([start.theta, theta]))
+        straight = np.stack([start.theta, theta])
+        path, lack = self._passable(mae, straight, self.takes_nearest)
         problem = '; '.join(filter(None, (problem, lack)))
         towards = self._hand.towards(start, path[-1], now)
         planned = self._within_limits(mae, towards)
@@ -200,7 +201,7 @@ class Planner:
             raise MessageError(NOT_HOLDABLE, problem)
         return held, f'{problem}; the arm goes to that posture instead'
 
-    def _passable(self, mae: Mae, path: Array, nearest: bool | None = None) -> tuple[Array, str]:
+    def _passable(self, mae: Mae, path: Array, nearest: bool) -> tuple[Array, str]:
         """Return the part of a path [rad], (K, D), along which the muscles can move the arm.
 
         Paths of an arm without isolated muscles are not checked.
@@ -209,7 +210,7 @@ class Planner:
             mae: The network in use.
             path: Postures that straight lines connect.
             nearest: Whether to return a part of the path if the muscles cannot move the arm along
-                the rest; `takes_nearest` if None.
+                the rest.
 
         Returns:
             The path or its first part, and why it is only a part, or ''.
@@ -224,7 +225,7 @@ class Planner:
         if not missing:
             return path, ''
         problem = f'on the way, the muscles lack {missing}, {self._because_of_isolation}'
-        if not (self.takes_nearest if nearest is None else nearest):
+        if not nearest:
             remedy = 'choose another target, or call estimator/restore and send this one again'
             raise MessageError(NOT_HOLDABLE, f'{problem}; {remedy}')
         return part, problem

@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plans the tensions along a trajectory, and the lengths that muscle stiffness control needs.
 
-The module `follower` states the equations.
+The module `follower` states the equations. Only the tensions are varied, and the network is
+evaluated at the setpoint, so that no plan deviates from it. Torque balance and tension limits are
+constraints and therefore take priority over the least tension. In a weighted sum of norms, ‖T‖
+could outweigh the torque balance, and the arm would sag.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from musculoskeletal_ae.motion.feedback import (
     depends_on_limit,
     largest_support,
 )
-from musculoskeletal_ae.motion.methods import Solution, stiffness_command
+from musculoskeletal_ae.motion.methods import SOLVES, Solution, stiffness_command
 from musculoskeletal_ae.motion.reach import FRICTION, tendon_friction
 from musculoskeletal_ae.motion.slowness import SHARE
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
@@ -30,9 +33,6 @@ from musculoskeletal_ae.signals.friction import slid
 #: plan full tendon friction for tendons that slide much faster than this [m/s], and less for slower
 #: ones, whose sliding direction is uncertain because of noise
 TURNING = 0.005
-#: plan a resting arm this many times, each with G at the tension of the plan before; a third plan
-#: would change the tension by well under a newton
-SOLVES = 2
 AHEAD = 0.2  # compute T_K at this interval, for the setpoint that is this time ahead [s]
 
 
