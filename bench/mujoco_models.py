@@ -23,9 +23,10 @@ with the same initial network and are not exported. The numbers of a model are
 - the estimation error on 60 s of held-out motion before and after learning [rad, norm over the
   joints that contacts let move], and the number of rest samples: median and range over the
   individuals,
-- the difference from the individual in lengths (standard deviation) and moment arms (root mean
-  square) [mm, median over the muscles], over POSTURES random postures: of the file, and of the
-  exported model.
+- the difference of each muscle from the individual in length (standard deviation) and moment arms
+  (root mean square) [mm], over POSTURES random postures: of the file, and of the exported model;
+  their means over the muscles, how many muscles have learned points, and how many of these are
+  further from the individual than in the file.
 
 If a model is refused, the reason is stored with the CPU time after which it was known.
 
@@ -53,6 +54,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.exporting.exported_mjcf import export_into
 from musculoskeletal_ae.figures import save_figure
 from musculoskeletal_ae.importing.convert import import_robot
+from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.options import Parser, names
 from musculoskeletal_ae.presets.registry import preset_named
@@ -62,6 +64,7 @@ from musculoskeletal_ae.tools.mujoco_learning import learn
 
 SEEDS = 1, 2, 3  # seeds of the emulated individuals; the first one is also exported
 POSTURES = 200  # compare exported models with the individual in this many postures
+SAME = 1e-6  # ignore differences between file and exported model up to this [m]
 QUICK = 10  # divide the number of mini-batches of the initial training by this, without --whole
 SOON = 10.0  # name what cannot work within this time [s]
 #: file of a complete result, and of one that has only the prospects
@@ -151,6 +154,7 @@ def measured(model: Model, file: Path, folder: Path, args: Namespace) -> dict[st
             })  # fmt: skip
             if seed == args.seeds[0]:
                 result['still'] = learned.still
+                checkpoint.save(learned.mae, folder / 'learned.safetensors')
                 export_into(robot, learned.mae, file, folder / 'exported', seed)
                 result['whole'] = seconds()
         exported = folder / 'exported' / file.name, folder / 'exported_robot'
@@ -166,7 +170,8 @@ def measured(model: Model, file: Path, folder: Path, args: Namespace) -> dict[st
     model_file = str(robot_folder / 'model.xml')
     body = make_arm(robot, args.seeds[0], model_file, deviates=True).individual
     for name, other in (('file', robot), ('exported', again)):
-        result[f'{name}_length'], result[f'{name}_arm'] = differences(other, body, theta)
+        length, arm = differences(other, body, theta)
+        result |= {f'{name}_length': length.tolist(), f'{name}_arm': arm.tolist()}
     return result
 
 
@@ -177,15 +182,14 @@ def held_text(found: Prospects) -> str:
     return f'{100 * found.share:.0f} %'
 
 
-def differences(robot: Robot, body: Any, theta: Array) -> tuple[float, float]:
-    """Return the differences of lengths and moment arms from an individual [m].
+def differences(robot: Robot, body: Any, theta: Array) -> tuple[Array, Array]:
+    """Return each muscle's difference in length and moment arms from an individual [m], (M,).
 
-    They are medians over the muscles: of the standard deviation of the length, and of the root mean
-    square of the moment arms, over postures θ (N, D).
+    They are the standard deviation of the length and the root mean square of the moment arms over
+    postures θ (N, D).
     """
     length = robot.routes.absolute_lengths(theta) - body.absolute_lengths(theta)
-    arms = arm_errors(robot.routes.muscle_jacobian, body.muscle_jacobian, theta)
-    return float(np.median(length.std(axis=0))), float(np.median(arms))
+    return length.std(axis=0), arm_errors(robot.routes.muscle_jacobian, body.muscle_jacobian, theta)
 
 
 def result_of(model: Model, args: Namespace) -> dict[str, Any] | None:
@@ -222,16 +226,20 @@ def cells(model: Model, result: dict[str, Any]) -> list[str]:
     head = [model.name, size, result['held'], f'{result["known"]:.1f}']
     if 'whole' not in result:
         return [*head, *('–' for _ in HEAD[len(head) :])]
+    pairs = [[np.array(result[f'{kind}_{what}']) for kind in ('file', 'exported')]
+             for what in ('length', 'arm')]  # fmt: skip
     length, arm = (
-        ' → '.join(f'{1e3 * result[f"{kind}_{what}"]:.2f}' for kind in ('file', 'exported'))
-        for what in ('length', 'arm')
+        f'{1e3 * before.mean():.2f} → {1e3 * after.mean():.2f}' for before, after in pairs
     )
+    is_moved = np.logical_or.reduce([np.abs(after - before) > SAME for before, after in pairs])
+    is_worse = np.logical_or.reduce([after > before + SAME for before, after in pairs])
+    moved = f'{is_moved.sum()}, {is_worse.sum()} worse' if is_moved.any() else '0'
     times = f'{result["first"]:.0f}', f'{result["whole"]:.0f}'
     found = [values(result, name, '.3f') for name in ('before', 'after')]
     errors = ' → '.join(found)
     if still := result['still']:
         errors += f'; without {", ".join(still)}'
-    return [*head, *times, errors, values(result, 'samples', '.0f'), length, arm]
+    return [*head, *times, errors, values(result, 'samples', '.0f'), moved, length, arm]
 
 
 def values(result: dict[str, Any], name: str, form: str) -> str:
@@ -243,7 +251,7 @@ def values(result: dict[str, Any], name: str, form: str) -> str:
 
 HEAD = (
     'model', 'joints × muscles', 'held', 'known [s]', 'first estimate [s]', 'whole [s]',
-    'error [rad]', 'samples', 'export: lengths [mm]', 'export: moment arms [mm]',
+    'error [rad]', 'samples', 'muscles with learned points', 'lengths [mm]', 'moment arms [mm]',
 )  # fmt: skip
 REFUSED_HEAD = 'model', 'known after [s]', 'reason'
 PAGE = """# Public MuJoCo models
@@ -268,9 +276,12 @@ measured {commit}).
   count. The exploration is short: the errors of longer runs are in the
   [results](../results.md#mujoco-models).
 - **samples**: rest samples in {minutes:g} min.
-- **export**: difference from the individual, before (the file) and after (the exported model), over
-  {postures} random postures: standard deviation of the length, and root mean square of the moment
-  arms, medians over the muscles.
+- **muscles with learned points**: in the exported model, of individual {seed}, and how many of them
+  are further from the individual than the file, in length or in moment arms. The others keep
+  their points ([why](../howto/mujoco.md#export-the-learned-body)).
+- **lengths**, **moment arms**: difference from the individual, before (the file) and after (the
+  exported model), over {postures} random postures: standard deviation of the length, and root mean
+  square of the moment arms, means over the muscles.
 
 ## Models that were explored
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Covariances of a network's estimation errors, and of the learned constants of motor currents."""
+"""How far learned angles, lengths and constants of motor currents may be wrong."""
 
 import math
 
@@ -23,6 +23,7 @@ MANY_MESSAGES = 200
 #: draws underestimates the errors of other draws.
 BODIES = 100
 POSTURES_PER_BODY = 10  # draw estimation errors of each drawn body at this many postures
+WORKSPACE = 100  # compare the courses of lengths over this many random postures
 #: Multiply the covariance by this factor if there are fewer than MANY_MESSAGES validation messages.
 #: It stands for errors that all samples share and no prior describes, for example where tendons
 #: wrap round bones. With this factor, the ellipsoids contain 95 % of the true angles on emulator
@@ -105,6 +106,28 @@ def drive_covariance(body: CalibratedBody, fit: FittedBody) -> Array | None:
             covariance[m] = scale[:, None] * (0.5 * (widened + widened.T)) * scale
             end += layout.size
     return covariance
+
+
+def length_spread(body: CalibratedBody, fit: FittedBody, seed: int) -> Array:
+    """Return how far the learned course of each muscle's length may be wrong [m], (M,).
+
+    The course is the length minus its mean over the workspace. The result is its standard deviation
+    in the posterior of the route points, root mean square over the workspace.
+    """
+    robot = body.robot
+    theta = robot.random_postures(WORKSPACE, np.random.default_rng([seed, 0x1E]))
+    poses, still = body.poses(theta), np.zeros(WORKSPACE)
+    spread = np.empty(robot.muscle_count)
+    for muscles, root in fit.root:
+        inverse, end = solve_triangular(root, np.eye(len(root))), 0
+        for m in muscles.tolist():
+            layout, tension = body.layouts[m], np.full(WORKSPACE, robot.tension.bias[m])
+            places = end + np.arange(layout.size)[layout.attachment]
+            slope = body.linearised(poses, tension, still, m)[1][:, layout.attachment]
+            errors = (slope - slope.mean(axis=0)) @ inverse[places]
+            spread[m] = math.sqrt(np.square(errors).sum(axis=1).mean())
+            end += layout.size
+    return spread
 
 
 def _drawn_errors(

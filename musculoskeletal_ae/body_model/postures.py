@@ -206,7 +206,10 @@ class GroupFit:
         self.noise, self.weight = noise_and_weight(
             residuals.length, self._known, self.noise, self._determined, self._least_noise
         )
-        usual_torque = 1.5 * np.median(np.abs(residuals.torque), axis=0)
+        # The torque of a joint that is at a stop in most samples would look usual there.
+        near = self.stops.are_near(own)
+        torques = np.ma.array(np.abs(residuals.torque), mask=near & (near.mean(axis=0) > 0.5))
+        usual_torque = 1.5 * np.ma.median(torques, axis=0).filled(0.0)
         usual_torque = np.maximum(usual_torque, LEAST_TORQUE * residuals.load + SMALL)
         is_free = self.stops.are_free(own, residuals.torque / usual_torque)
         sigma = np.maximum(usual_torque, TORQUE_NOISE * residuals.load)

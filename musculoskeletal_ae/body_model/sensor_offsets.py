@@ -169,6 +169,11 @@ class Stops:
         #: limit [rad] at whose stop each joint is, NaN for joints that are not at a stop, (N, D)
         self._at = np.full(model.by_sensor.shape, np.nan)
 
+    def are_near(self, own: Array) -> Bools:
+        """Return which joints may be at a stop, because they are near a limit; own: (N, D)."""
+        near: Bools = (own > self._upper - self._near) | (own < self._lower + self._near)
+        return near
+
     def are_free(self, own: Array, score: Array) -> Bools:
         """Return which joints are free of their stops, so that their torques must balance.
 

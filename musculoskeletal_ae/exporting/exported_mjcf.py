@@ -132,9 +132,18 @@ def export_into(robot: Robot, mae: Mae, file: Path, out: Path, seed: int = 0) ->
 
     user = UserFile(file)
     bodies = [user.model.body(i).name for i in range(user.model.nbody)]
-    places = user.places(dict(zip(bodies, names_of_all('body', bodies), strict=True)))
-    own = {place_of(p) for r in robot.description.routes for p in r if isinstance(p, RoutePoint)}
-    if own.isdisjoint(places):
+    tendons = [user.model.tendon(i).name for i in range(user.model.ntendon)]
+    sites = user.tendon_sites(
+        dict(zip(bodies, names_of_all('body', bodies), strict=True)),
+        dict(zip(tendons, names_of_all('tendon', tendons), strict=True)),
+    )
+    own = {
+        (name, place_of(point))
+        for name, route in zip(robot.muscles, robot.description.routes, strict=True)
+        for point in route
+        if isinstance(point, RoutePoint)
+    }
+    if own.isdisjoint(sites):
         raise refuse(
             file,
             f'it has no site at a route point of {robot.description.directory}; import this file '
@@ -144,11 +153,12 @@ def export_into(robot: Robot, mae: Mae, file: Path, out: Path, seed: int = 0) ->
         robot = robot.with_elasticity(mae.elasticity)
         body = CalibratedBody(robot)
         fit_to_network(body, mae, seed, with_remainder=False)
-        learned = learned_routes(robot, body, mae, places)
-        for route, moved in zip(robot.description.routes, learned.routes, strict=True):
+        learned = learned_routes(robot, body, mae, sites)
+        pairs = zip(robot.muscles, robot.description.routes, learned.routes, strict=True)
+        for name, route, moved in pairs:
             for before, after in zip(route, moved, strict=True):
                 if isinstance(before, RoutePoint) and before is not after:
-                    user.move(places[place_of(before)], after.xyz)
+                    user.move(sites[name, place_of(before)], after.xyz)
         written = user.write(out)
         mjx = loads_in_mjx(mujoco.MjModel.from_xml_path(str(written)))
         head = f'{"muscle":<28}{"length [mm]":>18}{"moment arm [mm]":>20}'

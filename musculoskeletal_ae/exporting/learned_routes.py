@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learned route points, except for muscles that the points of the robot directory describe better.
 
-Learned points are fitted to the lengths of the network. A fit may be worse than the input for some
-muscles: if the learned arm deviates in ways that route points cannot express, or if a tendon slips
-over an object that it wraps around and its length jumps. Such muscles keep their points.
+Learned points are fitted to the lengths of the network. The input may be better for some muscles:
+if the samples do not determine the course of their lengths over the workspace, for example because
+a joint never moved, if the learned arm deviates in ways that route points cannot express, or if a
+tendon slips over an object that it wraps around and its length jumps. Such muscles keep their
+points.
 """
 
-from collections.abc import Container
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -19,8 +21,13 @@ from musculoskeletal_ae.robot.description import Route, RoutePoint
 from musculoskeletal_ae.robot.robot import Robot
 
 POSTURES = 400  # compare routes with the network in this many postures
+#: move the points of a muscle only if this changes the course of its length by more than so many
+#: times what samples left open (`Mae.length_spread`)
+CLEAR = 2.5
 #: identifies the place of a route point: its link, and its position there in units of 1e-7 m
 Place = tuple[str, tuple[int, ...]]
+#: for each movable route point, its muscle and place → name of its site in the user's file
+TendonSites = Mapping[tuple[str, Place], str]
 
 
 class Errors(NamedTuple):
@@ -46,7 +53,7 @@ def place_of(point: RoutePoint) -> Place:
 
 
 def learned_routes(
-    robot: Robot, body: CalibratedBody, mae: Mae, movable: Container[Place] | None = None
+    robot: Robot, body: CalibratedBody, mae: Mae, sites: TendonSites | None = None
 ) -> LearnedRoutes:
     """Return routes with learned points.
 
@@ -54,15 +61,17 @@ def learned_routes(
         robot: The robot whose points are moved.
         body: The calibrated body that was fitted to the network.
         mae: The network.
-        movable: The places that may be moved; a point that several muscles share stays shared.
-            None if all points may be moved on their own.
+        sites: The sites that may be moved; one that several muscles share stays shared. None if all
+            points may be moved on their own.
     """
     theta = robot.random_postures(POSTURES, np.random.default_rng([3, 0xE2]))
     before = errors(robot, mae, theta)
+    course = robot.routes.absolute_lengths(theta)
+    least_change = 0.0 if mae.length_spread is None else CLEAR * mae.length_spread
     is_kept = np.zeros(robot.muscle_count, dtype=bool)
     kept = dict[str, str]()
     while True:
-        routes = _moved(robot, body, is_kept, movable)
+        routes = _moved(robot, body, is_kept, sites)
         moved = robot.with_routes(routes)
         after = errors(moved, mae, theta)
         is_worse = (after.lengths > before.lengths) | (after.arms > before.arms)
@@ -70,7 +79,9 @@ def learned_routes(
         jumps = is_moved & newly_jumping(
             moved.routes.absolute_lengths, robot.routes.absolute_lengths, robot
         )
+        change = (moved.routes.absolute_lengths(theta) - course).std(axis=0)
         reasons = (
+            (is_moved & (change < least_change), 'the samples do not determine how it differs'),
             (jumps, 'its length would jump'),
             (is_worse & is_moved, 'learned points are not closer to the network'),
         )
@@ -97,7 +108,7 @@ def errors(robot: Robot, mae: Mae, theta: Array) -> Errors:
 
 
 def _moved(
-    robot: Robot, body: CalibratedBody, is_kept: Bools, movable: Container[Place] | None
+    robot: Robot, body: CalibratedBody, is_kept: Bools, sites: TendonSites | None
 ) -> tuple[Route, ...]:
     """Return the routes with learned points; unchanged routes are those of the description.
 
@@ -105,31 +116,27 @@ def _moved(
         robot: The robot whose points are moved.
         body: The fitted body, which has the displacement of each point.
         is_kept: Which muscles keep their points, (M,).
-        movable: As in `learned_routes`. Shared points move by the mean of their displacements, and
+        sites: As in `learned_routes`. Shared sites move by the mean of their displacements. They
             stay if one of their muscles keeps its points.
     """
-    shifts, routes = dict[Place, list[Array]](), robot.description.routes
-    own = [iter(body.link_shifts(m)) for m in range(robot.muscle_count)]
-    of_points = [[next(own[m]) if isinstance(p, RoutePoint) else None for p in route]
-                 for m, route in enumerate(routes)]  # fmt: skip
-    fixed = set[Place]()
-    for m, route in enumerate(routes):
-        for point, shift in zip(route, of_points[m], strict=True):
-            if isinstance(point, RoutePoint) and shift is not None:
-                shifts.setdefault(place_of(point), []).append(shift)
-                if is_kept[m]:
-                    fixed.add(place_of(point))
-    result = list[Route]()
-    for m, route in enumerate(routes):
-        items, changed = list(route), False
-        for i, (point, shift) in enumerate(zip(route, of_points[m], strict=True)):
-            if not isinstance(point, RoutePoint) or shift is None or is_kept[m]:
-                continue
-            if movable is not None:
-                place = place_of(point)
-                if place not in movable or place in fixed:
-                    continue
-                shift = np.mean(shifts[place], axis=0)
-            items[i], changed = point._replace(xyz=point.xyz + shift), True
-        result.append(tuple(items) if changed else route)
-    return tuple(result)
+    site_of, shifts = dict[tuple[int, int], object](), dict[object, list[Array]]()
+    for m, route in enumerate(robot.description.routes):
+        points = [(i, item) for i, item in enumerate(route) if isinstance(item, RoutePoint)]
+        for (i, point), shift in zip(points, body.link_shifts(m), strict=True):
+            key = robot.muscles[m], place_of(point)
+            site: object = (m, i) if sites is None else sites.get(key)
+            if site is not None:
+                site_of[m, i] = site
+                shifts.setdefault(site, []).append(shift)
+    fixed = {site for (m, _), site in site_of.items() if is_kept[m]}
+    result = [list(route) for route in robot.description.routes]
+    for (m, i), site in site_of.items():
+        if site not in fixed:
+            result[m][i] = result[m][i]._replace(
+                xyz=result[m][i].xyz + np.mean(shifts[site], axis=0)
+            )
+    moved = {m for (m, _), site in site_of.items() if site not in fixed}
+    return tuple(
+        tuple(result[m]) if m in moved else route
+        for m, route in enumerate(robot.description.routes)
+    )

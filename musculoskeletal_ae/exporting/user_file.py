@@ -16,7 +16,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.exporting.learned_routes import Place
+from musculoskeletal_ae.exporting.learned_routes import Place, TendonSites
 
 COMMENT = re.compile(r'<!--.*?-->', re.DOTALL)
 SITE = re.compile(r'<site\b[^>]*>')
@@ -82,18 +82,24 @@ class UserFile:
                 sites[name] = place
         return sites
 
-    def places(self, links: dict[str, str]) -> dict[Place, str]:
-        """Return the name of each movable site, by its link and its position there.
+    def tendon_sites(self, links: dict[str, str], muscles: dict[str, str]) -> TendonSites:
+        """Return the names of the tendons' movable sites, by muscle and place.
 
         Args:
             links: Name of the link of each body, by the name of the body.
+            muscles: Name of the muscle of each tendon, by the name of the tendon.
         """
-        places = dict[Place, str]()
-        for name, xyz in self.sites.items():
-            body = self.model.body(self.model.site(name).bodyid[0]).name
-            if body in links:
-                places[links[body], tuple(np.rint(1e7 * xyz).astype(int).tolist())] = name
-        return places
+        model, found = self.model, dict[tuple[str, Place], set[str]]()
+        for t in range(model.ntendon):
+            path = slice(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])
+            is_site = model.wrap_type[path] == mujoco.mjtWrap.mjWRAP_SITE
+            for site in map(model.site, model.wrap_objid[path][is_site].tolist()):
+                body, xyz = model.body(site.bodyid[0]).name, self.sites.get(site.name)
+                if body in links and xyz is not None:
+                    at = links[body], tuple(np.rint(1e7 * xyz).astype(int).tolist())
+                    found.setdefault((muscles[model.tendon(t).name], at), set()).add(site.name)
+        # If a tendon has two sites in one place, it is unknown which one a route point is.
+        return {key: min(names) for key, names in found.items() if len(names) == 1}
 
     def move(self, name: str, xyz: Array) -> None:
         """Move the site `name` to `xyz` [m], (3,), in the frame of its body, in the file's text."""

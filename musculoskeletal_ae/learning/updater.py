@@ -17,6 +17,7 @@ from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.covariance import (
     drive_covariance,
     estimate_covariance,
+    length_spread,
     observed_theta,
 )
 from musculoskeletal_ae.body_model.fit import FittedBody
@@ -86,6 +87,7 @@ class Updater(ABC):
         if fit is not None and self.body is not None:
             tension, judging = job.observed.end_tension(mae.transmission), job.healthy.judging
             covariance = estimate_covariance(mae, self.body, fit, tension, self._seed, judging)
-            mae = replace(mae, covariance=covariance)
+            spread = length_spread(self.body, fit, self._seed)
+            mae = replace(mae, covariance=covariance, length_spread=spread)
         self._mae = mae
         return mae

@@ -89,6 +89,7 @@ class Metadata(Strict, frozen=True):
     #: duration of motion in the touch statistics [s]; None if there are no touch statistics
     touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None
     uncertain: bool  # whether the covariance of the estimates is included
+    spread: bool = False  # whether the possible errors of the learned lengths are included
     drive: bool = False  # whether learned constants of motor currents are included
     elastic: bool = False  # whether learned springs of the joints are included
     #: for each group's block, the index of its base (the block whose inputs it uses as well) or,
@@ -163,6 +164,8 @@ class Metadata(Strict, frozen=True):
             shapes['touch.drive_covariance'] = len(self.muscles), 3, 3
         if self.uncertain:
             shapes['covariance'] = len(self.joints), len(self.joints)
+        if self.spread:
+            shapes['length_spread'] = (len(self.muscles),)
         if self.elastic:
             count = len(self.joints)
             shapes |= {f'elasticity.{name}': (count,) for name in ('preload', 'damping')}
@@ -191,6 +194,8 @@ def to_bytes(mae: Mae) -> bytes:
             tensors['touch.drive_covariance'] = certain if known is None else known
     if mae.covariance is not None:
         tensors['covariance'] = mae.covariance
+    if mae.length_spread is not None:
+        tensors['length_spread'] = mae.length_spread
     if (springs := mae.elasticity) is not None:
         tensors['elasticity.stiffness'] = springs.stiffness
         tensors |= {'elasticity.preload': springs.preload, 'elasticity.damping': springs.damping}
@@ -205,6 +210,7 @@ def to_bytes(mae: Mae) -> bytes:
         'touch_time': None if touch is None else touch.time,
         'drive': touch is not None and touch.drive is not None,
         'uncertain': mae.covariance is not None,
+        'spread': mae.length_spread is not None,
         'elastic': mae.elasticity is not None,
     }
     return save_tensors(
@@ -328,6 +334,8 @@ def _tensors(data: bytes, meta: Metadata) -> dict[str, Array]:
         value_text, limit = distinct(most, LARGEST_GAIN)
         problem = f'tensor touch.drive has a gain of ±{value_text}; legal: -{limit} to {limit}'
         raise CheckpointError(problem)
+    if (least := tensors.get('length_spread', np.zeros(1)).min()) < 0.0:
+        raise CheckpointError(f'tensor length_spread has the value {least:g}; legal: 0 or more')
     for name in ('anomaly.covariance', 'covariance'):
         if name in tensors:
             _check_covariance(name, tensors[name])
@@ -406,6 +414,7 @@ def _mae(meta: Metadata, tensors: dict[str, Array]) -> Mae:
         anomaly=anomaly,
         touch=touch,
         covariance=tensors.get('covariance'),
+        length_spread=tensors.get('length_spread'),
         elasticity=elasticity,
         **{name: getattr(meta, name) for name in SHARED},
     )

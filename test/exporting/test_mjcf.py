@@ -2,6 +2,7 @@
 """Export of a learned body as MJCF: import, learn, export, load."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -175,7 +176,34 @@ def test_a_muscle_keeps_points_if_learned_ones_are_worse_or_make_its_length_jump
     assert np.all(found.after.arms <= found.before.arms)
 
 
+def test_a_muscle_keeps_its_points_if_samples_leave_open_how_it_differs(learned):
+    robot, _, mae, _ = learned
+    body = CalibratedBody(robot)
+    fit_to_network(body, mae, with_remainder=False)
+    open_one = np.zeros(robot.muscle_count)
+    open_one[2] = 1.0
+    found = learned_routes.learned_routes(robot, body, replace(mae, length_spread=open_one))
+    assert found.kept == {robot.muscles[2]: 'the samples do not determine how it differs'}
+    assert found.routes[2] is robot.description.routes[2]
+
+
 def test_a_directory_in_use_is_refused(learned):
     robot, _, mae, folder = learned
     with pytest.raises(MusculoskeletalError, match='expected a new or empty directory'):
         export(robot, mae, folder)
+
+
+def test_two_sites_in_one_place_are_told_apart_by_their_tendons(tmp_path):
+    file = tmp_path / 'twins.xml'
+    file.write_text("""<mujoco><worldbody>
+      <site name="a0" pos="0 0 .1"/><site name="b0" pos="0 0 .1"/><site name="of both"/>
+      <body name="link"><joint/><geom size=".01"/><site name="a1"/><site name="b1"/></body>
+    </worldbody><tendon>
+      <spatial name="a"><site site="of both"/><site site="a0"/><site site="a1"/></spatial>
+      <spatial name="b"><site site="of both"/><site site="b0"/><site site="b1"/></spatial>
+    </tendon></mujoco>""")
+    found = UserFile(file).tendon_sites({'world': 'base', 'link': 'hand'}, {'a': 'm', 'b': 'n'})
+    above, origin = ('base', (0, 0, 1_000_000)), (0, 0, 0)
+    assert found['m', above] == 'a0' and found['n', above] == 'b0'
+    assert found['m', ('hand', origin)] == 'a1' and found['n', ('hand', origin)] == 'b1'
+    assert found['m', ('base', origin)] == found['n', ('base', origin)] == 'of both'

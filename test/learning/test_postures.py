@@ -10,7 +10,7 @@ from robots import write_robot
 
 from learning.conftest import Stage, drawn_body
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
-from musculoskeletal_ae.body_model.covariance import ellipsoids, estimate_covariance
+from musculoskeletal_ae.body_model.covariance import ellipsoids, estimate_covariance, length_spread
 from musculoskeletal_ae.body_model.fit import fit_body
 from musculoskeletal_ae.body_model.observations import Observations
 from musculoskeletal_ae.body_model.posture_model import Bent, PostureModel, Unknowns
@@ -21,10 +21,14 @@ from musculoskeletal_ae.robot.robot import Robot
 class Resting(Stage):
     """Generates samples of a body whose muscles hold its weight, as in a real rest."""
 
-    def observations(self, count: int) -> Observations:
+    def observations(self, count: int, push: float = 0.0) -> Observations:
+        """Return rests; muscles that `push` [N·m] hold the last joint at its upper stop."""
         robot, body = self.body.robot, self.body
         theta = robot.random_postures(count, self.rng)
+        if push:
+            theta[:, -1] = robot.upper[-1]
         weight = robot.kinematics.holding_torque(theta)
+        weight[:, -1] += push
         tension = self.rng.uniform(30.0, 200.0, (count, robot.muscle_count))
         direction = self.rng.choice([-1.0, 1.0], tension.shape)
         steps = 1e-4 * np.eye(robot.joint_count)
@@ -171,6 +175,31 @@ def test_the_jacobian_of_the_residuals_is_the_difference_quotient(arm26, resting
             expected = rows.torque_by_body[:, :, column + k]
             np.testing.assert_allclose(expected, slope, atol=1e-2 + 1e-3 * np.abs(slope).max())
         column += layout.size
+
+
+def test_a_joint_that_is_always_at_its_stop_does_not_spoil_the_moment_arms(arm26, resting):
+    observed = resting.observations(20, push=10.0)
+    body, theta = CalibratedBody(arm26), arm26.random_postures(50, np.random.default_rng(4))
+    fit_body(body, observed)
+    tension = np.full((50, arm26.muscle_count), 60.0)
+
+    def moment_arms(of: CalibratedBody) -> np.ndarray:
+        step = np.array([0.0, 1e-4])
+        ends = (of.lengths(theta + sign * step, tension, 0.0 * tension)[0] for sign in (1, -1))
+        return np.subtract(*ends) / 2e-4
+
+    true = moment_arms(resting.body)
+    before = np.abs(moment_arms(CalibratedBody(arm26)) - true).mean()
+    after = np.abs(moment_arms(body) - true).mean()
+    assert after < before
+
+
+def test_samples_of_one_posture_leave_open_how_lengths_change(arm26, observed):
+    body = CalibratedBody(arm26)
+    everywhere = length_spread(body, fit_body(body, observed), 0)
+    body = CalibratedBody(arm26)
+    nowhere = length_spread(body, fit_body(body, observed[np.zeros(60, dtype=int)]), 0)
+    assert (everywhere < 0.001).all() and (nowhere > 3.0 * everywhere).all()
 
 
 # Of several seeds, these give the bodies with the largest errors.

@@ -88,10 +88,11 @@ def test_round_trip_keeps_every_bit(mae, robot):
 
 
 def test_what_one_joint_has_learned_is_read_back():
-    learned = replace(small(), covariance=np.array([[1e-4]]))
+    learned = replace(small(), covariance=np.array([[1e-4]]), length_spread=np.array([0.0, 0.002]))
     back = from_bytes(to_bytes(learned))
     check_same(learned, back)
     np.testing.assert_array_equal(back.covariance, learned.covariance)
+    np.testing.assert_array_equal(back.length_spread, learned.length_spread)
 
 
 def test_a_file_written_in_this_format_is_read():
@@ -191,6 +192,11 @@ def test_numbers_that_are_no_weights_are_refused(name, value):
 def test_zero_spread_is_refused():
     with pytest.raises(CheckpointError, match='std'):
         from_bytes(to_bytes(replace(small(), std=np.full(5, 1e-30))))
+
+
+def test_a_negative_spread_of_lengths_is_refused():
+    with pytest.raises(CheckpointError, match=r'length_spread has the value -0\.1; legal: 0 or'):
+        from_bytes(to_bytes(replace(small(), length_spread=np.array([0.1, -0.1]))))
 
 
 @pytest.mark.parametrize(
