@@ -8,7 +8,8 @@
 
 CLONES has a clone (a working tree) of each repository of MODELS in OWNER/NAME; models of MyoSuite
 load only from a folder of their repository's name. A model whose clone is missing is left out.
-Finished models are read from DIR, so the same command continues an interrupted run.
+Finished models are read from DIR, so the same command continues an interrupted run. The folder of
+a model has the network of the first individual (`learned.safetensors`), for `export_mjcf`.
 
 Each model takes the way of `train --mujoco FILE --seed 1 --quick`, by the same functions: import,
 prospects, initial training, a minute of exploration and learning on an emulated individual, and
@@ -171,7 +172,7 @@ def measured(model: Model, file: Path, folder: Path, args: Namespace) -> dict[st
     body = make_arm(robot, args.seeds[0], model_file, deviates=True).individual
     for name, other in (('file', robot), ('exported', again)):
         length, arm = differences(other, body, theta)
-        result |= {f'{name}_length': length.tolist(), f'{name}_arm': arm.tolist()}
+        result |= {f'{name}_lengths': length.tolist(), f'{name}_arms': arm.tolist()}
     return result
 
 
@@ -227,7 +228,7 @@ def cells(model: Model, result: dict[str, Any]) -> list[str]:
     if 'whole' not in result:
         return [*head, *('–' for _ in HEAD[len(head) :])]
     pairs = [[np.array(result[f'{kind}_{what}']) for kind in ('file', 'exported')]
-             for what in ('length', 'arm')]  # fmt: skip
+             for what in ('lengths', 'arms')]  # fmt: skip
     length, arm = (
         f'{1e3 * before.mean():.2f} → {1e3 * after.mean():.2f}' for before, after in pairs
     )

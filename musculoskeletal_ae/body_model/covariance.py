@@ -23,7 +23,7 @@ MANY_MESSAGES = 200
 #: draws underestimates the errors of other draws.
 BODIES = 100
 POSTURES_PER_BODY = 10  # draw estimation errors of each drawn body at this many postures
-WORKSPACE = 100  # compare the courses of lengths over this many random postures
+WORKSPACE = 100  # average possible errors of lengths over this many random postures
 #: Multiply the covariance by this factor if there are fewer than MANY_MESSAGES validation messages.
 #: It stands for errors that all samples share and no prior describes, for example where tendons
 #: wrap round bones. With this factor, the ellipsoids contain 95 % of the true angles on emulator
@@ -109,10 +109,13 @@ def drive_covariance(body: CalibratedBody, fit: FittedBody) -> Array | None:
 
 
 def length_spread(body: CalibratedBody, fit: FittedBody, seed: int) -> Array:
-    """Return how far the learned course of each muscle's length may be wrong [m], (M,).
+    """Return how far the learned lengths may be wrong over the workspace [m], (M,).
 
-    The course is the length minus its mean over the workspace. The result is its standard deviation
-    in the posterior of the route points, root mean square over the workspace.
+        s_m² = mean over θ of Var(e_m(θ) − mean over θ of e_m)
+
+    e_m(θ) is the error of the length of muscle m that the samples leave open: the error of its
+    route points in the posterior of the fit. The mean over the workspace does not count, because
+    it is an offset. Errors of elastic constants and of the remainder are left out.
     """
     robot = body.robot
     theta = robot.random_postures(WORKSPACE, np.random.default_rng([seed, 0x1E]))

@@ -62,9 +62,6 @@ LEAST_NOISE = 0.0008
 #: Expect errors of the torque balance (σ_τ) of this share of the muscles' absolute torques at a
 #: joint. The share is high, because all samples have the same friction and sensor offsets.
 TORQUE_NOISE = 0.3
-#: assume that unbalanced torques are usually at least this share of the muscles' summed absolute
-#: torques at a joint
-LEAST_TORQUE = 0.01
 #: recompute the factor for the spreads of the prior (Birge ratio, `GroupFit._posterior`) this many
 #: times
 SCALINGS = 2
@@ -206,11 +203,7 @@ class GroupFit:
         self.noise, self.weight = noise_and_weight(
             residuals.length, self._known, self.noise, self._determined, self._least_noise
         )
-        # The torque of a joint that is at a stop in most samples would look usual there.
-        near = self.stops.are_near(own)
-        torques = np.ma.array(np.abs(residuals.torque), mask=near & (near.mean(axis=0) > 0.5))
-        usual_torque = 1.5 * np.ma.median(torques, axis=0).filled(0.0)
-        usual_torque = np.maximum(usual_torque, LEAST_TORQUE * residuals.load + SMALL)
+        usual_torque = self.stops.usual_torque(own, residuals.torque, residuals.load)
         is_free = self.stops.are_free(own, residuals.torque / usual_torque)
         sigma = np.maximum(usual_torque, TORQUE_NOISE * residuals.load)
         y = self.prior.angle_precision

@@ -54,6 +54,14 @@ NEAR_STOP = 0.05
 #: conclude that muscles push a joint against its stop if the unbalanced torque exceeds the usual
 #: one by this factor
 LEAST_PUSH = 3.0
+#: assume that unbalanced torques are usually at least this share of the muscles' summed absolute
+#: torques at a joint
+LEAST_TORQUE = 0.01
+#: assume this share if a joint is near a limit in every sample, so that its torques tell nothing
+UNKNOWN_TORQUE = 0.05
+#: distinguish samples near a limit only for a joint whose range is larger than this multiple of the
+#: distance that counts as near
+LEAST_INSIDE = 4.0
 #: give every angle this weight relative to that of a stop, so that the normal equations have a
 #: unique solution
 SMALL = 1e-6
@@ -169,10 +177,23 @@ class Stops:
         #: limit [rad] at whose stop each joint is, NaN for joints that are not at a stop, (N, D)
         self._at = np.full(model.by_sensor.shape, np.nan)
 
-    def are_near(self, own: Array) -> Bools:
-        """Return which joints may be at a stop, because they are near a limit; own: (N, D)."""
-        near: Bools = (own > self._upper - self._near) | (own < self._lower + self._near)
-        return near
+    def usual_torque(self, own: Array, torque: Array, load: Array) -> Array:
+        """Return the usual unbalanced torque at each joint [N·m], (D,).
+
+        At a stop, the unbalanced torque is that of the stop and not usual. Samples near a limit are
+        therefore left out if they are the majority, unless the whole range is near the limits.
+
+        Args:
+            own: Joint angles θ of the group [rad], (N, D).
+            torque: Unbalanced torques [N·m], (N, D).
+            load: Usual sum of the muscles' absolute torques at each joint [N·m], (D,).
+        """
+        near = np.logical_or(*self._near_limits(own))
+        has_inside = self._upper - self._lower > LEAST_INSIDE * self._near
+        is_mostly_near = has_inside & (near.mean(axis=0) > 0.5)
+        inside = np.ma.array(np.abs(torque), mask=near & is_mostly_near)
+        usual = 1.5 * np.ma.median(inside, axis=0)
+        return np.maximum(usual.filled(UNKNOWN_TORQUE * load), LEAST_TORQUE * load + SMALL)
 
     def are_free(self, own: Array, score: Array) -> Bools:
         """Return which joints are free of their stops, so that their torques must balance.
@@ -189,10 +210,14 @@ class Stops:
         # joint without a sensor has to exceed LEAST_PUSH at every call. Otherwise a stop that was
         # assumed wrongly would hold the joint and distort the other joints.
         enough = np.where(self._by_sensor & np.isfinite(self._at), 0.0, LEAST_PUSH)
-        above = self.is_balanced & (own > self._upper - self._near) & (score > enough)
-        below = self.is_balanced & (own < self._lower + self._near) & (score < -enough)
+        near_lower, near_upper = self._near_limits(own)
+        above = self.is_balanced & near_upper & (score > enough)
+        below = self.is_balanced & near_lower & (score < -enough)
         self._at = np.where(above, self._upper, np.where(below, self._lower, np.nan))
         return self.is_balanced & ~(above | below)
+
+    def _near_limits(self, own: Array) -> tuple[Bools, Bools]:
+        return own < self._lower + self._near, own > self._upper - self._near
 
     def pull(self, own: Array, repeated: Array) -> tuple[Array, Array]:
         """Return the displacements [rad] that move joints back to their stops, and their weights.

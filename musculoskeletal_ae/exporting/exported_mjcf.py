@@ -15,6 +15,7 @@ Tendon friction is approximated by a constant force μ T_mid, although it is a s
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,7 +30,7 @@ from musculoskeletal_ae.emulator.foreign import mujoco_model
 from musculoskeletal_ae.emulator.foreign.effects import NONE, Draw
 from musculoskeletal_ae.emulator.modules import joint_gear
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.exporting.learned_routes import learned_routes, place_of
+from musculoskeletal_ae.exporting.learned_routes import learned_routes
 from musculoskeletal_ae.exporting.user_file import UserFile
 from musculoskeletal_ae.files import new_directory
 from musculoskeletal_ae.importing.source import names_of_all
@@ -133,32 +134,28 @@ def export_into(robot: Robot, mae: Mae, file: Path, out: Path, seed: int = 0) ->
     user = UserFile(file)
     bodies = [user.model.body(i).name for i in range(user.model.nbody)]
     tendons = [user.model.tendon(i).name for i in range(user.model.ntendon)]
-    sites = user.tendon_sites(
-        dict(zip(bodies, names_of_all('body', bodies), strict=True)),
-        dict(zip(tendons, names_of_all('tendon', tendons), strict=True)),
-    )
-    own = {
-        (name, place_of(point))
-        for name, route in zip(robot.muscles, robot.description.routes, strict=True)
-        for point in route
-        if isinstance(point, RoutePoint)
-    }
-    if own.isdisjoint(sites):
+    links, muscles = names_of_all('body', bodies), names_of_all('tendon', tendons)
+    sites = user.sites_of(robot, links, muscles)
+    if not any(filter(None, chain(*sites))):
         raise refuse(
             file,
-            f'it has no site at a route point of {robot.description.directory}; import this file '
-            'again, because the robot was imported from another version of it',
+            f'it has no tendon with the name and the sites of a muscle of '
+            f'{robot.description.directory}; import this file again, because the robot was '
+            'imported from another version of it, or its muscles were renamed',
         )
     with new_directory(out, refuse):
         robot = robot.with_elasticity(mae.elasticity)
         body = CalibratedBody(robot)
         fit_to_network(body, mae, seed, with_remainder=False)
         learned = learned_routes(robot, body, mae, sites)
-        pairs = zip(robot.muscles, robot.description.routes, learned.routes, strict=True)
-        for name, route, moved in pairs:
-            for before, after in zip(route, moved, strict=True):
-                if isinstance(before, RoutePoint) and before is not after:
-                    user.move(sites[name, place_of(before)], after.xyz)
+        for names, route, moved in zip(
+            sites, robot.description.routes, learned.routes, strict=True
+        ):
+            pairs = zip(route, moved, strict=True)
+            points = [pair for pair in pairs if isinstance(pair[0], RoutePoint)]
+            for name, (before, after) in zip(names, points, strict=True):
+                if name is not None and before is not after:
+                    user.move(name, after.xyz)
         written = user.write(out)
         mjx = loads_in_mjx(mujoco.MjModel.from_xml_path(str(written)))
         head = f'{"muscle":<28}{"length [mm]":>18}{"moment arm [mm]":>20}'

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learned route points, except for muscles that the points of the robot directory describe better.
 
-Learned points are fitted to the lengths of the network. The input may be better for some muscles:
-if the samples do not determine the course of their lengths over the workspace, for example because
-a joint never moved, if the learned arm deviates in ways that route points cannot express, or if a
-tendon slips over an object that it wraps around and its length jumps. Such muscles keep their
-points.
+Learned points are fitted to the lengths of the network. A muscle keeps its original points
+
+- if the samples do not determine how its length differs, for example because a joint never moved,
+- if the learned points are not closer to the network, because the arm differs in ways that route
+  points cannot express,
+- or if its length would jump where a tendon slips over an object that it wraps around.
 """
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,13 +22,11 @@ from musculoskeletal_ae.robot.description import Route, RoutePoint
 from musculoskeletal_ae.robot.robot import Robot
 
 POSTURES = 400  # compare routes with the network in this many postures
-#: move the points of a muscle only if this changes the course of its length by more than so many
-#: times what samples left open (`Mae.length_spread`)
+#: keep the points of a muscle unless its length changes by more than this multiple of what the
+#: samples leave open (`Mae.length_spread`)
 CLEAR = 2.5
-#: identifies the place of a route point: its link, and its position there in units of 1e-7 m
-Place = tuple[str, tuple[int, ...]]
-#: for each movable route point, its muscle and place → name of its site in the user's file
-TendonSites = Mapping[tuple[str, Place], str]
+#: identifies what is moved: a site of the user's file, or else a point of a muscle, (m, k)
+Site = str | tuple[int, int]
 
 
 class Errors(NamedTuple):
@@ -47,13 +46,11 @@ class LearnedRoutes(NamedTuple):
     after: Errors
 
 
-def place_of(point: RoutePoint) -> Place:
-    """Return the link of a route point, and its position there, as a hashable value."""
-    return point.link, tuple(np.rint(1e7 * point.xyz).astype(int).tolist())
-
-
 def learned_routes(
-    robot: Robot, body: CalibratedBody, mae: Mae, sites: TendonSites | None = None
+    robot: Robot,
+    body: CalibratedBody,
+    mae: Mae,
+    sites: Sequence[Sequence[Site | None]] | None = None,
 ) -> LearnedRoutes:
     """Return routes with learned points.
 
@@ -61,15 +58,24 @@ def learned_routes(
         robot: The robot whose points are moved.
         body: The calibrated body that was fitted to the network.
         mae: The network.
-        sites: The sites that may be moved; one that several muscles share stays shared. None if all
-            points may be moved on their own.
+        sites: For each muscle, the sites of its route points, and None where a point cannot be
+            moved. A site that several muscles share stays shared. None if all points may be moved
+            on their own.
     """
+    if sites is None:
+        counts = [len(body.link_shifts(m)) for m in range(robot.muscle_count)]
+        sites = [[(m, k) for k in range(count)] for m, count in enumerate(counts)]
     theta = robot.random_postures(POSTURES, np.random.default_rng([3, 0xE2]))
     before = errors(robot, mae, theta)
-    course = robot.routes.absolute_lengths(theta)
-    least_change = 0.0 if mae.length_spread is None else CLEAR * mae.length_spread
-    is_kept = np.zeros(robot.muscle_count, dtype=bool)
-    kept = dict[str, str]()
+    kept, is_kept = dict[str, str](), np.zeros(robot.muscle_count, dtype=bool)
+    if mae.length_spread is not None:
+        learned = robot.with_routes(_moved(robot, body, is_kept, sites)).routes
+        change = learned.absolute_lengths(theta) - robot.routes.absolute_lengths(theta)
+        is_kept = change.std(axis=0) < CLEAR * mae.length_spread
+        kept = {
+            robot.muscles[m]: 'too few samples to tell how it differs'
+            for m in np.flatnonzero(is_kept).tolist()
+        }
     while True:
         routes = _moved(robot, body, is_kept, sites)
         moved = robot.with_routes(routes)
@@ -79,9 +85,7 @@ def learned_routes(
         jumps = is_moved & newly_jumping(
             moved.routes.absolute_lengths, robot.routes.absolute_lengths, robot
         )
-        change = (moved.routes.absolute_lengths(theta) - course).std(axis=0)
         reasons = (
-            (is_moved & (change < least_change), 'the samples do not determine how it differs'),
             (jumps, 'its length would jump'),
             (is_worse & is_moved, 'learned points are not closer to the network'),
         )
@@ -108,7 +112,7 @@ def errors(robot: Robot, mae: Mae, theta: Array) -> Errors:
 
 
 def _moved(
-    robot: Robot, body: CalibratedBody, is_kept: Bools, sites: TendonSites | None
+    robot: Robot, body: CalibratedBody, is_kept: Bools, sites: Sequence[Sequence[Site | None]]
 ) -> tuple[Route, ...]:
     """Return the routes with learned points; unchanged routes are those of the description.
 
@@ -119,24 +123,19 @@ def _moved(
         sites: As in `learned_routes`. Shared sites move by the mean of their displacements. They
             stay if one of their muscles keeps its points.
     """
-    site_of, shifts = dict[tuple[int, int], object](), dict[object, list[Array]]()
-    for m, route in enumerate(robot.description.routes):
-        points = [(i, item) for i, item in enumerate(route) if isinstance(item, RoutePoint)]
-        for (i, point), shift in zip(points, body.link_shifts(m), strict=True):
-            key = robot.muscles[m], place_of(point)
-            site: object = (m, i) if sites is None else sites.get(key)
+    shifts, fixed = dict[Site, list[Array]](), set[Site]()
+    for m, own in enumerate(sites):
+        for site, shift in zip(own, body.link_shifts(m), strict=True):
             if site is not None:
-                site_of[m, i] = site
                 shifts.setdefault(site, []).append(shift)
-    fixed = {site for (m, _), site in site_of.items() if is_kept[m]}
-    result = [list(route) for route in robot.description.routes]
-    for (m, i), site in site_of.items():
-        if site not in fixed:
-            result[m][i] = result[m][i]._replace(
-                xyz=result[m][i].xyz + np.mean(shifts[site], axis=0)
-            )
-    moved = {m for (m, _), site in site_of.items() if site not in fixed}
-    return tuple(
-        tuple(result[m]) if m in moved else route
-        for m, route in enumerate(robot.description.routes)
-    )
+                if is_kept[m]:
+                    fixed.add(site)
+    steps = {site: np.mean(each, axis=0) for site, each in shifts.items() if site not in fixed}
+    routes = list[Route]()
+    for own, route in zip(sites, robot.description.routes, strict=True):
+        left, items = iter(own), list(route)
+        for i, item in enumerate(route):
+            if isinstance(item, RoutePoint) and (site := next(left)) in steps:
+                items[i] = item._replace(xyz=item.xyz + steps[site])
+        routes.append(tuple(items) if not steps.keys().isdisjoint(own) else route)
+    return tuple(routes)

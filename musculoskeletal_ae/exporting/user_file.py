@@ -9,6 +9,7 @@ that lie beside an included file.
 """
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -16,7 +17,8 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.exporting.learned_routes import Place, TendonSites
+from musculoskeletal_ae.robot.description import RoutePoint
+from musculoskeletal_ae.robot.robot import Robot
 
 COMMENT = re.compile(r'<!--.*?-->', re.DOTALL)
 SITE = re.compile(r'<site\b[^>]*>')
@@ -26,6 +28,8 @@ ATTRIBUTE = r'\b{name}\s*=\s*(["\'])(.*?)\1'
 ASSET = re.compile(r'<(mesh|hfield|skin|texture)\b[^>]*>')
 ASSET_FILE = re.compile(r'\bfile\w*\s*=\s*(["\'])(.*?)\1')
 FOLDERS = 'meshdir', 'texturedir', 'assetdir'
+#: identifies a place: the link, and the position there in units of 1e-7 m
+Place = tuple[str, tuple[int, ...]]
 SAME = 1e-6  # regard a site as unchanged if it has moved by no more than this [m]
 
 
@@ -82,24 +86,35 @@ class UserFile:
                 sites[name] = place
         return sites
 
-    def tendon_sites(self, links: dict[str, str], muscles: dict[str, str]) -> TendonSites:
-        """Return the names of the tendons' movable sites, by muscle and place.
+    def sites_of(
+        self, robot: Robot, links: Sequence[str], muscles: Sequence[str]
+    ) -> list[list[str | None]]:
+        """Return the site of each muscle's route points; None for a site that cannot be moved.
 
         Args:
-            links: Name of the link of each body, by the name of the body.
-            muscles: Name of the muscle of each tendon, by the name of the tendon.
+            robot: The robot that was imported from the file.
+            links: Name of the link of each body of the file.
+            muscles: Name of the muscle of each tendon of the file.
         """
-        model, found = self.model, dict[tuple[str, Place], set[str]]()
-        for t in range(model.ntendon):
-            path = slice(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])
-            is_site = model.wrap_type[path] == mujoco.mjtWrap.mjWRAP_SITE
-            for site in map(model.site, model.wrap_objid[path][is_site].tolist()):
-                body, xyz = model.body(site.bodyid[0]).name, self.sites.get(site.name)
-                if body in links and xyz is not None:
-                    at = links[body], tuple(np.rint(1e7 * xyz).astype(int).tolist())
-                    found.setdefault((muscles[model.tendon(t).name], at), set()).add(site.name)
-        # If a tendon has two sites in one place, it is unknown which one a route point is.
-        return {key: min(names) for key, names in found.items() if len(names) == 1}
+        model, paths = self.model, dict[str, list[tuple[Place, str]]]()
+        for t, muscle in enumerate(muscles):
+            items = slice(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])
+            is_site = model.wrap_type[items] == mujoco.mjtWrap.mjWRAP_SITE
+            paths[muscle] = [
+                (place(links[model.site_bodyid[i]], model.site_pos[i]), model.site(i).name)
+                for i in model.wrap_objid[items][is_site].tolist()
+            ]
+        result = list[list[str | None]]()
+        for muscle, route in zip(robot.muscles, robot.description.routes, strict=True):
+            path, names, start = paths.get(muscle, []), list[str | None](), 0
+            for point in (item for item in route if isinstance(item, RoutePoint)):
+                here = place(point.link, point.xyz)
+                k = next((k for k in range(start, len(path)) if path[k][0] == here), None)
+                name = None if k is None else path[k][1]
+                names.append(name if name in self.sites else None)
+                start = start if k is None else k + 1
+            result.append(names)
+        return result
 
     def move(self, name: str, xyz: Array) -> None:
         """Move the site `name` to `xyz` [m], (3,), in the frame of its body, in the file's text."""
@@ -190,6 +205,11 @@ class UserFile:
         for start, end, new in sorted(edits, reverse=True):
             text = text[:start] + new + text[end:]
         return text
+
+
+def place(link: str, xyz: Array) -> Place:
+    """Return a position of a link [m], (3,), as a value that can be compared."""
+    return link, tuple(np.rint(1e7 * xyz).astype(int).tolist())
 
 
 def _without_comments(text: str) -> str:

@@ -89,7 +89,7 @@ class Metadata(Strict, frozen=True):
     #: duration of motion in the touch statistics [s]; None if there are no touch statistics
     touch_time: Annotated[float, Meta(ge=0.0, le=LARGEST)] | None
     uncertain: bool  # whether the covariance of the estimates is included
-    spread: bool = False  # whether the possible errors of the learned lengths are included
+    length_spread: bool = False  # whether the possible errors of the learned lengths are included
     drive: bool = False  # whether learned constants of motor currents are included
     elastic: bool = False  # whether learned springs of the joints are included
     #: for each group's block, the index of its base (the block whose inputs it uses as well) or,
@@ -164,7 +164,7 @@ class Metadata(Strict, frozen=True):
             shapes['touch.drive_covariance'] = len(self.muscles), 3, 3
         if self.uncertain:
             shapes['covariance'] = len(self.joints), len(self.joints)
-        if self.spread:
+        if self.length_spread:
             shapes['length_spread'] = (len(self.muscles),)
         if self.elastic:
             count = len(self.joints)
@@ -210,7 +210,7 @@ def to_bytes(mae: Mae) -> bytes:
         'touch_time': None if touch is None else touch.time,
         'drive': touch is not None and touch.drive is not None,
         'uncertain': mae.covariance is not None,
-        'spread': mae.length_spread is not None,
+        'length_spread': mae.length_spread is not None,
         'elastic': mae.elasticity is not None,
     }
     return save_tensors(

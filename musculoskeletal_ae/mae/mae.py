@@ -308,8 +308,8 @@ class Mae:
     touch: TouchStatistics | None = None
     #: covariance of θ_est − θ [rad²], (D, D); None if not yet learned
     covariance: Array | None = None
-    #: how far the learned course of each muscle's length may be wrong (standard deviation over the
-    #: workspace) [m], (M,); None if not yet learned
+    #: how far the learned lengths may be wrong over the workspace [m], (M,), without their means
+    #: (`body_model.covariance.length_spread`); None if not yet learned
     length_spread: Array | None = None
     elasticity: JointElasticity | None = None  # springs of the joints; None if not learned
     #: groups of joints and muscles, each with a block of the network; () for one block

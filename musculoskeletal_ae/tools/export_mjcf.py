@@ -13,7 +13,8 @@ def main(argv: list[str] | None = None) -> int:
     parser = Parser(
         'export_mjcf',
         'Writes the body model of a checkpoint as an MJCF model. Links, joints, limits and masses '
-        'are those of the robot; route points, series elastic elements and friction are learned. '
+        'are those of the robot; series elastic elements and friction are learned, and so are the '
+        'route points of each muscle of which there are enough samples. '
         'A report compares lengths and moment arms with those of the network, and the torques of '
         'weight and springs with those of the robot. With --into, a copy of your MJCF file gets '
         'the learned attachment points instead, and everything else in it stays as it is.',

@@ -148,7 +148,7 @@ def test_meshes_are_found_wherever_an_included_file_places_them(tmp_path):
 def test_another_file_is_refused(learned):
     robot, _, mae, folder = learned
     (folder / 'other.xml').write_text('<mujoco><worldbody/></mujoco>')
-    with pytest.raises(MusculoskeletalError, match='no site at a route point'):
+    with pytest.raises(MusculoskeletalError, match='no tendon with the name and the sites'):
         export_into(robot, mae, folder / 'other.xml', folder / 'refused')
 
 
@@ -183,7 +183,7 @@ def test_a_muscle_keeps_its_points_if_samples_leave_open_how_it_differs(learned)
     open_one = np.zeros(robot.muscle_count)
     open_one[2] = 1.0
     found = learned_routes.learned_routes(robot, body, replace(mae, length_spread=open_one))
-    assert found.kept == {robot.muscles[2]: 'the samples do not determine how it differs'}
+    assert found.kept == {robot.muscles[2]: 'too few samples to tell how it differs'}
     assert found.routes[2] is robot.description.routes[2]
 
 
@@ -193,17 +193,28 @@ def test_a_directory_in_use_is_refused(learned):
         export(robot, mae, folder)
 
 
-def test_two_sites_in_one_place_are_told_apart_by_their_tendons(tmp_path):
+TWINS = """<mujoco><compiler autolimits="true"/><worldbody>
+  <site pos=".03 0 .1" name="a0"/><site pos=".03 0 .1" name="b0"/><site pos="-.03 0 .1" name="c0"/>
+  <body><joint axis="0 1 0" range="-60 60"/><geom size=".01" pos="0 0 -.1" mass=".1"/>
+    <site pos=".03 0 -.1" name="a1"/><site pos=".03 0 -.1" name="b1"/>
+    <site pos="-.03 0 -.1" name="c1"/>
+  </body></worldbody>
+  <tendon><spatial><site site="a0"/><site site="a1"/></spatial>
+    <spatial><site site="b0"/><site site="b1"/></spatial>
+    <spatial><site site="c0"/><site site="c1"/></spatial></tendon></mujoco>"""
+
+
+def test_each_of_two_sites_in_one_place_is_moved_for_its_own_tendon(tmp_path, monkeypatch):
     file = tmp_path / 'twins.xml'
-    file.write_text("""<mujoco><worldbody>
-      <site name="a0" pos="0 0 .1"/><site name="b0" pos="0 0 .1"/><site name="of both"/>
-      <body name="link"><joint/><geom size=".01"/><site name="a1"/><site name="b1"/></body>
-    </worldbody><tendon>
-      <spatial name="a"><site site="of both"/><site site="a0"/><site site="a1"/></spatial>
-      <spatial name="b"><site site="of both"/><site site="b0"/><site site="b1"/></spatial>
-    </tendon></mujoco>""")
-    found = UserFile(file).tendon_sites({'world': 'base', 'link': 'hand'}, {'a': 'm', 'b': 'n'})
-    above, origin = ('base', (0, 0, 1_000_000)), (0, 0, 0)
-    assert found['m', above] == 'a0' and found['n', above] == 'b0'
-    assert found['m', ('hand', origin)] == 'a1' and found['n', ('hand', origin)] == 'b1'
-    assert found['m', ('base', origin)] == found['n', ('base', origin)] == 'of both'
+    file.write_text(TWINS)
+    robot = import_robot(file, tmp_path / 'robot').robot
+    shifts = np.array([[[0.0, 0.0, 0.001 * (2 * m + k)] for k in range(2)] for m in range(3)])
+    monkeypatch.setattr(CalibratedBody, 'link_shifts', lambda _, m: list(shifts[m]))
+    never = np.zeros(robot.muscle_count, dtype=bool)
+    monkeypatch.setattr(learned_routes, 'newly_jumping', lambda *_: never)
+    exact = learned_routes.Errors(np.zeros(3), np.zeros(3))
+    monkeypatch.setattr(learned_routes, 'errors', lambda *_: exact)
+    export_into(robot, initial_mae(robot, steps=1), file, tmp_path / 'out')
+    again = mujoco.MjModel.from_xml_path(str(tmp_path / 'out' / 'twins.xml'))
+    heights = [again.site(f'{name}{k}').pos[2] for name in 'abc' for k in range(2)]
+    np.testing.assert_allclose(heights, [0.1, -0.099, 0.102, -0.097, 0.104, -0.095], atol=1e-9)

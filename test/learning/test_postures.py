@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The body and the postures are fitted together, with any combination of sensors."""
 
+import re
+import shutil
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -21,10 +23,13 @@ from musculoskeletal_ae.robot.robot import Robot
 class Resting(Stage):
     """Generates samples of a body whose muscles hold its weight, as in a real rest."""
 
+    def postures(self, count: int) -> np.ndarray:
+        return self.body.robot.random_postures(count, self.rng)
+
     def observations(self, count: int, push: float = 0.0) -> Observations:
         """Return rests; muscles that `push` [N·m] hold the last joint at its upper stop."""
         robot, body = self.body.robot, self.body
-        theta = robot.random_postures(count, self.rng)
+        theta = self.postures(count)
         if push:
             theta[:, -1] = robot.upper[-1]
         weight = robot.kinematics.holding_torque(theta)
@@ -177,21 +182,65 @@ def test_the_jacobian_of_the_residuals_is_the_difference_quotient(arm26, resting
         column += layout.size
 
 
-def test_a_joint_that_is_always_at_its_stop_does_not_spoil_the_moment_arms(arm26, resting):
-    observed = resting.observations(20, push=10.0)
-    body, theta = CalibratedBody(arm26), arm26.random_postures(50, np.random.default_rng(4))
-    fit_body(body, observed)
-    tension = np.full((50, arm26.muscle_count), 60.0)
+def arms_of_last_joint(body: CalibratedBody) -> np.ndarray:
+    """Return the moment arms [m] of the last joint of arm26 in 50 postures, (50, M)."""
+    theta = body.robot.random_postures(50, np.random.default_rng(4))
+    tension, step = np.full((50, body.robot.muscle_count), 60.0), np.array([0.0, 1e-4])
+    ends = (body.lengths(theta + sign * step, tension, 0.0 * tension)[0] for sign in (1, -1))
+    return np.subtract(*ends) / 2e-4
 
-    def moment_arms(of: CalibratedBody) -> np.ndarray:
-        step = np.array([0.0, 1e-4])
-        ends = (of.lengths(theta + sign * step, tension, 0.0 * tension)[0] for sign in (1, -1))
-        return np.subtract(*ends) / 2e-4
 
-    true = moment_arms(resting.body)
-    before = np.abs(moment_arms(CalibratedBody(arm26)) - true).mean()
-    after = np.abs(moment_arms(body) - true).mean()
-    assert after < before
+def test_a_joint_that_is_always_at_its_stop_does_not_spoil_the_moment_arms(arm26, other_body):
+    true, geometric = arms_of_last_joint(other_body), arms_of_last_joint(CalibratedBody(arm26))
+    errors = []
+    for seed in range(4, 7):
+        body = CalibratedBody(arm26)
+        fit_body(body, Resting(other_body, seed).observations(20, push=10.0))
+        errors.append(np.abs(arms_of_last_joint(body) - true).mean())
+    # Measured: 3.29 mm for the geometric model and 3.19 mm, or 3.9 mm if the joint counts as free.
+    assert np.mean(errors) < 1.07 * np.abs(geometric - true).mean()
+
+
+def test_the_sensor_of_a_joint_that_rests_near_its_limit_keeps_its_offset(arm26):
+    class Parked(Resting):
+        def postures(self, count: int) -> np.ndarray:
+            theta = super().postures(count)
+            theta[:, -1] = self.body.robot.upper[-1] - 0.05
+            return theta
+
+    for seed, count in ((0, 8), (1, 3), (4, 8)):
+        body = CalibratedBody(arm26)
+        fit_body(body, Parked(drawn_body(arm26, 7, 3 + seed, 0.7), seed).observations(count))
+        assert abs(body.zero[-1]) < 0.02
+
+
+def test_a_joint_of_narrow_range_is_learned(arm26, tmp_path):
+    folder = shutil.copytree(arm26.description.directory, tmp_path / 'narrow')
+    urdf = (folder / 'robot.urdf').read_text()
+    before, after = urdf.rsplit('<limit', 1)
+    after = re.sub(
+        'upper="[^"]*"', 'upper="0.72"', re.sub('lower="[^"]*"', 'lower="0.6"', after, 1), 1
+    )
+    (folder / 'robot.urdf').write_text(f'{before}<limit{after}')
+    robot = Robot.load(folder)
+    other, body = drawn_body(robot, 7, 3, 0.7), CalibratedBody(robot)
+    fit_body(body, Resting(other, 0).observations(20))
+    assert abs(body.zero[-1]) < 0.02
+
+
+def test_lengths_are_wrong_by_about_as_much_as_their_spread_says(arm26):
+    ratios = []
+    theta = arm26.random_postures(100, np.random.default_rng(6))
+    tension = np.tile(arm26.tension.bias, (100, 1))
+    for seed in range(5):
+        other, body = drawn_body(arm26, 7, seed, 1.0), CalibratedBody(arm26)
+        other.remainder = body.remainder
+        spread = length_spread(body, fit_body(body, Resting(other, seed).observations(15)), seed)
+        lengths = (each.lengths(theta, tension, 0.0 * tension)[0] for each in (other, body))
+        ratios.append(np.subtract(*lengths).std(axis=0) / spread)
+    print(np.round(np.array(ratios), 2))
+    # Measured: at most 1.1. The spread also covers errors that these bodies do not have.
+    assert np.median(ratios) < 2.0 and np.quantile(ratios, 0.9) < 3.0
 
 
 def test_samples_of_one_posture_leave_open_how_lengths_change(arm26, observed):
