@@ -217,11 +217,10 @@ def test_the_sensor_of_a_joint_that_rests_near_its_limit_keeps_its_offset(arm26)
 def test_a_joint_of_narrow_range_is_learned(arm26, tmp_path):
     folder = shutil.copytree(arm26.description.directory, tmp_path / 'narrow')
     urdf = (folder / 'robot.urdf').read_text()
-    before, after = urdf.rsplit('<limit', 1)
-    after = re.sub(
-        'upper="[^"]*"', 'upper="0.72"', re.sub('lower="[^"]*"', 'lower="0.6"', after, 1), 1
-    )
-    (folder / 'robot.urdf').write_text(f'{before}<limit{after}')
+    before, last = urdf.rsplit('<limit', 1)
+    for name, limit in (('lower', 0.6), ('upper', 0.72)):
+        last = re.sub(f'{name}="[^"]*"', f'{name}="{limit}"', last, count=1)
+    (folder / 'robot.urdf').write_text(f'{before}<limit{last}')
     robot = Robot.load(folder)
     other, body = drawn_body(robot, 7, 3, 0.7), CalibratedBody(robot)
     fit_body(body, Resting(other, 0).observations(20))
