@@ -300,6 +300,9 @@ A model that cannot work is refused with the reason, before any training.
 ## Sources
 
 {sources}
+
+The Aero hand was measured without its meshes, and the ostrich with another mesh for its head,
+because the clones lack them. The masses and inertias are stated in the files.
 """
 
 
