@@ -114,12 +114,12 @@ def test_models_that_several_individuals_have_learned_show_median_and_range(tmp_
         for seed, after in ((1, 0.3), (2, 0.1), (3, 0.2))
     ]
     result = {'joints': 1, 'muscles': 6, 'known': 1.0, 'held': '100 %', 'first': 3.0, 'whole': 20.0}
-    result |= {
-        f'{kind}_{what}': 0.001 for kind in ('file', 'exported') for what in ('length', 'arm')
-    }
+    result |= {'file_lengths': [0.001, 0.003], 'exported_lengths': [0.001, 0.001]}
+    result |= {'file_arms': [0.002, 0.004], 'exported_arms': [0.002, 0.005]}
     result |= {'individuals': individuals, 'still': ['elbow'], 'commit': 'abc'}
     (tmp_path / 'arm26').mkdir()
     (tmp_path / 'arm26' / 'result.json').write_text(json.dumps(result))
     main(['mujoco_models', str(tmp_path), '--out', str(tmp_path), '--only', 'arm26'])
     printed = capsys.readouterr().out
     assert '0.400 (0.400 to 0.400) → 0.200 (0.100 to 0.300); without elbow' in printed
+    assert '1, 1 worse | 2.00 → 1.00 | 3.00 → 3.50' in printed
