@@ -24,10 +24,10 @@ with the same initial network and are not exported. The numbers of a model are
 - the estimation error on 60 s of held-out motion before and after learning [rad, norm over the
   joints that contacts let move], and the number of rest samples: median and range over the
   individuals,
-- the difference of each muscle from the individual in length (standard deviation) and moment arms
-  (root mean square) [mm], over POSTURES random postures: of the file, and of the exported model;
-  their means over the muscles, how many muscles have learned points, and how many of these are
-  further from the individual than in the file.
+- how many muscles of the exported model have learned points, and how many of these differ more from
+  the individual than in the file,
+- how far the file and the exported model differ from the individual over POSTURES random postures
+  [mm, mean over the muscles]: in length (standard deviation) and moment arms (root mean square).
 
 If a model is refused, the reason is stored with the CPU time after which it was known.
 
@@ -65,7 +65,7 @@ from musculoskeletal_ae.tools.mujoco_learning import learn
 
 SEEDS = 1, 2, 3  # seeds of the emulated individuals; the first one is also exported
 POSTURES = 200  # compare exported models with the individual in this many postures
-SAME = 1e-6  # ignore differences between file and exported model up to this [m]
+SAME = 1e-6  # regard an exported muscle as unchanged if it differs from the file by less [m]
 QUICK = 10  # divide the number of mini-batches of the initial training by this, without --whole
 SOON = 10.0  # name what cannot work within this time [s]
 #: file of a complete result, and of one that has only the prospects
@@ -184,10 +184,11 @@ def held_text(found: Prospects) -> str:
 
 
 def differences(robot: Robot, body: Any, theta: Array) -> tuple[Array, Array]:
-    """Return each muscle's difference in length and moment arms from an individual [m], (M,).
+    """Return how far each muscle of a robot differs from the same muscle of an individual [m].
 
-    They are the standard deviation of the length and the root mean square of the moment arms over
-    postures θ (N, D).
+    Returns:
+        The standard deviation of the difference in length over postures θ (N, D), and the root mean
+        square of the difference in moment arms, (M,) each.
     """
     length = robot.routes.absolute_lengths(theta) - body.absolute_lengths(theta)
     return length.std(axis=0), arm_errors(robot.routes.muscle_jacobian, body.muscle_jacobian, theta)
@@ -227,13 +228,14 @@ def cells(model: Model, result: dict[str, Any]) -> list[str]:
     head = [model.name, size, result['held'], f'{result["known"]:.1f}']
     if 'whole' not in result:
         return [*head, *('–' for _ in HEAD[len(head) :])]
-    pairs = [[np.array(result[f'{kind}_{what}']) for kind in ('file', 'exported')]
-             for what in ('lengths', 'arms')]  # fmt: skip
-    length, arm = (
-        f'{1e3 * before.mean():.2f} → {1e3 * after.mean():.2f}' for before, after in pairs
+    before, after = (
+        np.array([result[f'{kind}_lengths'], result[f'{kind}_arms']])
+        for kind in ('file', 'exported')
     )
-    is_moved = np.logical_or.reduce([np.abs(after - before) > SAME for before, after in pairs])
-    is_worse = np.logical_or.reduce([after > before + SAME for before, after in pairs])
+    means = zip(1e3 * before.mean(axis=1), 1e3 * after.mean(axis=1), strict=True)
+    length, arm = (f'{first:.2f} → {last:.2f}' for first, last in means)
+    is_moved = (np.abs(after - before) > SAME).any(axis=0)
+    is_worse = (after > before + SAME).any(axis=0)
     moved = f'{is_moved.sum()}, {is_worse.sum()} worse' if is_moved.any() else '0'
     times = f'{result["first"]:.0f}', f'{result["whole"]:.0f}'
     found = [values(result, name, '.3f') for name in ('before', 'after')]

@@ -2,6 +2,7 @@
 """How far learned angles, lengths and constants of motor currents may be wrong."""
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -91,20 +92,13 @@ def drive_covariance(body: CalibratedBody, fit: FittedBody) -> Array | None:
         return None
     covariance = np.empty((len(body.layouts), 3, 3))
     share = min(1.0, INDEPENDENT_SAMPLES / len(fit.theta))
-    for muscles, root in fit.root:
-        end = 0
-        for m in muscles.tolist():
-            layout = body.layouts[m]
-            places = end + np.arange(layout.size)[layout.drive]
-            unit = np.zeros((len(root), 3))
-            unit[places, range(3)] = 1.0
-            half = solve_triangular(root, unit, trans='T')
-            prior = np.diag(1.0 / np.square(PRIOR.drive))
-            observed = np.linalg.inv(half.T @ half) - prior
-            widened = np.linalg.inv(prior + share * observed)
-            scale = body.drive_units[:, m]
-            covariance[m] = scale[:, None] * (0.5 * (widened + widened.T)) * scale
-            end += layout.size
+    for m, of_muscle in _muscle_covariances(body, fit):
+        drive = body.layouts[m].drive
+        prior = np.diag(1.0 / np.square(PRIOR.drive))
+        observed = np.linalg.inv(of_muscle[drive, drive]) - prior
+        widened = np.linalg.inv(prior + share * observed)
+        scale = body.drive_units[:, m]
+        covariance[m] = scale[:, None] * (0.5 * (widened + widened.T)) * scale
     return covariance
 
 
@@ -121,16 +115,24 @@ def length_spread(body: CalibratedBody, fit: FittedBody, seed: int) -> Array:
     theta = robot.random_postures(WORKSPACE, np.random.default_rng([seed, 0x1E]))
     poses, still = body.poses(theta), np.zeros(WORKSPACE)
     spread = np.empty(robot.muscle_count)
-    for muscles, root in fit.root:
-        inverse, end = solve_triangular(root, np.eye(len(root))), 0
-        for m in muscles.tolist():
-            layout, tension = body.layouts[m], np.full(WORKSPACE, robot.tension.bias[m])
-            places = end + np.arange(layout.size)[layout.attachment]
-            slope = body.linearised(poses, tension, still, m)[1][:, layout.attachment]
-            errors = (slope - slope.mean(axis=0)) @ inverse[places]
-            spread[m] = math.sqrt(np.square(errors).sum(axis=1).mean())
-            end += layout.size
+    for m, of_muscle in _muscle_covariances(body, fit):
+        points, tension = body.layouts[m].attachment, np.full(WORKSPACE, robot.tension.bias[m])
+        slope = body.linearised(poses, tension, still, m)[1][:, points]
+        slope -= slope.mean(axis=0)
+        variance = np.einsum('ni,ij,nj->n', slope, of_muscle[points, points], slope)
+        spread[m] = math.sqrt(variance.mean())
     return spread
+
+
+def _muscle_covariances(body: CalibratedBody, fit: FittedBody) -> Iterator[tuple[int, Array]]:
+    """Yield each muscle and the posterior covariance of its parameters w, (P, P)."""
+    for muscles, root in fit.root:
+        end = 0
+        for m in muscles.tolist():
+            size = body.layouts[m].size
+            half = solve_triangular(root, np.eye(len(root), size, -end), trans='T')
+            yield m, half.T @ half
+            end += size
 
 
 def _drawn_errors(

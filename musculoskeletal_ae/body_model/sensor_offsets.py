@@ -54,14 +54,15 @@ NEAR_STOP = 0.05
 #: conclude that muscles push a joint against its stop if the unbalanced torque exceeds the usual
 #: one by this factor
 LEAST_PUSH = 3.0
-#: assume that unbalanced torques are usually at least this share of the muscles' summed absolute
-#: torques at a joint
+#: assume that the usual unbalanced torque at a joint is at least this share of the muscles' summed
+#: absolute torques
 LEAST_TORQUE = 0.01
-#: assume this share if a joint is near a limit in every sample, so that its torques tell nothing
+#: Assume that it is this share if the joint is near a limit in every sample. It could be at a stop
+#: in all of them, so the samples do not show the usual torque.
 UNKNOWN_TORQUE = 0.05
-#: distinguish samples near a limit only for a joint whose range is larger than this multiple of the
-#: distance that counts as near
-LEAST_INSIDE = 4.0
+#: If the range of a joint is at most this multiple of the distance that counts as near, the joint
+#: is near a limit nearly everywhere. Samples near a limit then count like all others.
+NARROW = 4.0
 #: give every angle this weight relative to that of a stop, so that the normal equations have a
 #: unique solution
 SMALL = 1e-6
@@ -180,8 +181,8 @@ class Stops:
     def usual_torque(self, own: Array, torque: Array, load: Array) -> Array:
         """Return the usual unbalanced torque at each joint [N·m], (D,).
 
-        At a stop, the unbalanced torque is that of the stop and not usual. Samples near a limit are
-        therefore left out if they are the majority, unless the whole range is near the limits.
+        Near a limit, a stop may exert the torque that is missing, and the median over all samples
+        would call its torque usual if most samples are there. In this case, they are left out.
 
         Args:
             own: Joint angles θ of the group [rad], (N, D).
@@ -189,10 +190,10 @@ class Stops:
             load: Usual sum of the muscles' absolute torques at each joint [N·m], (D,).
         """
         near = np.logical_or(*self._near_limits(own))
-        has_inside = self._upper - self._lower > LEAST_INSIDE * self._near
-        is_mostly_near = has_inside & (near.mean(axis=0) > 0.5)
-        inside = np.ma.array(np.abs(torque), mask=near & is_mostly_near)
-        usual = 1.5 * np.ma.median(inside, axis=0)
+        is_wide = self._upper - self._lower > NARROW * self._near
+        is_mostly_near = is_wide & (near.mean(axis=0) > 0.5)
+        usable = np.ma.array(np.abs(torque), mask=near & is_mostly_near)
+        usual = 1.5 * np.ma.median(usable, axis=0)
         return np.maximum(usual.filled(UNKNOWN_TORQUE * load), LEAST_TORQUE * load + SMALL)
 
     def are_free(self, own: Array, score: Array) -> Bools:

@@ -33,7 +33,6 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.exporting.learned_routes import learned_routes
 from musculoskeletal_ae.exporting.user_file import UserFile
 from musculoskeletal_ae.files import new_directory
-from musculoskeletal_ae.importing.source import names_of_all
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.description import RoutePoint
 from musculoskeletal_ae.robot.drawing import SHORTEST_BONE
@@ -132,11 +131,8 @@ def export_into(robot: Robot, mae: Mae, file: Path, out: Path, seed: int = 0) ->
         return MusculoskeletalError(f'{where}: {problem}')
 
     user = UserFile(file)
-    bodies = [user.model.body(i).name for i in range(user.model.nbody)]
-    tendons = [user.model.tendon(i).name for i in range(user.model.ntendon)]
-    links, muscles = names_of_all('body', bodies), names_of_all('tendon', tendons)
-    sites = user.sites_of(robot, links, muscles)
-    if not any(filter(None, chain(*sites))):
+    sites = user.sites_of(robot)
+    if not any(chain(*sites)):
         raise refuse(
             file,
             f'it has no tendon with the name and the sites of a muscle of '

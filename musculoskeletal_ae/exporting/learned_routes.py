@@ -3,10 +3,11 @@
 
 Learned points are fitted to the lengths of the network. A muscle keeps its original points
 
-- if the samples do not determine how its length differs, for example because a joint never moved,
-- if the learned points are not closer to the network, because the arm differs in ways that route
-  points cannot express,
-- or if its length would jump where a tendon slips over an object that it wraps around.
+- if there are too few samples to tell how its length differs, for example because a joint never
+  moved,
+- if the arm differs in ways that route points cannot express, so that learned points are not closer
+  to the network,
+- or if its length would jump in some posture, because its tendon slips over an object there.
 """
 
 from collections.abc import Sequence
@@ -25,7 +26,7 @@ POSTURES = 400  # compare routes with the network in this many postures
 #: keep the points of a muscle unless its length changes by more than this multiple of what the
 #: samples leave open (`Mae.length_spread`)
 CLEAR = 2.5
-#: identifies what is moved: a site of the user's file, or else a point of a muscle, (m, k)
+#: what moves as one: a site of the user's file, by its name, or route point k of muscle m, (m, k)
 Site = str | tuple[int, int]
 
 

@@ -9,7 +9,6 @@ that lie beside an included file.
 """
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -17,6 +16,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
+from musculoskeletal_ae.importing.source import names_of_all
 from musculoskeletal_ae.robot.description import RoutePoint
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -86,17 +86,14 @@ class UserFile:
                 sites[name] = place
         return sites
 
-    def sites_of(
-        self, robot: Robot, links: Sequence[str], muscles: Sequence[str]
-    ) -> list[list[str | None]]:
+    def sites_of(self, robot: Robot) -> list[list[str | None]]:
         """Return the site of each muscle's route points; None for a site that cannot be moved.
 
-        Args:
-            robot: The robot that was imported from the file.
-            links: Name of the link of each body of the file.
-            muscles: Name of the muscle of each tendon of the file.
+        `robot` was imported from the file. Its route points are in the order of the tendons' sites.
         """
         model, paths = self.model, dict[str, list[tuple[Place, str]]]()
+        links = names_of_all('body', (model.body(i).name for i in range(model.nbody)))
+        muscles = names_of_all('tendon', (model.tendon(i).name for i in range(model.ntendon)))
         for t, muscle in enumerate(muscles):
             items = slice(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])
             is_site = model.wrap_type[items] == mujoco.mjtWrap.mjWRAP_SITE

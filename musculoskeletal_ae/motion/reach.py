@@ -41,9 +41,9 @@ from musculoskeletal_ae.robot.joint_stops import AT_STOP, supporting_stops
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
-#: Refuse a path unless the muscles that are not isolated could exert this share of SUPPORT σ more
-#: than it needs, in the direction of the motion. The share makes it σ, the residual torque of the
-#: healthy arm.
+#: Refuse a path of an arm with isolated muscles if the others cannot exert more torque in the
+#: direction of the motion than it needs, by this multiple of SUPPORT σ. SUPPORT is 2, so they need
+#: σ more: the residual torque of the healthy arm.
 RESERVE = 0.5
 NOTABLE = 0.05  # treat a posture as not holdable if it lacks more torque than this [N·m]
 HALVINGS = 6  # search for the last holdable posture of a path with this many bisection steps

@@ -23,15 +23,18 @@ from musculoskeletal_ae.robot.robot import Robot
 class Resting(Stage):
     """Generates samples of a body whose muscles hold its weight, as in a real rest."""
 
-    def postures(self, count: int) -> np.ndarray:
-        return self.body.robot.random_postures(count, self.rng)
+    def observations(
+        self, count: int, below_stop: float | None = None, push: float = 0.0
+    ) -> Observations:
+        """Return rests.
 
-    def observations(self, count: int, push: float = 0.0) -> Observations:
-        """Return rests; muscles that `push` [N·m] hold the last joint at its upper stop."""
+        With `below_stop` [rad], the last joint is always this far below its upper limit. With
+        `push` [N·m], muscles push it upwards harder than its weight, as against a stop.
+        """
         robot, body = self.body.robot, self.body
-        theta = self.postures(count)
-        if push:
-            theta[:, -1] = robot.upper[-1]
+        theta = robot.random_postures(count, self.rng)
+        if below_stop is not None:
+            theta[:, -1] = robot.upper[-1] - below_stop
         weight = robot.kinematics.holding_torque(theta)
         weight[:, -1] += push
         tension = self.rng.uniform(30.0, 200.0, (count, robot.muscle_count))
@@ -195,22 +198,17 @@ def test_a_joint_that_is_always_at_its_stop_does_not_spoil_the_moment_arms(arm26
     errors = []
     for seed in range(4, 7):
         body = CalibratedBody(arm26)
-        fit_body(body, Resting(other_body, seed).observations(20, push=10.0))
+        fit_body(body, Resting(other_body, seed).observations(20, 0.0, push=10.0))
         errors.append(np.abs(arms_of_last_joint(body) - true).mean())
     # Measured: 3.29 mm for the geometric model and 3.19 mm, or 3.9 mm if the joint counts as free.
     assert np.mean(errors) < 1.07 * np.abs(geometric - true).mean()
 
 
 def test_the_sensor_of_a_joint_that_rests_near_its_limit_keeps_its_offset(arm26):
-    class Parked(Resting):
-        def postures(self, count: int) -> np.ndarray:
-            theta = super().postures(count)
-            theta[:, -1] = self.body.robot.upper[-1] - 0.05
-            return theta
-
     for seed, count in ((0, 8), (1, 3), (4, 8)):
         body = CalibratedBody(arm26)
-        fit_body(body, Parked(drawn_body(arm26, 7, 3 + seed, 0.7), seed).observations(count))
+        other = drawn_body(arm26, 7, 3 + seed, 0.7)
+        fit_body(body, Resting(other, seed).observations(count, below_stop=0.05))
         assert abs(body.zero[-1]) < 0.02
 
 
@@ -237,7 +235,6 @@ def test_lengths_are_wrong_by_about_as_much_as_their_spread_says(arm26):
         spread = length_spread(body, fit_body(body, Resting(other, seed).observations(15)), seed)
         lengths = (each.lengths(theta, tension, 0.0 * tension)[0] for each in (other, body))
         ratios.append(np.subtract(*lengths).std(axis=0) / spread)
-    print(np.round(np.array(ratios), 2))
     # Measured: at most 1.1. The spread also covers errors that these bodies do not have.
     assert np.median(ratios) < 2.0 and np.quantile(ratios, 0.9) < 3.0
 
