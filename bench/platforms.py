@@ -254,13 +254,13 @@ def _debian_13(site: Site) -> None:
 def _rclpy(version: str) -> Callable[[Site], None]:
     """Return a function that replaces rclpy in the wheels, with Python 3.12 as on Ubuntu 24.04.
 
-    tf2_msgs and control_msgs, which the wheels lack, are built as well.
+    control_msgs, which the wheels lack, is built as well.
     """
 
     def make(site: Site) -> None:
         _wheels('3.12')(site)
         site.run('dependencies', *SET_UP, on_platform=True)
-        packages = f'rclpy=={version} tf2_msgs control_msgs'
+        packages = f'rclpy=={version} control_msgs'
         site.run(
             f'{packages} from source',
             f'.venv/bin/python -m bench ros_sources {packages}',

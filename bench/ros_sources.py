@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Builds ROS 2 packages that are not on PyPI, and installs them beside the ROS wheels.
 
-    python -m bench ros_sources tf2_msgs control_msgs    # /tf, and the action of the controller
-    python -m bench ros_sources rclpy==7.1.11            # another version of rclpy
+    python -m bench ros_sources control_msgs    # the action of the controller
+    python -m bench ros_sources rclpy==7.1.11   # another version of rclpy
 
 Each package is cloned from the release repository that the packages of apt are built from, and
 compiled against the ROS wheels in a separate virtual environment. The result is a wheel, which pip
@@ -45,7 +45,6 @@ class Release(NamedTuple):
 RELEASES = {
     'control_msgs': Release('control_msgs', '5.9.0'),
     'rclpy': Release('rclpy', '7.1.11'),
-    'tf2_msgs': Release('geometry2', '0.36.20'),
 }
 
 

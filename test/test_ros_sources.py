@@ -18,8 +18,8 @@ def builder(tmp_path, monkeypatch):
     subprocess.run(['git', 'init', '-q', repository], check=True)
     subprocess.run([*git, 'commit', '-q', '--allow-empty', '-m', 'release'], check=True)
     for version in ('0.36.2-1', '0.36.2-2', '0.36.2-10', '0.36.10-1'):
-        subprocess.run([*git, 'tag', f'release/jazzy/tf2_msgs/{version}'], check=True)
-    url = ros_sources.RELEASES['tf2_msgs'].url()
+        subprocess.run([*git, 'tag', f'release/jazzy/control_msgs/{version}'], check=True)
+    url = ros_sources.RELEASES['control_msgs'].url()
     monkeypatch.setenv('GIT_CONFIG_COUNT', '1')
     monkeypatch.setenv('GIT_CONFIG_KEY_0', f'url.file://{repository}.insteadOf')
     monkeypatch.setenv('GIT_CONFIG_VALUE_0', url)
@@ -27,12 +27,12 @@ def builder(tmp_path, monkeypatch):
 
 
 def test_the_last_increment_of_a_release_is_built(builder):
-    assert builder.tag('tf2_msgs', '0.36.2') == 'release/jazzy/tf2_msgs/0.36.2-10'
+    assert builder.tag('control_msgs', '0.36.2') == 'release/jazzy/control_msgs/0.36.2-10'
 
 
 def test_a_version_that_was_not_released_is_refused_with_the_released_ones(builder):
     with pytest.raises(MusculoskeletalError, match=r'legal: 0\.36\.2, 0\.36\.10$'):
-        builder.tag('tf2_msgs', '0.36.3')
+        builder.tag('control_msgs', '0.36.3')
 
 
 def test_an_unknown_package_is_refused_with_the_known_ones(capsys):
@@ -40,4 +40,4 @@ def test_an_unknown_package_is_refused_with_the_known_ones(capsys):
         ros_sources.main(['rviz2'])
     assert ended.value.code == 2
     error = capsys.readouterr().err
-    assert 'rviz2' in error and 'control_msgs, rclpy, tf2_msgs' in error
+    assert 'rviz2' in error and 'control_msgs, rclpy' in error

@@ -1,26 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishers of states, markers and frames for emulated, simulated and estimated arms.
+"""Publishers of states and markers for emulated, simulated and estimated arms.
 
 Markers show bones, muscles and names in RViz and Foxglove. The bones of the hardware are ivory and
-opaque, the bones of the estimate green, and the bones of the simulator violet. Link poses are
-published on /tf.
+opaque, the bones of the estimate green, and the bones of the simulator violet.
 """
 
 from collections.abc import Callable
 
-import pinocchio as pin
-from geometry_msgs.msg import Point, TransformStamped, WrenchStamped
+from geometry_msgs.msg import Point, WrenchStamped
 from sensor_msgs.msg import JointState
 from std_msgs.msg import ColorRGBA, Float64MultiArray, String
 from visualization_msgs.msg import Marker, MarkerArray
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.messages.arrival import LONGEST_STEP
 from musculoskeletal_ae.messages.message_reading import read_wrench
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.robot.drawing import BONE_COLOUR, Line
-from musculoskeletal_ae.robot.kinematics import body_frames
 from musculoskeletal_ae.ros.messages import (
     LATCHED,
     RELIABLE,
@@ -77,36 +73,6 @@ class Markers:
         marker.pose.orientation.w = 1.0
         message.markers.append(marker)
         return marker
-
-
-class Frames:
-    """Publishes link poses on /tf; needs tf2_msgs, which the ROS packages of PyPI lack."""
-
-    def __init__(self, node: Shell) -> None:
-        try:
-            from tf2_msgs.msg import TFMessage
-        except ImportError as error:
-            raise MusculoskeletalError(
-                'parameter publish_tf: tf2_msgs is not installed; install it as described in '
-                'doc/howto/install.md, or set the parameter to "none"'
-            ) from error
-        self._node, self._message = node, TFMessage
-        self._prefix: str = node.parameter('frame_prefix')
-        self._publisher = node.create_publisher(TFMessage, '/tf', RELIABLE)
-
-    def publish(self, theta: Array) -> None:
-        """Publish the poses of all links at the joint angles θ [rad], (D,)."""
-        robot, stamp = self._node.robot, self._node.get_clock().now().to_msg()
-        joints, transforms = robot.kinematics.tree.transforms(theta[None])[0], []
-        for frame in body_frames(robot.kinematics.model):
-            if frame.name != robot.root_link:
-                transform = TransformStamped(child_frame_id=self._prefix + frame.name)
-                transform.header.frame_id, transform.header.stamp = self._node.root_frame, stamp
-                pose = pin.SE3(joints[frame.parentJoint]) * frame.placement
-                p, q = transform.transform.translation, transform.transform.rotation
-                p.x, p.y, p.z, q.x, q.y, q.z, q.w = pin.SE3ToXYZQUAT(pose).tolist()
-                transforms.append(transform)
-        self._publisher.publish(self._message(transforms=transforms))
 
 
 class ArmNode(Shell):

@@ -81,12 +81,6 @@ PARAMETERS: dict[str, dict[str, Parameter]] = {  # all parameters of all nodes, 
         'mirror_muscles': Parameter(
             False, 'publish muscle_joint_states: l and T under the names of the muscles, for plots'
         ),
-        'publish_tf': Parameter(
-            'none',
-            'source of the joint angles for link poses on /tf; requires tf2_msgs '
-            '(doc/howto/install.md)',
-            legal=('none', 'estimate', 'sensor'),
-        ),
     },
     'hardware_emulator': {
         **SHARED,

@@ -3,7 +3,7 @@
 
 muscle_states → estimated_joint_states with estimated_joint_covariance, estimated_muscle_states,
 anomaly, body_state, joint_sensor_trust, estimated_external_wrench, estimated/markers; on request
-muscle_joint_states and /tf.
+muscle_joint_states.
 mae_checkpoint → accepted_checkpoint, the networks that have passed the validation, and
 rejected_checkpoint, the versions of those that have not.
 marker_pose → vision_joint_states, the joint angles measured by a camera.
@@ -32,7 +32,7 @@ from musculoskeletal_ae.estimation.suspect_verification import VerificationVerdi
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.message_reading import read_pose
-from musculoskeletal_ae.nodes.arm_node import Frames, Markers
+from musculoskeletal_ae.nodes.arm_node import Markers
 from musculoskeletal_ae.nodes.candidates import Candidates
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
@@ -110,8 +110,6 @@ class EstimatorNode(Shell):
         self.mirror = None
         if self.parameter('mirror_muscles'):
             self.mirror = publisher(JointState, 'muscle_joint_states', RELIABLE)
-        self.tf_source = self.parameter('publish_tf')
-        self.frames = None if self.tf_source == 'none' else Frames(self)
 
     # -- parameters and services ----------------------------------------------------------------
 
@@ -188,8 +186,6 @@ class EstimatorNode(Shell):
 
     def _on_joints(self, theta: Array) -> None:
         self.core.joints(theta, time.monotonic())
-        if np.isfinite(theta).all() and self.frames is not None and self.tf_source == 'sensor':
-            self.frames.publish(theta)
 
     def _on_command(self, kind: str, command: Array) -> None:
         if kind == 'length':
@@ -222,8 +218,6 @@ class EstimatorNode(Shell):
 
     def _publish(self, output: Output, stamp: Any, now: float) -> None:
         state, sample = output.state, output.sample
-        if self.frames is not None and self.tf_source == 'estimate':
-            self.frames.publish(state.theta)
         if self.core.body.offsets.known:
             self.core.networks.message(
                 sample.tension_read, sample.length, sample.sliding, now, self.core.measured

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Topics for RViz, Foxglove and PlotJuggler: distinguishable arms, names and frames."""
+"""Topics for RViz, Foxglove and PlotJuggler: distinguishable arms and names."""
 
 import json
-import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import yaml
 from geometry_msgs.msg import Point
@@ -13,11 +11,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from visualization_msgs.msg import Marker, MarkerArray
 
-from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.nodes.arm_node import Frames
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
-from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.ros_tools import render
 
 CONFIG = Path(__file__).parents[2] / 'config'
@@ -85,33 +80,6 @@ def test_render_refuses_an_unknown_file_type(capsys):
         render.main(['--out', 'arm.foo'])
     refusal = capsys.readouterr().err
     assert 'arm.foo' in refusal and '.png' in refusal
-
-
-def test_without_tf2_msgs_the_parameter_publish_tf_is_refused(graph, monkeypatch):
-    shell = graph.host(lambda **options: Shell('estimator', **options))
-    for module in ('tf2_msgs', 'tf2_msgs.msg'):
-        monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(MusculoskeletalError, match='tf2_msgs is not installed'):
-        Frames(shell)
-
-
-def test_poses_of_all_links_go_to_tf(graph):
-    message = pytest.importorskip('tf2_msgs.msg', reason='tf2_msgs is not installed')
-    shell = graph.host(lambda **options: Shell('estimator', **options), frame_prefix='a/')
-    received = graph.listen(message.TFMessage, '/tf')
-    robot, frames = shell.robot, Frames(shell)
-    theta = 0.5 * (robot.lower + robot.upper)
-
-    def is_received():
-        frames.publish(theta)
-        return received
-
-    transforms = graph.wait(is_received, 'poses')[0].transforms
-    assert {t.header.frame_id for t in transforms} == {f'a/{robot.root_link}'}
-    poses = {t.child_frame_id: t.transform.translation for t in transforms}
-    hand = robot.kinematics.end_effector_pose(theta).translation
-    end = poses[f'a/{robot.description.end_effector}']
-    np.testing.assert_allclose([end.x, end.y, end.z], hand)
 
 
 def test_the_layouts_for_rviz_and_foxglove_show_existing_topics():

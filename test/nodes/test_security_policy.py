@@ -51,7 +51,7 @@ def test_a_node_uses_exactly_the_rights_of_the_policy(graph, name, tmp_path):
     used = names(node.get_publisher_names_and_types_by_node(*own))
     allowed = {topic.replace(f'{name}/', '~/') for topic in rights(name, 'topics', 'publish')}
     allowed |= of_actions(name, 'feedback', 'status')
-    assert used == allowed - {'/tf'}  # published only with tf2_msgs and the parameter publish_tf
+    assert used == allowed
     used = names(node.get_subscriber_names_and_types_by_node(*own))
     allowed = {topic.replace(f'{name}/', '~/') for topic in rights(name, 'topics', 'subscribe')}
     # A node subscribes to /clock only with use_sim_time, to vision_joint_states only if a camera is
