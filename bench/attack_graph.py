@@ -50,9 +50,9 @@ from musculoskeletal_ae.nodes.declared_parameters import PARAMETERS
 from musculoskeletal_ae.nodes.reported_conditions import Situation
 from musculoskeletal_ae.process_signals import STOP
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.ros.messages import LATCHED, bytes_message
+from musculoskeletal_ae.ros.message_building import LATCHED, bytes_message
 from musculoskeletal_ae.ros_tools.ros_tool import Spinner, message_class
-from musculoskeletal_ae.signals.muscle_readings import raw_muscle_states
+from musculoskeletal_ae.signals.muscle_states import raw_muscle_states
 
 NODES = ('hardware_emulator', 'estimator', 'controller', 'learner', 'sim', 'bringup_status')
 RUN = 'import sys; from musculoskeletal_ae.nodes import running; running.run(sys.argv.pop(1))'

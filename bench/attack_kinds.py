@@ -24,8 +24,8 @@ from bench.attack_graph import COOLING, NODES, OWN, PATIENCE, Attack, digest, se
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import LENGTH_SCALE
-from musculoskeletal_ae.remedy import Step
-from musculoskeletal_ae.ros.messages import LATCHED, array_message, bytes_message
+from musculoskeletal_ae.remedy_steps import Step
+from musculoskeletal_ae.ros.message_building import LATCHED, array_message, bytes_message
 from musculoskeletal_ae.signals.body_state import Anomaly, BodyState, LengthOffsets
 
 MOMENTS = 'holding', 'exploring'

@@ -42,7 +42,7 @@ from musculoskeletal_ae.learning.state_directory import StateStore
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.signals.body_state import BodyState
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 
 CORES = 2  # simulate a computer with this many cores
 #: let a process wait for the processor for this mean time, for each process per core [s]

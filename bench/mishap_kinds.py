@@ -22,8 +22,8 @@ from bench.lab import CONTROLLER, ESTIMATOR, LEARNER, CommandFault, Lab, Packet,
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.remedy import Step
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings, Quantity
+from musculoskeletal_ae.remedy_steps import Step
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings, Quantity
 
 Rng = np.random.Generator
 

@@ -66,7 +66,7 @@ from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.explored_postures import holdable_postures
 from musculoskeletal_ae.options import Parser, names, positive
-from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.remedy_steps import Step
 from musculoskeletal_ae.robot.robot import Robot
 
 LEARNING = 180.0  # let an individual explore and learn for this time before its mishaps [s]

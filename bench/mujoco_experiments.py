@@ -55,7 +55,7 @@ from musculoskeletal_ae.exporting.exported_mjcf import export_into
 from musculoskeletal_ae.exporting.learned_routes import errors as route_errors
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae import checkpoint
-from musculoskeletal_ae.motion import reach, slowness
+from musculoskeletal_ae.motion import holdable_paths, slowness
 from musculoskeletal_ae.motion.explored_postures import holdable_postures
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.presets.preset import PAPER_PRESET
@@ -101,7 +101,7 @@ def holdable(study: Study, seed: int) -> Iterator[Array]:
 
 
 def can_exert(
-    limits: reach.ReachLimits, muscle_jacobian: MuscleJacobian, planned: Trajectory
+    limits: holdable_paths.PathLimits, muscle_jacobian: MuscleJacobian, planned: Trajectory
 ) -> bool:
     """Return whether the muscles can exert the torque of a trajectory throughout the motion.
 
@@ -124,7 +124,7 @@ def exertable_path(study: Study, seed: int) -> list[Array]:
     Raises:
         MusculoskeletalError: If too few of the random postures qualify.
     """
-    arm, limits = study.arm(seed), reach.ReachLimits(study.robot, study.network(seed))
+    arm, limits = study.arm(seed), holdable_paths.PathLimits(study.robot, study.network(seed))
     path, duration = [arm.theta], motion.STARTING
     for theta in holdable(study, seed):
         straight = Trajectory.to(Setpoint.resting(path[-1]), theta, duration)

@@ -21,7 +21,7 @@ from std_msgs.msg import Float64MultiArray
 from bench.processes import end_processes
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.ros.messages import array_message
+from musculoskeletal_ae.ros.message_building import array_message
 
 ROBOT = 'arm26'
 PATIENCE = 120.0  # wait at most this long for an estimate, because the machine may be busy [s]

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from musculoskeletal_ae.control.controller import Controller
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.remedy_steps import Step
 from musculoskeletal_ae.robot.robot import Robot
 
 

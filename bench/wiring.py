@@ -38,9 +38,9 @@ from musculoskeletal_ae.experiments.recording import SAMPLE_TIME
 from musculoskeletal_ae.experiments.workers import workers
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.options import Parser
-from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.remedy_steps import Step
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.signals.wiring import Wiring
 

@@ -77,7 +77,7 @@ MODULES = {
     'estimation/finding.py': ['Finding', 'Observation', 'Detector'],
     'estimation/health.py': ['HealthMonitor'],
     'signals/body_state.py': ['BodyState', 'LengthOffsets', 'Trust'],
-    'signals/muscle_readings.py': ['MuscleReadings', 'Quantity'],
+    'signals/muscle_states.py': ['MuscleReadings', 'Quantity'],
     'signals/muscle_stream.py': ['MuscleStream', 'MuscleSample', 'RejectionError'],
     'signals/friction.py': ['FrictionDirection', 'Transmission'],
     'control/controller.py': ['Controller'],

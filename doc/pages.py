@@ -11,7 +11,7 @@ from musculoskeletal_ae.conditions import (
     stop_causes,
 )
 from musculoskeletal_ae.control import controller_status, supervisor
-from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.remedy_steps import Step
 
 STOPS = """\
 # Why the arm stops, and how to continue

@@ -29,7 +29,7 @@ from std_msgs.msg import Float64MultiArray
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm  # for the fake bus only
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.ros.messages import array_message, joint_message
+from musculoskeletal_ae.ros.message_building import array_message, joint_message
 
 RATE = 100.0  # rate at which sensors are read and motors commanded [Hz]
 TURN = 10.0  # time in which a hand moves the first joint to and fro, if `moved` [s]

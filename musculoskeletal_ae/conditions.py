@@ -19,7 +19,7 @@ from itertools import chain
 from typing import Literal, NamedTuple, cast, get_args
 
 from musculoskeletal_ae.exceptions import printable
-from musculoskeletal_ae.remedy import REPAIR, Step
+from musculoskeletal_ae.remedy_steps import REPAIR, Step
 
 #: 'ok' means that nothing has to be done: another condition, or the user, is the cause
 Level = Literal['ok', 'warn', 'error']

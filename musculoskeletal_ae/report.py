@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from musculoskeletal_ae.conditions import Condition, Level, ordered, remedy_of, worst
-from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.remedy_steps import Step
 
 MOST_DIGITS = 17  # number of significant digits with which every double is printed uniquely
 _UNITS_OF_TIME = {'years': 365.25 * 86400.0, 'days': 86400.0, 'h': 3600.0, 'min': 60.0}

@@ -15,7 +15,7 @@ from musculoskeletal_ae.nodes.controller import ControllerNode
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.nodes.learner import LearnerNode
-from musculoskeletal_ae.signals.muscle_readings import read_muscle_states
+from musculoskeletal_ae.signals.muscle_states import read_muscle_states
 
 RATE = 50.0  # rate of the arm's messages [Hz]; 100 Hz would take twice the processor time
 RATE_LIMIT = 0.2  # rate limit of length commands [m/s]

@@ -30,7 +30,7 @@ from std_msgs.msg import Float64MultiArray, UInt8MultiArray
 from musculoskeletal_ae.conditions import CONDITIONS, Condition, from_json
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros.executor import LeanExecutor
-from musculoskeletal_ae.ros.messages import LATCHED, array_message, bytes_message
+from musculoskeletal_ae.ros.message_building import LATCHED, array_message, bytes_message
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState
 
 DEADLINE = 180.0  # longest wait on a loaded machine; then the test fails [s]

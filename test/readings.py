@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 
 
 def reading(states):

@@ -22,13 +22,13 @@ from musculoskeletal_ae.conditions import ConditionKind as Kind
 from musculoskeletal_ae.control.stop_memory import StopMemory
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.estimation.body_memory import BodyMemory
-from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.remedy_steps import Step
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros.needed_topics import SLOW_REPORTS, NeededTopics
 
 TESTS = Path(__file__).parent
 HERE = Path(__file__).name
-JOINTS = 'estimation/test_joint_sensor_check.py'
+JOINTS = 'estimation/test_joint_sensor_trust.py'
 PLACES = {
     Kind.NODE_ENDED: ['nodes/test_controller_stops.py: test_a_crashed_estimator_stops',
                       'nodes/test_bringup_status.py: test_nodes_that_have_ended_or_hang'],

@@ -30,7 +30,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState, LengthOffsets
 from musculoskeletal_ae.signals.joint_series import JointSeries, judge_series
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
-from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, MuscleReadings, raw_muscle_states
+from musculoskeletal_ae.signals.muscle_states import QUANTITIES, MuscleReadings, raw_muscle_states
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream
 from musculoskeletal_ae.signals.pairing import Pairing
 

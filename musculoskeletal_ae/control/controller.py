@@ -59,7 +59,7 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly, BodyState
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence, check_posture
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
 WINDOW = 3  # take the median of this many messages, so that a single outlier has no effect

@@ -12,9 +12,9 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.control.holding import away_text
 from musculoskeletal_ae.control.supervisor import Activity
-from musculoskeletal_ae.motion import reach
+from musculoskeletal_ae.motion import holdable_paths
 from musculoskeletal_ae.motion.follower import Follower
-from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.remedy_steps import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.description import NO_TENSION
 from musculoskeletal_ae.signals.heat import soon
@@ -135,7 +135,7 @@ def _target(core: Controller) -> Iterator[Condition]:
     if core.is_following and follower.progress.is_moving and (slow := slowed(follower)):
         yield kind.TRAJECTORY_SLOWED.condition(f'trajectory {slow}')
     missing = _missing_torque(core)
-    if missing is not None and np.abs(missing).max() > reach.NOTABLE:
+    if missing is not None and np.abs(missing).max() > holdable_paths.NOTABLE:
         yield kind.TORQUE_MISSING.condition()
     if target.unreachable_reason:
         yield kind.OUT_OF_REACH.condition(target.unreachable_reason)
@@ -180,7 +180,7 @@ def _add_motion(core: Controller, values: dict[str, str]) -> None:
         lag = core.activities.follower.winches.lag
         values['lag of the winches'] = f'{1000.0 * lag:.0f} ms'
     missing = _missing_torque(core)
-    if missing is not None and np.abs(missing).max() > reach.NOTABLE:
+    if missing is not None and np.abs(missing).max() > holdable_paths.NOTABLE:
         each = zip(robot.joints, missing, robot.units)
         values['missing torque'] = ', '.join(f'{n} {unit.torque_text(m)}' for n, m, unit in each)
     if distance := core.holding.text:

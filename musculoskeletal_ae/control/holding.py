@@ -22,7 +22,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.motion import reach
+from musculoskeletal_ae.motion import holdable_paths
 from musculoskeletal_ae.robot.robot import Robot
 
 #: report a joint that rests further than this away from its target [rad]; tendon friction alone
@@ -109,7 +109,7 @@ def away_text(check: HoldingCheck, robot: Robot, mae: Mae, theta: Array) -> str:
     """
     text = f'{check.text} away'
     cause = POSSIBLE_CAUSES
-    if missing := reach.lacking(robot, mae, theta):
+    if missing := holdable_paths.lacking(robot, mae, theta):
         without = f'without {robot.names(robot.isolated)}, ' if robot.isolated else ''
         lift = '; lift the arm by hand' if robot.isolated else ''
         cause = f'{without}in this posture, the muscles lack {missing}{lift}'

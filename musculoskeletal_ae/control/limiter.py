@@ -66,7 +66,7 @@ from musculoskeletal_ae.motion.activities import (
 )
 from musculoskeletal_ae.robot.model_errors import LARGEST
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 POSTURES = 200  # sample this many random postures to find the longest length of each muscle

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from enum import Enum
 
 from musculoskeletal_ae.conditions import Action, Clears, Condition, ConditionKind
-from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.remedy_steps import Step
 
 RESUME = 0.2  # let a paused arm continue once no cause has been present for this time [s]
 

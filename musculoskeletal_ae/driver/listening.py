@@ -31,7 +31,7 @@ from musculoskeletal_ae.signals import joint_sensors, wiring
 from musculoskeletal_ae.signals.joint_series import judge_series
 from musculoskeletal_ae.signals.limits import length_range
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
-from musculoskeletal_ae.signals.muscle_readings import (
+from musculoskeletal_ae.signals.muscle_states import (
     QUANTITIES,
     MuscleReadings,
     Presence,

@@ -19,7 +19,7 @@ from musculoskeletal_ae.driver.order import EXCHANGE_BETTER, judge_order, wrong_
 from musculoskeletal_ae.driver.verdict import FAULTS, Verdict
 from musculoskeletal_ae.report import is_overloaded
 from musculoskeletal_ae.signals.joint_sensors import corrected, judge, sign_notes
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.signals.wiring import WiringJudgement
 
 #: pay a released muscle out for this time, and let a muscle settle for this time after its target

@@ -31,7 +31,7 @@ from musculoskeletal_ae.driver.motion_test import (
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 
 #: first step of a muscle's target length inwards, from which the latency is measured [m]
 STEP = 0.003

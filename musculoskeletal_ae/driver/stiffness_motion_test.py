@@ -49,7 +49,7 @@ from musculoskeletal_ae.driver.motion_test import (
 from musculoskeletal_ae.driver.verdict import Verdict
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import distinct
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 
 #: demand at least this much above T_bias [N], because noise hides the response to smaller demands
 LEAST_ABOVE_BIAS = 20.0

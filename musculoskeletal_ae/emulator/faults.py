@@ -17,7 +17,7 @@ import pinocchio as pin
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import QUANTITIES, MuscleReadings
 
 SPEED_LIMIT = 0.25  # wind no muscle module faster than this [m/s]; chosen by hand
 TURN = 6.2832  # reject a turn of the base by more than this [rad], one revolution

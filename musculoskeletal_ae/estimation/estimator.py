@@ -34,7 +34,7 @@ from musculoskeletal_ae.estimation.further_loss import needed_muscles
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
 from musculoskeletal_ae.estimation.isolation import SuspectHandling
-from musculoskeletal_ae.estimation.joint_sensor_check import JointSensorCheck
+from musculoskeletal_ae.estimation.joint_sensor_trust import JointSensorTrust
 from musculoskeletal_ae.estimation.lengths.length_calibration import LengthCalibration
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthTrust
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
@@ -46,13 +46,13 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.messages.arrival import INTERRUPTION, LONGEST_STEP, SILENCE, SPACING
-from musculoskeletal_ae.remedy import REPAIR, Step, sentence
+from musculoskeletal_ae.remedy_steps import REPAIR, Step, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.inverse_kinematics import posture_of_marker
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 from musculoskeletal_ae.signals.joint_stream import JointStream
-from musculoskeletal_ae.signals.joint_trust import JointTrust
+from musculoskeletal_ae.signals.joint_trust_message import JointTrust
 from musculoskeletal_ae.signals.limits import Persistence
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 
@@ -148,7 +148,7 @@ class Estimator:
         self._commands = ModuleCommands()
         self._rejected = Persistence()  # why messages are rejected
         self.joint_stream = JointStream(robot)
-        self.joint_check = JointSensorCheck(robot)
+        self.joint_check = JointSensorTrust(robot)
         #: usable readings of the joint sensors [rad] and their times [s], (2, D); NaN if unknown
         self._readings = np.full((2, robot.joint_count), np.nan)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation.suspect_verification import LONGEST
-from musculoskeletal_ae.remedy import REPAIR, Step
+from musculoskeletal_ae.remedy_steps import REPAIR, Step
 from musculoskeletal_ae.report import Report
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.conditions import ConditionKind, Revokes
 from musculoskeletal_ae.estimation.estimate import Estimate
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 #: discard messages that arrived within this time before a fault was detected [s], because the fault

@@ -18,7 +18,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.heat import Heat
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 
 
 class HealthMonitor:

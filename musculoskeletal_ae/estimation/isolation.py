@@ -48,7 +48,7 @@ from musculoskeletal_ae.estimation.suspect_verification import (
     Verification,
     VerificationVerdict,
 )
-from musculoskeletal_ae.remedy import REPAIR
+from musculoskeletal_ae.remedy_steps import REPAIR
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly
 

@@ -22,7 +22,7 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import directions
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 PAYLOAD = 3.6  # let the arm grasp this mass, that of the paper's dumbbell (§IV-B) [kg]

@@ -59,8 +59,8 @@ from musculoskeletal_ae.experiments.study import (
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.explored_postures import TRIES, holdable_postures
 from musculoskeletal_ae.motion.hand import POSITION
+from musculoskeletal_ae.motion.holdable_paths import lacking
 from musculoskeletal_ae.motion.ramps import RAMP_SHARE
-from musculoskeletal_ae.motion.reach import lacking
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot

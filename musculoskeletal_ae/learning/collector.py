@@ -28,7 +28,7 @@ from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.joint_stream import JointStream
-from musculoskeletal_ae.signals.joint_trust import JointTrust
+from musculoskeletal_ae.signals.joint_trust_message import JointTrust
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, MuscleStream, RejectionError
 from musculoskeletal_ae.signals.pairing import Paired, Pairing

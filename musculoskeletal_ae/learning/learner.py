@@ -44,9 +44,9 @@ from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
-from musculoskeletal_ae.signals.joint_trust import JointTrust
+from musculoskeletal_ae.signals.joint_trust_message import JointTrust
 from musculoskeletal_ae.signals.limits import LIMITS
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, RejectionError
 from musculoskeletal_ae.signals.pairing import Paired
 

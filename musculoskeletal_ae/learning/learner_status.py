@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.learning.detector_calibration import is_learned
 from musculoskeletal_ae.learning.scheduler import Update
-from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.remedy_steps import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 

@@ -32,7 +32,7 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly
 from musculoskeletal_ae.signals.friction import directions
 from musculoskeletal_ae.signals.joint_stream import JointStream
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 from musculoskeletal_ae.tables.table import Table
 

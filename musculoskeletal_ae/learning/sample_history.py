@@ -17,8 +17,8 @@ offsets are corrected.
 
 `JointHistory` removes the angles of joint sensors from samples while the estimator does not use the
 sensors. The estimator doubts a sensor some time after its fault, and publishes when the doubt
-begins (`signals/joint_trust.py`). Samples of the doubtful time then lose the angle of this joint.
-They keep tensions, lengths and the other angles. What happens next depends on the estimator:
+begins (`signals/joint_trust_message.py`). Samples of the doubtful time then lose the angle of this
+joint. They keep tensions, lengths and the other angles. What happens next depends on the estimator:
 
     trusted again        the sensor was false in the meantime, so these angles stay unknown
     confirmed by user    the doubt was wrong, so the samples get their angles back
@@ -30,7 +30,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.learning.samples import SampleStore
-from musculoskeletal_ae.signals.joint_trust import JointTrust, SensorTrust
+from musculoskeletal_ae.signals.joint_trust_message import JointTrust, SensorTrust
 from musculoskeletal_ae.signals.limits import LIMITS
 
 #: conclude that length offsets have changed only if two calibrations differ by more than this [m]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Validate messages and read their values, one function for each kind of message.
 
-`signals/muscle_readings.py` does so for muscle states.
+`signals/muscle_states.py` does so for muscle states.
 
 doc/reference/topics_and_services.md lists the rules. The functions access only the fields of a
 message, which may be live or from a bag. An invalid message raises a `MessageError` with a short

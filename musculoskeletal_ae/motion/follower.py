@@ -11,10 +11,11 @@ muscle lengths,
     l_target = l + l_comp(T e^{μ s}) + λ dl/dt
 
 Tendon friction: the motor-side tension is T e^{μ s}. Here s is the direction in which the tendon
-slides, and μ is learned or a typical value (`reach.tendon_friction`).
+slides, and μ is learned or a typical value (`holdable_paths.tendon_friction`).
 
 Joint stops: f is the torque of the stops of those joints whose desired angle is at a limit
-(`robot/joint_stops.py`). Paths of an arm with isolated muscles may lead along a stop (`reach`).
+(`robot/joint_stops.py`). Paths of an arm with isolated muscles may lead along a stop
+(`holdable_paths.py`).
 
 Lag of the muscle modules: a motor under muscle stiffness control (MSC) turns at
 dl/dt = (T − T_MSC)/(K_stiff λ). Therefore the command has to lead by λ dl/dt. A tendon that is

@@ -5,7 +5,7 @@ Inverse kinematics converts a pose into joint angles. The search starts from the
 so that it finds the nearest of several solutions. The solution has to be within the joint limits
 and holdable with the learned G; otherwise the pose is refused. With `unreachable: nearest`, the
 target is the posture within the joint limits in which the hand is nearest to the pose. If this
-posture is not holdable, the arm stops on the straight path to it (`reach.nearest_held`).
+posture is not holdable, the arm stops on the straight path to it (`holdable_paths.nearest_held`).
 
 The hand moves to a single pose at HAND_SPEED or more slowly. Poses in quick succession form a
 path, which the hand follows at the speed at which they arrive. A pose is reached when the next pose
@@ -20,7 +20,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
-from musculoskeletal_ae.motion.reach import lacking, nearest_held
+from musculoskeletal_ae.motion.holdable_paths import lacking, nearest_held
 from musculoskeletal_ae.motion.trajectory import STOPPING, Setpoint, Trajectory
 from musculoskeletal_ae.robot.inverse_kinematics import inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot

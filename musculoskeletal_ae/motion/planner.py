@@ -5,8 +5,8 @@ The methods that plan return a trajectory, or raise a MessageError with the reas
 except those of `to_rest` are slowed to the speed of the muscle modules. They stay within the joint
 limits, with the tolerance `trajectory.BEYOND`. Those of `to_pose` and `by_twist` end in a holdable
 posture. Those of `through` are checked for this only if a muscle is isolated. `to_posture` does not
-check the target: its caller does so with `reachable`. With isolated muscles, the whole way is
-checked, except that of `by_twist`.
+check the target: its caller does so with `reachable`. With isolated muscles, `holdable_paths.py`
+finds the path, and the whole way is checked, except that of `by_twist`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
-from musculoskeletal_ae.motion import reach
+from musculoskeletal_ae.motion import holdable_paths
 from musculoskeletal_ae.motion.hand import Hand
 from musculoskeletal_ae.motion.slowness import exertion_slowness, slowness
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
@@ -64,9 +64,9 @@ class Planner:
     ) -> tuple[Trajectory, str]:
         """Plan a motion to rest at θ [rad], (D,).
 
-        With isolated muscles, the motion avoids postures that are not holdable (`reach.way`). If
-        the muscles cannot move the arm along the whole way, the motion is refused, or ends on the
-        way if `takes_nearest`.
+        With isolated muscles, the motion avoids postures that are not holdable
+        (`holdable_paths.way`). If the muscles cannot move the arm along the whole way, the motion
+        is refused, or ends on the way if `takes_nearest`.
 
         Args:
             mae: The network in use.
@@ -82,7 +82,7 @@ class Planner:
         Raises:
             MessageError: If the motion is refused.
         """
-        path = np.vstack([start.theta, reach.way(self._robot, mae, start.theta, theta)])
+        path = np.vstack([start.theta, holdable_paths.way(self._robot, mae, start.theta, theta)])
         path, problem = self._passable(mae, path, self.takes_nearest)
         planned = self._within_limits(mae, Trajectory.to(start, path[1:], duration))
         slower = exertion_slowness(self._robot, mae, planned, lag)
@@ -172,8 +172,8 @@ class Planner:
     def reachable(self, mae: Mae, start: Array, theta: Array, nearest: bool) -> tuple[Array, str]:
         """Return θ if the muscles can hold it, else the nearest holdable posture.
 
-        The nearest holdable posture is that of `reach.nearest_held`. If no muscle is isolated, θ is
-        returned without a check.
+        The nearest holdable posture is that of `holdable_paths.nearest_held`. If no muscle is
+        isolated, θ is returned without a check.
 
         Args:
             mae: The network in use.
@@ -190,7 +190,7 @@ class Planner:
         robot = self._robot
         if robot.used.all():
             return theta, ''
-        held, problem = reach.nearest_held(robot, mae, start, theta)
+        held, problem = holdable_paths.nearest_held(robot, mae, start, theta)
         if not problem:
             return theta, ''
         problem = (
@@ -221,7 +221,7 @@ class Planner:
         robot = self._robot
         if robot.used.all():
             return path, ''
-        part, missing = reach.passable(robot, mae, path)
+        part, missing = holdable_paths.passable(robot, mae, path)
         if not missing:
             return path, ''
         problem = f'on the way, the muscles lack {missing}, {self._because_of_isolation}'

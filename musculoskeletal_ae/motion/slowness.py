@@ -9,7 +9,7 @@ import numpy as np
 
 from musculoskeletal_ae.control.settings import Settings
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.motion import reach
+from musculoskeletal_ae.motion.holdable_paths import NOTABLE, USED, PathLimits
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -56,12 +56,12 @@ def exertion_slowness(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float
         T_low(s) = (T_bias + K_stiff λ max(dl/dt, 0)/s)/loss
 
     The factor s is the smallest of `SLOWER` for which the largest missing torque of the motion is
-    at most `reach.NOTABLE` above that of a very slow motion. If a motion lacks torque at one
-    instant however slow it is, it is therefore not slowed because of a smaller lack at another
-    instant. If no factor suffices, s is the largest of `SLOWER`. If the muscle modules provide no
-    tensions, s is 1. An arm without isolated muscles may use all tensions up to T_limit. For an arm
-    with isolated muscles, the factors are those of `SLOWER_ISOLATED`, and the highest tension is
-    that of `reach.ReachLimits`, which keeps a reserve. `loss` is defined there, too.
+    at most `NOTABLE` above that of a very slow motion. If a motion lacks torque at one instant
+    however slow it is, it is therefore not slowed because of a smaller lack at another instant. If
+    no factor suffices, s is the largest of `SLOWER`. If the muscle modules provide no tensions, s
+    is 1. An arm without isolated muscles may use all tensions up to T_limit. For an arm with
+    isolated muscles, the factors are those of `SLOWER_ISOLATED`, and the highest tension is that of
+    `PathLimits`, which keeps a reserve. `loss` is defined there, too.
 
     Args:
         robot: The robot; isolated muscles have no tension.
@@ -73,8 +73,8 @@ def exertion_slowness(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float
     is_still = (theta == theta[0]).all()
     if not robot.actuation.knows_tension or is_still:
         return 1.0
-    factors, used = (SLOWER, 1.0) if robot.used.all() else (SLOWER_ISOLATED, reach.USED)
-    limits, bias, lag = reach.ReachLimits(robot, mae, used), robot.tension.bias, max(lag, LEAST_LAG)
+    factors, used = (SLOWER, 1.0) if robot.used.all() else (SLOWER_ISOLATED, USED)
+    limits, bias, lag = PathLimits(robot, mae, used), robot.tension.bias, max(lag, LEAST_LAG)
     travelled = np.linalg.norm(np.diff(theta, axis=0), axis=1).cumsum()
     spacing = max(MOMENT_SPACING, travelled[-1] / MOST_EXERTIONS)
     marks = np.arange(0.0, travelled[-1], spacing)
@@ -83,10 +83,10 @@ def exertion_slowness(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float
     lacking = [  # the instants at which the muscles lack torque if the motion is not slowed
         (jacobian, at)
         for at, jacobian in zip(map(Setpoint._make, zip(*moments)), jacobians)
-        if limits.missing_in_motion(jacobian, at, lag, factors[0]) > reach.NOTABLE
+        if limits.missing_in_motion(jacobian, at, lag, factors[0]) > NOTABLE
     ]
     very_slow = [limits.missing_in_motion(*moment, lag, np.inf) for moment in lacking]
-    legal = max(very_slow, default=0.0) + reach.NOTABLE
+    legal = max(very_slow, default=0.0) + NOTABLE
     number = 0
     for moment in lacking:
         while limits.missing_in_motion(*moment, lag, factors[number]) > legal:

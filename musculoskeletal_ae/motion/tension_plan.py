@@ -21,8 +21,8 @@ from musculoskeletal_ae.motion.feedback import (
     depends_on_limit,
     largest_support,
 )
+from musculoskeletal_ae.motion.holdable_paths import FRICTION, tendon_friction
 from musculoskeletal_ae.motion.methods import SOLVES, Solution, stiffness_command
-from musculoskeletal_ae.motion.reach import FRICTION, tendon_friction
 from musculoskeletal_ae.motion.slowness import SHARE
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.robot.joint_stops import supporting_stops

@@ -17,7 +17,7 @@ from musculoskeletal_ae.messages.arrival import LONGEST_STEP
 from musculoskeletal_ae.messages.message_reading import read_wrench
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.robot.drawing import BONE_COLOUR, Line
-from musculoskeletal_ae.ros.messages import (
+from musculoskeletal_ae.ros.message_building import (
     LATCHED,
     RELIABLE,
     add_joints,
@@ -28,7 +28,7 @@ from musculoskeletal_ae.ros.messages import (
 )
 from musculoskeletal_ae.ros.second_publishers import COMMANDS, MOTOR_COMMAND
 from musculoskeletal_ae.signals.motor_interface import STATES
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 
 MARKER_RATE = 10.0  # publish markers at this rate [Hz]
 NAME_HEIGHT = 0.018  # height of the letters with which the muscles' names are drawn [m]

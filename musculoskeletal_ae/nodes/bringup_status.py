@@ -33,7 +33,7 @@ from musculoskeletal_ae.report import (
     with_load,
 )
 from musculoskeletal_ae.ros.diagnostics import LAST_REJECTED
-from musculoskeletal_ae.ros.messages import RELIABLE, SENSOR
+from musculoskeletal_ae.ros.message_building import RELIABLE, SENSOR
 
 #: hide problems for this time after the start and after the first estimate, because most of them
 #: end by themselves while the nodes start [s]

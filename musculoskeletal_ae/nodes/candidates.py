@@ -30,7 +30,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, REJECTED
 from musculoskeletal_ae.nodes.shell import Shell
-from musculoskeletal_ae.ros.messages import LATCHED, bytes_message
+from musculoskeletal_ae.ros.message_building import LATCHED, bytes_message
 from musculoskeletal_ae.signals.body_state import BodyState
 
 

@@ -42,9 +42,9 @@ from musculoskeletal_ae.motion.activities import LENGTH, TENSION
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.nodes.stop_recording import StopRecording
 from musculoskeletal_ae.parameters import naming_parameter, parameters_of
-from musculoskeletal_ae.remedy import Step, sentence
+from musculoskeletal_ae.remedy_steps import Step, sentence
 from musculoskeletal_ae.report import Report
-from musculoskeletal_ae.ros.messages import (
+from musculoskeletal_ae.ros.message_building import (
     LATCHED,
     RELIABLE,
     SENSOR,

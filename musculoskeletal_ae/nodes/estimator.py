@@ -36,7 +36,7 @@ from musculoskeletal_ae.nodes.arm_node import Markers
 from musculoskeletal_ae.nodes.candidates import Candidates
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
-from musculoskeletal_ae.ros.messages import (
+from musculoskeletal_ae.ros.message_building import (
     LATCHED,
     RELIABLE,
     SENSOR,
@@ -47,7 +47,7 @@ from musculoskeletal_ae.ros.messages import (
     serve,
 )
 from musculoskeletal_ae.ros.second_publishers import AUTHORS
-from musculoskeletal_ae.signals.joint_trust import JointTrust
+from musculoskeletal_ae.signals.joint_trust_message import JointTrust
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, RejectionError
 
 OWN_TOPICS = [topic for topic, author in AUTHORS.items() if author == 'the estimator']

@@ -26,7 +26,7 @@ from musculoskeletal_ae.nodes.arm_node import ArmNode, Markers
 from musculoskeletal_ae.parameters import naming_parameter
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
-from musculoskeletal_ae.ros.messages import RELIABLE, serve
+from musculoskeletal_ae.ros.message_building import RELIABLE, serve
 
 PACE_TIME = 5.0  # average the real-time factor over this time [s]
 

@@ -25,7 +25,7 @@ from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, REJECTED
 from musculoskeletal_ae.nodes.shell import STEADY, Shell
 from musculoskeletal_ae.parameters import naming_parameter
 from musculoskeletal_ae.robot.kinematics import body_frames
-from musculoskeletal_ae.ros.messages import LATCHED, SENSOR, bytes_message, serve
+from musculoskeletal_ae.ros.message_building import LATCHED, SENSOR, bytes_message, serve
 
 MOST_DIGITS = 15  # reject a version of a network with more digits
 POLL_PERIOD = 0.05  # look at this interval whether the training process has finished an update [s]

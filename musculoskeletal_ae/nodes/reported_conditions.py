@@ -20,7 +20,7 @@ from rclpy.node import Node as RosNode
 from musculoskeletal_ae import conditions
 from musculoskeletal_ae.conditions import CONDITIONS, KINDS, LEVELS, Condition, ConditionKind, Level
 from musculoskeletal_ae.control.supervisor import Activity, StopState
-from musculoskeletal_ae.remedy import Step, sentence
+from musculoskeletal_ae.remedy_steps import Step, sentence
 from musculoskeletal_ae.report import with_load
 from musculoskeletal_ae.ros.diagnostics import IDENTITY, NODE_SILENCE, values_of
 

@@ -50,12 +50,12 @@ from musculoskeletal_ae.messages.reception import SHOWN, Reception
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, CheckpointQueue
 from musculoskeletal_ae.nodes.declared_parameters import check_names
 from musculoskeletal_ae.nodes.node_parameters import NodeParameters
-from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.remedy_steps import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros.diagnostics import MANY_REPORTS, PERIOD, Diagnostics
 from musculoskeletal_ae.ros.executor import parameter_overrides
-from musculoskeletal_ae.ros.messages import LATCHED, RELIABLE, SENSOR, refuse
+from musculoskeletal_ae.ros.message_building import LATCHED, RELIABLE, SENSOR, refuse
 from musculoskeletal_ae.ros.needed_topics import NeededTopics
 from musculoskeletal_ae.ros.second_publishers import (
     AUTHORS,
@@ -66,7 +66,7 @@ from musculoskeletal_ae.ros.second_publishers import (
     Twins,
 )
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState
-from musculoskeletal_ae.signals.joint_trust import JointTrust
+from musculoskeletal_ae.signals.joint_trust_message import JointTrust
 from musculoskeletal_ae.signals.motor_interface import STATES, MotorInterface
 
 if TYPE_CHECKING:  # a slow import, because it loads the bag writer

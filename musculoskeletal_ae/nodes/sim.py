@@ -21,12 +21,12 @@ from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.message_reading import read_target
 from musculoskeletal_ae.nodes.arm_node import ArmNode, Markers
-from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.remedy_steps import Step
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.drawing import Line, draw_arm
-from musculoskeletal_ae.ros.messages import RELIABLE
+from musculoskeletal_ae.ros.message_building import RELIABLE
 from musculoskeletal_ae.ros.second_publishers import MOTOR_COMMAND
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.simulation.equilibrium import PAID_OUT
 from musculoskeletal_ae.simulation.simulation import Simulation
 

@@ -10,7 +10,7 @@ from rclpy.qos import QoSProfile
 from musculoskeletal_ae.conditions import CONDITIONS, ordered, to_json
 from musculoskeletal_ae.exceptions import printable
 from musculoskeletal_ae.messages.reception import Reception
-from musculoskeletal_ae.remedy import sentence
+from musculoskeletal_ae.remedy_steps import sentence
 from musculoskeletal_ae.report import Report
 
 MANY_REPORTS = QoSProfile(depth=50)  # QoS of /diagnostics, on which all nodes of the graph report

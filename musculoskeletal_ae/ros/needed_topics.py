@@ -12,7 +12,7 @@ from rclpy.node import Node
 from musculoskeletal_ae.conditions import Condition, ConditionKind, Level
 from musculoskeletal_ae.messages.arrival import SILENCE
 from musculoskeletal_ae.messages.reception import Reception
-from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.remedy_steps import Step
 from musculoskeletal_ae.report import with_load
 
 #: topics whose silence is an error, because they are published continually, each with the remedy;

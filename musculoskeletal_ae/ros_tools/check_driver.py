@@ -25,7 +25,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.messages.arrival import SILENCE, Arrival
 from musculoskeletal_ae.options import Parser, names, number, numbers, positive
 from musculoskeletal_ae.process_signals import import_heavy
-from musculoskeletal_ae.ros.messages import RELIABLE, SENSOR, array_message, motor_command
+from musculoskeletal_ae.ros.message_building import RELIABLE, SENSOR, array_message, motor_command
 from musculoskeletal_ae.ros_tools.ros_tool import (
     ROS_HELP,
     Spinner,
@@ -170,7 +170,7 @@ class CheckDriver:
     def wind(self, verdict: Verdict) -> None:
         """Wind the tested muscles in slightly; add the faults of their responses to the verdict."""
         winding = _winding(self.robot, verdict, self.options)
-        readings = import_heavy('musculoskeletal_ae.signals.muscle_readings')
+        readings = import_heavy('musculoskeletal_ae.signals.muscle_states')
         publisher = self.node.create_publisher(Float64MultiArray, self.command, RELIABLE)
         self.spin_until(publisher.get_subscription_count, 3.0)
         if not publisher.get_subscription_count():

@@ -12,7 +12,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.options import Parser, picture
 from musculoskeletal_ae.robot.drawing import Line, save_picture
-from musculoskeletal_ae.ros.messages import SENSOR
+from musculoskeletal_ae.ros.message_building import SENSOR
 from musculoskeletal_ae.ros_tools.ros_tool import ROS_HELP, Spinner, run_tool, start_ros
 
 #: topics of markers: a picture shows the emulated arm if it is published, otherwise the estimate

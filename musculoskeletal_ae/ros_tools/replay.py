@@ -50,7 +50,7 @@ from musculoskeletal_ae.report import (
 )
 from musculoskeletal_ae.robot.motors import NO_MOTORS, motor_topics
 from musculoskeletal_ae.ros.diagnostics import MANY_REPORTS, PERIOD, Diagnostics
-from musculoskeletal_ae.ros.messages import LATCHED, RELIABLE, array_message, serve
+from musculoskeletal_ae.ros.message_building import LATCHED, RELIABLE, array_message, serve
 from musculoskeletal_ae.ros_tools.lockstep import Lockstep
 from musculoskeletal_ae.ros_tools.rejecting_nodes import Rejections
 from musculoskeletal_ae.ros_tools.ros_tool import (

@@ -17,7 +17,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.topics import select
 from musculoskeletal_ae.exceptions import BagError, MusculoskeletalError
 from musculoskeletal_ae.ros.diagnostics import LAST_REJECTED, PERIOD, rejected_counts, values_of
-from musculoskeletal_ae.ros.messages import RELIABLE
+from musculoskeletal_ae.ros.message_building import RELIABLE
 from musculoskeletal_ae.ros_tools.ros_tool import Spinner, start_ros
 
 #: wait at most this long for reliable subscribers to acknowledge the messages [s]

@@ -50,11 +50,11 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.inverse_kinematics import POSITION_ONLY, inverse_kinematics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros import diagnostics
-from musculoskeletal_ae.ros.messages import LATCHED, RELIABLE, joint_message
+from musculoskeletal_ae.ros.message_building import LATCHED, RELIABLE, joint_message
 from musculoskeletal_ae.ros_tools.ros_tool import ROS_HELP, message_class, run_tool, start_ros
 from musculoskeletal_ae.signals.body_state import ROWS, BodyState
 from musculoskeletal_ae.signals.motor_interface import STATES, MotorInterface
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings, read_muscle_states
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings, read_muscle_states
 
 #: QoS of topics of which only the newest message counts
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)

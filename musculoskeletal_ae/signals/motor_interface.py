@@ -24,7 +24,7 @@ from musculoskeletal_ae.messages.arrival import is_later, nanoseconds
 from musculoskeletal_ae.messages.message_reading import joint_names, read_array
 from musculoskeletal_ae.robot.motors import ARRAY, JOINT_STATE, NO_MOTORS, Motors
 from musculoskeletal_ae.robot.tension_source import TENSION_SENSOR, TensionSource
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 
 STATES = 'muscle_states'  # topic of the readings of a robot with a driver
 

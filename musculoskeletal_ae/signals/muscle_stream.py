@@ -32,7 +32,7 @@ from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.friction import FrictionDirection, Transmission
 from musculoskeletal_ae.signals.length_jumps import LengthJumps
 from musculoskeletal_ae.signals.limits import LIMITS, Persistence
-from musculoskeletal_ae.signals.muscle_readings import (
+from musculoskeletal_ae.signals.muscle_states import (
     MuscleReadings,
     raw_muscle_states,
     read_muscle_states,

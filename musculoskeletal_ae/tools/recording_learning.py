@@ -46,7 +46,7 @@ from musculoskeletal_ae.process_signals import STOP, Reaction
 from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import LIMITS
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings, possible_readings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings, possible_readings
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 from musculoskeletal_ae.tables.columns import UNITS, Column
 from musculoskeletal_ae.tables.csv_file import looks_like_a_sequence, read_csv

@@ -16,7 +16,7 @@ from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.report import whole
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import QUANTITIES, MuscleReadings
 from musculoskeletal_ae.view import body
 from musculoskeletal_ae.view.body import MARKS, DrawnState
 from musculoskeletal_ae.view.controls import Controls, with_buttons

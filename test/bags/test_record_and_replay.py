@@ -24,7 +24,7 @@ from musculoskeletal_ae.exceptions import BagError
 from musculoskeletal_ae.messages.message_reading import read_array
 from musculoskeletal_ae.nodes.controller import ControllerNode
 from musculoskeletal_ae.nodes.learner import LearnerNode
-from musculoskeletal_ae.ros.messages import SENSOR
+from musculoskeletal_ae.ros.message_building import SENSOR
 from musculoskeletal_ae.ros_tools import record as record_tool
 from musculoskeletal_ae.ros_tools import replay as replay_tool
 

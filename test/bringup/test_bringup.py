@@ -22,8 +22,8 @@ from std_msgs.msg import String, UInt8MultiArray
 from std_srvs.srv import Trigger
 
 from musculoskeletal_ae.importing.convert import import_robot
-from musculoskeletal_ae.remedy import Step
-from musculoskeletal_ae.ros.messages import LATCHED
+from musculoskeletal_ae.remedy_steps import Step
+from musculoskeletal_ae.ros.message_building import LATCHED
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 pytestmark = pytest.mark.usefixtures('both_cores')

@@ -16,7 +16,7 @@ from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_readings import read_muscle_states
+from musculoskeletal_ae.signals.muscle_states import read_muscle_states
 
 ROBOT = Robot.load('arm26')
 MUSCLE = ROBOT.muscles[3]

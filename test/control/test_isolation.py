@@ -18,11 +18,11 @@ from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
 from musculoskeletal_ae.mae.residuals import LEAST_MOTION, TouchStatistics
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
-from musculoskeletal_ae.motion import reach
+from musculoskeletal_ae.motion import holdable_paths
 from musculoskeletal_ae.motion.activities import LENGTH, TENSION
 from musculoskeletal_ae.motion.feedback import SUPPORT
+from musculoskeletal_ae.motion.holdable_paths import FRICTION, lacking
 from musculoskeletal_ae.motion.planner import Planner
-from musculoskeletal_ae.motion.reach import FRICTION, lacking
 from musculoskeletal_ae.motion.slowness import slowness
 from musculoskeletal_ae.motion.tension_plan import TURNING
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
@@ -325,11 +325,11 @@ def test_a_path_avoids_postures_that_cannot_be_held():
     postures = robot.random_postures(200, np.random.default_rng(0))
     known = [theta for theta in postures if not lacking(robot, mae, theta)]
     start, goal = next(pair for pair in pairwise(known) if lack(pair[0], pair[1:]) > 0.3)
-    path = reach.way(robot, mae, start, goal)
+    path = holdable_paths.way(robot, mae, start, goal)
     np.testing.assert_array_equal(path[-1], goal)
     assert ((robot.lower <= path) & (path <= robot.upper)).all()
     assert lack(start, path) == 0.0
-    np.testing.assert_array_equal(reach.way(whole, mae, start, goal), [goal])
+    np.testing.assert_array_equal(holdable_paths.way(whole, mae, start, goal), [goal])
 
 
 def test_a_path_keeps_a_reserve_of_torque_for_errors_of_the_learned_body():
@@ -356,10 +356,12 @@ def test_a_path_keeps_a_reserve_of_torque_for_errors_of_the_learned_body():
     postures = robot.random_postures(200, np.random.default_rng(0))
     known = [theta for theta in postures if not lacking(robot, unaware, theta)]
     pairs = list(pairwise(known))[:40]
-    hard = [pair for pair in pairs if lack(pair[0], reach.way(robot, unaware, *pair)) > 0.2]
+    hard = [
+        pair for pair in pairs if lack(pair[0], holdable_paths.way(robot, unaware, *pair)) > 0.2
+    ]
     assert hard
     for start, goal in hard:
-        assert lack(start, reach.way(robot, aware, start, goal)) < reach.NOTABLE
+        assert lack(start, holdable_paths.way(robot, aware, start, goal)) < holdable_paths.NOTABLE
 
 
 @pytest.mark.parametrize(
@@ -398,7 +400,7 @@ def test_a_motion_is_slow_enough_for_the_torque_of_the_muscles(lost, limit, dura
     hard = 0
     for start, goal in list(pairwise(known))[:21]:
         rest = Setpoint.resting(start)
-        fast = Trajectory.to(rest, reach.way(robot, mae, start, goal), duration)
+        fast = Trajectory.to(rest, holdable_paths.way(robot, mae, start, goal), duration)
         fast = fast.scaled(slowness(robot, mae, fast, settings))
         if lack(fast) > 0.3:
             hard += 1
@@ -432,7 +434,7 @@ def test_a_prismatic_joint_without_muscles_lacks_force_in_newtons(sliding):
     is_supported = (wrist < low) & (force > 0.0) | (wrist > high) & (force < 0.0)
     missing = np.where(is_supported, 0.0, np.abs(force))
     reported = [lacking(robot, ExactMae(robot), theta) for theta in postures]
-    notable = reach.NOTABLE / robot.units[-1].radian
+    notable = holdable_paths.NOTABLE / robot.units[-1].radian
     assert reported == [f'{f:.2f} N at joint wrist' if f > notable else '' for f in missing]
     assert 0 < np.sum(missing > notable) < len(force)
     assert is_supported.any()
@@ -444,7 +446,7 @@ def test_a_prismatic_joint_without_muscles_is_led_along_its_stop(sliding):
     apart = np.linalg.norm((steep[:, None] - steep)[..., :3], axis=2)
     start, goal = steep[list(np.unravel_index(apart.argmax(), apart.shape))]
     start[-1], goal[-1] = robot.upper[-1], 0.5 * robot.upper[-1]
-    path = reach.way(robot, ExactMae(robot), start, goal)
+    path = holdable_paths.way(robot, ExactMae(robot), start, goal)
     np.testing.assert_array_equal(path[:, -1], [robot.upper[-1], goal[-1]])
 
 

@@ -20,7 +20,7 @@ from musculoskeletal_ae.control.supervisor import RESUME
 from musculoskeletal_ae.control.watchdog import OVERHEATED, OVERLOAD_TIME, Overload
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.signals.limits import LIMITS
-from musculoskeletal_ae.signals.muscle_readings import QUANTITIES
+from musculoskeletal_ae.signals.muscle_states import QUANTITIES
 
 TICK = 0.1 * DT  # largest change of a length command in one step under the rate limit [m]
 MUSCLE = ROBOT.muscles[0]

@@ -29,9 +29,9 @@ from musculoskeletal_ae.robot.description import TensionRange, with_modules
 from musculoskeletal_ae.robot.motors import Motors, MotorTopics
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.series_elastic import SeriesElastic
-from musculoskeletal_ae.signals import motor_interface, muscle_readings
+from musculoskeletal_ae.signals import motor_interface, muscle_states
 from musculoskeletal_ae.signals.motor_interface import MotorInterface
-from musculoskeletal_ae.signals.muscle_readings import (
+from musculoskeletal_ae.signals.muscle_states import (
     QUANTITIES,
     MuscleReadings,
     Presence,
@@ -417,10 +417,10 @@ def test_advice_on_a_rejected_message_is_that_of_its_topic():
 def test_every_reason_to_reject_a_message_of_a_driver_has_its_own_advice():
     readers = {
         ('muscle_states', message_reading): ('read_rows',),
-        ('muscle_states', muscle_readings): ('read_muscle_states',),
+        ('muscle_states', muscle_states): ('read_muscle_states',),
         ('joint_states', message_reading): ('read_posture', 'joint_names'),
         ('motors', message_reading): ('joint_names',),
-        ('motors', muscle_readings): ('read_muscle_states',),
+        ('motors', muscle_states): ('read_muscle_states',),
         ('motors', motor_interface): ('reading', '_find'),
     }
     for (topic, module), functions in readers.items():
@@ -1030,7 +1030,7 @@ def test_an_optional_quantity_is_judged_by_its_entry_in_the_table(monkeypatch):
     humidity = Quantity('%', 'impossible humidity', lambda _: (0.0, 100.0), Presence.OPTIONAL)
     monkeypatch.setattr(MuscleReadings, 'humidity', humidity, raising=False)
     humidity.__set_name__(MuscleReadings, 'humidity')
-    for module in (muscle_readings, listening):
+    for module in (muscle_states, listening):
         monkeypatch.setattr(module, 'QUANTITIES', (*QUANTITIES, humidity))
     row = np.full(M, 40.0)
     assert not heard(publish=lambda rows: np.vstack([rows, row])).faults

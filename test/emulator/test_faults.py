@@ -10,7 +10,7 @@ from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.emulator.sensors import Sensors, read_sensors
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 
 MUSCLE = 2
 

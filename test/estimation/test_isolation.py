@@ -16,7 +16,7 @@ from musculoskeletal_ae.estimation.suspect_verification import (
     Verification,
 )
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.remedy import REPAIR
+from musculoskeletal_ae.remedy_steps import REPAIR
 from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 

@@ -16,7 +16,7 @@ from musculoskeletal_ae.estimation.lengths.length_calibration import (
 )
 from musculoskeletal_ae.estimation.lengths.length_moments import WINDOW
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.remedy import Step
+from musculoskeletal_ae.remedy_steps import Step
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 from musculoskeletal_ae.signals.wiring import Wiring

@@ -13,7 +13,7 @@ from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.estimator import Estimator
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.remedy import REPAIR, Step, sentence
+from musculoskeletal_ae.remedy_steps import REPAIR, Step, sentence
 from musculoskeletal_ae.signals.body_state import Anomaly
 from musculoskeletal_ae.signals.muscle_stream import RejectionError
 

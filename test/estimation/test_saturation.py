@@ -8,7 +8,7 @@ import pytest
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.detectors.saturated_sensor import SaturatedSensor
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 
 DT, SATURATED = 0.01, 2
 

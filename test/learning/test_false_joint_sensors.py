@@ -6,7 +6,7 @@ import pytest
 
 from musculoskeletal_ae.learning.sample_history import JointHistory
 from musculoskeletal_ae.learning.samples import SampleStore
-from musculoskeletal_ae.signals.joint_trust import JointTrust, SensorTrust
+from musculoskeletal_ae.signals.joint_trust_message import JointTrust, SensorTrust
 
 
 def trust(elbow, since=np.nan):

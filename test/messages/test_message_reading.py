@@ -30,8 +30,8 @@ from musculoskeletal_ae.messages.message_reading import (
 )
 from musculoskeletal_ae.robot.joint_units import JointUnits
 from musculoskeletal_ae.robot.tension_source import TENSION_SENSOR
-from musculoskeletal_ae.ros.messages import array_message, posture_message
-from musculoskeletal_ae.signals.muscle_readings import read_muscle_states
+from musculoskeletal_ae.ros.message_building import array_message, posture_message
+from musculoskeletal_ae.signals.muscle_states import read_muscle_states
 
 # Stands in for a robot with two muscles.
 TWO = SimpleNamespace(muscle_count=2, muscles=('triceps', 'biceps'), tension_source=TENSION_SENSOR)

@@ -26,8 +26,8 @@ from musculoskeletal_ae.motion import hand as hand_motion
 from musculoskeletal_ae.motion.activities import LENGTH
 from musculoskeletal_ae.motion.feedback import CORRECTION, SUPPORT
 from musculoskeletal_ae.motion.hand import HAND_SPEED, Hand
+from musculoskeletal_ae.motion.holdable_paths import NOTABLE, PathLimits
 from musculoskeletal_ae.motion.methods import StiffnessModel
-from musculoskeletal_ae.motion.reach import NOTABLE, ReachLimits
 from musculoskeletal_ae.motion.slowness import SHARE, exertion_slowness, slowness
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.motion.winches import Winches
@@ -411,7 +411,7 @@ def test_a_motion_that_lacks_torque_at_any_speed_is_slowed_only_as_far_as_that_h
     weak = replace(stated.tension, limit=np.full_like(stated.tension.limit, 90.0))
     robot = Robot(replace(stated, tension=weak))
     mae, lag, slowed = ExactMae(robot), 0.02, []
-    limits = ReachLimits(robot, mae, used=1.0)
+    limits = PathLimits(robot, mae, used=1.0)
 
     def lack(motion, slower):
         """Return the largest missing torque of a slowed motion [N·m]."""

@@ -24,7 +24,7 @@ from musculoskeletal_ae.conditions import (
 )
 from musculoskeletal_ae.nodes import bringup_status
 from musculoskeletal_ae.nodes.reported_conditions import Situation, figures
-from musculoskeletal_ae.remedy import Step, sentence
+from musculoskeletal_ae.remedy_steps import Step, sentence
 
 
 def diagnostics(

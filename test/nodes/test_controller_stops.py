@@ -13,8 +13,8 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.nodes.controller import ControllerNode
 from musculoskeletal_ae.nodes.stop_recording import FILE
-from musculoskeletal_ae.remedy import Step
-from musculoskeletal_ae.ros.messages import LATCHED
+from musculoskeletal_ae.remedy_steps import Step
+from musculoskeletal_ae.ros.message_building import LATCHED
 
 HERE, THERE = np.array([-0.5, -1.2]), np.array([-0.3, -1.0])
 

@@ -17,7 +17,7 @@ from std_msgs.msg import Float64MultiArray
 from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.nodes.controller import ControllerNode
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.ros.messages import array_message, joint_message
+from musculoskeletal_ae.ros.message_building import array_message, joint_message
 
 TEMPLATE = Path(__file__).parents[2] / 'examples' / 'driver.py'
 ROBOT = Robot.load('arm26')

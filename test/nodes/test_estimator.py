@@ -19,7 +19,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.ros.messages import array_message
+from musculoskeletal_ae.ros.message_building import array_message
 
 
 @pytest.fixture

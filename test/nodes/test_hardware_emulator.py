@@ -13,9 +13,9 @@ from visualization_msgs.msg import MarkerArray
 
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
-from musculoskeletal_ae.remedy import Step
-from musculoskeletal_ae.ros.messages import LATCHED, array_message
-from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, read_muscle_states
+from musculoskeletal_ae.remedy_steps import Step
+from musculoskeletal_ae.ros.message_building import LATCHED, array_message
+from musculoskeletal_ae.signals.muscle_states import QUANTITIES, read_muscle_states
 
 
 @pytest.fixture

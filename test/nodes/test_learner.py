@@ -29,7 +29,7 @@ from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.nodes.learner import LearnerNode
 from musculoskeletal_ae.nodes.running import NICENESS
-from musculoskeletal_ae.ros.messages import LATCHED, array_message
+from musculoskeletal_ae.ros.message_building import LATCHED, array_message
 from musculoskeletal_ae.signals.body_state import Anomaly, BodyState
 
 REST, MOVE = 0.8, 0.3  # duration of a rest, and of the motion between two rests [s]

@@ -11,7 +11,7 @@ import yaml
 from graph import Process
 from std_msgs.msg import Float64MultiArray
 
-from musculoskeletal_ae.ros.messages import array_message
+from musculoskeletal_ae.ros.message_building import array_message
 
 ROS2 = shutil.which('ros2') or ''
 pytestmark = pytest.mark.skipif(not ROS2, reason='there is no ros2 command (doc/howto/install.md)')

@@ -20,8 +20,8 @@ from musculoskeletal_ae.nodes.controller import ControllerNode
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.sim import SimNode
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.ros.messages import LATCHED, array_message
-from musculoskeletal_ae.signals.muscle_readings import QUANTITIES, read_muscle_states
+from musculoskeletal_ae.ros.message_building import LATCHED, array_message
+from musculoskeletal_ae.signals.muscle_states import QUANTITIES, read_muscle_states
 from musculoskeletal_ae.simulation.simulation import Simulation
 
 

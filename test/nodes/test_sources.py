@@ -17,7 +17,7 @@ from std_srvs.srv import Trigger
 from musculoskeletal_ae.nodes.controller import ControllerNode
 from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.ros.diagnostics import NODE_SILENCE
-from musculoskeletal_ae.ros.messages import LATCHED, array_message, joint_message
+from musculoskeletal_ae.ros.message_building import LATCHED, array_message, joint_message
 from musculoskeletal_ae.ros.second_publishers import (
     LEASE,
     NAMING,

@@ -23,7 +23,7 @@ from musculoskeletal_ae.nodes.estimator import EstimatorNode
 from musculoskeletal_ae.nodes.hardware_emulator import HardwareEmulatorNode
 from musculoskeletal_ae.nodes.learner import LearnerNode
 from musculoskeletal_ae.nodes.sim import SimNode
-from musculoskeletal_ae.ros.messages import LATCHED, array_message, joint_message
+from musculoskeletal_ae.ros.message_building import LATCHED, array_message, joint_message
 from musculoskeletal_ae.signals.body_state import Anomaly
 
 HERE = np.array([-0.5, -1.2])

@@ -10,7 +10,7 @@ from musculoskeletal_ae.estimation.lengths.length_calibration import stated_thet
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.joint_sensors import ORDER, JointFault, corrected
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 
 WRIST = 3  # index of the prismatic joint in θ; its limits are 0 and 0.05 m
 POLYNOMIAL = [0.1, 20.0, -3.0]  # of the position of `finger`, for the position of `wrist` [m]

@@ -18,7 +18,7 @@ from musculoskeletal_ae.experiments.recording import ClosedLoop
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.friction import Transmission
-from musculoskeletal_ae.signals.muscle_readings import read_muscle_states
+from musculoskeletal_ae.signals.muscle_states import read_muscle_states
 from musculoskeletal_ae.signals.muscle_stream import MuscleStream, RejectionError
 
 DRIVE = {'torque_constant': 0.05, 'gear': 20.0, 'spool_radius': 0.01}

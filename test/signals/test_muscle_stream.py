@@ -12,11 +12,11 @@ from readings import reading
 
 from musculoskeletal_ae.messages.arrival import Arrival
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals import muscle_readings
+from musculoskeletal_ae.signals import muscle_states
 from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets, Trust
 from musculoskeletal_ae.signals.friction import Transmission
 from musculoskeletal_ae.signals.limits import LIMITS, longest_lengths
-from musculoskeletal_ae.signals.muscle_readings import (
+from musculoskeletal_ae.signals.muscle_states import (
     QUANTITIES,
     MuscleReadings,
     Presence,
@@ -66,7 +66,7 @@ def test_an_optional_quantity_is_one_entry_of_the_table(monkeypatch, isolated):
     humidity = Quantity('%', 'impossible humidity', lambda _: (0.0, 100.0), Presence.OPTIONAL)
     monkeypatch.setattr(MuscleReadings, 'humidity', humidity, raising=False)
     humidity.__set_name__(MuscleReadings, 'humidity')
-    monkeypatch.setattr(muscle_readings, 'QUANTITIES', (*QUANTITIES, humidity))
+    monkeypatch.setattr(muscle_states, 'QUANTITIES', (*QUANTITIES, humidity))
     stream = MuscleStream(ROBOT, HEALTHY.with_isolated(isolated))
     percent = np.full(M, 24.0)
     read = reading(resting()).replace(humidity=percent)

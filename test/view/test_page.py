@@ -24,8 +24,8 @@ from std_msgs.msg import String
 
 from musculoskeletal_ae.conditions import stop_causes
 from musculoskeletal_ae.exceptions import MusculoskeletalError
-from musculoskeletal_ae.remedy import Step, sentence
-from musculoskeletal_ae.ros.messages import LATCHED
+from musculoskeletal_ae.remedy_steps import Step, sentence
+from musculoskeletal_ae.ros.message_building import LATCHED
 
 pytest.importorskip('viser', reason='./bringup.sh --view installs what the page needs')
 
@@ -35,7 +35,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.view import controls
 from musculoskeletal_ae.view.controls import REST_TIME
 from musculoskeletal_ae.view.entries import SETTLE_TIME

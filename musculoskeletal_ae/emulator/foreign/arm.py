@@ -27,7 +27,7 @@ from musculoskeletal_ae.importing.adapted_mjcf import HAND
 from musculoskeletal_ae.importing.source import listed
 from musculoskeletal_ae.robot.description import Wrap
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 
 #: update the bends of the tendons, and how far route points yield, once in this many steps
 GUIDES_EVERY = 5

@@ -33,7 +33,7 @@ from musculoskeletal_ae.handle import Handle
 from musculoskeletal_ae.robot.kinematics import joint_space_inertia
 from musculoskeletal_ae.robot.passive_tendon_torque import add_passive
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 
 #: let tendon friction build up to its full size over this sliding distance [m]
 SLIDING_DISTANCE = 0.0005

@@ -15,7 +15,7 @@ by as much as the offset.
 A joint sensor with an offset δθ changes g as well, but like a change of posture: Δ = −G δθ, where G
 is the muscle Jacobian ∂l/∂θ. Because muscles outnumber joints, arbitrary errors of lengths rarely
 have this form. If some δθ explains most of Δ, and more of it than a wrong length of one muscle, the
-joint sensors are false: nothing is reported here, and `joint_sensor_check.py` decides. Otherwise,
+joint sensors are false: nothing is reported here, and `joint_sensor_trust.py` decides. Otherwise,
 the lengths are reported. If only one length disagrees with θ, only its muscle is reported.
 
 A healthy tendon that is shorter than l_net is stretched and has tension. If a tendon is shorter but
@@ -246,7 +246,7 @@ class LengthDisagreement(Detector):
         by_muscle = np.delete(change, muscle)  # what remains unexplained if this length is wrong
         limit = min(UNEXPLAINED * np.linalg.norm(change), np.linalg.norm(by_muscle))
         if np.linalg.norm(unexplained) <= limit:
-            return None  # joint sensors are false; `joint_sensor_check.py` judges them
+            return None  # joint sensors are false; `joint_sensor_trust.py` judges them
         is_alone = self._others_agree(muscle, change, largest)
         kind = ConditionKind.LENGTH_DISAGREES if is_alone else ConditionKind.LENGTHS_DISAGREE
         return Finding(muscle, kind, f'its {evidence}')

@@ -13,7 +13,7 @@ from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.muscle_readings import MuscleReadings
+from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 
 SILENT = 0.15  # report a muscle once it alone has reported NaN for this long [s]
 

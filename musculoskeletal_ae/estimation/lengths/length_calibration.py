@@ -28,7 +28,7 @@ from musculoskeletal_ae.estimation.lengths.length_moments import MomentCollector
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.remedy import Step, sentence
+from musculoskeletal_ae.remedy_steps import Step, sentence
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import UNKNOWN, LengthOffsets
 from musculoskeletal_ae.signals.wiring import WiringJudgement, judge

@@ -11,7 +11,7 @@ holdable. `way` returns the cheapest path through a roadmap of random postures, 
 
 where τ_missing,j is the torque of joint j that muscles and joint stops do not provide. Tensions
 are limited to T_bias + USED (T_limit − T_bias), so that the path keeps a reserve of tension. On an
-edge, tendon friction opposes the motion (`ReachLimits`), and the path keeps a reserve of torque:
+edge, tendon friction opposes the motion (`PathLimits`), and the path keeps a reserve of torque:
 
     τ_reserve = SUPPORT σ d/‖d‖
 
@@ -163,7 +163,7 @@ def tendon_friction(robot: Robot, mae: Mae) -> Array:
     return np.full(robot.muscle_count, FRICTION) if mae.touch is None else mae.touch.friction
 
 
-class ReachLimits:
+class PathLimits:
     """The bone-side tensions that a moving arm may use.
 
         T_bias/loss ≤ T_end ≤ (T_bias + used (T_limit − T_bias))/loss,   loss = e^{μ s}
@@ -232,7 +232,7 @@ class PathCost:
             reserve: Torque in reserve, as a multiple of SUPPORT σ.
         """
         self._robot, self._mae = robot, mae
-        self._limits = ReachLimits(robot, mae, used)
+        self._limits = PathLimits(robot, mae, used)
         #: torque of each joint that is kept in reserve if only this joint moves [N·m], (D,)
         self._reserve = reserve * largest_support(mae)
 

@@ -6,9 +6,9 @@ from copy import deepcopy
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.estimation.joint_sensor_check import JointSensorCheck
+from musculoskeletal_ae.estimation.joint_sensor_trust import JointSensorTrust
 from musculoskeletal_ae.experiments.detection import observe
-from musculoskeletal_ae.signals.joint_trust import SensorTrust
+from musculoskeletal_ae.signals.joint_trust_message import SensorTrust
 
 DT = 0.5
 
@@ -18,7 +18,7 @@ class Arm:
 
     def __init__(self, robot, mae):
         self.robot, self.mae, self.time = robot, mae, 0.0
-        self.check, self.rng = JointSensorCheck(robot), np.random.default_rng(0)
+        self.check, self.rng = JointSensorTrust(robot), np.random.default_rng(0)
         self.check.use(mae)
 
     def go(self, seconds, read=lambda theta, _: theta, longer=0.0):

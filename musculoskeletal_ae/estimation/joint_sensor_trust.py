@@ -48,7 +48,7 @@ from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.estimation.finding import Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.joint_trust import NOT_USED, JointTrust, SensorTrust
+from musculoskeletal_ae.signals.joint_trust_message import NOT_USED, JointTrust, SensorTrust
 
 SPACING = 0.5  # judge sensors by at most one message in this time [s]
 #: skip a message unless the estimated angle of a joint has changed by this much since the last
@@ -103,7 +103,7 @@ class _Usual(NamedTuple):
     residual_spread: Array  # spread of these length errors [m], (M,)
 
 
-class JointSensorCheck:
+class JointSensorTrust:
     """Decides which joint sensors of one arm are trusted, by comparing them with muscle lengths.
 
     Attributes:
