@@ -1033,9 +1033,13 @@ def test_an_optional_quantity_is_judged_by_its_entry_in_the_table(monkeypatch):
     for module in (muscle_states, listening):
         monkeypatch.setattr(module, 'QUANTITIES', (*QUANTITIES, humidity))
     row = np.full(M, 40.0)
-    assert not heard(publish=lambda rows: np.vstack([rows, row])).faults
+
+    def publish(rows):  # the driver measures no other optional quantity
+        return np.vstack([rows, np.full((len(QUANTITIES) - len(rows), M), np.nan), row])
+
+    assert not heard(publish=publish).faults
     row[BICEPS] = 190.0
-    (fault,) = heard(publish=lambda rows: np.vstack([rows, row])).faults
+    (fault,) = heard(publish=publish).faults
     assert fault.muscles == (BICEPS,)
     assert fault.observation == 'its humidity is 190 %; possible: 0 to 100 %'
     assert fault.change == 'publish %, or NaN if it is not measured'
