@@ -35,7 +35,10 @@ from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
 from musculoskeletal_ae.estimation.isolation import SuspectHandling
 from musculoskeletal_ae.estimation.joint_sensor_trust import JointSensorTrust
-from musculoskeletal_ae.estimation.lengths.length_calibration import LengthCalibration
+from musculoskeletal_ae.estimation.lengths.length_calibration import (
+    LARGEST_RESIDUAL,
+    LengthCalibration,
+)
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthTrust
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
 from musculoskeletal_ae.estimation.mounting import MountingCheck
@@ -50,7 +53,7 @@ from musculoskeletal_ae.remedy_steps import REPAIR, Step, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.inverse_kinematics import posture_of_marker
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
+from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets, Trust
 from musculoskeletal_ae.signals.joint_stream import JointStream
 from musculoskeletal_ae.signals.joint_trust_message import JointTrust
 from musculoskeletal_ae.signals.limits import Persistence
@@ -209,8 +212,7 @@ class Estimator:
         self.complete_mae, self.mae = mae, reduced
         self.needed_muscles = needed_muscles(self.robot, reduced)
         if self.calibration is not None:
-            posture = self.calibration.posture
-            self.calibration = LengthCalibration(self.robot, reduced, posture)
+            self.calibration = self._new_calibration(self.calibration.posture)
         return mae
 
     def isolate(self, muscles: Iterable[int]) -> None:
@@ -227,7 +229,7 @@ class Estimator:
         self.health.reset()
 
     def distrust_lengths(self, evidence: Evidence, offset: Array | None = None) -> None:
-        """Consider the length offsets unknown until the next length calibration.
+        """Consider all length offsets unknown until the next length calibration.
 
         Args:
             evidence: Why the offsets are unknown.
@@ -237,8 +239,23 @@ class Estimator:
         offset = unknown.offset if offset is None else offset
         self._note(evidence, found=LengthOffsets(offset, unknown.deviation))
 
+    def _new_calibration(self, posture: tuple[float, ...]) -> LengthCalibration:
+        """Return a calibration of the offsets that are not known, or of all if all are known.
+
+        Lengths of isolated muscles are not checked, so their offsets count as unknown. So do
+        offsets that were calibrated while the muscle was isolated: they are only approximate.
+        """
+        offsets = self.body.offsets
+        is_precise = offsets.deviation < LARGEST_RESIDUAL
+        known = self.body.used & (offsets.trust == Trust.KNOWN) & is_precise
+        is_partial = (known != self.body.used).any()
+        offset = np.where(known & is_partial, offsets.offset, np.nan)
+        return LengthCalibration(self.robot, self.mae, posture, offset)
+
     def calibrate_lengths(self, posture: tuple[float, ...] = ()) -> None:
         """Start a length calibration, during which the arm stands in a posture or moves gently.
+
+        It determines the offsets that are not known; if all are known, it determines all anew.
 
         Args:
             posture: Positions of the joints at which the arm stands [rad or m], (D,); () if the arm
@@ -248,8 +265,9 @@ class Estimator:
             MusculoskeletalError: If there is no network, if the posture is not valid, or if no
                 posture is stated for a robot whose tensions are unknown.
         """
-        self.calibration = LengthCalibration(self.robot, self.mae, posture)
-        self.distrust_lengths(Evidence.CALIBRATING)
+        self.calibration = self._new_calibration(posture)
+        unknown = LengthOffsets.unknown(self.robot.muscle_count)
+        self._note(Evidence.CALIBRATING, self.calibration.muscles, unknown)
         self.health.residual.forget_reading()
         self.output = self.load = None
         self.contact.reset()
@@ -541,6 +559,7 @@ class Estimator:
         """
         if self.calibration is not None:
             # Start again, because readings before and after the jump have different offsets.
+            self._note(Evidence.CALIBRATING, jumped)
             self.calibrate_lengths(self.calibration.posture)
         elif self.mae is None and self.body.offsets.known:
             self._handle(finding_of(jumped), now)
@@ -644,8 +663,12 @@ class Estimator:
         """
         theta = self._measured_theta(self._fresh_readings(now))
         evidence = calibration.step(sample.motor_tension, sample.length_read, dt, theta)
+        if calibration.contradicts_known:
+            self._note(Evidence.CALIBRATING)
+            self.calibration = self._new_calibration(calibration.posture)
+            return None
         if evidence is not None:
-            self._note(evidence, found=calibration.offsets)
+            self._note(evidence, calibration.muscles, calibration.offsets)
         if evidence is Evidence.CALIBRATED:
             self.calibration = None
             self.health.reset()

@@ -76,11 +76,12 @@ class LengthFit:
         used: Whether each muscle is used, that is, not isolated, (M,).
     """
 
-    def __init__(self, robot: Robot, mae: Mae) -> None:
+    def __init__(self, robot: Robot, mae: Mae, known: Array) -> None:
+        """Prepare fits in which the offsets `known` [m] (M,) are fixed; NaN for all others."""
         robot = robot.with_elasticity(mae.elasticity)
-        self._robot, self._mae = robot, mae
+        self._robot, self._mae, self._known = robot, mae, known
         self._rng = np.random.default_rng([0, 0x2E])
-        self._model = LengthModel(robot, mae, self._rng)
+        self._model = LengthModel(robot, mae, known, self._rng)
         self.used = self._model.used
 
     def known_angles(self, moments: Moments) -> Fit:
@@ -90,8 +91,13 @@ class LengthFit:
         """
         residual = moments.length - self._mae.lengths(moments.theta, moments.tension)
         muscle_count = self._robot.muscle_count
-        constants = np.concatenate([residual.mean(axis=0), self._model.prior_mean[muscle_count:]])
+        offset = self.with_known(residual.mean(axis=0))
+        constants = np.concatenate([offset, self._model.prior_mean[muscle_count:]])
         return Fit(0.0, constants, moments.theta)
+
+    def with_known(self, offset: Array) -> Array:
+        """Return offsets [m] (..., M) in which the known ones have their known values."""
+        return np.where(np.isnan(self._known), offset, self._known)
 
     def unknown_angles(self, moments: Moments, before: Fit | None) -> Steps:
         """Fit the offsets to moments whose joint angles were not measured.
@@ -214,7 +220,7 @@ class LengthFit:
             unbalanced.append(np.linalg.norm(torque, axis=1))
             yield
         first = np.concatenate(drawn)[np.argsort(np.concatenate(unbalanced))[:FITTED_POSTURES]]
-        offset = moments.length[0] - mae.lengths(first, tension)
+        offset = self.with_known(moments.length[0] - mae.lengths(first, tension))
         largest = np.abs(offset * self.used).max(axis=1)
         plausible = max(REFINED_FITS, int((largest < FARTHEST).sum()))
         offset = offset[np.argsort(largest)[:plausible]]

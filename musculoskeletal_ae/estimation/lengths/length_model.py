@@ -36,6 +36,8 @@ NOISE_FACTORS = 0.3, 5.0  # multiply LENGTH_NOISE of a single muscle by a factor
 #: weigh the length of an isolated muscle by this, relative to that of a used muscle, so that it has
 #: no influence
 ISOLATED_WEIGHT = 1e-6
+#: let a known offset differ by this standard deviation from its value [m]
+KNOWN_OFFSET = 0.001
 #: expect that a stop may carry torque within this distance from the joint limit [rad]
 AT_STOP = 0.03
 
@@ -72,8 +74,15 @@ class LengthModel:
             torques [N·m], then of the excess over the joint limits [rad].
     """
 
-    def __init__(self, robot: Robot, mae: Mae, rng: np.random.Generator) -> None:
-        """Create the model; `rng` draws the postures over which the torques are compared."""
+    def __init__(self, robot: Robot, mae: Mae, known: Array, rng: np.random.Generator) -> None:
+        """Create the model.
+
+        Args:
+            robot: The robot.
+            mae: The network.
+            known: Known length offsets [m], (M,); NaN for those that are to be fitted.
+            rng: Draws the postures over which the torques are compared.
+        """
         self.robot, self._mae = robot, mae
         muscle_count, joint_count = robot.muscle_count, robot.joint_count
         postures = robot.random_postures(64, rng)
@@ -86,6 +95,8 @@ class LengthModel:
         self.prior_mean: Array = np.repeat([0.0, FRICTION, 0.0, 0.0], counts)
         spread = OFFSET, FRICTION, TENSION_OFFSET, JOINT_FRICTION * weight
         self.prior_spread: Array = np.repeat(spread, counts)
+        is_known = np.flatnonzero(np.isfinite(known))
+        self.prior_mean[is_known], self.prior_spread[is_known] = known[is_known], KNOWN_OFFSET
         self.used = ~np.isin(np.arange(muscle_count), mae.isolated)
         length_weight = np.where(self.used, 1.0, ISOLATED_WEIGHT)
         length_noise = LENGTH_NOISE * _noise_factors(mae) / length_weight

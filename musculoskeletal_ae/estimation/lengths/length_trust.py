@@ -8,7 +8,7 @@ on `body_state`, and all other nodes follow it.
 
     start ── ASSUMED ───────────────────► KNOWN ── a finding that revokes offsets ──► REVOKED
     start ── NOT_CALIBRATED, RESTARTED ─► UNKNOWN ── CALIBRATED ─► KNOWN
-    any ──── CALIBRATING ───────────────► UNKNOWN
+    any ──── CALIBRATING ───────────────► UNKNOWN, for the muscles that are calibrated
     KNOWN ── MOVED, then CONFIRMED ─────► KNOWN
 
 The estimator itself knows that it has restarted, because it saves its offsets (`body_memory`).
