@@ -35,10 +35,7 @@ from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
 from musculoskeletal_ae.estimation.isolation import SuspectHandling
 from musculoskeletal_ae.estimation.joint_sensor_trust import JointSensorTrust
-from musculoskeletal_ae.estimation.lengths.length_calibration import (
-    LARGEST_RESIDUAL,
-    LengthCalibration,
-)
+from musculoskeletal_ae.estimation.lengths.length_calibration import LengthCalibration
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence, LengthTrust
 from musculoskeletal_ae.estimation.module_commands import ModuleCommands
 from musculoskeletal_ae.estimation.mounting import MountingCheck
@@ -53,7 +50,7 @@ from musculoskeletal_ae.remedy_steps import REPAIR, Step, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.inverse_kinematics import posture_of_marker
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets, Trust
+from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 from musculoskeletal_ae.signals.joint_stream import JointStream
 from musculoskeletal_ae.signals.joint_trust_message import JointTrust
 from musculoskeletal_ae.signals.limits import Persistence
@@ -240,22 +237,20 @@ class Estimator:
         self._note(evidence, found=LengthOffsets(offset, unknown.deviation))
 
     def _new_calibration(self, posture: tuple[float, ...]) -> LengthCalibration:
-        """Return a calibration of the offsets that are not known, or of all if all are known.
+        """Return a calibration of the offsets that are not certain, or of all if all are certain.
 
-        Lengths of isolated muscles are not checked, so their offsets count as unknown. So do
-        offsets that were calibrated while the muscle was isolated: they are only approximate.
+        Lengths of isolated muscles are not checked, so their offsets are never certain.
         """
-        offsets = self.body.offsets
-        is_precise = offsets.deviation < LARGEST_RESIDUAL
-        known = self.body.used & (offsets.trust == Trust.KNOWN) & is_precise
-        is_partial = (known != self.body.used).any()
-        offset = np.where(known & is_partial, offsets.offset, np.nan)
+        used = self.body.used
+        certain = used & self.trust.is_certain
+        is_partial = (certain != used).any()
+        offset = np.where(certain & is_partial, self.body.offsets.offset, np.nan)
         return LengthCalibration(self.robot, self.mae, posture, offset)
 
     def calibrate_lengths(self, posture: tuple[float, ...] = ()) -> None:
         """Start a length calibration, during which the arm stands in a posture or moves gently.
 
-        It determines the offsets that are not known; if all are known, it determines all anew.
+        It determines the offsets that are not certain; if all are certain, it determines all anew.
 
         Args:
             posture: Positions of the joints at which the arm stands [rad or m], (D,); () if the arm

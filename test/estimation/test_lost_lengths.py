@@ -333,6 +333,7 @@ def test_after_a_repair_with_another_zero_the_reset_is_refused_until_a_calibrati
     assert ruptured.core.remedy == (Step.CALIBRATE_LENGTHS,)
     ruptured.core.calibrate_lengths()
     assert ruptured.kind is None
+    assert ruptured.core.calibration.muscles == (2,)
 
 
 @pytest.mark.parametrize('ruptured', [True], indirect=True)

@@ -22,11 +22,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.signals.body_state import LengthOffsets, Trust
 
 #: Add this standard deviation to an offset that is confirmed after a repair [m], because the repair
-#: may have changed it slightly.
+#: may have changed it slightly. The next calibration determines an offset anew if its standard
+#: deviation is at least this.
 CONFIRMED = 0.01
 
 
@@ -114,6 +116,16 @@ class LengthTrust:
         offset, deviation, trust = rows
         self.offsets = LengthOffsets(offset, deviation, trust.astype(int))
         return True
+
+    @property
+    def is_certain(self) -> Bools:
+        """Which offsets a calibration need not determine anew, (M,).
+
+        They are known and precise, and their muscle has not been repaired since.
+        """
+        is_moved = np.array([evidence is Evidence.MOVED for evidence in self.evidence])
+        is_precise = self.offsets.deviation < CONFIRMED
+        return (self.offsets.trust == Trust.KNOWN) & is_precise & ~is_moved
 
     @property
     def doubts(self) -> dict[str, tuple[int, ...]]:
