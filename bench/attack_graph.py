@@ -49,6 +49,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.declared_parameters import PARAMETERS
 from musculoskeletal_ae.nodes.reported_conditions import Situation
 from musculoskeletal_ae.process_signals import STOP
+from musculoskeletal_ae.remedy_steps import Step
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.ros.message_building import LATCHED, bytes_message
 from musculoskeletal_ae.ros_tools.ros_tool import Spinner, message_class
@@ -366,6 +367,8 @@ class Attack:
     def moving(self) -> bool:
         """Remove all faults, reset the nodes and explore; return whether the arm moves.
 
+        If the estimator refuses a reset because it has revoked length offsets, they are calibrated.
+
         If the arm does not move in time, this is recorded as a violation.
         """
         self.wait(
@@ -382,7 +385,9 @@ class Attack:
         self.call(SetBool, 'learner/enable', SetBool.Request(data=True))
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
-            self.call(Trigger, 'estimator/reset')
+            answer = self.call(Trigger, 'estimator/reset')
+            if answer is not None and 'estimator/zero' in answer.message:
+                self.calibrate_lengths()
             self.spin(0.3)
             answer = self.call(Trigger, 'controller/reset')
             if answer is not None and answer.success:
@@ -395,6 +400,20 @@ class Attack:
         why = answer.message if answer is not None else 'no answer'
         self.found('the arm moves again after an attack', f'in {PATIENCE:g} s: {why}')
         return False
+
+    def calibrate_lengths(self) -> None:
+        """Calibrate the lengths: request the calibration, and wait until it has ended.
+
+        The calibration takes half a minute of gentle motion. A second request would restart it.
+        """
+        self.call(Trigger, 'estimator/zero')
+        self.call(Trigger, 'controller/reset')
+        self.call(SetBool, 'controller/explore', SetBool.Request(data=True))
+        end = time.monotonic() + 0.6 * PATIENCE
+        is_calibrating = True
+        while is_calibrating and time.monotonic() < end:
+            self.spin(1.0)
+            is_calibrating = Step.CALIBRATE_LENGTHS in self.situation.steps()
 
     def is_warm(self) -> bool:
         """Return whether a winding was warmer than WARM in the last genuine message."""

@@ -170,28 +170,13 @@ class Scene:
         elif step is Step.RESTORE_MUSCLES:
             attack.call(Trigger, 'estimator/restore')
         elif step is Step.CALIBRATE_LENGTHS:
-            self._calibrate_lengths()
+            attack.calibrate_lengths()
         elif step in (Step.EXPLORE, Step.EXPLORE_GENTLY, Step.CHANGE_TARGET):
             attack.call(SetBool, 'controller/explore', SetBool.Request(data=True))
         elif step in (Step.RESET_CONTROLLER, Step.RESET_ESTIMATOR):
             node = 'controller' if step is Step.RESET_CONTROLLER else 'estimator'
             attack.call(Trigger, f'{node}/reset')
             attack.spin(0.5)
-
-    def _calibrate_lengths(self) -> None:
-        """Calibrate the lengths: request the calibration, and wait until it has ended.
-
-        The calibration takes half a minute of gentle motion. A second request would restart it.
-        """
-        attack = self.attack
-        attack.call(Trigger, 'estimator/zero')
-        attack.call(Trigger, 'controller/reset')
-        attack.call(SetBool, 'controller/explore', SetBool.Request(data=True))
-        end = time.monotonic() + 0.6 * PATIENCE
-        is_calibrating = True
-        while is_calibrating and time.monotonic() < end:
-            attack.spin(1.0)
-            is_calibrating = Step.CALIBRATE_LENGTHS in attack.situation.steps()
 
     # -- actions of the hostile node ------------------------------------------------------------
 
