@@ -289,6 +289,8 @@ class ControllerNode(Shell):
     def _step(self) -> None:
         self.overdue.reset()
         command = self.core.step(time.monotonic(), self.now())
+        # Publish the mode first, so that no command of a moving arm follows a mode `stopped`.
+        self._publish_mode()
         if command is not None:
             value, offset = command.value, self.body.offsets.offset
             value = value + offset if command.kind == LENGTH else value
@@ -302,7 +304,6 @@ class ControllerNode(Shell):
             self.states.publish(self._state())
         if self.action is not None:
             self.action.step(self._state)
-        self._publish_mode()
         if command is not None:
             self._remember_stop()
         self._record_stop()
