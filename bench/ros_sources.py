@@ -6,7 +6,7 @@
 
 Each package is cloned from the release repository that the packages of apt are built from, and
 compiled against the ROS wheels in a separate virtual environment. The result is a wheel, which pip
-installs into the virtual environment of this Python, so `pip uninstall ros-tf2-msgs` removes it.
+installs into the virtual environment of this Python, so `pip uninstall ros-control-msgs` removes it.
 The bench requires git, a C++ compiler and the headers of Python. It takes one to three minutes a
 package.
 """
@@ -175,7 +175,7 @@ def _check_machine() -> None:
         raise MusculoskeletalError(
             f'the ROS wheels are not installed in {sys.prefix}. Run ./bringup.sh first, and start '
             'this bench with .venv/bin/python. If ROS 2 Jazzy is installed, use apt-get instead: '
-            'ros-jazzy-tf2-msgs and ros-jazzy-control-msgs.'
+            'ros-jazzy-control-msgs.'
         ) from error
     header = Path(sysconfig.get_path('include'), 'Python.h')
     found = {

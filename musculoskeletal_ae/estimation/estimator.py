@@ -239,13 +239,21 @@ class Estimator:
     def _new_calibration(self, posture: tuple[float, ...]) -> LengthCalibration:
         """Return a calibration of the offsets that are not certain, or of all if all are certain.
 
-        Lengths of isolated muscles are not checked, so their offsets are never certain.
+        In a stated posture, all offsets are calibrated, so that they agree with each other.
         """
-        used = self.body.used
-        certain = used & self.trust.is_certain
-        is_partial = (certain != used).any()
-        offset = np.where(certain & is_partial, self.body.offsets.offset, np.nan)
+        certain = self.trust.is_certain
+        keeps = certain & (not certain.all() and not posture)
+        offset = np.where(keeps, self.body.offsets.offset, np.nan)
         return LengthCalibration(self.robot, self.mae, posture, offset)
+
+    def _begin_calibration(self, posture: tuple[float, ...]) -> None:
+        """Begin a calibration; until its first estimate, offsets and posture are unknown."""
+        self.calibration = self._new_calibration(posture)
+        unknown = LengthOffsets.unknown(self.robot.muscle_count)
+        self._note(Evidence.CALIBRATING, self.calibration.muscles, unknown)
+        self.health.residual.forget_reading()
+        self.output = self.load = None
+        self.contact.reset()
 
     def calibrate_lengths(self, posture: tuple[float, ...] = ()) -> None:
         """Start a length calibration, during which the arm stands in a posture or moves gently.
@@ -260,12 +268,7 @@ class Estimator:
             MusculoskeletalError: If there is no network, if the posture is not valid, or if no
                 posture is stated for a robot whose tensions are unknown.
         """
-        self.calibration = self._new_calibration(posture)
-        unknown = LengthOffsets.unknown(self.robot.muscle_count)
-        self._note(Evidence.CALIBRATING, self.calibration.muscles, unknown)
-        self.health.residual.forget_reading()
-        self.output = self.load = None
-        self.contact.reset()
+        self._begin_calibration(posture)
         self.reset()
         self.health.joints.forget()
         self.joint_check.forget()
@@ -547,10 +550,11 @@ class Estimator:
         return np.where(now - time < JOINTS_AGE, theta, np.nan)
 
     def _handle_jump(self, jumped: tuple[int, ...], now: float) -> None:
-        """Respond to a jump of lengths in two cases in which the detector `LengthJump` does not.
+        """Respond to a jump of lengths in three cases in which the detector `LengthJump` does not.
 
         During a length calibration, the calibration starts again. Without a network, the jump is
-        latched as a finding.
+        latched as a finding. While other offsets are not known, those of the lengths that have
+        jumped are revoked as well.
         """
         if self.calibration is not None:
             # Start again, because readings before and after the jump have different offsets.
@@ -558,6 +562,8 @@ class Estimator:
             self.calibrate_lengths(self.calibration.posture)
         elif self.mae is None and self.body.offsets.known:
             self._handle(finding_of(jumped), now)
+        elif not self.body.offsets.known:
+            self._note(finding_of(jumped).kind, jumped)
 
     def _check_suspect(self, isolating: Iterable[int]) -> None:
         """Check that suspect muscles are repaired, unless they are among the muscles `isolating`.
@@ -659,8 +665,8 @@ class Estimator:
         theta = self._measured_theta(self._fresh_readings(now))
         evidence = calibration.step(sample.motor_tension, sample.length_read, dt, theta)
         if calibration.contradicts_known:
-            self._note(Evidence.CALIBRATING)
-            self.calibration = self._new_calibration(calibration.posture)
+            self._note(Evidence.CALIBRATING)  # no offset is certain any more
+            self._begin_calibration(calibration.posture)
             return None
         if evidence is not None:
             self._note(evidence, calibration.muscles, calibration.offsets)

@@ -8,7 +8,6 @@ covariance is therefore computed in advance for the loss of each further muscle.
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -32,37 +31,17 @@ def needed_muscles(robot: Robot, mae: Mae) -> dict[str, str]:
     """
     if not mae.isolated:
         return {}
-    jacobian = _jacobian(robot, mae)
+    theta = robot.random_postures(POSTURES, np.random.default_rng(0))
+    jacobian = mae.muscle_jacobian(theta, np.tile(robot.tension.bias, (POSTURES, 1)))
     needed = dict[str, str]()
     for muscle, name in enumerate(robot.muscles):
         if muscle in mae.isolated:
             continue
-        share = _undetermined_share(mae.without((*mae.isolated, muscle)), jacobian)
+        covariance = mae.without((*mae.isolated, muscle)).posture_covariance(jacobian)
+        variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+        share = (variance > UNDETERMINED**2).mean(axis=0)
         joints = np.flatnonzero(share > NOTABLE_SHARE)
         if joints.size:
             shares = (f'{robot.joints[j]} in {share[j]:.0%} of the postures' for j in joints)
             needed[name] = ', '.join(shares)
     return needed
-
-
-def determine_posture(robot: Robot, mae: Mae) -> bool:
-    """Return whether the muscles that are not isolated determine the angles of all joints."""
-    return bool((_undetermined_share(mae, _jacobian(robot, mae)) <= NOTABLE_SHARE).all())
-
-
-def _jacobian(robot: Robot, mae: Mae) -> Array:
-    """Return the muscle Jacobians in random postures [m/rad], (POSTURES, M, D)."""
-    theta = robot.random_postures(POSTURES, np.random.default_rng(0))
-    return mae.muscle_jacobian(theta, np.tile(robot.tension.bias, (POSTURES, 1)))
-
-
-def _undetermined_share(mae: Mae, jacobian: Array) -> Array:
-    """Return the share of postures in which the muscles in use leave a joint undetermined, (D,).
-
-    Args:
-        mae: The network; its isolated muscles do not count.
-        jacobian: Muscle Jacobians in these postures [m/rad], (N, M, D).
-    """
-    variance = np.diagonal(mae.posture_covariance(jacobian), axis1=-2, axis2=-1)
-    share: Array = (variance > UNDETERMINED**2).mean(axis=0)
-    return share

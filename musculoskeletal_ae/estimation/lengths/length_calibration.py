@@ -5,10 +5,9 @@ The arm moves gently, with or without measured joint angles, or it stands in a s
 `length_moments.py` collects the readings, and `length_fit.py` fits the offsets to them. This file
 decides when to fit and whether the result is reliable.
 
-Offsets that are known stay as they are. If only some offsets are unknown, for example after one
-winch has slipped, and if the other muscles determine the posture, their estimate of the joint
-angles takes the place of joint sensors. If the readings contradict a known offset, the caller
-starts again without any (`contradicts_known`).
+Offsets that are known stay as they are. After one winch has slipped, only its offset is therefore
+fitted. If the readings contradict the known offsets, the caller starts again without them
+(`contradicts_known`).
 
 Offsets cannot correct readings in a wrong order, or lengths with a wrong sign. Such readings would
 often lead to plausible but false offsets. Before offsets of a moving arm are accepted, the wiring
@@ -28,7 +27,6 @@ from collections.abc import Generator
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.estimation.further_loss import determine_posture
 from musculoskeletal_ae.estimation.lengths.length_fit import FARTHEST, Fit, LengthFit
 from musculoskeletal_ae.estimation.lengths.length_moments import MomentCollector, Moments
 from musculoskeletal_ae.estimation.lengths.length_trust import Evidence
@@ -53,6 +51,10 @@ MOST_PIECES = 4  # do at most this many pieces of a fit at one message, so that 
 #: reject a fit if the median residual of a length is larger than this [m]; correct offsets leave
 #: 0.0003 m
 LARGEST_RESIDUAL = 0.02
+#: Drop all known offsets if the median error of a known length is larger than this [m]. With right
+#: offsets, it is below 7 mm for most muscles of emulator model `foreign`. If it is larger, only the
+#: advantage of the known offsets is lost.
+CONTRADICTION = 0.01
 #: reject a fit with a larger cost per residual than this: correct offsets cost 0.2 to 0.5, offsets
 #: of a wrong posture 1.1, and pure noise 0.95
 LARGEST_COST = 0.75
@@ -86,7 +88,7 @@ class LengthCalibration:
         posture: Positions of the joints at which the arm stands, as the user has stated them [rad
             or m], (D,); () if the arm moves gently.
         muscles: Indices of the muscles whose offsets are calibrated; all others are known.
-        contradicts_known: Whether the readings contradict a known offset.
+        contradicts_known: Whether the readings contradict the known offsets.
         wiring: Whether muscles are exchanged or lengths have a wrong sign, according to the newest
             fit; None before the wiring has been judged.
     """
@@ -105,8 +107,8 @@ class LengthCalibration:
             mae: The network; its isolated muscles are ignored.
             posture: Positions of the joints at which the arm stands still [rad or m], (D,); () if
                 it moves gently during the calibration.
-            known: Offsets of used muscles that are known [m], (M,), NaN for those that are to be
-                calibrated; None if all are.
+            known: Offsets that are known [m], (M,), NaN for those that are to be calibrated; None
+                if all are.
 
         Raises:
             MusculoskeletalError: If there is no network, if the posture is not valid, or if no
@@ -127,10 +129,6 @@ class LengthCalibration:
         self._known = np.full(robot.muscle_count, np.nan) if known is None else known
         self.muscles: tuple[int, ...] = tuple(np.flatnonzero(np.isnan(self._known)).tolist())
         self.contradicts_known = False
-        others = mae.without(self.muscles)
-        #: the network that estimates joint angles from the muscles whose offsets are known; None if
-        #: these do not determine them
-        self._others = others if determine_posture(robot, others) else None
         self._fit = LengthFit(robot, mae, self._known)
         self._collector = MomentCollector(self._fit.used, robot.joint_count, self._stated)
         self._since = 0.0  # time since the last fit began [s]
@@ -214,8 +212,6 @@ class LengthCalibration:
         if not self.is_done:
             if self.is_standing and theta is not None:
                 self._measured.append(theta)
-            if theta is None and self._others is not None:
-                theta = self._others.estimate(tension, length - self._known).theta
             self._continue(tension, length, dt, theta)
         if self.is_done and (problem := self._posture_problem()):
             self._problem = problem
@@ -297,20 +293,32 @@ class LengthCalibration:
         # An isolated muscle still receives commands and needs an offset, however uncertain.
         of_isolated = np.median(moments.read - expected, axis=0)
         of_isolated = np.clip(of_isolated, -FARTHEST, FARTHEST)
-        offset = np.where(used, self._fit.with_known(fit.constants[:muscle_count]), of_isolated)
-        residual = np.median(np.abs(used * (moments.length - offset - expected)), axis=0)
+        offset = np.where(used, fit.constants[:muscle_count], of_isolated)
+        offset = self._fit.with_known(offset)
+        error = used * (moments.length - offset - expected)
+        residual = np.median(np.abs(error), axis=0)
         self._best, self._problem = fit, ''
         deviation = np.full(muscle_count, UNKNOWN)
         if is_enough:
             self._problem = self._problem_of(fit, residual)
-            self.contradicts_known = bool(
-                (residual[~np.isnan(self._known)] > LARGEST_RESIDUAL).any()
-            )
+            self.contradicts_known = self._contradicts_known(error)
             if not self._problem:
                 independent = max(1.0, len(fit.theta) / CORRELATED)
                 deviation = MAD_TO_DEVIATION * residual / np.sqrt(independent)
                 deviation[~used] = LARGEST_RESIDUAL
         self._estimate = LengthOffsets(offset, deviation)
+
+    def _contradicts_known(self, error: Array) -> bool:
+        """Return whether the fit is bad, unless the wiring is the cause, or a known offset is off.
+
+        Args:
+            error: Measured lengths minus those of the fit [m], (K, M).
+        """
+        is_known = ~np.isnan(self._known)
+        if not is_known.any() or self.remedy:
+            return False
+        off = np.abs(np.median(error[:, is_known], axis=0)) > CONTRADICTION
+        return bool(self._problem) or bool(off.any())
 
     def _problem_of(self, fit: Fit, residual: Array) -> str:
         """Return why a fit is not reliable, as a text for users, or '' if it is reliable.

@@ -77,7 +77,14 @@ class LengthFit:
     """
 
     def __init__(self, robot: Robot, mae: Mae, known: Array) -> None:
-        """Prepare fits in which the offsets `known` [m] (M,) are fixed; NaN for all others."""
+        """Prepare fits in which some offsets are known.
+
+        Args:
+            robot: The robot.
+            mae: The network.
+            known: Known offsets [m], (M,); NaN for all others. Without joint angles, the fit may
+                change them by about a millimetre.
+        """
         robot = robot.with_elasticity(mae.elasticity)
         self._robot, self._mae, self._known = robot, mae, known
         self._rng = np.random.default_rng([0, 0x2E])
@@ -221,7 +228,7 @@ class LengthFit:
             yield
         first = np.concatenate(drawn)[np.argsort(np.concatenate(unbalanced))[:FITTED_POSTURES]]
         offset = self.with_known(moments.length[0] - mae.lengths(first, tension))
-        largest = np.abs(offset * self.used).max(axis=1)
+        largest = np.abs(offset * self.used * np.isnan(self._known)).max(axis=1)
         plausible = max(REFINED_FITS, int((largest < FARTHEST).sum()))
         offset = offset[np.argsort(largest)[:plausible]]
         cost, postures = np.empty(len(offset)), list[Array]()

@@ -119,7 +119,7 @@ class LengthTrust:
 
     @property
     def is_certain(self) -> Bools:
-        """Which offsets a calibration need not determine anew, (M,).
+        """Which offsets a calibration leaves as they are, (M,).
 
         They are known and precise, and their muscle has not been repaired since.
         """
