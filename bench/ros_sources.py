@@ -6,9 +6,9 @@
 
 Each package is cloned from the release repository that the packages of apt are built from, and
 compiled against the ROS wheels in a separate virtual environment. The result is a wheel, which pip
-installs into the virtual environment of this Python, so `pip uninstall ros-control-msgs` removes it.
-The bench requires git, a C++ compiler and the headers of Python. It takes one to three minutes a
-package.
+installs into the virtual environment of this Python, so `pip uninstall ros-control-msgs` removes
+it. The bench requires git, a C++ compiler and the headers of Python. It takes one to three minutes
+a package.
 """
 
 import argparse
