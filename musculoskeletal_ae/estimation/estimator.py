@@ -239,10 +239,13 @@ class Estimator:
     def _new_calibration(self, posture: tuple[float, ...]) -> LengthCalibration:
         """Return a calibration of the offsets that are not certain, or of all if all are certain.
 
-        In a stated posture, all offsets are calibrated, so that they agree with each other.
+        Only offsets of used muscles can be certain, because lengths of isolated muscles are not
+        checked. In a stated posture, all offsets are calibrated, so that they agree with each
+        other.
         """
-        certain = self.trust.is_certain
-        keeps = certain & (not certain.all() and not posture)
+        used = self.body.used
+        certain = self.trust.is_certain & used
+        keeps = certain & (not certain[used].all() and not posture)
         offset = np.where(keeps, self.body.offsets.offset, np.nan)
         return LengthCalibration(self.robot, self.mae, posture, offset)
 
@@ -326,6 +329,8 @@ class Estimator:
             again = 'then call estimator/restore again'
             raise MusculoskeletalError(f'{"; ".join(problems)}; {again}')
         self._confirm(restored)
+        if self.calibration is not None:  # the lengths of these muscles were not checked meanwhile
+            self._note(Evidence.CALIBRATING, restored)
         self.isolate(muscle for muscle in self.body.isolated if muscle not in restored)
 
     def reset(self, isolating: Iterable[int] = ()) -> None:

@@ -166,6 +166,57 @@ def test_offsets_that_the_readings_contradict_are_calibrated_as_well(robot, mae)
     np.testing.assert_allclose(arm.offsets.offset, arm.off, atol=2e-3)
 
 
+def isolated_and_calibrated(robot, mae):
+    """Return an arm whose offsets were calibrated while muscle 5 was isolated, as it still is."""
+    arm = MovingArm(robot, mae)
+    arm.go(2.0)
+    arm.core.isolate([5])
+    arm.core.calibrate_lengths()
+    arm.go(25.0)
+    assert arm.offsets.known
+    return arm
+
+
+def test_beside_an_isolated_muscle_a_requested_calibration_determines_all_offsets(robot, mae):
+    arm = isolated_and_calibrated(robot, mae)
+    arm.off = 0.009 * np.eye(6)[4]
+    arm.core.calibrate_lengths()
+    arm.go(25.0)
+    assert arm.offsets.offset[4] == pytest.approx(0.009, abs=2e-3)
+
+
+def test_an_isolated_muscle_with_another_zero_can_be_calibrated_and_restored(robot, mae):
+    arm = isolated_and_calibrated(robot, mae)
+    arm.core.isolate([2, 5])
+    arm.off = 0.12 * np.eye(6)[2]
+    arm.go(2.0)
+    with pytest.raises(MusculoskeletalError, match='estimator/zero'):
+        arm.core.restore([2])
+    arm.core.calibrate_lengths()
+    arm.go(25.0)
+    arm.core.restore([2])
+    arm.core.calibrate_lengths()
+    arm.go(25.0)
+    assert arm.offsets.known
+    assert arm.offsets.offset[2] == pytest.approx(0.12, abs=2e-3)
+
+
+def test_a_muscle_that_is_restored_during_a_calibration_is_calibrated_as_well(robot, mae):
+    arm = MovingArm(robot, mae)
+    arm.go(2.0)
+    arm.core.isolate([4])
+    arm.off = 0.008 * np.eye(6)[4]
+    arm.go(2.0)
+    arm.off = arm.off + ONE
+    arm.go(2.0)
+    arm.core.calibrate_lengths()
+    arm.go(3.0)
+    arm.core.restore([4])
+    arm.go(30.0)
+    assert arm.offsets.known
+    np.testing.assert_allclose(arm.offsets.offset, arm.off, atol=2e-3)
+
+
 @pytest.mark.parametrize('pair', [(0, 2), (1, 4)])
 def test_exchanged_muscles_are_named_instead_of_lost_offsets(robot, calibrated, pair):
     arm = MovingArm(robot, calibrated)
