@@ -209,7 +209,8 @@ class Estimator:
         self.complete_mae, self.mae = mae, reduced
         self.needed_muscles = needed_muscles(self.robot, reduced)
         if self.calibration is not None:
-            self.calibration = self._new_calibration(self.calibration.posture)
+            posture = self.calibration.posture
+            self.calibration = self._new_calibration(posture, 'the network changed')
         return mae
 
     def isolate(self, muscles: Iterable[int]) -> None:
@@ -236,22 +237,26 @@ class Estimator:
         offset = unknown.offset if offset is None else offset
         self._note(evidence, found=LengthOffsets(offset, unknown.deviation))
 
-    def _new_calibration(self, posture: tuple[float, ...]) -> LengthCalibration:
+    def _new_calibration(self, posture: tuple[float, ...], reason: str = '') -> LengthCalibration:
         """Return a calibration of the offsets that are not certain, or of all if all are certain.
 
         Only offsets of used muscles can be certain, because lengths of isolated muscles are not
         checked. In a stated posture, all offsets are calibrated, so that they agree with each
         other.
+
+        Args:
+            posture: The stated posture; () if the arm moves gently.
+            reason: Why an earlier calibration begins again, as a text for users.
         """
         used = self.body.used
         certain = self.trust.is_certain & used
         keeps = certain & (not certain[used].all() and not posture)
         offset = np.where(keeps, self.body.offsets.offset, np.nan)
-        return LengthCalibration(self.robot, self.mae, posture, offset)
+        return LengthCalibration(self.robot, self.mae, posture, offset, reason)
 
-    def _begin_calibration(self, posture: tuple[float, ...]) -> None:
+    def _begin(self, calibration: LengthCalibration) -> None:
         """Begin a calibration; until its first estimate, offsets and posture are unknown."""
-        self.calibration = self._new_calibration(posture)
+        self.calibration = calibration
         unknown = LengthOffsets.unknown(self.robot.muscle_count)
         self._note(Evidence.CALIBRATING, self.calibration.muscles, unknown)
         self.health.residual.forget_reading()
@@ -268,11 +273,14 @@ class Estimator:
                 moves gently.
 
         Raises:
-            MusculoskeletalError: If there is no network, if the posture is not valid, or if no
-                posture is stated for a robot whose tensions are unknown.
+            MusculoskeletalError: If there is no network, if the posture is not valid, if no posture
+                is stated for a robot whose tensions are unknown, or if other readings than the
+                length of the suspect muscle show that it is not repaired. Nothing changes then.
         """
-        self._begin_calibration(posture)
-        self.reset()
+        calibration = self._new_calibration(posture)
+        self._check_suspect(checks_lengths=False)
+        self._begin(calibration)
+        self._accept_body()
         self.health.joints.forget()
         self.joint_check.forget()
 
@@ -347,6 +355,10 @@ class Estimator:
         self._check_suspect(tuple(isolating))
         if self.body.offsets.revoked:
             raise MusculoskeletalError(f'{self.cause}; {self.advice}')
+        self._accept_body()
+
+    def _accept_body(self) -> None:
+        """Consider the body healthy in its present state, and clear a finding."""
         self.health.heat.accept(*range(self.robot.muscle_count))
         self.mounting.reset()
         self._clear(self.suspects.clear(self.body.isolated))
@@ -564,16 +576,20 @@ class Estimator:
         if self.calibration is not None:
             # Start again, because readings before and after the jump have different offsets.
             self._note(Evidence.CALIBRATING, jumped)
-            self.calibrate_lengths(self.calibration.posture)
+            self._begin(self._new_calibration(self.calibration.posture, 'a length jumped'))
         elif self.mae is None and self.body.offsets.known:
             self._handle(finding_of(jumped), now)
         elif not self.body.offsets.known:
             self._note(finding_of(jumped).kind, jumped)
 
-    def _check_suspect(self, isolating: Iterable[int]) -> None:
+    def _check_suspect(self, isolating: Iterable[int] = (), checks_lengths: bool = True) -> None:
         """Check that suspect muscles are repaired, unless they are among the muscles `isolating`.
 
         Then confirm the length offset of each suspect whose length has jumped since the finding.
+
+        Args:
+            isolating: Muscles (indices) that the caller isolates next; they need not be repaired.
+            checks_lengths: Whether the lengths must fit the posture.
 
         Raises:
             MusculoskeletalError: If the readings of a suspect still contradict the rest of the arm;
@@ -583,8 +599,10 @@ class Estimator:
         if suspected is None or suspected.kind.steps != REPAIR or suspected.muscle in isolating:
             return
         used = [muscle for muscle in suspected.muscles if muscle not in isolating]
-        if problems := list(filter(None, map(self._repair_problem, used))):
-            raise MusculoskeletalError(f'{"; ".join(problems)}; then call estimator/reset again')
+        problems = [self._repair_problem(muscle, checks_lengths) for muscle in used]
+        if problems := list(filter(None, problems)):
+            again = f'call estimator/{"reset" if checks_lengths else "zero"} again'
+            raise MusculoskeletalError(f'{"; ".join(problems)}; then {again}')
         self._confirm(used)
 
     def _confirm(self, muscles: Iterable[int]) -> None:
@@ -592,10 +610,12 @@ class Estimator:
         moved = [muscle for muscle in muscles if self.trust.evidence[muscle] is Evidence.MOVED]
         self._note(Evidence.CONFIRMED, moved)
 
-    def _repair_problem(self, muscle: int) -> str:
+    def _repair_problem(self, muscle: int, checks_lengths: bool = True) -> str:
         """Return why a muscle must not be used yet, or '' if it may be used."""
         check = self._repair_check
-        return '' if check is None else check.problem(muscle)
+        if check is None:
+            return ''
+        return (check if checks_lengths else check._replace(limit=math.inf)).problem(muscle)
 
     @property
     def _repair_check(self) -> RepairCheck | None:
@@ -671,7 +691,8 @@ class Estimator:
         evidence = calibration.step(sample.motor_tension, sample.length_read, dt, theta)
         if calibration.contradicts_known:
             self._note(Evidence.CALIBRATING)  # no offset is certain any more
-            self._begin_calibration(calibration.posture)
+            reason = 'readings contradict the known offsets'
+            self._begin(self._new_calibration(calibration.posture, reason))
             return None
         if evidence is not None:
             self._note(evidence, calibration.muscles, calibration.offsets)

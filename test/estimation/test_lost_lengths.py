@@ -161,7 +161,9 @@ def test_offsets_that_the_readings_contradict_are_calibrated_as_well(robot, mae)
     arm.go(2.0)
     assert arm.offsets.revoked == (2,)
     arm.core.calibrate_lengths()
-    arm.go(60.0)
+    arm.go(25.0)
+    assert 'contradict' in arm.core.calibration.progress
+    arm.go(35.0)
     assert arm.offsets.known
     np.testing.assert_allclose(arm.offsets.offset, arm.off, atol=2e-3)
 
@@ -302,6 +304,7 @@ def test_a_jump_during_the_length_calibration_begins_it_again(robot, mae):
     arm.off = SEVERAL
     arm.go(2.0)
     assert arm.core.calibration is not before
+    assert 'a length jumped' in arm.core.calibration.progress
 
 
 @pytest.mark.parametrize('jump', [0.05 * np.eye(6)[2], SEVERAL], ids=['50 mm', 'all muscles'])
@@ -583,6 +586,10 @@ def test_a_reset_right_after_the_jump_of_a_repair_is_refused_until_the_jump_is_o
     ruptured.go(0.1, sensors=ruptured.has_sensors)
     with pytest.raises(MusculoskeletalError, match='just jumped'):
         ruptured.core.reset()
+    with pytest.raises(MusculoskeletalError, match=r'just jumped.*estimator/zero again'):
+        ruptured.core.calibrate_lengths()
+    assert ruptured.core.calibration is None
+    assert ruptured.offsets.known
     ruptured.go(1.5, sensors=ruptured.has_sensors)
     ruptured.core.reset()
     ruptured.go(3.0, sensors=ruptured.has_sensors)

@@ -5,9 +5,9 @@ The arm moves gently, with or without measured joint angles, or it stands in a s
 `length_moments.py` collects the readings, and `length_fit.py` fits the offsets to them. This file
 decides when to fit and whether the result is reliable.
 
-Offsets that are known stay as they are. After one winch has slipped, only its offset is therefore
+While the arm moves, known offsets stay as they are: after one winch has slipped, only its offset is
 fitted. If the readings contradict the known offsets, the caller starts again without them
-(`contradicts_known`).
+(`contradicts_known`). In a stated posture, all offsets are determined.
 
 Offsets cannot correct readings in a wrong order, or lengths with a wrong sign. Such readings would
 often lead to plausible but false offsets. Before offsets of a moving arm are accepted, the wiring
@@ -99,6 +99,7 @@ class LengthCalibration:
         mae: Mae | None,
         posture: tuple[float, ...] = (),
         known: Array | None = None,
+        reason: str = '',
     ) -> None:
         """Start a calibration.
 
@@ -109,6 +110,7 @@ class LengthCalibration:
                 it moves gently during the calibration.
             known: Offsets that are known [m], (M,), NaN for those that are to be calibrated; None
                 if all are.
+            reason: Why an earlier calibration begins again, as a text for users; '' if it does not.
 
         Raises:
             MusculoskeletalError: If there is no network, if the posture is not valid, or if no
@@ -125,7 +127,7 @@ class LengthCalibration:
                 'without tensions (tension_source: none), lengths can be calibrated only in a '
                 'known posture; hold the arm still and set the parameter zero_posture'
             )
-        self._robot, self._mae = robot, mae
+        self._robot, self._mae, self._reason = robot, mae, reason
         self._known = np.full(robot.muscle_count, np.nan) if known is None else known
         self.muscles: tuple[int, ...] = tuple(np.flatnonzero(np.isnan(self._known)).tolist())
         self.contradicts_known = False
@@ -176,7 +178,8 @@ class LengthCalibration:
     def progress(self) -> str:
         """Progress of the calibration and any problem, as a text for users."""
         how = 'of standing still' if self.is_standing else 'of gentle motion'
-        progress = f'{self.time:.0f} of {self.enough:.0f} s {how}'
+        again = f' (begun again: {self._reason})' if self._reason else ''
+        progress = f'{self.time:.0f} of {self.enough:.0f} s {how}{again}'
         return f'{progress}; {self.problem}' if self.problem else progress
 
     @property
@@ -309,13 +312,16 @@ class LengthCalibration:
         self._estimate = LengthOffsets(offset, deviation)
 
     def _contradicts_known(self, error: Array) -> bool:
-        """Return whether the fit is bad, unless the wiring is the cause, or a known offset is off.
+        """Return whether the fit is bad, or a known offset is off.
+
+        If measured joint angles show that the wiring is wrong, the known offsets are not blamed.
+        Without them, the wiring is judged by the fit, so wrong known offsets would mislead it.
 
         Args:
             error: Measured lengths minus those of the fit [m], (K, M).
         """
         is_known = ~np.isnan(self._known)
-        if not is_known.any() or self.remedy:
+        if not is_known.any() or (self.remedy and self._has_angles):
             return False
         off = np.abs(np.median(error[:, is_known], axis=0)) > CONTRADICTION
         return bool(self._problem) or bool(off.any())
