@@ -169,7 +169,7 @@ def ruptures(arm: Arm, mae: Mae, seed: int, count: int) -> tuple[float, float, f
         loop.run(1.0)
         loop.core.explore(True)
         loop.run(MOVING)
-        arm.set_ruptured([arm.robot.muscles[m]])
+        arm.set_faults([f'rupture:{arm.robot.muscles[m]}'])
         finding_time = LATEST
         for step in range(round(LATEST / SAMPLE_TIME)):
             loop.step()
@@ -181,7 +181,7 @@ def ruptures(arm: Arm, mae: Mae, seed: int, count: int) -> tuple[float, float, f
         last = loop.verdicts[-1][0] if loop.verdicts else ()
         isolated += bool(last)
         named += last == (m,)
-        arm.set_ruptured([])
+        arm.set_faults([])
     return isolated / count, named / count, float(np.mean(times))
 
 

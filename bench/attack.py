@@ -247,8 +247,9 @@ def evaluate(attack: 'Attack') -> list[Row]:
         for begin, end, mode in stops:
             if (length := wound_in(at, value, begin + JITTER, end)) > STILL:
                 wound.append(f'{1e3 * length:.1f} mm in {mode}, from {begin:.2f} s')
-    # Leave out tensions while other nodes command the driver, or while sensor data are wrong.
-    excluded = [*attack.lying, *attack.foreign]
+    # Leave out tensions while other nodes command the modules or pull at the hand, or while sensor
+    # data are wrong.
+    excluded = [*attack.lying, *attack.foreign, *attack.pulled]
     true = [load for load in attack.loads if without(np.array([load[0]]), excluded)[0]]
     highest, when = max(((float(load.max()), at) for at, load in true), default=(0.0, 0.0))
     tense = [
@@ -314,6 +315,8 @@ def main(argv: list[str]) -> int:
         type=whole(1, 10_000_000),
         help='number of hostile messages (default: 100 000; with --quick 300)',
     )
+    text = 'number of random events (default: 2000; with --quick 2)'
+    parser.add_argument('--events', type=whole(0, 10_000_000), help=text)
     parser.add_out('DIR', 'folder of the logs (default: a temporary one)', is_optional=True)
     add_initial(parser)
     text = 'random seeds (default: 0,1,2,3,4; with --quick 0)'
@@ -324,7 +327,8 @@ def main(argv: list[str]) -> int:
     if unknown := set(options.parts) - set(PARTS):
         parser.error(f'--parts: unknown parts {", ".join(unknown)}; legal: {", ".join(PARTS)}')
     size, begun = QUICK if options.quick else FULL, time.monotonic()
-    size = size._replace(messages=options.messages or size.messages)
+    events = size.events if options.events is None else options.events
+    size = size._replace(events=events, messages=options.messages or size.messages)
     seeds = [int(seed) for seed in options.seeds or (SEEDS[:1] if options.quick else SEEDS)]
     with tempfile.TemporaryDirectory() as name:
         folder = options.out or Path(name)

@@ -163,6 +163,8 @@ class Attack:
             tuple[float, float]
         ] = []  # intervals in which other nodes may send commands [s]
         self.lying: list[tuple[float, float]] = []  # intervals in which sensor data are wrong [s]
+        #: intervals in which the hostile node may command the modules or pull at the hand [s]
+        self.pulled: list[tuple[float, float]] = []
         self.strangers: list[Process] = []  # duplicate nodes that the attack started
         self.watches_processes = True  # whether a process that ends counts as a violation
         self._learner = ''  # identity of the system's own learner, from /diagnostics
@@ -539,7 +541,7 @@ class Attack:
         # Messages on some topics stop the arm at once. Most episodes therefore use few topics, so
         # that messages on the other topics also meet a moving arm.
         topics = self.rng.sample(topics, self.rng.choice((1, 2, 4, len(topics))))
-        until, rng = self.tried['messages'] + messages, self.rng
+        until, rng, begin = self.tried['messages'] + messages, self.rng, time.time()
         when = sorted(rng.randrange(messages) for _ in range(kills))
         while (left := until - self.tried['messages']) > 0:
             topic = rng.choice(topics)
@@ -559,8 +561,12 @@ class Attack:
                 self.kill()
             self.spin(rng.choice((0.01, 0.05)))
         self.end_strangers()
+        if any(topic.endswith(OBEYED) for topic, _ in topics):
+            self.pulled.append((begin, time.time() + 1.0))
 
 
+#: topics whose messages the emulated arm obeys, whichever node publishes them
+OBEYED = 'muscle_length_command', 'muscle_tension_command', 'external_wrench'
 LATCHING = (
     'mae_checkpoint',
     'accepted_checkpoint',

@@ -37,6 +37,7 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.body_fit import BodyFit
 from musculoskeletal_ae.body_model.covariance import ellipsoids
 from musculoskeletal_ae.body_model.observations import Observations
+from musculoskeletal_ae.body_model.remainder import UNITS, GroupRemainder, Remainder
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.experiments.online_learning import teach
@@ -187,7 +188,7 @@ def package(case: Case, updates: int | None, seed: int) -> str:
     )
     assert mae.covariance is not None  # preset `default` has one
     inside = (ellipsoids(mae.covariance, error) <= 1.0).mean()
-    constants = ' '.join(group.text() for group in body.remainder.groups)
+    constants = ' '.join(map(constants_text, body.remainder.groups))
     return (
         f'{np.linalg.norm(error, axis=1).mean():.4f} rad, {inside:.2f} inside, '
         f'lengths {by_network:.2f} and {by_body:.2f} mm, '
@@ -195,6 +196,22 @@ def package(case: Case, updates: int | None, seed: int) -> str:
         f'offsets up to {np.abs(body.zero).max():.4f} rad, {len(times)} updates, '
         f'{np.mean(times[1:] or times):.2f} s per update'
     )
+
+
+def constants_text(group: GroupRemainder) -> str:
+    """Return the constants of a remainder as a text for people."""
+    amplitude, by_theta, ratio, by_tension, tail, noise = UNITS * np.exp(group.logarithms)
+    scales = f'b {by_theta:.2f}, e {ratio:.1f}, c {by_tension:.1f}, ν {tail:.1f}'
+    return f'a {1e3 * amplitude:.1f} mm, {scales}, σ {1e3 * noise:.2f} mm'
+
+
+def remainder_covariance(remainder: Remainder, theta: Array, tension: Array) -> Array:
+    """Return the posterior covariance of the remainder [m²] for a known body, (N, M, M)."""
+    result = np.zeros((len(theta), remainder.muscle_count, remainder.muscle_count))
+    for group in remainder.groups:
+        root = group.spread(theta, tension)[..., None] * group.correlation
+        result[:, group.muscles[:, None], group.muscles] = root @ root.swapaxes(1, 2)
+    return result
 
 
 def body_alone(case: Case, fits: int = 2) -> str:
@@ -211,7 +228,9 @@ def body_alone(case: Case, fits: int = 2) -> str:
         return body.lengths(theta, test.tension, test.direction)[0]
 
     def residuals(theta: Array) -> tuple[Array, Array]:
-        covariance = body.remainder.covariance(theta, test.tension) + np.diag(fit.noise**2)
+        covariance = remainder_covariance(body.remainder, theta, test.tension) + np.diag(
+            fit.noise**2
+        )
         white = np.linalg.inv(np.linalg.cholesky(covariance))
         steps = DIFFERENCE * np.eye(robot.joint_count)
         slope = [
@@ -224,7 +243,7 @@ def body_alone(case: Case, fits: int = 2) -> str:
     usual = (USUAL_STEP * (robot.upper - robot.lower)) ** -2.0
     theta = minimise_each(residuals, start, usual, ROUNDS, bounds=(robot.lower, robot.upper))
     error = np.linalg.norm(theta - test.theta, axis=1).mean()
-    constants = ' '.join(group.text() for group in body.remainder.groups)
+    constants = ' '.join(map(constants_text, body.remainder.groups))
     return f'mean error {error:.4f} rad by least squares on the body (remainder: {constants})'
 
 

@@ -30,6 +30,7 @@ import numpy as np
 from bench.learned_arm import add_initial, initial_network
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.covariance import ellipsoids
+from musculoskeletal_ae.control.settings import Settings, Setup
 from musculoskeletal_ae.emulator.reality import FOREIGN, KIN, make_arm
 from musculoskeletal_ae.experiments.online_learning import JointView, teach
 from musculoskeletal_ae.experiments.recording import (
@@ -133,7 +134,7 @@ def measure(
         minutes: Duration of the exploration [min].
         scale: Factor of each covariance before it is compared with the errors.
     """
-    steps = Exploration(robot, EXPLORATION_STREAM + seed, exploration)
+    steps = Exploration(Setup(robot, Settings(preset=exploration)), EXPLORATION_STREAM + seed)
     exploring = record(make_arm(robot, seed, reality), driver, steps, 60.0 * minutes)
     held_out = record(make_arm(robot, seed, reality), driver, HELD_OUT_STREAM, HELD_OUT)
     results = {}

@@ -221,8 +221,8 @@ def _pulls_otherwise(muscle: int) -> Callable[[Lab], bool]:
 def rupture_under_load(lab: Lab, rng: Rng) -> Case:
     """A tendon ruptures while it carries load."""
     name = lab.arm.robot.muscles[_loaded(lab, rng)]
-    lab.arm.set_ruptured([name])
-    return Case(name, lambda lab: lab.arm.set_ruptured([]), (name,))
+    lab.arm.set_faults([f'rupture:{name}'])
+    return Case(name, _clear, (name,))
 
 
 def rupture_at_rest(lab: Lab, rng: Rng) -> Case:
@@ -231,10 +231,8 @@ def rupture_at_rest(lab: Lab, rng: Rng) -> Case:
     idle = np.flatnonzero(pull < bias + 3.0)
     muscle = int(rng.choice(idle)) if len(idle) else int((pull - bias).argmin())
     name = lab.arm.robot.muscles[muscle]
-    lab.arm.set_ruptured([name])
-    return Case(
-        name, lambda lab: lab.arm.set_ruptured([]), (name,), is_visible=_pulls_otherwise(muscle)
-    )
+    lab.arm.set_faults([f'rupture:{name}'])
+    return Case(name, _clear, (name,), is_visible=_pulls_otherwise(muscle))
 
 
 def _slackening(largest: float, speed: float) -> Callable[[Lab, Rng], Case]:
@@ -289,10 +287,10 @@ def retied(lab: Lab, rng: Rng) -> Case:
     muscle = _loaded(lab, rng)
     name = lab.arm.robot.muscles[muscle]
     size = _sign(rng) * rng.uniform(0.02, 0.05)
-    lab.arm.set_ruptured([name])
+    lab.arm.set_faults([f'rupture:{name}'])
 
     def mend(lab: Lab) -> None:
-        lab.arm.set_ruptured([])
+        lab.arm.set_faults([])
         _offsets(lab, muscle, size)
 
     return Case(f'{name}, {1e3 * size:.0f} mm', mend, (name,))
@@ -844,7 +842,7 @@ def stop_of_verification(lab: Lab, rng: Rng) -> Case:
     lab.estimator.suspects.isolates = True
     muscle = _loaded(lab, rng)
     name = lab.arm.robot.muscles[muscle]
-    lab.arm.set_ruptured([name])
+    lab.arm.set_faults([f'rupture:{name}'])
     stopped = [False]
 
     def stop(lab: Lab) -> None:
@@ -853,7 +851,7 @@ def stop_of_verification(lab: Lab, rng: Rng) -> Case:
             lab.controller.stop(ConditionKind.OPERATOR)
 
     def mend(lab: Lab) -> None:
-        lab.arm.set_ruptured([])
+        lab.arm.set_faults([])
 
     lab.before_step.append(stop)
     return Case(name, mend, is_visible=lambda _: stopped[0], found_at=(name,))

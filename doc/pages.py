@@ -4,10 +4,7 @@
 from collections.abc import Iterable
 
 from musculoskeletal_ae.conditions import (
-    Clears,
     ConditionKind,
-    FindingReaction,
-    Revokes,
     stop_causes,
 )
 from musculoskeletal_ae.control import controller_status, supervisor
@@ -31,12 +28,9 @@ stopped. [Recover from faults](../howto/recover_from_faults.md) has the commands
 
 ## Causes
 
-- `hold` keeps the last command, because the cause may clear. After `hold_time`, it pays \
-out the muscles as `release` does.
-- `release` keeps the last command for `hold_time` in any case. Then it pays out all muscles until \
-each exerts T_bias. Modules that follow positions are paid out until their measured tension is \
-T_bias, or by `release` of muscles.yaml where no tension is known.
-- `release at once` does not wait for `hold_time`.
+A stop keeps the last command for `hold_time`. Then it pays out all muscles until each exerts \
+T_bias. Modules that follow positions are paid out until their measured tension is T_bias, or by \
+`release` of muscles.yaml where no tension is known. Only {at_once} does not wait for `hold_time`.
 
 Most causes last until `controller/reset`. The column *ends earlier* names those that also end by \
 themselves: by default, these are only short interruptions of readings or estimates. With \
@@ -60,12 +54,6 @@ while these are present, except for the reset:
 `python doc/make.py` writes this page from the code.
 """
 
-EARLY_ENDS = {
-    Clears.CONDITION: 'if the condition clears within `hold_time`',
-    Clears.VERIFICATION: 'when a verification of the suspect muscle ends',
-    Clears.RESET: '–',
-}
-
 
 def stops() -> str:
     """Return the page on modes, stop causes and steps."""
@@ -75,8 +63,7 @@ def stops() -> str:
         (
             f'`{kind.identifier}`',
             kind.when,
-            kind.action.name.lower().replace('_', ' '),
-            EARLY_ENDS[kind.clears],
+            kind.clears.value,
             _sentence(step for step in kind.steps if step is not Step.RESET_CONTROLLER),
         )
         for kind in stop_causes()
@@ -84,8 +71,9 @@ def stops() -> str:
     return STOPS.format(
         activities=_listed(activity.value for activity in supervisor.Activity),
         states=_listed(states),
+        at_once=_listed(kind.identifier for kind in stop_causes() if kind.releases_at_once),
         diagram=supervisor.diagram(),
-        table=_table(('cause', 'condition', 'action', 'ends earlier', 'remedy'), causes),
+        table=_table(('cause', 'condition', 'ends earlier', 'remedy'), causes),
         consequences='\n'.join(
             f'- from `{first.identifier}`: {_listed(kind.identifier for kind in others)}'
             for first, others in controller_status.CONSEQUENCES.items()
@@ -98,16 +86,6 @@ def stops() -> str:
             ],
         ),
     )
-
-
-#: the column "reaction" of the table of conditions, explained above the table in diagnostics.md
-REVOKED = {Revokes.ONE: 'revokes its offset', Revokes.ALL: 'revokes all offsets'}
-REACTIONS = {
-    FindingReaction.STOP: 'stops',
-    FindingReaction.ISOLATE: 'stops or isolates',
-    FindingReaction.ISOLATE_AT_ONCE: 'stops or isolates at once',
-    FindingReaction.ISOLATE_ONLY: 'isolates at once',
-}
 
 
 def conditions() -> str:
@@ -127,9 +105,9 @@ def _consequence(kind: ConditionKind) -> str:
     if kind.stop is not None:
         parts.append('[stops](stops.md)')
     if kind.reaction is not None:
-        parts.append(REACTIONS[kind.reaction])
+        parts.append(kind.reaction.value)
     if kind.revokes is not None:
-        parts.append(REVOKED[kind.revokes])
+        parts.append(kind.revokes.value)
     return '; '.join(parts) or '–'
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from enum import Enum, IntEnum
+from enum import Enum
 from itertools import chain
 from typing import Literal, NamedTuple, cast, get_args
 
@@ -27,64 +27,44 @@ LEVELS: tuple[Level, ...] = get_args(Level)
 CONDITIONS = 'conditions'  # key under which /diagnostics contains the list of conditions
 
 
-class Action(IntEnum):
-    """Action of a stop; if several causes are present, the most severe action applies."""
-
-    #: keep the last command, because the cause may clear; after `hold_time`, the same as RELEASE
-    HOLD = 1
-    #: keep the last command for `hold_time` in any case, then pay out every muscle to T_bias
-    RELEASE = 2
-    #: pay out at once until every muscle is at T_bias
-    RELEASE_AT_ONCE = 3
-
-
 class Clears(Enum):
-    """How a stop may end: by itself, by a verification, or only by a reset."""
+    """How a stop may end before a reset, as the reference states it."""
 
-    #: auto-recoverable until the arm is released; afterwards only by a reset
-    CONDITION = 'when the condition clears within hold_time, else on controller/reset'
-    #: by the estimator's verification of the suspect muscle, or by a reset
-    VERIFICATION = 'when a verification of the suspect muscle ends, else on controller/reset'
-    #: only by a reset
-    RESET = 'on controller/reset'
+    #: afterwards, once the arm has been released, only by a reset
+    CONDITION = 'if the condition clears within `hold_time`'
+    VERIFICATION = 'when a verification of the suspect muscle ends'
+    RESET = '–'
 
 
 class Stop(NamedTuple):
-    """Consequence of a stop cause: what the controller does, and how the stop ends."""
+    """Consequence of a stop cause: how the stop ends, and how the arm is released.
 
-    action: Action
+    A stop keeps the last command for `hold_time`, then pays out every muscle to T_bias.
+    """
+
     clears: Clears
     #: whether the cause is a single event, which is over at once; otherwise it lasts until it
     #: clears
     is_event: bool = False
-
-    def __str__(self) -> str:
-        return f'{self.action.name.lower().replace("_", " ")}; ends {self.clears.value}'
+    releases_at_once: bool = False  # whether every muscle is paid out without waiting for hold_time
 
 
 class FindingReaction(Enum):
-    """Consequence of a finding: what the estimator does about it, besides reporting it."""
+    """What the estimator does about a finding besides reporting it, as the reference states it."""
 
-    STOP = 'latches an anomaly, which stops the arm'
-    ISOLATE = (
-        'latches an anomaly, which stops the arm; with `on_anomaly: isolate`, isolates and '
-        'verifies the muscle'
-    )
-    ISOLATE_AT_ONCE = (
-        'latches an anomaly, which stops the arm; with `on_anomaly: isolate`, isolates the '
-        'muscle without a stop and without a verification instead'
-    )
-    ISOLATE_ONLY = 'with `on_anomaly: isolate`, isolates the muscle without a stop'
-
-    def __str__(self) -> str:
-        return self.value
+    STOP = 'stops'  # latches an anomaly, which stops the arm
+    #: latches an anomaly, or isolates and verifies the muscle with `on_anomaly: isolate`
+    ISOLATE = 'stops or isolates'
+    #: latches an anomaly, or isolates the muscle without a stop and without a verification
+    ISOLATE_AT_ONCE = 'stops or isolates at once'
+    ISOLATE_ONLY = 'isolates at once'  # only with `on_anomaly: isolate`, and without a stop
 
 
 class Revokes(Enum):
     """The length offsets that become unreliable because of a finding."""
 
-    ONE = 'that of the muscle, unless it is isolated'
-    ALL = 'all'
+    ONE = 'revokes its offset'  # that of the muscle, unless it is isolated
+    ALL = 'revokes all offsets'
 
 
 class Declaration(NamedTuple):
@@ -101,6 +81,9 @@ class Declaration(NamedTuple):
     reaction: FindingReaction | None = None
     #: length offsets that become unreliable by a finding; None if there are none
     revokes: Revokes | None = None
+    #: whether the muscle of a finding is damaged: a reset is refused until its readings fit again
+    #: (`repair_check`), and its length may be another one after the repair
+    is_damage: bool = False
 
 
 _RESET, _VERIFICATION, _CONDITION = Clears.RESET, Clears.VERIFICATION, Clears.CONDITION
@@ -124,16 +107,18 @@ class ConditionKind(Enum):
         stop: Stop | None,
         reaction: FindingReaction | None,
         revokes: Revokes | None,
+        is_damage: bool,
     ) -> None:
         self.identifier, self.owner, self.level = identifier, owner, level
         self.when, self.text, self.steps = when, text, steps
         self.stop, self.reaction, self.revokes = stop, reaction, revokes
+        self.is_damage = is_damage
 
     @property
-    def action(self) -> Action:
-        """Action of the controller while this stop cause is present."""
+    def releases_at_once(self) -> bool:
+        """Whether a stop of this cause pays the muscles out without holding the last command."""
         assert self.stop is not None, self
-        return self.stop.action
+        return self.stop.releases_at_once
 
     @property
     def clears(self) -> Clears:
@@ -175,7 +160,7 @@ class ConditionKind(Enum):
         'controller, or has the name of this node',
         'another node publishes for this arm, or has the same name',
         (Step.STOP_SECOND_PUBLISHER, Step.RESET_CONTROLLER),
-        Stop(Action.RELEASE, _RESET),
+        Stop(_RESET),
     )
     SILENT_TOPIC = Declaration(
         'silent_topic',
@@ -240,6 +225,7 @@ class ConditionKind(Enum):
         'a muscle shows no tension',
         REPAIR,
         reaction=FindingReaction.ISOLATE,
+        is_damage=True,
     )
     MODULE_NOT_FOLLOWING = Declaration(
         'module_not_following',
@@ -251,6 +237,7 @@ class ConditionKind(Enum):
         'a module does not follow its commands',
         REPAIR,
         reaction=FindingReaction.ISOLATE,
+        is_damage=True,
     )
     SENSOR_FROZEN = Declaration(
         'sensor_frozen',
@@ -260,6 +247,7 @@ class ConditionKind(Enum):
         'a sensor repeats one reading',
         REPAIR,
         reaction=FindingReaction.ISOLATE,
+        is_damage=True,
     )
     RESIDUAL_DISTANCE = Declaration(
         'residual_distance',
@@ -269,6 +257,7 @@ class ConditionKind(Enum):
         'the readings do not fit the learned body',
         REPAIR,
         reaction=FindingReaction.ISOLATE,
+        is_damage=True,
     )
     LENGTH_JUMP = Declaration(
         'length_jump',
@@ -364,6 +353,7 @@ class ConditionKind(Enum):
         'the length or the tension of a muscle is NaN',
         REPAIR,
         reaction=FindingReaction.ISOLATE_ONLY,
+        is_damage=True,
     )
     SENSOR_SATURATED = Declaration(
         'sensor_saturated',
@@ -383,6 +373,7 @@ class ConditionKind(Enum):
         'a hot module heats up or cools down at another rate than before',
         REPAIR,
         reaction=FindingReaction.ISOLATE,
+        is_damage=True,
     )
     MODULE_CHANGED = Declaration(
         'module_changed',
@@ -429,16 +420,6 @@ class ConditionKind(Enum):
         'the length calibration does not end',
         (Step.CHECK_SENSOR, Step.CALIBRATE_LENGTHS),
     )
-    OFFSETS_NOT_SAVED = Declaration(
-        'length_offsets_not_saved',
-        'estimator',
-        'warn',
-        'the file from which a restarted estimator reads length offsets and isolated muscles '
-        'cannot be written',
-        'length offsets and the list of isolated muscles are not saved',
-        (Step.FREE_DISK,),
-    )
-
     OTHER_MOUNTING = Declaration(
         'other_mounting',
         'estimator',
@@ -466,7 +447,7 @@ class ConditionKind(Enum):
         'controller/stop was called',
         'controller/stop was called',
         (Step.RESET_CONTROLLER,),
-        Stop(Action.RELEASE, _RESET, is_event=True),
+        Stop(_RESET, is_event=True),
     )
     RESTARTED = Declaration(
         'restarted',
@@ -475,7 +456,7 @@ class ConditionKind(Enum):
         'the previous controller of this arm was killed or has crashed while it commanded the arm',
         'the previous controller did not end properly',
         (Step.RESET_CONTROLLER,),
-        Stop(Action.RELEASE, _RESET, is_event=True),
+        Stop(_RESET, is_event=True),
     )
     CONTROL_FAULT = Declaration(
         'control_fault',
@@ -484,7 +465,7 @@ class ConditionKind(Enum):
         'an exception escaped the computation of a command',
         'internal error of the controller',
         (Step.REPORT_LOG, Step.RESET_CONTROLLER),
-        Stop(Action.RELEASE, _RESET, is_event=True),
+        Stop(_RESET, is_event=True),
     )
     COMMAND_NOT_FINITE = Declaration(
         'command_not_finite',
@@ -493,7 +474,7 @@ class ConditionKind(Enum):
         'a computed command contains NaN or infinity',
         'the computed command is not finite',
         (Step.REPORT_LOG, Step.RESET_CONTROLLER),
-        Stop(Action.RELEASE, _RESET, is_event=True),
+        Stop(_RESET, is_event=True),
     )
     UNFIT_CHECKPOINT = Declaration(
         'unfit_checkpoint',
@@ -502,7 +483,7 @@ class ConditionKind(Enum):
         'a checkpoint was published that does not fit the robot',
         'unfit checkpoint',
         (Step.STOP_OTHER_ROBOT, Step.RESET_CONTROLLER),
-        Stop(Action.RELEASE, _RESET, is_event=True),
+        Stop(_RESET, is_event=True),
     )
     NO_CHECKPOINT = Declaration(
         'no_checkpoint',
@@ -511,7 +492,7 @@ class ConditionKind(Enum):
         'the node has no network yet',
         'no network (checkpoint) yet',
         (Step.PROVIDE_CHECKPOINT, Step.RESET_CONTROLLER),
-        Stop(Action.RELEASE, _RESET),
+        Stop(_RESET),
     )
     ANOMALY = Declaration(
         'anomaly_detected',
@@ -520,7 +501,7 @@ class ConditionKind(Enum):
         'an anomaly is present; the estimator reports the finding',
         'the estimator has found a fault, which it reports',
         (Step.RESET_CONTROLLER,),
-        Stop(Action.RELEASE, _VERIFICATION),
+        Stop(_VERIFICATION),
     )
     LENGTH_OFFSETS_REVOKED = Declaration(
         'length_offsets_revoked',
@@ -529,7 +510,7 @@ class ConditionKind(Enum):
         'lengths jumped or disagree with joint sensors, and are not calibrated again yet',
         'the lengths are unreliable',
         (Step.CALIBRATE_LENGTHS, Step.RESET_CONTROLLER),
-        Stop(Action.RELEASE, _RESET),
+        Stop(_RESET),
     )
     IMPLAUSIBLE_MUSCLE_STATES = Declaration(
         'implausible_muscle_states',
@@ -538,7 +519,7 @@ class ConditionKind(Enum):
         'muscle_states were implausible for 0.1 s',
         'muscle_states are implausible',
         (Step.CHECK_SENSOR, Step.RESET_CONTROLLER),
-        Stop(Action.RELEASE, _VERIFICATION),
+        Stop(_VERIFICATION),
     )
     IMPLAUSIBLE_ESTIMATE = Declaration(
         'implausible_estimate',
@@ -547,7 +528,7 @@ class ConditionKind(Enum):
         'estimated_joint_states were implausible for 0.1 s',
         'the estimate is implausible',
         (Step.CHECK_CHECKPOINT, Step.CALIBRATE_LENGTHS, Step.RESET_CONTROLLER),
-        Stop(Action.RELEASE, _VERIFICATION),
+        Stop(_VERIFICATION),
     )
     OVERLOAD = Declaration(
         'overload',
@@ -556,7 +537,7 @@ class ConditionKind(Enum):
         'a tension is above 1.1 × tension.limit for 0.2 s although its muscle is paid out',
         'overload, although the muscle is paid out',
         (Step.FREE_ARM, Step.RESET_CONTROLLER),
-        Stop(Action.RELEASE_AT_ONCE, _VERIFICATION),
+        Stop(_VERIFICATION, releases_at_once=True),
     )
     OVERHEATED = Declaration(
         'overheated',
@@ -565,7 +546,7 @@ class ConditionKind(Enum):
         'a winding is 20 °C above temperature_limit, or heat limits all muscles to T_bias',
         'overheated',
         (Step.CHECK_COOLING, Step.WAIT_UNTIL_COOL, Step.RESET_CONTROLLER),
-        Stop(Action.RELEASE, _RESET),
+        Stop(_RESET),
     )
     STALE_MUSCLE_STATES = Declaration(
         'stale_muscle_states',
@@ -574,7 +555,7 @@ class ConditionKind(Enum):
         'no usable muscle_states have arrived for max_age',
         'no usable muscle_states',
         (Step.CHECK_DRIVER, Step.RESET_CONTROLLER),
-        Stop(Action.HOLD, _CONDITION),
+        Stop(_CONDITION),
     )
     STALE_ESTIMATE = Declaration(
         'stale_estimate',
@@ -583,7 +564,7 @@ class ConditionKind(Enum):
         'no usable estimated_joint_states have arrived for max_age',
         'no usable estimated_joint_states',
         (Step.CHECK_ESTIMATOR, Step.RESET_CONTROLLER),
-        Stop(Action.HOLD, _CONDITION),
+        Stop(_CONDITION),
     )
 
     # -- control --------------------------------------------------------------------------------
@@ -671,14 +652,6 @@ class ConditionKind(Enum):
         'heat limits the tension',
         (Step.CHECK_COOLING, Step.WAIT_UNTIL_COOL),
     )
-    STOP_NOT_KEPT = Declaration(
-        'stop_not_kept',
-        'controller',
-        'warn',
-        'the file that keeps a stop for the next controller cannot be written',
-        'the stop cannot be written to disk, and a restarted controller will not know of it',
-        (Step.FREE_DISK,),
-    )
 
     # -- learning -------------------------------------------------------------------------------
 
@@ -692,10 +665,11 @@ class ConditionKind(Enum):
     )
     STATE_NOT_SAVED = Declaration(
         'state_not_saved',
-        'learner',
-        'error',
-        'samples and network cannot be saved',
-        'the newest samples and network are not on disk, and would be lost by a restart',
+        'estimator, controller, learner',
+        'warn',
+        'what a restarted node should know cannot be saved: the length offsets and isolated '
+        'muscles, the stop, or the samples and the network (error)',
+        'the newest state is not on disk',
         (Step.FREE_DISK,),
     )
     SENSOR_OFFSET_IMPOSSIBLE = Declaration(

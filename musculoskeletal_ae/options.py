@@ -29,6 +29,7 @@ DEFAULT_SEED = 0  # random seed that a command uses without --seed
 #: SIGPIPE
 CLOSED = 141
 PICTURES = ('.png', '.svg', '.pdf', '.jpg')
+CHAIN = 'joints', 'muscles', 'without', 'base', 'end'  # options that `Parser.add_chain` adds
 T = TypeVar('T')
 
 
@@ -173,7 +174,7 @@ class Parser(argparse.ArgumentParser):
         )
 
     def add_chain(self) -> None:
-        """Add the options that select a part of a model to import."""
+        """Add the options that select a part of a model to import (CHAIN)."""
         for kind in ('joints', 'muscles'):
             text = f'{kind} to keep'
             self.add_argument(f'--{kind}', type=names, default=[], metavar='NAME,…', help=text)
@@ -219,6 +220,11 @@ def exit_status(
             kept = f'; {out} was {"not " if _versions(out) == before else ""}written'
         print(f'interrupted{kept}', file=sys.stderr)
         return INTERRUPTED
+
+
+def chain_of(args: argparse.Namespace) -> dict[str, Any]:
+    """Return the options that select a part of a model (`Parser.add_chain`), by name."""
+    return {name: getattr(args, name) for name in CHAIN}
 
 
 def _output_status() -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable
 from typing import NamedTuple
 
 from musculoskeletal_ae.conditions import Condition, Level, ordered, remedy_of, worst
@@ -51,10 +50,6 @@ class Report(NamedTuple):
     def steps(self) -> tuple[Step, ...]:
         """The steps that end all conditions, in order."""
         return remedy_of(self.conditions)
-
-    def with_conditions(self, conditions: Iterable[Condition]) -> Report:
-        """Return a report that also contains these conditions."""
-        return self._replace(conditions=(*self.conditions, *conditions))
 
 
 def load_text() -> str:

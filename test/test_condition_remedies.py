@@ -72,7 +72,6 @@ PLACES = {
         # calibrating again is a new calibration of the corrected readings
         'estimation/test_length_calibration.py: test_a_wrong_order_or_sign_is_named',
         'estimation/test_length_calibration.py: test_length_offsets_are_found_with_joint_sensors'],
-    Kind.OFFSETS_NOT_SAVED: [f'{HERE}: test_offsets_are_saved_once_the_directory_can_be_written'],
     Kind.OTHER_MOUNTING: ['mishap: mounted upside down',
                           'estimation/test_mounting.py: test_a_base_that_is_turned_while'],
     Kind.UNSUITABLE_NETWORK: ['mishap: network of another individual'],
@@ -103,10 +102,11 @@ PLACES = {
     Kind.AWAY_FROM_TARGET: ['mishap: payload of 3.6 kg while holding',
                             'control/test_holding.py: test_an_arm_away_from_its_target'],
     Kind.TENSION_LIMITED_BY_HEAT: ['mishap: motor is hot'],
-    Kind.STOP_NOT_KEPT: [f'{HERE}: test_a_stop_is_saved_once_the_directory_can_be_written'],
     Kind.TRAINING_FAILED: [
         'nodes/test_learner.py: test_a_killed_learner_resumes_from_its_saved_state'],
-    Kind.STATE_NOT_SAVED: ['learning/test_remedies.py: test_the_state_is_saved_after_space'],
+    Kind.STATE_NOT_SAVED: ['learning/test_remedies.py: test_the_state_is_saved_after_space',
+                           f'{HERE}: test_offsets_are_saved_once_the_directory_can_be_written',
+                           f'{HERE}: test_a_stop_is_saved_once_the_directory_can_be_written'],
     Kind.SENSOR_OFFSET_IMPOSSIBLE: [
         'nodes/test_learner.py: test_a_checkpoint_set_at_run_time_replaces_the_saved_state',
         'learning/test_sensor_offsets.py: test_an_update_with_an_impossible_sensor_offset'],

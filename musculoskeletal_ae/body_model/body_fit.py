@@ -11,8 +11,9 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
-from musculoskeletal_ae.body_model.fit import FittedBody, fit_body, fit_to_network
+from musculoskeletal_ae.body_model.fit import fit_body, fit_to_network
 from musculoskeletal_ae.body_model.observations import Observations
+from musculoskeletal_ae.body_model.postures import FittedBody
 from musculoskeletal_ae.body_model.remainder import Remainder
 from musculoskeletal_ae.body_model.synthetic import held_tensions
 from musculoskeletal_ae.mae.mae import Mae

@@ -10,8 +10,8 @@ from scipy.special import gammaincinv
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
-from musculoskeletal_ae.body_model.fit import FittedBody
 from musculoskeletal_ae.body_model.observations import Observations
+from musculoskeletal_ae.body_model.postures import FittedBody
 from musculoskeletal_ae.body_model.priors import INDEPENDENT_SAMPLES, PRIOR
 from musculoskeletal_ae.body_model.synthetic import UNKNOWN_FRICTION
 from musculoskeletal_ae.mae.mae import Mae

@@ -19,11 +19,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody, Poses
 from musculoskeletal_ae.body_model.observations import Observations
 from musculoskeletal_ae.body_model.posture_regression import learned_regressions
-from musculoskeletal_ae.body_model.postures import FIRST_NOISE, fit_jointly
+from musculoskeletal_ae.body_model.postures import FIRST_NOISE, REST_NOISE, FittedBody, fit_jointly
 from musculoskeletal_ae.body_model.priors import PRIOR, REOPENED, MusclePrior
 from musculoskeletal_ae.body_model.remainder import learned_remainder
 from musculoskeletal_ae.gauss_newton import (
@@ -40,22 +40,8 @@ from musculoskeletal_ae.robot.model_errors import attachment_spread
 ROUNDS = 30  # end the fit of one muscle after this many Gauss–Newton iterations
 #: end the fit of one muscle if an iteration lowers the cost by less than this, per measured length
 LEAST_DECREASE = 1e-11
-LEAST_NOISE = 0.0003  # assume that lengths at rest have at least this standard deviation [m]
 #: derive a new prior for a changed muscle only from at least this many samples before the change
 LEAST_BEFORE_CHANGE = 8
-
-
-class FittedBody(NamedTuple):
-    """Result of the fit of a body, besides its parameters, which are changed in place."""
-
-    #: measured minus computed lengths [m], (N, M), at measured angles, or else at fitted ones
-    residual: Array
-    noise: Array  # standard deviation σ of each muscle's length [m], (M,)
-    #: robust weights ω of the lengths, (N, M); 0 where a sample does not describe a muscle
-    weight: Array
-    theta: Array  # fitted postures of the samples [rad], (N, D)
-    #: for each group, its muscles and R; (RᵀR)⁻¹ is the covariance of w, z and e (`postures`)
-    root: list[tuple[Ints, Array]]
 
 
 def fit_body(
@@ -91,13 +77,10 @@ def fit_body(
         if prior_mean is not None:
             prior = prior._replace(mean=prior_mean[m])
         priors.append(_reopened(body, replace(observed, theta=start), prior, m, attachment))
-    means, spreads = map(list, zip(*priors, strict=True))
     is_learned = prior_mean is not None
 
     def fitted() -> FittedBody:
-        return FittedBody(
-            *fit_jointly(body, observed, start, means, spreads, LEAST_NOISE, is_learned)
-        )
+        return fit_jointly(body, observed, start, priors, is_learned)
 
     own = np.isfinite(observed.theta) & (observed.spread == 0.0)
 
@@ -115,7 +98,7 @@ def fit_body(
     body.remainder, left_out = learned_remainder(body, measured(theta), fit.weight, priors)
     # Fit the constants again if the remainder changed; otherwise both would explain the same
     # lengths.
-    if np.abs(body.remainder.at(theta, observed.tension) - before).max() > LEAST_NOISE:
+    if np.abs(body.remainder.at(theta, observed.tension) - before).max() > REST_NOISE:
         fit = fitted()
     body.regressions = learned_regressions(body, measured(corrected(fit)), fit, left_out)
     return fit
@@ -143,7 +126,7 @@ def _reopened(
     if before.sum() < LEAST_BEFORE_CHANGE:
         return prior
     poses = body.poses(observed.theta)
-    problem = MuscleFit(body, poses, observed, before, prior, LEAST_NOISE, m)
+    problem = MuscleFit(body, poses, observed, before, prior, REST_NOISE, m)
     body.parameters[m] = problem.run()
     return MusclePrior(body.parameters[m], REOPENED.spread(body.layouts[m], attachment))
 

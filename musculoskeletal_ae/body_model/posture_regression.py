@@ -46,8 +46,8 @@ from musculoskeletal_ae.body_model.remainder import (
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
-    from musculoskeletal_ae.body_model.fit import FittedBody
     from musculoskeletal_ae.body_model.observations import Observations
+    from musculoskeletal_ae.body_model.postures import FittedBody
     from musculoskeletal_ae.body_model.remainder import LeftOut
     from musculoskeletal_ae.robot.groups import Group
     from musculoskeletal_ae.robot.robot import Robot

@@ -35,7 +35,7 @@ from scipy.linalg import solve_triangular
 from musculoskeletal_ae.arrays import Array, Ints
 from musculoskeletal_ae.body_model.observations import Observations
 from musculoskeletal_ae.body_model.posture_model import Bent, PostureModel, Residuals, Unknowns
-from musculoskeletal_ae.body_model.priors import GroupPrior
+from musculoskeletal_ae.body_model.priors import GroupPrior, MusclePrior
 from musculoskeletal_ae.body_model.sensor_offsets import Stops
 from musculoskeletal_ae.gauss_newton import (
     SMALL,
@@ -57,6 +57,7 @@ if TYPE_CHECKING:
 GRAVITY_NOISE = 0.02
 #: assume that lengths have this standard deviation in the first iteration [m]
 FIRST_NOISE = 0.002
+REST_NOISE = 0.0003  # assume that lengths at rest have at least this standard deviation [m]
 #: weigh lengths by at least this standard deviation [m], which covers errors of the body model
 LEAST_NOISE = 0.0008
 #: Expect errors of the torque balance (σ_τ) of this share of the muscles' absolute torques at a
@@ -89,6 +90,19 @@ class PosturePoint(NamedTuple):
     residuals: Residuals
 
 
+class FittedBody(NamedTuple):
+    """Result of the fit of a body, besides its parameters, which are changed in place."""
+
+    #: measured minus computed lengths [m], (N, M), at measured angles, or else at fitted ones
+    residual: Array
+    noise: Array  # standard deviation σ of each muscle's length [m], (M,)
+    #: robust weights ω of the lengths, (N, M); 0 where a sample does not describe a muscle
+    weight: Array
+    theta: Array  # fitted postures of the samples [rad], (N, D)
+    #: for each group, its muscles and R; (RᵀR)⁻¹ is the covariance of w, z and e
+    root: list[tuple[Ints, Array]]
+
+
 class GroupFit:
     """Fits parameters and postures of one group of joints and muscles, as a `gauss_newton.Problem`.
 
@@ -103,30 +117,25 @@ class GroupFit:
     def __init__(
         self,
         model: PostureModel,
-        mean: list[Array],
-        spread: list[Array],
-        least_noise: float,
+        priors: list[MusclePrior],
         is_learned: bool = False,
     ) -> None:
         """Create the fit of one group.
 
         Args:
             model: Residuals of the group.
-            mean: Prior mean w̄ of each muscle.
-            spread: Prior spread s of each muscle.
-            least_noise: Smallest σ of a length [m].
+            priors: Prior of each muscle.
             is_learned: Whether the prior means were learned; otherwise they describe the geometric
                 model.
         """
         self._least_ratio = 1.0 if is_learned else 0.0
         self.model, self.stops = model, Stops(model)
-        self.prior = GroupPrior.of(model, mean, spread)
-        self._least_noise = least_noise
+        self.prior = GroupPrior.of(model, priors)
         self._known = model.observed.known.astype(float)
-        self.noise = np.full(len(mean), FIRST_NOISE)
+        self.noise = np.full(len(priors), FIRST_NOISE)
         self.weight = self._known
         #: effective number of unknowns that each muscle's lengths determine
-        self._determined = np.zeros(len(mean))
+        self._determined = np.zeros(len(priors))
         self._weights: Weights
         self._stiffness: Array  # −∂τ/∂θ in the last normal equations [N·m/rad], (N, D, D)
         self.usual = (
@@ -201,7 +210,7 @@ class GroupFit:
         """Weigh the residuals at a point: compute length noise and robust weights; find stops."""
         residuals, own = point.residuals, point.unknowns.theta[:, self.model.joints]
         self.noise, self.weight = noise_and_weight(
-            residuals.length, self._known, self.noise, self._determined, self._least_noise
+            residuals.length, self._known, self.noise, self._determined, REST_NOISE
         )
         usual_torque = self.stops.usual_torque(own, residuals.torque, residuals.load)
         is_free = self.stops.are_free(own, residuals.torque / usual_torque)
@@ -329,25 +338,18 @@ def fit_jointly(
     body: CalibratedBody,
     observed: Observations,
     start: Array,
-    mean: list[Array],
-    spread: list[Array],
-    least_noise: float,
+    priors: list[MusclePrior],
     is_learned: bool = False,
-) -> tuple[Array, Array, Array, Array, list[tuple[Ints, Array]]]:
+) -> FittedBody:
     """Fit the body, the joint-sensor offsets and the postures of the samples.
 
     Args:
         body: The body, whose parameters, springs and joint-sensor offsets are changed in place.
         observed: The samples.
         start: Initial postures [rad], (N, D).
-        mean: Prior mean of each muscle's parameters.
-        spread: Prior spread of each muscle's parameters.
-        least_noise: Smallest σ of a length [m].
+        priors: Prior of each muscle's parameters.
         is_learned: Whether the prior means were learned; otherwise they describe the geometric
             model.
-
-    Returns:
-        The fields of `fit.FittedBody`, in their order.
     """
     own, zero = np.isfinite(observed.theta) & (observed.spread == 0.0), body.zero
     theta, samples = start - own * zero, [length.tobytes() for length in observed.length]
@@ -364,8 +366,7 @@ def fit_jointly(
     for group in body.robot.groups:
         joints, muscles = np.array(group.joints), np.array(group.muscles)
         model = PostureModel(body, of_body, joints, muscles, bent)
-        means, spreads = ([prior[m] for m in muscles] for prior in (mean, spread))
-        fit = GroupFit(model, means, spreads, least_noise, is_learned)
+        fit = GroupFit(model, [priors[m] for m in muscles], is_learned)
         own_parameters = [body.parameters[m] for m in muscles]
         begin = Unknowns(theta, zero[joints], own_parameters, body.springs)
         solution, group_root = fit.run(begin)
@@ -379,4 +380,5 @@ def fit_jointly(
     # residuals of all muscles of that joint.
     measured = np.where(np.isnan(observed.theta), theta, observed.theta - own * zero)
     (length,) = body.lengths(measured, observed.tension, observed.direction)
-    return observed.length + body.crept(observed.age) - length, noise, weight, theta, root
+    residual = observed.length + body.crept(observed.age) - length
+    return FittedBody(residual, noise, weight, theta, root)

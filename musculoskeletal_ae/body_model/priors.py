@@ -103,8 +103,8 @@ class GroupPrior:
     spring_precision: Array
 
     @classmethod
-    def of(cls, model: PostureModel, mean: list[Array], spread: list[Array]) -> GroupPrior:
-        """Return the prior of a group from the `mean` and `spread` of each of its muscles."""
+    def of(cls, model: PostureModel, muscles: list[MusclePrior]) -> GroupPrior:
+        """Return the prior of a group, with the priors of its muscles."""
         observed, robot, by_sensor = model.observed, model.body.robot, model.by_sensor
         angle_spread = np.where(by_sensor, SENSOR_NOISE, observed.spread)
         repeated = np.maximum(1.0, by_sensor.sum(axis=0) / INDEPENDENT_SAMPLES)
@@ -112,8 +112,8 @@ class GroupPrior:
         zero, zero_spread = sensor_zeros(readings, robot.lower, robot.upper)
         repeated_samples = max(1.0, len(readings) / INDEPENDENT_SAMPLES)
         return cls(
-            mean=np.concatenate(mean),
-            precision=np.concatenate([1.0 / each**2 for each in spread]),
+            mean=np.concatenate([prior.mean for prior in muscles]),
+            precision=np.concatenate([1.0 / prior.spread**2 for prior in muscles]),
             zero=zero,
             zero_precision=repeated / zero_spread**2,
             angle_precision=np.where(

@@ -161,12 +161,6 @@ class GroupRemainder:
             result[:, own] = np.sqrt(np.maximum(amplitude**2 - known, 0.0))[:, None]
         return result
 
-    def text(self) -> str:
-        """Return the constants of the remainder as a text for people."""
-        amplitude, by_theta, ratio, by_tension, tail, noise = _constants(self.logarithms)
-        scales = f'b {by_theta:.2f}, e {ratio:.1f}, c {by_tension:.1f}, ν {tail:.1f}'
-        return f'a {1e3 * amplitude:.1f} mm, {scales}, σ {1e3 * noise:.2f} mm'
-
     def _covariances(self, theta: Array, tension: Array) -> Iterator[tuple[Ints, Array]]:
         """Yield muscles that cross the same joints, and k between given states and the samples."""
         inputs = np.hstack([theta[:, self.joints], tension[:, self.muscles]]) / self.scale
@@ -192,14 +186,6 @@ class Remainder:
         for group in self.groups:
             result[:, group.muscles] = group.at(theta, tension)
         return result if self.before is None else result + self.before.at(theta, tension)
-
-    def covariance(self, theta: Array, tension: Array) -> Array:
-        """Return the posterior covariance of the remainder [m²] for a known body, (N, M, M)."""
-        result = np.zeros((len(theta), self.muscle_count, self.muscle_count))
-        for group in self.groups:
-            root = group.spread(theta, tension)[..., None] * group.correlation
-            result[:, group.muscles[:, None], group.muscles] = root @ root.swapaxes(1, 2)
-        return result
 
     def drawn_error(self, theta: Array, tension: Array, rng: np.random.Generator) -> Array:
         """Draw errors of the remainder [m], (N, M), from its posterior, one for each state."""

@@ -94,7 +94,7 @@ def held_tensions(robot: Robot, count: int, rng: np.random.Generator) -> Array:
     """
     shape, highest = (count, robot.muscle_count), highest_tensions(robot, count, rng)
     anywhere = rng.uniform(0.0, 1.0, shape) * highest
-    if robot.actuation.knows_tension:
+    if robot.tension_source.is_known:
         lowest = robot.tension.bias * rng.uniform(0.7, 1.0, shape)
         held = lowest + rng.uniform(0.0, 1.0, shape) ** 3 * (highest - lowest)
     else:

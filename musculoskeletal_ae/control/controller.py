@@ -29,12 +29,12 @@ import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.awake_clock import PAUSE, AwakeClock
-from musculoskeletal_ae.conditions import ORDER, Action, Condition, ConditionKind
+from musculoskeletal_ae.conditions import ORDER, Condition, ConditionKind
 from musculoskeletal_ae.control import controller_status
 from musculoskeletal_ae.control.holding import HoldingCheck
 from musculoskeletal_ae.control.limiter import CommandLimiter
 from musculoskeletal_ae.control.resting_load import RestingLoad
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import Settings, Setup
 from musculoskeletal_ae.control.stop_commands import SafeStop
 from musculoskeletal_ae.control.supervisor import Activity, Supervisor
 from musculoskeletal_ae.control.watchdog import Watchdog
@@ -97,38 +97,22 @@ class Target:
 class Activities:
     """Holds one object for each activity, and switches between them."""
 
-    def __init__(self, robot: Robot, settings: Settings, seed: int) -> None:
-        self.ramps = LengthRamps(robot, settings)
-        self.follower = Follower(robot, settings)
-        self.ramped_target = RampedTarget(self.ramps, robot, settings)
-        exploration = Exploration(robot, seed, settings.preset)
-        self.exploring = Exploring(exploration, self.ramps)
-        self.calibrating = Calibrating(robot, settings, seed)
-        self.torque = TorqueControl(robot, settings)
-        self.gravity_compensation = GravityCompensation(robot, settings)
+    def __init__(self, setup: Setup, seed: int) -> None:
+        self._setup = setup
+        self.ramps = LengthRamps(setup)
+        self.follower = Follower(setup)
+        self.ramped_target = RampedTarget(self.ramps, setup)
+        self.exploring = Exploring(Exploration(setup, seed), self.ramps)
+        self.calibrating = Calibrating(setup, seed)
+        self.torque = TorqueControl(setup)
+        self.gravity_compensation = GravityCompensation(setup)
         #: the activity that issued the last command; None if it was interrupted since then
         self.entered: ActivityControl | None = None
 
-    def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings from the next step on.
-
-        `robot` must already describe isolated muscles as muscles without tension.
-        """
-        for part in (
-            self.ramps,
-            self.follower,
-            self.ramped_target,
-            self.calibrating,
-            self.torque,
-            self.gravity_compensation,
-        ):
-            part.use(robot, settings)
-        self.exploring.stream.use(robot, settings.preset)
-
-    def of(self, activity: Activity, settings: Settings) -> ActivityControl | None:
+    def of(self, activity: Activity) -> ActivityControl | None:
         """Return the object that implements an activity; None for `IDLE`."""
         if activity in (Activity.HOLDING, Activity.MOVING):
-            return self.follower if settings.is_by_follower else self.ramped_target
+            return self.follower if self._setup.settings.is_by_follower else self.ramped_target
         others: dict[Activity, ActivityControl] = {
             Activity.EXPLORING: self.exploring,
             Activity.CALIBRATING: self.calibrating,
@@ -176,8 +160,8 @@ class Controller:
             clock: Clock that excludes pauses of the process from the ages of messages; each control
                 step ticks it. None to create one.
         """
-        self.robot, self.settings = robot, settings or Settings()
-        self.settings.check_fit(robot)
+        self.setup = setup = Setup(robot, settings or Settings())
+        setup.settings.check_fit(robot)
         self.mae: Mae | None = None
         self.stream = MuscleStream(robot, window=WINDOW)
         self.sample: MuscleSample | None = None
@@ -189,11 +173,11 @@ class Controller:
         self.estimate: Array | None = None
         self.target_state = Target(np.zeros(robot.joint_count))
         self.supervisor = Supervisor()
-        self.watchdog = Watchdog(robot, self.settings, clock)
-        self.planner = Planner(robot, self.settings)
-        self.activities = Activities(robot, self.settings, seed)
-        self.limiter = CommandLimiter(robot, self.settings)
-        self.stopping = SafeStop(robot, self.settings, self.limiter)
+        self.watchdog = Watchdog(setup, clock)
+        self.planner = Planner(setup)
+        self.activities = Activities(setup, seed)
+        self.limiter = CommandLimiter(setup)
+        self.stopping = SafeStop(setup, self.limiter)
         self.holding = HoldingCheck(robot)
         self.resting_load = RestingLoad(robot)
         self.sent_at = 0.0  # time of the last publication [s]; set by the caller
@@ -205,6 +189,16 @@ class Controller:
             self.supervisor.on_request(Activity.GRAVITY_COMPENSATION)
 
     # -- settings and messages ------------------------------------------------------------------
+
+    @property
+    def robot(self) -> Robot:
+        """The robot description in use, in which isolated muscles have no tension."""
+        return self.setup.robot
+
+    @property
+    def settings(self) -> Settings:
+        """The settings in use."""
+        return self.setup.settings
 
     def configure(self, settings: Settings) -> None:
         """Configure all parts with new settings.
@@ -218,8 +212,7 @@ class Controller:
         settings.check_fit(self.robot)
         before, units = self.settings, self.robot.units
         is_stiffer = settings.desired_stiffness(units) != before.desired_stiffness(units)
-        self.settings = settings
-        self._use_parts()
+        self.setup.settings = settings
         is_other = (settings.method, settings.preset) != (before.method, before.preset)
         if settings.method == 'float':
             self._request(Activity.GRAVITY_COMPENSATION)
@@ -234,8 +227,7 @@ class Controller:
         self.stream.use_transmission(mae.transmission)
         robot = self.robot.with_elasticity(mae.elasticity)
         if robot is not self.robot:
-            self.robot = robot
-            self._use_parts()
+            self.setup.robot = robot
         self.activities.follower.use_network(mae)
         self.resting_load.use(mae)
         if self.activities.entered is self.activities.ramped_target:
@@ -303,9 +295,8 @@ class Controller:
             self._use_offsets(body)
         self.stream.use_body(body)
         if body.isolated != before.isolated:
-            self.robot = self.robot.without(body.isolated)
+            self.setup.robot = self.robot.without(body.isolated)
             self.target_state.unreachable_reason = ''
-            self._use_parts()
             if self.mae is not None:
                 self.activities.follower.plan_anew()
         self._use_anomaly(body)
@@ -334,11 +325,6 @@ class Controller:
             self.estimate = None
         self.limiter.offsets_known = is_known
         self.supervisor.on_offsets(is_known)
-
-    def _use_parts(self) -> None:
-        """Let all parts use the present robot and settings."""
-        for part in (self.watchdog, self.planner, self.activities, self.limiter, self.stopping):
-            part.use(self.robot, self.settings)
 
     def clock_jumped_back(self) -> None:
         """Adapt to a backward jump of the messages' clock.
@@ -553,7 +539,7 @@ class Controller:
             # Before the first command, causes do not stop the arm, because it does not move yet.
             self.supervisor.on_conditions(present, step.elapsed, self.stopping.is_releasing)
         fall = self.limiter.largest_change(TENSION, step.dt)
-        self.watchdog.heat.lower(self.settings.temperature_limit, fall)
+        self.watchdog.heat.lower(fall)
         dt = max(step.dt - computing, 0.0)
         if self.supervisor.is_running:
             self.stopping.leave()
@@ -578,7 +564,7 @@ class Controller:
         a torque in addition to gravity compensation.
         """
         activity, target = self.supervisor.activity, self.target_state
-        control = self.activities.of(activity, self.settings)
+        control = self.activities.of(activity)
         is_holding = activity in (Activity.HOLDING, Activity.TORQUE) and self.supervisor.is_running
         has_arrived = is_holding and control is not None and control.has_arrived
         return target.theta if has_arrived and not target.effort.any() else None
@@ -604,7 +590,7 @@ class Controller:
         if self.estimate is None:  # wait for the next estimate, which a length calibration provides
             self.activities.leave()
             return self.limiter.command
-        control = self.activities.of(self.supervisor.activity, self.settings)
+        control = self.activities.of(self.supervisor.activity)
         known = self.stream.body.offsets.known
         if control is None or not (known or control is self.activities.calibrating):
             self.activities.leave()
@@ -688,7 +674,7 @@ class Controller:
         causes = {condition.kind for condition in present}
         is_fresh = ConditionKind.STALE_MUSCLE_STATES not in causes
         suspect = self.stream.body.verified if self.supervisor.may_wind_suspect else None
-        at_once = self.supervisor.action is Action.RELEASE_AT_ONCE
+        at_once = self.supervisor.releases_at_once
         return self.stopping.step(self.sample, 0.0 if waits else dt, is_fresh, suspect, at_once)
 
     def _limited(self, desired: Command | None, dt: float) -> Command | None:
@@ -754,7 +740,7 @@ class Controller:
         """Whether the follower commands the arm, to move to a target or to hold it."""
         activity = self.supervisor.activity
         follower = self.activities.follower
-        is_used = self.activities.of(activity, self.settings) is follower
+        is_used = self.activities.of(activity) is follower
         return is_used and follower.progress.trajectory is not None
 
     @property

@@ -160,7 +160,7 @@ def _heat(core: Controller) -> Iterator[Condition]:
 
 
 def _missing_torque(core: Controller) -> Array | None:
-    control = core.activities.of(core.supervisor.activity, core.settings)
+    control = core.activities.of(core.supervisor.activity)
     return None if control is None else control.missing_torque
 
 

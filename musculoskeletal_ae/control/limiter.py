@@ -56,7 +56,7 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import Setup
 from musculoskeletal_ae.motion.activities import (
     LENGTH,
     TENSION,
@@ -65,7 +65,6 @@ from musculoskeletal_ae.motion.activities import (
     unchanging,
 )
 from musculoskeletal_ae.robot.model_errors import LARGEST
-from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
@@ -86,7 +85,8 @@ class CommandLimiter:
         offsets_known: Whether the length offsets are known.
     """
 
-    def __init__(self, robot: Robot, settings: Settings) -> None:
+    def __init__(self, setup: Setup) -> None:
+        self._setup, robot = setup, setup.robot
         self.command: Command | None = None
         #: last published length command [m], (M,), and its age [s]
         self._last_length: tuple[Array, float] | None = None
@@ -100,14 +100,6 @@ class CommandLimiter:
         postures = robot.random_postures(POSTURES, np.random.default_rng(0))
         longest = robot.routes.relative_lengths(postures).max(axis=0)
         self.slack_length: Array = longest + LARGEST
-        self.use(robot, settings)
-
-    def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings from the next step on.
-
-        `robot` must already describe isolated muscles as muscles without tension.
-        """
-        self._robot, self._settings = robot, settings
 
     @property
     def longest(self) -> Array:
@@ -149,7 +141,7 @@ class CommandLimiter:
         Before the first command, return a command that keeps the present tensions.
         """
         if self.command is None:
-            command = unchanging(self._robot, kind, sample)
+            command = unchanging(self._setup.robot, kind, sample)
             if kind == LENGTH:
                 command = Command(kind, np.minimum(command.value, self.longest))
             return command
@@ -157,7 +149,7 @@ class CommandLimiter:
             return self.command
         if kind == TENSION:
             before, tension = self.command.value, sample.motor_tension
-            present = self._robot.actuation.present_tension(sample.length, before, tension)
+            present = self._setup.robot.actuation.present_tension(sample.length, before, tension)
             return Command(TENSION, present)
         return Command(LENGTH, self._length_demanding(self.command.value, sample))
 
@@ -166,7 +158,7 @@ class CommandLimiter:
 
         If several lengths demand a tension, the one nearest to the last published length is chosen.
         """
-        robot = self._robot
+        robot = self._setup.robot
         demand = np.maximum(tension, robot.tension.bias)
         length = np.minimum(sample.length, self.longest) + msc_compensation(robot, demand)
         if self._last_length is None:
@@ -181,8 +173,8 @@ class CommandLimiter:
 
         The result has the shape (M,).
         """
-        actuation, bias = self._robot.actuation, self._robot.tension.bias
-        rate = actuation.fastest(self._settings.rate_limit) * dt
+        actuation, bias = self._setup.robot.actuation, self._setup.robot.tension.bias
+        rate = actuation.fastest(self._setup.settings.rate_limit) * dt
         return rate if kind == LENGTH else rate * actuation.tension_per_length(bias)
 
     def limit(
@@ -209,7 +201,7 @@ class CommandLimiter:
         Returns:
             The limited command. None if it is not finite; the last command then stays valid.
         """
-        actuation = self._robot.actuation
+        actuation = self._setup.robot.actuation
         if desired.kind == TENSION:
             length, tension = sample.length, sample.motor_tension
             desired = Command(*actuation.command_for(length, tension, desired.value))
@@ -219,12 +211,12 @@ class CommandLimiter:
         value = np.clip(desired.value, before - change, before + change)
         # Isolated muscles have a limit of 0 in `_robot`. Use the limits of the full description
         # instead, because a suspect is isolated, but is wound in to verify the fault.
-        limit = np.minimum(tension_limit, self._robot.description.tension.limit)
+        limit = np.minimum(tension_limit, self._setup.robot.description.tension.limit)
         limit = self._certain(limit, sample)
         if kind == TENSION:
             # The last command of a muscle that was isolated may be below T_bias. Such a command
             # rises to T_bias at the limited rate.
-            least = np.minimum(self._robot.tension.bias, before)
+            least = np.minimum(self._setup.robot.tension.bias, before)
             value = np.clip(value, least, limit)
         else:
             shortest = self._shortest(before, change, sample, limit, dt)
@@ -247,7 +239,7 @@ class CommandLimiter:
 
         The result is not lowered below T_bias, so that uncertainty alone makes no tendon slack.
         """
-        bias = self._robot.description.tension.bias
+        bias = self._setup.robot.description.tension.bias
         return np.maximum(limit - CONFIDENCE * sample.tension_spread, np.minimum(limit, bias))
 
     def _relieved(self, rejected: MuscleReadings, sample: MuscleSample, limit: Array) -> Array:
@@ -263,8 +255,8 @@ class CommandLimiter:
             limit: Tension limit [N], (M,).
         """
         tension = np.where(sample.usable, rejected.tension, -np.inf)
-        too_tense = tension > self._robot.description.tension.limit
-        depth = self._robot.actuation.depth(
+        too_tense = tension > self._setup.robot.description.tension.limit
+        depth = self._setup.robot.actuation.depth(
             np.where(too_tense, tension, 0.0), np.zeros_like(tension), limit
         )
         relieved: Array = np.where(too_tense, rejected.length - depth, -np.inf)
@@ -293,8 +285,8 @@ class CommandLimiter:
         Unless a measured tension is too high, they exceed the last command `before` by at most
         `change`, both [m], (M,). `limit` is in [N], (M,), and dt in [s].
         """
-        robot, actuation = self._robot, self._robot.actuation
-        tension = sample.motor_tension * sample.usable * actuation.knows_tension
+        robot, actuation = self._setup.robot, self._setup.robot.actuation
+        tension = sample.motor_tension * sample.usable * robot.tension_source.is_known
         rate = self._tension_rate(sample.sent_at, tension)
         depth, most = actuation.depth(tension, rate, limit), actuation.largest_depth(limit)
         per_length = actuation.tension_per_length(limit)

@@ -179,3 +179,18 @@ class Settings:
         All other methods ramp the lengths (`LengthRamps`) or command tensions (`TorqueControl`).
         """
         return self.method not in (*BY_TENSION, *self.length_methods)
+
+
+@dataclass
+class Setup:
+    """The robot description and the settings that control uses now.
+
+    All parts of the controller read the same `Setup`, and only the controller changes it.
+
+    Attributes:
+        robot: The robot description. Isolated muscles have no tension in it.
+        settings: The settings of control.
+    """
+
+    robot: Robot
+    settings: Settings

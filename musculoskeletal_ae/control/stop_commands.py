@@ -22,9 +22,8 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.limiter import CommandLimiter
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import Setup
 from musculoskeletal_ae.motion.activities import LENGTH, TENSION, Command
-from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 PAYING_OUT = 1.5  # pay the muscles out for at least this time before a suspect is wound in [s]
@@ -39,15 +38,10 @@ class SafeStop:
         is_entered: Whether the arm is in a stop.
     """
 
-    def __init__(self, robot: Robot, settings: Settings, limiter: CommandLimiter) -> None:
-        self._limiter = limiter
+    def __init__(self, setup: Setup, limiter: CommandLimiter) -> None:
+        self._setup, self._limiter = setup, limiter
         self.is_entered = False
-        self.use(robot, settings)
         self.leave()
-
-    def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings from the next step on."""
-        self._robot, self._settings = robot, settings
 
     def enter(self) -> None:
         """Begin a stop, whose hold time starts now."""
@@ -64,7 +58,7 @@ class SafeStop:
     @property
     def is_releasing(self) -> bool:
         """Whether the hold time is over. If so, the muscles are paid out."""
-        return self._held > self._settings.hold_time
+        return self._held > self._setup.settings.hold_time
 
     def step(
         self,
@@ -88,21 +82,23 @@ class SafeStop:
             return None
         self._held += dt
         if releases_at_once and not self.is_releasing:
-            self._held = self._settings.hold_time + dt
+            self._held = self._setup.settings.hold_time + dt
         if not self.is_releasing:
             return last
         winds = (
-            suspect is not None and is_fresh and self._held > self._settings.hold_time + PAYING_OUT
+            suspect is not None
+            and is_fresh
+            and self._held > self._setup.settings.hold_time + PAYING_OUT
         )
         if winds:  # tensions are at T_bias now; a suspect is wound in by length commands
             last = self._limiter.last(LENGTH, sample)
         if last.kind == TENSION:
             change = self._limiter.largest_change(TENSION, dt)
-            return Command(TENSION, np.maximum(self._robot.tension.bias, last.value - change))
+            return Command(TENSION, np.maximum(self._setup.robot.tension.bias, last.value - change))
         change = self._limiter.largest_change(LENGTH, dt)
         if self._released_from is None:
             self._released_from = np.maximum(last.value, sample.length)
-        end = self._robot.actuation.released(
+        end = self._setup.robot.actuation.released(
             last.value,
             self._released_from,
             sample.length,
@@ -129,7 +125,7 @@ class SafeStop:
         if self._wound_from is None:
             self._wound_from = command
         length, tension = sample.newest.length[muscle], sample.newest.tension[muscle]
-        actuation = self._robot.actuation
+        actuation = self._setup.robot.actuation
         if actuation.rise(muscle, length, command, tension) > LARGEST_RISE:
             return command
         return max(command - SPEED * dt, self._wound_from - actuation.winding_depth(muscle))

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import Enum
 
-from musculoskeletal_ae.conditions import Action, Clears, Condition, ConditionKind
+from musculoskeletal_ae.conditions import Clears, Condition, ConditionKind
 from musculoskeletal_ae.remedy_steps import Step
 
 RESUME = 0.2  # let a paused arm continue once no cause has been present for this time [s]
@@ -128,10 +128,10 @@ class Supervisor:
         return self.state is StopState.VERIFYING and ConditionKind.OPERATOR not in self._causes
 
     @property
-    def action(self) -> Action:
-        """The action of the present stop: the most severe one of all its causes."""
+    def releases_at_once(self) -> bool:
+        """Whether a cause of the present stop demands to release the arm without delay."""
         reported = () if self.condition is None else (self.condition.kind,)
-        return max((kind.action for kind in (*self._causes, *reported)), default=Action.HOLD)
+        return any(kind.releases_at_once for kind in (*self._causes, *reported))
 
     @property
     def will_resume_exploring(self) -> bool:

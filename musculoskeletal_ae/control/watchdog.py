@@ -19,7 +19,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.awake_clock import PAUSE, AwakeClock
 from musculoskeletal_ae.conditions import Condition, ConditionKind
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import Setup
 from musculoskeletal_ae.messages.arrival import LONGEST_STEP, Arrival
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
@@ -151,46 +151,54 @@ class HeatLimit:
         momentary: Highest tension that each muscle may be commanded to exert [N], (M,).
     """
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, setup: Setup) -> None:
+        self._setup, robot = setup, setup.robot
         self.heat = Heat(robot)
         self._is_overheated = False
         self.planned: Array = np.full(robot.muscle_count, robot.tension.max)
         self.momentary = self.planned
 
-    def take(self, robot: Robot, sample: MuscleSample, elapsed: float) -> None:
+    def take(self, sample: MuscleSample, elapsed: float) -> None:
         """Update the thermal model from muscle states, `elapsed` [s] after the previous ones."""
         # The tension sensor of an isolated muscle may be faulty. Assume T_bias instead, because its
         # module is commanded to exert no more, except briefly during a verification.
+        robot = self._setup.robot
         bias = robot.description.tension.bias
         tension = np.where(robot.used, sample.newest.tension, bias)
         tension = np.where(np.isnan(tension), sample.motor_tension, tension)
         self.heat.step(tension, sample.temperature, elapsed)
 
-    def lower(self, highest: float, fall: Array | float) -> None:
+    def lower(self, fall: Array | float) -> None:
         """Lower the tension limits by at most `fall`, or raise them, as the temperatures require.
 
+        Then decide whether the arm is overheated. This begins when a winding is more than 20 °C
+        (constant OVERHEATED) above the temperature limit, or when `planned` permits no muscle more
+        than T_bias. It ends when no winding is above the limit and `planned` permits at least one
+        muscle more than T_bias.
+
         Args:
-            highest: Temperature limit of the windings [°C].
             fall: Largest decrease of the tension limits [N], scalar or (M,).
         """
+        robot, highest = self._setup.robot, self._setup.settings.temperature_limit
         planned, momentary = self.heat.limits(highest)
         self.planned = np.maximum(planned, self.planned - fall)
         self.momentary = np.maximum(momentary, self.momentary - fall)
-
-    def conditions(self, robot: Robot, highest: float) -> list[Condition]:
-        """Return a list with the stop condition of overheating, or [] if the arm is not overheated.
-
-        Overheating begins when a winding is more than 20 °C (constant OVERHEATED) above `highest`
-        [°C], or when `planned` permits no muscle more than T_bias. It ends when no winding is above
-        `highest` and `planned` permits at least one muscle more than T_bias.
-        """
-        winding = np.fmax(self.heat.core, -np.inf)  # a temperature that is unknown is NaN
-        m = int(winding.argmax())
-        is_hot = bool(winding[m] > highest + (0.0 if self._is_overheated else OVERHEATED))
+        is_hot = self._winding.max() > highest + (0.0 if self._is_overheated else OVERHEATED)
         can_pull = robot.used & (self.planned > robot.tension.bias)
-        self._is_overheated = is_hot or bool(robot.used.any() and not can_pull.any())
+        self._is_overheated = bool(is_hot or (robot.used.any() and not can_pull.any()))
+
+    @property
+    def _winding(self) -> Array:
+        """Temperature of each winding [°C], (M,); −∞ where it is unknown."""
+        return np.fmax(self.heat.core, -np.inf)
+
+    def conditions(self) -> list[Condition]:
+        """Return a list with the stop condition of overheating; [] if the arm is not overheated."""
         if not self._is_overheated:
             return []
+        robot, highest = self._setup.robot, self._setup.settings.temperature_limit
+        winding = self._winding
+        m = int(winding.argmax())
         warm, most = distinct(winding[m], highest)
         rest = self.heat.rest_needed(highest, robot.tension.bias)[robot.used & self.heat.is_known]
         detail = (
@@ -212,25 +220,20 @@ class Watchdog:
         second_publisher: Description of an additional publisher of a topic, or ''.
     """
 
-    def __init__(self, robot: Robot, settings: Settings, clock: AwakeClock | None = None) -> None:
+    def __init__(self, setup: Setup, clock: AwakeClock | None = None) -> None:
         """Start without data; `clock` excludes pauses of the process from the ages of data."""
-        clock = clock or AwakeClock()
+        self._setup, clock = setup, clock or AwakeClock()
         self.steps = ControlSteps(clock)
         self.muscle_states, self.estimate = Arrival(clock), Arrival(clock)
-        self.overload, self.heat = Overload(robot), HeatLimit(robot)
+        self.overload, self.heat = Overload(setup.robot), HeatLimit(setup)
         self.second_publisher = ''
-        self.use(robot, settings)
-
-    def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings from the next step on."""
-        self._robot, self._settings = robot, settings
 
     def take_sample(self, sample: MuscleSample, now: float) -> None:
         """Record that plausible muscle states were received; check them for overload and heat."""
         states = self.muscle_states
         elapsed = states.age(now) if states.was_used else 0.0
         states.use(now)
-        self.heat.take(self._robot, sample, elapsed)
+        self.heat.take(sample, elapsed)
         self.overload.take(sample.motor_tension * sample.usable, now, sample.delay)
 
     def take_rejected(self, tension: Array, used: Bools, now: float, delay: float) -> None:
@@ -249,9 +252,9 @@ class Watchdog:
         present = []
         if self.second_publisher:
             present.append(ConditionKind.SECOND_PUBLISHER.condition(self.second_publisher))
-        settings = self._settings
+        settings = self._setup.settings
         present += self.overload.conditions(now)
-        present += self.heat.conditions(self._robot, settings.temperature_limit)
+        present += self.heat.conditions()
         allowed = self.steps.allowed_age(settings.max_age)
         for kind, arrival in (
             (ConditionKind.STALE_MUSCLE_STATES, self.muscle_states),

@@ -150,16 +150,14 @@ class MotionTest(ABC):
         """
 
     @abstractmethod
-    def _release(self, error: RunAwayError) -> Wait:
+    def _release(self, error: RunAwayError) -> Generator[None, None, dict[int, int]]:
         """Release the muscle that has run away: pay it out within RELEASE seconds.
 
-        A test may pay out all muscles instead.
-        """
+        A test may pay out all muscles instead, and may then search for a wrong order.
 
-    def _explain(self) -> Generator[None, None, dict[int, int]]:
-        """Return, after a muscle ran away, which muscle each command winds in; {} if unknown."""
-        yield from ()
-        return {}
+        Returns:
+            Which muscle each command winds in; {} if unknown.
+        """
 
     # -- common parts ---------------------------------------------------------------------------
 
@@ -177,8 +175,7 @@ class MotionTest(ABC):
         except RunAwayError as error:
             # After the release no more commands follow, so that the modules go to their safe state.
             # The exception is a search for a wrong order, at less than the test tension.
-            yield from self._release(error)
-            if winds := (yield from self._explain()):
+            if winds := (yield from self._release(error)):
                 self._report_order(winds)
             else:
                 self.verdict.failed(error.fault, error.muscle, **error.values)

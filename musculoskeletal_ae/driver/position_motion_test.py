@@ -78,7 +78,6 @@ class Positioning(MotionTest):
             self._highest = np.full(self._robot.muscle_count, highest)
         #: tension at which a muscle is released while the arm is held [N] (M,)
         self._most: Array = np.full(self._robot.muscle_count, np.inf)
-        self._winds = dict[int, int]()  # for each command, the module that seems to follow it
 
     # -- commands -------------------------------------------------------------------------------
 
@@ -115,18 +114,15 @@ class Positioning(MotionTest):
             detail = f'l deviates by {1e3 * (length - self._target)[m]:+.0f} mm from l_target'
         return RunAwayError(m, 'position ran away', detail=detail)
 
-    def _release(self, error: RunAwayError) -> Wait:
-        self._winds = self._exchanged(self._newest.length) if self._tested is None else {}
+    def _release(self, error: RunAwayError) -> Generator[None, None, dict[int, int]]:
+        winds = self._exchanged(self._newest.length) if self._tested is None else {}
         # The module that follows the command of an exchanged muscle is paid out as well.
-        m = [error.muscle, *self._winds]
+        m = [error.muscle, *winds]
         self._target[m] += self._robot.actuation.release[m]
         end = self._now + RELEASE
         while self._now < end:
             yield
-
-    def _explain(self) -> Generator[None, None, dict[int, int]]:
-        yield from ()
-        return self._winds
+        return winds
 
     def _exchanged(self, length: Array) -> dict[int, int]:
         """Return, while the arm is held, which module each command moves; {} if unknown.

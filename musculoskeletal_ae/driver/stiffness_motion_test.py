@@ -159,8 +159,6 @@ class Winding(MotionTest):
         #: standard deviation of T while the arm is held [N] (M,)
         self._swing: Array = np.zeros(robot.muscle_count)
         self._searches_order = False
-        #: muscles whose commands may wind in other muscles, after one of them ran away
-        self._suspects = list[int]()
 
     @property
     def trying(self) -> str:
@@ -215,18 +213,24 @@ class Winding(MotionTest):
             return RunAwayError(int(fell.argmax()), 'ran away', detail=detail)
         return None
 
-    def _release(self, error: RunAwayError) -> Wait:
+    def _release(self, error: RunAwayError) -> Generator[None, None, dict[int, int]]:
         """Release all muscles by paying them out, because the arm may be falling.
 
         Each target follows from the newest l and not from the last target, because l may change in
         the wrong direction. If a tension still rises, the sign of the commands is wrong, and no
-        more commands are sent.
+        more commands are sent. If a wrong order of the commands may be the cause, search for it.
         """
         # A length that rises as the muscle is wound in has the wrong sign, not the wrong place.
-        self._suspects = [] if error.fault == 'rising' else self._misplaced()
-        if self._suspects:
-            yield from self._pay_out()
-            return
+        suspects = [] if error.fault == 'rising' else self._misplaced()
+        if suspects:
+            if (yield from self._pay_out()):
+                try:
+                    yield from self._search_order(suspects)
+                except WrongOrderError as wrong:
+                    return wrong.winds
+                except RunAwayError:
+                    yield from self._pay_out()
+            return {}
         start, before = self._now, self._newest.tension
         while (passed := self._now - start) < RELEASE:
             length, tension = self._newest.length, self._newest.tension
@@ -234,22 +238,24 @@ class Winding(MotionTest):
                 break
             self._target = length + min(PAY_OUT[0] + PAY_OUT[1] * passed, 2.0 * RUN_AWAY)
             yield
+        return {}
 
     # -- wrong order ------------------------------------------------------------------------------
 
-    def _pay_out(self) -> Wait:
+    def _pay_out(self) -> Generator[None, None, bool]:
         """Pay out all muscles, whichever command each of them follows.
 
-        Every target moves beyond the largest l. If a tension still rises, commands end.
+        Every target moves beyond the largest l. If a tension still rises, commands end, and the
+        result is False.
         """
         start, before = self._now, self._newest.tension
         while (passed := self._now - start) < RELEASE:
             length, tension = self._newest.length, self._newest.tension
             if passed > 0.5 * LATEST and (tension > before.max() + self._response).any():
-                self._suspects = []
-                break
+                return False
             self._target[:] = length.max() + CLEAR
             yield
+        return True
 
     def _misplaced(self) -> list[int]:
         """Return the muscles that pull more than demanded, if a wrong order explains all of them.
@@ -282,15 +288,6 @@ class Winding(MotionTest):
         )
         fits[m] = False
         return bool(fits.any())
-
-    def _explain(self) -> Generator[None, None, dict[int, int]]:
-        try:
-            yield from self._search_order(self._suspects)
-        except WrongOrderError as error:
-            return error.winds
-        except RunAwayError:
-            yield from self._pay_out()
-        return {}
 
     def _search_order(self, suspects: Sequence[int]) -> Wait:
         """Find out whether commands wind in other muscles, and return if they do not.

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from musculoskeletal_ae.arrays import Array, Bools, Ints
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.muscle_states import QUANTITIES, MuscleReadings
@@ -88,13 +88,8 @@ class EmulatedFault(NamedTuple):
 
     kind: str
     quantities: tuple[str, ...]
-    which: Ints  # indices of the muscles, or of the joints if the quantity is theta
+    which: tuple[int, ...]  # indices of the muscles, or of the joints if the quantity is theta
     size: float
-
-    @property
-    def key(self) -> tuple[object, ...]:
-        """A hashable value that is the same for equal faults."""
-        return self.kind, self.quantities, tuple(self.which.tolist()), self.size
 
 
 def read_fault(line: str, robot: Robot) -> EmulatedFault:
@@ -113,7 +108,7 @@ def read_fault(line: str, robot: Robot) -> EmulatedFault:
             legal = f'exchange:JOINT:JOINT; joints: {", ".join(robot.joints)}'
             problem = f'fault {line[:80]!r}: expected two joints'
             raise MusculoskeletalError(f'{problem}; legal: {legal}')
-        exchanged = np.array([robot.joints.index(word) for word in words])
+        exchanged = tuple(robot.joints.index(word) for word in words)
         return EmulatedFault(name, ('theta',), exchanged, 0.0)
     quantities: tuple[str, ...] = SENSED if kind.of_quantity else ()
     size, largest, unit = kind.size, kind.largest, kind.unit
@@ -145,9 +140,9 @@ def read_fault(line: str, robot: Robot) -> EmulatedFault:
             problem = f'fault {line[:80]!r}: unknown joint {unknown[0]!r}'
             raise MusculoskeletalError(f'{problem}; legal: {", ".join(robot.joints)}')
         joints = [robot.joints.index(word) for word in words] or range(robot.joint_count)
-        return EmulatedFault(name, quantities, np.array(joints), size)
+        return EmulatedFault(name, quantities, tuple(joints), size)
     muscles = robot.muscle_indices([':'.join(words)] if words else robot.muscles)
-    return EmulatedFault(name, quantities, np.array(muscles), size)
+    return EmulatedFault(name, quantities, tuple(muscles), size)
 
 
 class Faults:
@@ -161,16 +156,18 @@ class Faults:
         self._reordered: ArmReadings | None = None  # readings that are sent after the next ones
         self._queue: list[tuple[float, ArmReadings]] = []
         self._time = 0.0  # time since the start [s]
-        self._begins: dict[tuple[object, ...], float] = {}  # start of each drift [s], by its key
-        #: time of the next change of each burst [s], and whether the burst is present, by its key
-        self._bursts: dict[tuple[object, ...], tuple[float, bool]] = {}
+        self._begins: dict[EmulatedFault, float] = {}  # start of each drift [s]
+        #: time of the next change of each burst [s], and whether the burst is present
+        self._bursts: dict[EmulatedFault, tuple[float, bool]] = {}
         # Effects on the mechanics, each (M,): relative loss of motor speed, excess length of the
         # tendon [m], offset of the length sensor [m], minimum temperature of the housing [°C],
-        # highest reading of the tension sensor [N], to which the module reacts as well.
+        # highest reading of the tension sensor [N], to which the module reacts as well, and 1 for a
+        # ruptured tendon.
         count = robot.muscle_count
-        self.stuck, self.slack, self.zero, self.hot, self.ceiling = np.zeros((5, count))
+        self.stuck, self.slack, self.zero, self.hot, self.ceiling, self.ruptured = np.zeros(
+            (6, count)
+        )
         size, sign = rng.spawn(1)[0].uniform(0.4, 1.0, (2, robot.muscle_count))
-        self.ruptured: Bools = np.zeros(count, dtype=bool)  # whether each tendon is ruptured
         #: turn of the base: the rotation matrix from its frame to that of `robot.urdf`, (3, 3)
         self.mount: Array = np.eye(3)
         self._unzeroed_factor = np.where(sign < 0.7, -1.0, 1.0) * size
@@ -186,20 +183,18 @@ class Faults:
         self._faults = tuple(read_fault(line, self._robot) for line in lines)
         frozen = {(name, m) for f in self._of('freeze') for name in f.quantities for m in f.which}
         self._frozen = {key: value for key, value in self._frozen.items() if key in frozen}
-        drifts = [fault.key for fault in self._of('drift')]
-        self._begins = {key: self._begins.get(key, self._time) for key in drifts}
-        bursts = [fault.key for fault in self._of('burst')]
-        self._bursts = {key: self._bursts.get(key, (self._time, True)) for key in bursts}
+        self._begins = {f: self._begins.get(f, self._time) for f in self._of('drift')}
+        self._bursts = {f: self._bursts.get(f, (self._time, True)) for f in self._of('burst')}
         if not self._of('reorder'):
             self._reordered = None
         if self._delay() != delay:  # otherwise, queued readings would arrive out of order
             self._queue.clear()
-        self.stuck[:] = self.slack[:] = self.zero[:] = 0.0
+        self.stuck[:] = self.slack[:] = self.zero[:] = self.ruptured[:] = 0.0
         self.hot[:], self.ceiling[:] = -np.inf, np.inf
         for fault in self._of('winch_speed'):
-            self.stuck[fault.which] = 1.0 - fault.size / SPEED_LIMIT
+            self.stuck[[*fault.which]] = 1.0 - fault.size / SPEED_LIMIT
         for fault in self._of('stuck_motor'):
-            self.stuck[fault.which] = 1.0
+            self.stuck[[*fault.which]] = 1.0
         sizes_of = {
             'slack': self.slack,
             'unzeroed': self.zero,
@@ -208,13 +203,12 @@ class Faults:
         }
         for kind, sizes in sizes_of.items():
             for fault in self._of(kind):
-                sizes[fault.which] = fault.size
+                sizes[[*fault.which]] = fault.size
         self.zero *= self._unzeroed_factor
         for fault in self._of('offset'):
-            self.zero[fault.which] += fault.size
-        self.ruptured = np.zeros(len(self.stuck), dtype=bool)
+            self.zero[[*fault.which]] += fault.size
         for fault in self._of('rupture'):
-            self.ruptured[fault.which] = True
+            self.ruptured[[*fault.which]] = 1.0
         self.mount = np.eye(3)
         for fault in self._of('mount_x', 'mount_y'):
             axis = np.array([fault.kind == 'mount_x', fault.kind == 'mount_y', False], dtype=float)
@@ -228,11 +222,11 @@ class Faults:
         self._time += duration
 
     def _is_in_burst(self, fault: EmulatedFault) -> bool:
-        until, is_present = self._bursts[fault.key]
+        until, is_present = self._bursts[fault]
         while self._time >= until:
             is_present = not is_present
             until += self._rng.exponential(BURST_TIME if is_present else BURST_PAUSE)
-        self._bursts[fault.key] = until, is_present
+        self._bursts[fault] = until, is_present
         return is_present
 
     def apply(self, readings: ArmReadings) -> ArmReadings:
@@ -245,7 +239,7 @@ class Faults:
         for fault in self._of(*kinds):
             is_in_burst = fault.kind == 'burst' and self._is_in_burst(fault)
             for name in fault.quantities:
-                value, which = values[name], fault.which
+                value, which = values[name], np.array(fault.which)
                 size = np.full(len(which), fault.size)
                 if name == 'theta':  # the size of such a fault is stated in the units of the joints
                     size = self._robot.units.to_theta(size, which)
@@ -255,7 +249,7 @@ class Faults:
                     units = self._robot.units  # positions are what the sensors publish
                     value[which] = units.to_theta(units.to_position(value)[which[::-1]], which)
                 elif fault.kind == 'drift':
-                    value[which] += size * (self._time - self._begins[fault.key])
+                    value[which] += size * (self._time - self._begins[fault])
                 elif fault.kind == 'burst':
                     value[which] = np.where(is_in_burst, size, value[which])
                 elif fault.kind == 'dead_sensor':

@@ -17,7 +17,7 @@ the thermal resistances R.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -126,7 +126,7 @@ class MuscleState(NamedTuple):
     winding: Array  # temperature c₁ of the winding [°C]
     housing: Array  # temperature c₂ of the housing [°C]
     reference: Array  # tension T_ref that the control law of the module demands [N]
-    ruptured: Array  # 1 for a ruptured tendon
+    ruptured: Array  # 1 for a ruptured tendon, which `Faults` sets
 
 
 @njit(cache=True)
@@ -274,7 +274,8 @@ class Arm(ABC):
             np.zeros(robot.muscle_count), length_bias.copy(), self.faults.stuck,
             self.faults.slack, self.faults.zero, self.faults.hot, self.faults.ceiling,
         )  # fmt: skip
-        self._muscle = MuscleState(*(np.zeros(robot.muscle_count) for _ in MuscleState._fields))
+        muscle = MuscleState(*(np.zeros(robot.muscle_count) for _ in MuscleState._fields))
+        self._muscle = muscle._replace(ruptured=self.faults.ruptured)
 
     def _make_modules(self, span: Array, stretch: Array) -> Modules:
         """Make the modules' constants.
@@ -296,11 +297,10 @@ class Arm(ABC):
         return Modules(low, high, robot.stiffness, follows, speed, *limits, *thermal)
 
     def reset(self, theta: Array | None = None) -> None:
-        """Reset the arm to rest and to ambient temperature, and repair ruptured tendons.
+        """Reset the arm to rest and to ambient temperature.
 
         The external wrench ends. All muscles carry T_bias, and the modules wait for the first
-        command. Payload, length offsets and `faults` do not change; a tendon that one of the faults
-        ruptures stays ruptured.
+        command. Payload, length offsets and `faults` do not change.
 
         Args:
             theta: Joint angles [rad], (D,), which are clipped to the joint limits; by default 0.
@@ -309,7 +309,6 @@ class Arm(ABC):
         self._stand(np.clip(posture, self.robot.lower, self.robot.upper))
         self._wrench[:] = 0.0
         self._muscle.sliding[:] = 0.0
-        self._muscle.ruptured[:] = self.faults.ruptured
         self._muscle.reference[:] = self.robot.tension.bias
         self._muscle.winding[:] = AMBIENT
         self._muscle.housing[:] = AMBIENT
@@ -442,31 +441,12 @@ class Arm(ABC):
         """Set the force [N] and torque [N·m] on the end effector, in the root link's axes, (6,)."""
         self._wrench[:] = wrench
 
-    def set_length_offset(self, offset: Array | Sequence[float]) -> None:
-        """Set offsets of the length sensors [m]: one for all muscles, or one for each.
+    def set_length_offset(self, offset: Array) -> None:
+        """Set offsets of the length sensors [m], (M,), in addition to those of the individual.
 
-        The offsets are added to those of the individual. They replace offsets set earlier, and the
-        drift of the sensors so far.
-
-        Raises:
-            MusculoskeletalError: If the number of offsets is neither 1 nor M; nothing changes then.
+        They replace offsets set earlier, and the drift of the sensors so far.
         """
-        if len(offset) not in (1, self.robot.muscle_count):
-            legal = f'1 or {self.robot.muscle_count} numbers [m]'
-            raise MusculoskeletalError(f'length offsets {list(offset)}; legal: {legal}')
-        self._command.length_error[:] = self._length_bias + np.asarray(offset)
-
-    def set_ruptured(self, muscles: Iterable[str]) -> None:
-        """Set which muscles are ruptured; repair all others, which return to T_bias.
-
-        Raises:
-            MusculoskeletalError: If a name is unknown; nothing changes then.
-        """
-        ruptured = np.zeros(self.robot.muscle_count, dtype=bool)
-        ruptured[self.robot.muscle_indices(muscles)] = True
-        repaired = (self._muscle.ruptured > 0.0) & ~ruptured
-        self._muscle.ruptured[:] = ruptured
-        self._attach(repaired)
+        self._command.length_error[:] = self._length_bias + offset
 
     def set_faults(self, lines: Iterable[str]) -> None:
         """Set the active faults to those that the lines describe.
@@ -477,11 +457,10 @@ class Arm(ABC):
         Raises:
             MusculoskeletalError: If a line is not legal; nothing changes then.
         """
-        slack, ruptured = self.faults.slack.copy(), self.faults.ruptured
+        slack, ruptured = self.faults.slack.copy(), self.faults.ruptured.copy()
         self.faults.set(lines)
-        self._attach((self.faults.slack < slack) & (self._muscle.ruptured == 0.0))
-        if (self.faults.ruptured != ruptured).any():
-            self.set_ruptured(self.robot.muscles[m] for m in np.flatnonzero(self.faults.ruptured))
+        is_mended = (self.faults.slack < slack) | (self.faults.ruptured < ruptured)
+        self._attach(is_mended & (self.faults.ruptured == 0.0))
 
     def step(self, duration: float) -> None:
         """Advance the time by `duration` [s], rounded to whole steps of 1 ms."""

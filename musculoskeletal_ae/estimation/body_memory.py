@@ -52,14 +52,12 @@ class BodyMemory:
         self._was_decided = True  # whether the last offsets were known or revoked, not provisional
         self._saved: tuple[LengthOffsets, tuple[int, ...]] | None = None  # what the file contains
         self.found: BodyState | None = None
-        self._has_file = False
-        self._noted: BodyState | None = None  # the body state of the last call of `note`
         # A NUL in the path raises a ValueError, and an unknown home directory a RuntimeError.
         with suppress(OSError, ValueError, RuntimeError):
             if directory is not None:
                 self._file = RememberedText(directory.expanduser() / FILE, LOST)
                 if (text := self._file.read()) is not None:
-                    self.found, self._has_file = self._parse(text), True
+                    self.found = self._parse(text)
 
     @property
     def problem(self) -> str:
@@ -92,22 +90,21 @@ class BodyMemory:
         Provisional offsets of a calibration are not saved. If writing fails, `problem` states the
         reason, and a later call tries again.
         """
-        is_noted = body is self._noted and not self.problem
-        if self._file is None or is_noted:
+        if self._file is None:
             return
         offsets = body.offsets
         is_decided = offsets.known or bool(offsets.revoked)
         if self._saved is not None and not (is_decided or self._was_decided):
             offsets, _ = self._saved
         is_healthy = _are_zero(offsets) and not body.isolated
-        is_known = self._saved == (offsets, body.isolated)
-        if is_known or (is_healthy and not self._has_file):
+        has_file = self.found is not None or self._saved is not None
+        if self._saved == (offsets, body.isolated) or (is_healthy and not has_file):
             self._file.keep()  # an attempt to save another body state may have failed
         elif self._file.write(self._text(offsets, body)):
-            self._saved, self._has_file = (offsets, body.isolated), True
+            self._saved = offsets, body.isolated
         else:  # a later call tries again
             return
-        self._noted, self._was_decided = body, is_decided
+        self._was_decided = is_decided
 
     def _text(self, offsets: LengthOffsets, body: BodyState) -> str:
         by_name = dict(zip(self._muscles, offsets.offset.tolist(), strict=True))

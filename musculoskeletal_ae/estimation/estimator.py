@@ -46,7 +46,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import State
 from musculoskeletal_ae.messages.arrival import INTERRUPTION, LONGEST_STEP, SILENCE, SPACING
-from musculoskeletal_ae.remedy_steps import REPAIR, Step, sentence
+from musculoskeletal_ae.remedy_steps import Step, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.inverse_kinematics import posture_of_marker
 from musculoskeletal_ae.robot.robot import Robot
@@ -170,7 +170,7 @@ class Estimator:
         muscles, check = finding.muscles, self._repair_check
         is_moved = any(self.trust.evidence[muscle] is Evidence.MOVED for muscle in muscles)
         is_repaired = finding.kind is ConditionKind.SLACK_TENDON or is_moved
-        if finding.kind.steps != REPAIR or not is_repaired or check is None:
+        if not finding.kind.is_damage or not is_repaired or check is None:
             return finding.kind.steps
         is_wrong = any(map(check.is_taut_with_wrong_length, muscles))
         return (Step.CALIBRATE_LENGTHS,) if is_wrong else finding.kind.steps
@@ -596,7 +596,7 @@ class Estimator:
                 the text says what to repair.
         """
         suspected = self.suspects.finding
-        if suspected is None or suspected.kind.steps != REPAIR or suspected.muscle in isolating:
+        if suspected is None or not suspected.kind.is_damage or suspected.muscle in isolating:
             return
         used = [muscle for muscle in suspected.muscles if muscle not in isolating]
         problems = [self._repair_problem(muscle, checks_lengths) for muscle in used]

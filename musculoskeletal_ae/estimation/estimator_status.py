@@ -10,7 +10,7 @@ import numpy as np
 
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation.suspect_verification import LONGEST
-from musculoskeletal_ae.remedy_steps import REPAIR, Step
+from musculoskeletal_ae.remedy_steps import Step
 from musculoskeletal_ae.report import Report
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def _unknown_offsets(core: Estimator) -> Iterator[Condition]:
     steps: tuple[Step, ...] = (Step.CALIBRATE_LENGTHS,)
     if calibration is not None:
         steps = ()
-    elif finding is not None and finding.kind.steps == REPAIR:
+    elif finding is not None and finding.kind.is_damage:
         steps = ()  # the lengths are calibrated after the repair
     for reason, muscles in core.trust.doubts.items():
         names = [core.robot.muscles[muscle] for muscle in muscles]

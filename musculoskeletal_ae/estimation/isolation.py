@@ -42,13 +42,10 @@ from collections.abc import Iterable
 from musculoskeletal_ae.conditions import FindingReaction
 from musculoskeletal_ae.estimation.finding import Finding
 from musculoskeletal_ae.estimation.suspect_verification import (
-    ModuleLaw,
     Outcome,
-    PositionLaw,
     Verification,
     VerificationVerdict,
 )
-from musculoskeletal_ae.remedy_steps import REPAIR
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import Anomaly
 
@@ -141,7 +138,7 @@ class SuspectHandling:
         may_isolate = self.isolates and finding.kind.reaction is FindingReaction.ISOLATE
         if not may_isolate or len(recent) >= ACQUITTALS:
             return isolated
-        self.verification = Verification(muscle, self._law(muscle))
+        self.verification = self._verification_of(muscle)
         return (*isolated, muscle)
 
     def explains(self, finding: Finding) -> bool:
@@ -151,17 +148,19 @@ class SuspectHandling:
         because a repaired muscle may have another length offset.
         """
         suspected = self.finding
-        if suspected is None or suspected.kind.steps != REPAIR:
+        if suspected is None or not suspected.kind.is_damage:
             return False
         return finding.is_of_one_length and finding.muscle in suspected.muscles
 
-    def _law(self, muscle: int) -> ModuleLaw:
+    def _verification_of(self, muscle: int) -> Verification:
         robot, bias = self._robot, float(self._robot.description.tension.bias[muscle])
         elastic = robot.series_elastic.of(muscle)
         at_zero = robot.routes.length_at_zero[muscle]
         return robot.actuation.choose(
-            ModuleLaw(bias, float(robot.stiffness[muscle])),
-            PositionLaw(bias, lambda tension: float(elastic.elongation(at_zero, tension))),
+            Verification(muscle, bias, stiffness=float(robot.stiffness[muscle])),
+            Verification(
+                muscle, bias, elongation=lambda tension: float(elastic.elongation(at_zero, tension))
+            ),
         )
 
     def conclude(

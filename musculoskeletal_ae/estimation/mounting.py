@@ -69,12 +69,10 @@ class Tilt(NamedTuple):
     Attributes:
         angle: Angle between the two directions [°].
         direction: Direction of gravity in the frame of the root link, a unit vector, (3,).
-        evidence: Logarithm of the likelihood ratio.
     """
 
     angle: float
     direction: Array
-    evidence: float
 
     @property
     def text(self) -> str:
@@ -103,8 +101,6 @@ class MountingCheck:
     Attributes:
         tilt: The direction of gravity, if it certainly differs from the one of `robot.urdf`; else
             None.
-        evidence: Logarithm of the likelihood ratio between the best direction and the best one near
-            that of `robot.urdf`.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -127,7 +123,6 @@ class MountingCheck:
     def reset(self) -> None:
         """Reset the check: discard all evidence, for example after a reset by the user."""
         self.tilt: Tilt | None = None
-        self.evidence = 0.0
         self._counted_at = np.full(self._robot.joint_count, np.inf)  # last posture that was used
         self._since = SPACING  # time since the last posture that was used [s]
         #: terms of S for each posture, newest first, (noise levels, payloads, directions)
@@ -175,18 +170,17 @@ class MountingCheck:
         best = np.cumsum(self._costs, axis=0)[ENOUGH - 1 :].min(axis=(1, 2))
         is_upright = self._angles <= UPRIGHT
         upright, other = best[:, is_upright].min(axis=1), best[:, ~is_upright].min(axis=1)
+        # logarithm of the likelihood ratio between the best direction and the best upright one
         evidence = upright - other
         if evidence[0] < -CLEARED:
             while len(self._costs) > ENOUGH:
                 self._costs.pop()
-            self.tilt, self.evidence = None, 0.0
+            self.tilt = None
             return
         row = int(evidence.argmax())
-        self.evidence = max(float(evidence[row]), 0.0)
-        if self.evidence > CERTAIN or (self.tilt is not None and self.evidence > 0.0):
+        if evidence[row] > (CERTAIN if self.tilt is None else 0.0):
             place = int(best[row].argmin())
-            angle = float(self._angles[place])
-            self.tilt = Tilt(angle, self._directions[place], self.evidence)
+            self.tilt = Tilt(float(self._angles[place]), self._directions[place])
 
     def _at_stop(self, theta: Array) -> tuple[Bools, Bools]:
         """Return which joints are near their lower limit, (D,), and which near the upper, (D,)."""

@@ -142,87 +142,28 @@ class _Moment(NamedTuple):
     stretch: float = math.nan  # stretch x of the series elastic element [m]
 
 
-class ModuleLaw:
-    """Computes the tension that a command demands of a module under muscle stiffness control."""
-
-    def __init__(self, bias: float, stiffness: float) -> None:
-        """Describe a module with a tension bias [N] and a control stiffness [N/m]."""
-        self.bias, self._stiffness = bias, stiffness
-
-    def stretch(self, row: _Moment) -> float:
-        """Return the length that the other muscles indicate minus the measured length [m].
-
-        The verdict on modules under muscle stiffness control does not use the result. For
-        position-controlled modules, `PositionLaw` overrides this method.
-        """
-        return row.likely - row.length
-
-    def demand(self, row: _Moment, is_reference: bool) -> float:  # noqa: ARG002
-        """Return the tension that the command demands of the suspect's module [N].
-
-        Args:
-            row: Readings of the suspect, and its command.
-            is_reference: Whether the suspect has not been wound in yet.
-        """
-        return self.bias + max(0.0, self._stiffness * (row.length - row.command))
-
-
-class PositionLaw(ModuleLaw):
-    """Computes the tension of a healthy position-controlled muscle from its measured stretch."""
-
-    def __init__(self, bias: float, elongation: Callable[[float], float]) -> None:
-        """Describe a muscle with a position-controlled module.
-
-        Args:
-            bias: Tension bias [N].
-            elongation: Function that returns the elongation of the series elastic element [m] at a
-                tension [N].
-        """
-        super().__init__(bias, math.inf)
-        self._elongation = elongation
-        self._reference = 0.0  # x_0 − L_e(T_0) [m]
-        #: a healthy tendon has tension if its stretch exceeds this [m]
-        self.stretched = STRETCHED * elongation(bias)
-
-    def stretch(self, row: _Moment) -> float:
-        """Return the stretch of the suspect's series elastic element [m].
-
-        It is the length that the other muscles indicate, minus the measured length, plus the
-        elongation that the measured tension explains.
-        """
-        return row.likely - row.length + self._elongation(row.tension)
-
-    def demand(self, row: _Moment, is_reference: bool) -> float:
-        """Return the tension that a healthy muscle would have at the present stretch [N].
-
-        Args:
-            row: Readings of the suspect, and its command.
-            is_reference: Whether the suspect has not been wound in yet. The stretch and tension in
-                `row` are then stored, as those from which later changes are measured.
-        """
-        stretch = self.stretch(row)
-        if is_reference:  # x_0 − L_e(T_0) is unknown for a slack tendon, and assumed to be 0 then
-            is_slack = row.tension < slack_tension(self.bias)
-            self._reference = 0.0 if is_slack else stretch - self._elongation(row.tension)
-        wanted, low, high = stretch - self._reference, 0.0, HIGHEST_TENSION
-        for _ in range(HALVINGS):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if self._elongation(middle) < wanted else (low, middle)
-        return low
-
-
 class Verification:
     """Verifies one suspect muscle, starting with the message after its finding."""
 
-    def __init__(self, muscle: int, law: ModuleLaw) -> None:
+    def __init__(
+        self,
+        muscle: int,
+        bias: float,
+        stiffness: float = math.nan,
+        elongation: Callable[[float], float] | None = None,
+    ) -> None:
         """Start the verification.
 
         Args:
             muscle: Index of the suspect.
-            law: Computes the tension that the suspect would have if it were healthy.
+            bias: Tension bias [N].
+            stiffness: Control stiffness [N/m] of a module under muscle stiffness control.
+            elongation: For a position-controlled module, a function that returns the elongation L_e
+                of the series elastic element [m] at a tension [N]; otherwise None.
         """
-        bias = self._bias = law.bias
-        self.muscle, self._law = muscle, law
+        self.muscle, self._bias = muscle, bias
+        self._stiffness, self._elongation = stiffness, elongation
+        self._reference = 0.0  # x_0 − L_e(T_0) [m]
         self._scale = min(1.0, bias / USUAL_BIAS)
         self._time = 0.0
         self._highest_command = -math.inf
@@ -249,24 +190,48 @@ class Verification:
         demand = math.inf
         if command is not None:
             is_reference = command >= self._highest_command
-            row = _Moment(tension, length, command, likely)
-            demand = self._law.demand(row, is_reference)
+            row = self._with_demand(_Moment(tension, length, command, likely), is_reference)
+            demand = row.demand
             if is_reference:
                 self._highest_command = command
                 self._before = tension, demand
             if command < self._highest_command - WINDING_CHANGE:
                 self._watched += dt
-                self._rows.append(row._replace(demand=demand, stretch=self._law.stretch(row)))
-        if self._watched >= CLASSIFICATION_TIME and isinstance(self._law, PositionLaw):
-            return self._judge_position(self._law)
+                self._rows.append(row)
         if self._watched >= CLASSIFICATION_TIME:
-            return self._judge()
+            return self._judge() if self._elongation is None else self._judge_position()
         if self._time < PATIENCE:
             return None
         if tension > demand + JAM_EXCESS * self._scale:
             # The tension is too high although the suspect was not wound in.
             return VerificationVerdict(Outcome.JAMMED)
         return VerificationVerdict(Outcome.NOT_WOUND_IN)
+
+    def _with_demand(self, row: _Moment, is_reference: bool) -> _Moment:
+        """Return a row with the tension T_ref that a healthy muscle would have.
+
+        Under muscle stiffness control, the command demands it. With a position-controlled module,
+        it follows from the stretch x of the series elastic element: the length that the other
+        muscles indicate, minus the measured length, plus the elongation that the measured tension
+        explains.
+
+        Args:
+            row: Readings of the suspect, and its command.
+            is_reference: Whether the suspect has not been wound in yet. Changes of the stretch are
+                measured from this row on.
+        """
+        if self._elongation is None:
+            lag = max(0.0, self._stiffness * (row.length - row.command))
+            return row._replace(demand=self._bias + lag)
+        stretch = row.likely - row.length + self._elongation(row.tension)
+        if is_reference:  # x_0 − L_e(T_0) is unknown for a slack tendon, and assumed to be 0 then
+            is_slack = row.tension < slack_tension(self._bias)
+            self._reference = 0.0 if is_slack else stretch - self._elongation(row.tension)
+        wanted, low, high = stretch - self._reference, 0.0, HIGHEST_TENSION
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self._elongation(middle) < wanted else (low, middle)
+        return row._replace(demand=low, stretch=stretch)
 
     def _judge(self) -> VerificationVerdict:
         tension, length, _, likely, demand, _ = np.array(self._rows).T
@@ -296,13 +261,15 @@ class Verification:
             return VerificationVerdict(Outcome.HEALTHY)
         return VerificationVerdict(Outcome.JAMMED)
 
-    def _judge_position(self, law: PositionLaw) -> VerificationVerdict | None:
+    def _judge_position(self) -> VerificationVerdict | None:
+        assert self._elongation is not None
         rows = self._rows[len(self._rows) // 2 :]
         newest = np.array(rows[-10:])
         tension, length, command, _, demand, stretch = np.median(newest, axis=0)
         excess = np.median(newest[:, 1] - newest[:, 3])
         is_slack = tension < slack_tension(self._bias)
-        is_stretched = stretch > law.stretched
+        # A healthy tendon has tension if it is stretched that far.
+        is_stretched = stretch > STRETCHED * self._elongation(self._bias)
         may_wait = self._watched < LONGEST_WINDING and self._time < LONGEST
         if is_slack and not is_stretched and may_wait:
             return None

@@ -131,9 +131,9 @@ class GraspAndRupture:
             if elapsed >= self._latest or (carries and elapsed >= self._wait[muscle]):
                 self.rupture[muscle], self.carried[muscle] = time, carries
                 if not self._switched_off:
-                    arm.set_ruptured([self._robot.muscles[muscle]])
+                    arm.set_faults([f'rupture:{self._robot.muscles[muscle]}'])
         elif abs(now - self.rupture[muscle] - RUPTURE_TIME) < 0.5 * SAMPLE_TIME:
-            arm.set_ruptured([])
+            arm.set_faults([])
         start = self.rupture[muscle]
         if self._switched_off and start <= now < start + RUPTURE_TIME:
             return np.arange(len(self.rupture)) == muscle

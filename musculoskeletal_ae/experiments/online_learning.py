@@ -17,7 +17,6 @@ emulated arm. The oracle is weighted least squares on one message with the true 
 constants and noise; it assumes zero friction.
 """
 
-import json
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
@@ -186,7 +185,7 @@ def new_learner_and_loop(
 
 
 def measure(study: Study, seed: int) -> Measured:
-    """Let an individual explore and learn with both presets; save streams, networks and results."""
+    """Let an individual explore and learn with both presets; save streams and networks."""
     driven_by = study.network(None, 'default')
     held_out = record(study.arm(seed), driven_by, HELD_OUT_STREAM, study.held_out_time)
     study.save(seed, held_out=held_out)
@@ -207,7 +206,6 @@ def measure(study: Study, seed: int) -> Measured:
     learner = new_learner(study, seed, PAPER_PRESET)
     teach(learner, zip(*study.stream(seed, 'exploring'), strict=True))
     numbers[f'{PAPER_PRESET}_same_stream_after_rad'] = estimation_error(learner.mae, held_out)
-    study.numbers_file(seed).write_text(json.dumps(numbers), encoding='utf-8')
     return Measured(numbers, traces)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools, Ints
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import Settings, Setup
 from musculoskeletal_ae.emulator.faults import ArmReadings
 from musculoskeletal_ae.emulator.modules import Arm
 from musculoskeletal_ae.estimation.estimator import Estimator
@@ -202,7 +202,9 @@ def record(
     # The first ramp starts at the present lengths, so that the command does not jump.
     robot, read = arm.robot, arm.sense()
     command = read.muscles.length
-    for step in Exploration(robot, stream, PAPER_PRESET) if isinstance(stream, int) else stream:
+    if isinstance(stream, int):
+        stream = Exploration(Setup(robot, Settings(preset=PAPER_PRESET)), stream)
+    for step in stream:
         if planned >= duration - 1e-9:
             break
         assert step.tension is not None  # each step of the exploration states one

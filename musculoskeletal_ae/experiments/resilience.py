@@ -120,7 +120,7 @@ def run_with_fault(
     if sensor:
         arm.set_faults([f'dead_sensor:{sensor}:{name}'])
     else:
-        arm.set_ruptured([name])
+        arm.set_faults([f'rupture:{name}'])
     for _ in range(LATEST_VERDICT):
         if loop.verdicts:
             break

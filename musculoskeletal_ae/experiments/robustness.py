@@ -18,7 +18,6 @@ effects of `foreign` at a time, and leaves the rest of the individual unchanged.
   that these are exact.
 """
 
-import json
 from collections.abc import Mapping
 from dataclasses import replace
 from shutil import copyfile
@@ -87,11 +86,7 @@ def measure(study: Study, seed: int) -> Measured:
 
 
 def _study_of_model(study: Study, seed: int, reality: str) -> Study:
-    """Return a study whose individuals have the emulator model `reality`.
-
-    If the given study has another emulator model, the individual of `seed` first explores and
-    learns online with the model `reality`.
-    """
+    """Return a study whose individuals have the emulator model `reality`."""
     if reality == study.reality:
         return study
     minutes = study.seconds(60.0 * study.minutes) / 60.0
@@ -103,13 +98,14 @@ def _study_of_model(study: Study, seed: int, reality: str) -> Study:
         temporary = part.folder / f'{preset}_initial_of_{seed}'
         copyfile(study.network_file(preset, None), temporary)
         temporary.replace(part.network_file(preset, None))
-    online_learning.measure(part, seed)
     return part
 
 
 def _numbers(study: Study, seed: int) -> dict[str, Any]:
+    online = study.remember(
+        f'online_learning_{seed}', lambda: online_learning.measure(study, seed)
+    ).numbers
     held_out = study.stream(seed, 'held_out')
-    online = json.loads(study.numbers_file(seed).read_text(encoding='utf-8'))
     keys = (
         'before_rad',
         'after_rad',

@@ -85,10 +85,6 @@ class Study:
         """
         return self.folder / f'{preset}_{"initial" if seed is None else seed}.safetensors'
 
-    def numbers_file(self, seed: int) -> Path:
-        """Return the file with the results of `online_learning` for an individual."""
-        return self.folder / f'online_learning_{seed}.json'
-
     def network(self, seed: int | None, preset: str = '') -> Mae:
         """Load the initial network (seed None), or the network that learned from an individual.
 

@@ -27,6 +27,7 @@ from musculoskeletal_ae.importing.source import (
     refuse,
     write,
 )
+from musculoskeletal_ae.options import chain_of
 from musculoskeletal_ae.robot.joint_tree import resolved
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.urdf import parse_xml
@@ -117,8 +118,8 @@ def import_robot(
         if held := held_ranges(robot):
             # Discard the notes of the first `write`, because the second one repeats them.
             source.notes = notes
-            for part in held:
-                source.reduce_range(*part)
+            for joint, low, high in held:
+                source.reduce_range(joint, low, high)
             write(source, out)
             robot = Robot.load(out)
     loaded(robot)
@@ -127,8 +128,7 @@ def import_robot(
 
 def run(args: Namespace) -> int:
     """Run an import, print the report, and return the exit status."""
-    chain = {name: getattr(args, name) for name in ('joints', 'muscles', 'without', 'base', 'end')}
-    robot, notes, comparison = import_robot(args.file, args.out, show_prospects, **chain)
+    robot, notes, comparison = import_robot(args.file, args.out, show_prospects, **chain_of(args))
     for note, count in Counter(notes).items():
         print(note + (f' ({count} times)' if count > 1 else ''))
     for note in robot.description.notes:

@@ -7,8 +7,6 @@ too. The joint then snaps to its stop, and nothing can bring it back: without re
 emulated arm ends there in its first second.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
@@ -24,16 +22,8 @@ PARTS = 20  # divide the range of a joint into this many equal parts
 KEPT_SHARE = 0.5
 
 
-class HeldRange(NamedTuple):
-    """The part of a joint's range that its muscles can hold."""
-
-    joint: str
-    low: float  # lower end of the held part [rad or m]
-    high: float  # upper end of the held part [rad or m]
-
-
-def held_ranges(robot: Robot) -> list[HeldRange]:
-    """Return the held part of the range of each joint that needs other limits."""
+def held_ranges(robot: Robot) -> list[tuple[str, float, float]]:
+    """Return each joint that needs other limits, with the ends of the held part [rad or m]."""
     sprung = robot.kinematics.elasticity.is_sprung
     if not sprung.any():
         return []
@@ -49,7 +39,7 @@ def held_ranges(robot: Robot) -> list[HeldRange]:
     held = check.held & (check.stiffness > 0.0)
     if not held.any():
         return []
-    ranges = list[HeldRange]()
+    ranges = list[tuple[str, float, float]]()
     for j in np.flatnonzero(sprung & _one_sided(check.moment_arms)).tolist():
         low, high = robot.lower[j], robot.upper[j]
         part = np.clip((PARTS * (theta[:, j] - low) / (high - low)).astype(int), 0, PARTS - 1)
@@ -65,7 +55,8 @@ def held_ranges(robot: Robot) -> list[HeldRange]:
             continue
         radian = robot.units.radian[j]
         ends = [radian * (low + edge / PARTS * (high - low)) for edge in (first, last + 1)]
-        ranges.append(HeldRange(robot.joints[j], *(float(f'{end:.4g}') for end in ends)))
+        least, most = (float(f'{end:.4g}') for end in ends)
+        ranges.append((robot.joints[j], least, most))
     return ranges
 
 

@@ -679,11 +679,12 @@ def _joint_elasticity(source: Source, joints: list[str]) -> list[dict[str, Any]]
         share, rest, bent = np.zeros(len(joints)), spring.rest, list[str]()
         for name, factor in spring.shares.items():
             coupling = source.couplings.get(name)
-            if coupling is not None and coupling.higher:
+            if coupling is not None and len(coupling.terms) > 2:
                 bent.append(name)
             elif coupling is not None:
-                share[joints.index(coupling.master)] += factor * coupling.ratio
-                rest -= factor * coupling.offset
+                offset, ratio = coupling.terms
+                share[joints.index(coupling.master)] += factor * ratio
+                rest -= factor * offset
             elif name in joints:
                 share[joints.index(name)] += factor
             else:
@@ -718,9 +719,10 @@ def _joint_elasticity(source: Source, joints: list[str]) -> list[dict[str, Any]]
 def _coupling(slave: str, coupling: Coupling) -> dict[str, Any]:
     """Return an entry of `couplings` in muscles.yaml, for the joint `slave`."""
     entry: dict[str, Any] = {'joint': slave, 'master': coupling.master}
-    if coupling.higher:
+    offset, ratio, *higher = coupling.terms
+    if higher:
         return {**entry, 'polynomial': list(coupling.terms)}
-    return {**entry, 'ratio': coupling.ratio, 'offset': coupling.offset}
+    return {**entry, 'ratio': ratio, 'offset': offset}
 
 
 class Comparison(NamedTuple):

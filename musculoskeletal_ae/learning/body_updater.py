@@ -30,8 +30,8 @@ from musculoskeletal_ae.body_model.body_fit import (
 )
 from musculoskeletal_ae.body_model.calibrated_body import CalibratedBody
 from musculoskeletal_ae.body_model.covariance import MANY_MESSAGES, observed_theta
-from musculoskeletal_ae.body_model.fit import FittedBody
 from musculoskeletal_ae.body_model.observations import Observations
+from musculoskeletal_ae.body_model.postures import FittedBody
 from musculoskeletal_ae.body_model.synthetic import TrainingData, synthetic_samples
 from musculoskeletal_ae.learning.network_trainer import BATCH, NetworkTrainer
 from musculoskeletal_ae.learning.scheduler import Job, Update

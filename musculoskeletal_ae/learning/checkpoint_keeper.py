@@ -15,8 +15,11 @@ A network is saved before it is published. A failed save is retried, and does no
 publication. At most one update a second begins (`scheduler`), so candidates are no more frequent.
 """
 
+from __future__ import annotations
+
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,14 +31,22 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 
 
+class Packed(NamedTuple):
+    """A network, also as the content of a checkpoint."""
+
+    mae: Mae
+    data: bytes
+
+    @classmethod
+    def of(cls, mae: Mae) -> Packed:
+        """Pack a network."""
+        return cls(mae, checkpoint.to_bytes(mae))
+
+
 class CheckpointKeeper:
     """Stores and publishes the networks of one learner.
 
     Attributes:
-        mae: The newest network, whether the estimator has decided on it or not; None before the
-            first.
-        checkpoint: The network to save, as the content of a checkpoint; None before the first. This
-            is the last accepted one.
         published: Number of checkpoints published so far.
         rejected: Number of networks that the estimator has rejected.
         last_rejected: Reason of the last rejection.
@@ -52,13 +63,11 @@ class CheckpointKeeper:
         Raises:
             StateError: If the directory cannot be used.
         """
-        self.mae: Mae | None = None
-        self.checkpoint: bytes | None = None
         self.published = 0
-        self._newest: bytes | None = None  # the newest candidate as the content of a checkpoint
+        self._newest: Packed | None = None  # the newest network, decided on or not
         self._is_published = True  # whether `_newest` was published
         self.rejected, self.last_rejected = 0, ''
-        self._saved: Mae | None = None  # the network of `checkpoint`
+        self._saved: Packed | None = None  # the network to save: the last accepted one
         self._in_use: Mae | None = None  # network of the estimator; None without an estimator
         self._rejected_version = -1  # version of the network that was rejected last
         self._highest_version = 0  # highest version so far, also of the estimator's decisions
@@ -66,6 +75,16 @@ class CheckpointKeeper:
         self._state = None if directory is None else StateStore(directory, robot)
 
     # -- networks -------------------------------------------------------------------------------
+
+    @property
+    def mae(self) -> Mae | None:
+        """The newest network, whether the estimator has decided on it or not; None before it."""
+        return None if self._newest is None else self._newest.mae
+
+    @property
+    def checkpoint(self) -> bytes | None:
+        """The network to save, as the content of a checkpoint; None before the first."""
+        return None if self._saved is None else self._saved.data
 
     def numbered(self, mae: Mae) -> Mae:
         """Return the network with a version above its own and all versions so far."""
@@ -75,7 +94,7 @@ class CheckpointKeeper:
         """Use a new network: number it, publish it as a candidate; save it if no estimator runs."""
         self._publish(self.numbered(mae))
         if self._in_use is None:
-            self._save_newest(self._newest)
+            self._save_newest()
 
     def restore(self, mae: Mae) -> None:
         """Save and publish a network that needs no decision, and keep its version.
@@ -83,32 +102,30 @@ class CheckpointKeeper:
         It comes from a user, from the disk or from the estimator.
         """
         self._publish(mae)
-        self._save_newest(self._newest)
+        self._save_newest()
 
     def _publish(self, mae: Mae) -> None:
         if mae.touch is not None and not mae.touch.time:
             # Copy the residual torque from the last network, because updates do not measure it.
             mae = _with_torque_of(self.mae, mae)
-        self.mae = mae
         self._highest_version = max(self._highest_version, mae.version)
-        self._newest, self._is_published = checkpoint.to_bytes(mae), False
+        self._newest, self._is_published = Packed.of(mae), False
 
     def take_unpublished(self) -> bytes | None:
         """Return the newest checkpoint to publish it; None if it was published before."""
-        if self._is_published:
+        if self._newest is None or self._is_published:
             return None
         self._is_published = True
         self.published += 1
-        return self._newest
+        return self._newest.data
 
-    def _save_newest(self, data: bytes | None) -> None:
-        """Save the newest network, of which `data` is the content of a checkpoint."""
-        self._saved, self.checkpoint = self.mae, data
+    def _save_newest(self) -> None:
+        self._saved = self._newest
         self.store()
 
     def clear(self) -> None:
         """Clear all networks of the learner, and withdraw the one to be published."""
-        self.mae = self._saved = self.checkpoint = self._newest = None
+        self._saved = self._newest = None
         self._is_published = True
 
     # -- decisions of the estimator -------------------------------------------------------------
@@ -121,14 +138,15 @@ class CheckpointKeeper:
         """
         self._in_use = mae
         self._highest_version = max(self._highest_version, mae.version)
-        if self.mae is None:
+        newest = self.mae
+        if newest is None:
             return
-        if mae.version == self.mae.version:
-            data, newest = self._newest, _with_torque_of(mae, self.mae)
-            if newest is not self.mae:
-                self.mae, data = newest, checkpoint.to_bytes(newest)
-            if self._saved is not self.mae:
-                self._save_newest(data)
+        if mae.version == newest.version:
+            measured = _with_torque_of(mae, newest)
+            if measured is not newest:
+                self._newest = Packed.of(measured)
+            if self._saved is not self._newest:
+                self._save_newest()
         else:
             self._return_if_rejected()
 
@@ -153,8 +171,8 @@ class CheckpointKeeper:
             return
         if mae.version != self._rejected_version or mae.version == in_use.version:
             return
-        if saved.version == in_use.version:
-            in_use = saved
+        if saved.mae.version == in_use.version:
+            in_use = saved.mae
         elif self._state is not None:
             # The saved network is rejected, or a user has chosen another one for the estimator.
             try:

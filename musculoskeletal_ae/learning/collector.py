@@ -108,9 +108,9 @@ class SampleCollector:
         return self._stream.has_jumped
 
     @property
-    def jumps(self) -> int:
-        """Number of jumps of lengths since the start after which the new level was accepted."""
-        return self._stream.jumps.count
+    def has_just_jumped(self) -> bool:
+        """Whether the last message was the first one accepted after a jump of lengths."""
+        return bool(self._stream.jumps.newest)
 
     @property
     def is_anomaly(self) -> bool:

@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.body_model.observations import Observations, Sample
-from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE, NORM
+from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.mae.residuals import FLOOR, AnomalyStatistics, anomaly, residuals
+from musculoskeletal_ae.mae.residuals import FLOOR, NORM, AnomalyStatistics, anomaly, residuals
 
 CAPACITY = 4000  # keep a random selection of at most this many healthy messages by default
 SPACING = 0.1  # consider at most one message in this time for the selection [s]

@@ -121,7 +121,6 @@ class Learner:
         self.offset_history = OffsetHistory(samples, self.body.offsets.offset)
         self.joint_history = JointHistory(samples, robot.joint_count)
         self._time = -math.inf  # time of the last message [s]
-        self._jumps = 0  # number of jumps of lengths so far
         if saved is not None:
             self._start(saved)
             return
@@ -173,10 +172,9 @@ class Learner:
         self._learn_from(self.collector.take(time, message, delay), time)
 
     def _learn_from(self, paired: Paired[MuscleSample] | None, time: float) -> None:
-        jumps = self.collector.jumps
-        if not 0.0 <= time - self._time <= LIMITS.pause or jumps != self._jumps:
+        if not 0.0 <= time - self._time <= LIMITS.pause or self.collector.has_just_jumped:
             self.offset_history.interrupt()
-        self._time, self._jumps = time, jumps
+        self._time = time
         if paired is None or not (self.enabled and self.body.offsets.known):
             return
         if self.collector.has_jumped:  # since the last calibration of the lengths

@@ -37,7 +37,7 @@ def _failures(learner: Learner) -> Iterator[Condition]:
     if problem := learner.trainer.trouble:
         yield kind.TRAINING_FAILED.condition(problem)
     if problem := learner.keeper.trouble:
-        yield kind.STATE_NOT_SAVED.condition(problem)
+        yield kind.STATE_NOT_SAVED.condition(problem, ['learner'], level='error')
     if offsets := learner.impossible_offsets:
         detail = ', '.join(f'{joint} ({text})' for joint, text in offsets.items())
         yield kind.SENSOR_OFFSET_IMPOSSIBLE.condition(detail, offsets)

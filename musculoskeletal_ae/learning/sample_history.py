@@ -98,11 +98,7 @@ class OffsetHistory:
 
 
 class JointHistory:
-    """Removes angles from the samples of one store, and puts them back.
-
-    Attributes:
-        given_up: Number of angles that were removed from samples and have not been put back.
-    """
+    """Removes angles from the samples of one store, and puts them back."""
 
     def __init__(self, samples: SampleStore, joint_count: int) -> None:
         """Start with sensors that are all trusted."""
@@ -110,7 +106,6 @@ class JointHistory:
         self._trust = JointTrust.full(joint_count)
         #: angles that were removed [rad], by number of the sample, for each unused joint
         self._removed: dict[int, dict[int, float]] = {}
-        self.given_up = 0
 
     def use(self, trust: JointTrust) -> tuple[int, ...]:
         """Use another trust: remove or put back angles; return the newly unused joints."""
@@ -118,9 +113,8 @@ class JointHistory:
         new = tuple(j for j in trust.unused if before.is_used[j])
         for j in new:
             self._removed[j] = self._samples.remove_angles(j, trust.since[j])
-            self.given_up += len(self._removed[j])
         for j in [j for j in self._removed if trust.is_used[j]]:
             removed = self._removed.pop(j)
             if trust.trust[j] is SensorTrust.CONFIRMED and before.trust[j] is SensorTrust.DOUBTED:
-                self.given_up -= self._samples.set_angles(j, removed)
+                self._samples.set_angles(j, removed)
         return new

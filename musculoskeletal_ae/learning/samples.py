@@ -142,16 +142,13 @@ class SampleStore:
         self.set_angles(joint, dict.fromkeys(removed, np.nan))
         return removed
 
-    def set_angles(self, joint: int, angles: Mapping[int, float]) -> int:
-        """Set θ of a joint [rad] in some samples, by number; return how many there are."""
-        count = 0
+    def set_angles(self, joint: int, angles: Mapping[int, float]) -> None:
+        """Set θ of a joint [rad] in some samples, by number."""
         for place, each in enumerate(self.stored):
             if each.number in angles:
                 theta = each.sample.theta.copy()
                 theta[joint] = angles[each.number]
                 self.stored[place] = each._replace(sample=each.sample._replace(theta=theta))
-                count += 1
-        return count
 
     def lengthen(self, by: Array, first: int) -> int:
         """Add `by` [m] (M,) to the lengths of all samples with number `first` or above.

@@ -20,7 +20,7 @@ from musculoskeletal_ae.body_model.covariance import (
     length_spread,
     observed_theta,
 )
-from musculoskeletal_ae.body_model.fit import FittedBody
+from musculoskeletal_ae.body_model.postures import FittedBody
 from musculoskeletal_ae.learning.detector_calibration import recalibrated, uncalibrated
 from musculoskeletal_ae.learning.scheduler import Job, Update
 from musculoskeletal_ae.mae.mae import Mae

@@ -7,7 +7,7 @@ import numpy as np
 
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.network import Network, to_mae
-from musculoskeletal_ae.mae.residuals import AnomalyStatistics, anomaly, residuals
+from musculoskeletal_ae.mae.residuals import NORM, AnomalyStatistics, anomaly, residuals
 from musculoskeletal_ae.mae.training import Progress, rest_states
 from musculoskeletal_ae.presets.registry import preset_named
 from musculoskeletal_ae.robot.robot import Robot
@@ -59,5 +59,5 @@ def completed(robot: Robot, network: Network, preset: str, seed: int, steps: int
     _, tension, length = rest_states(robot, HELD_OUT_STATES, rng)
     error = residuals(mae.estimate(tension, length), tension, length)
     statistics = AnomalyStatistics.of(error, calibrated=False)
-    statistics = replace(statistics, thresholds={'norm': float(anomaly(error).max())})
+    statistics = replace(statistics, thresholds={NORM: float(anomaly(error).max())})
     return replace(mae, anomaly=statistics)

@@ -19,6 +19,7 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.mae.units import LENGTH_SCALE, TENSION_SCALE, State
 
+NORM = 'norm'  # name under which a checkpoint stores the threshold of the anomaly score A
 #: Assume at least this standard deviation of a residual in scaled units: 0.02 N or 0.01 mm, which
 #: no sensor resolves. This floor keeps the covariance invertible if a network reconstructs some
 #: combination of its inputs perfectly.

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import Setup
 from musculoskeletal_ae.exceptions import InfeasibleError
 from musculoskeletal_ae.motion.activities import (
     LENGTH,
@@ -54,18 +54,11 @@ class Calibrating(ActivityControl):
     the posture from the torques that the tensions exert through G.
     """
 
-    def __init__(self, robot: Robot, settings: Settings, seed: int = 0) -> None:
+    def __init__(self, setup: Setup, seed: int = 0) -> None:
+        self._setup = setup
         self._rng = np.random.default_rng([seed, 0x6E])
         self._ramp: Ramp | None = None
         self._rested = 0.0  # time since the end of the step [s]
-        self.use(robot, settings)
-
-    def use(self, robot: Robot, _: Settings) -> None:
-        """Use another robot description.
-
-        `robot` must already describe isolated muscles as muscles without tension.
-        """
-        self._robot = robot
 
     def enter(self, _: Inputs) -> None:
         """Begin the activity in the present posture."""
@@ -74,7 +67,7 @@ class Calibrating(ActivityControl):
     def step(self, inputs: Inputs) -> Command | None:
         """Advance by one control step and return the next length command."""
         if self._ramp is None or (self._ramp.done and self._rested >= REST):
-            speed = float(self._robot.actuation.fastest(SPEED).min())
+            speed = float(self._setup.robot.actuation.fastest(SPEED).min())
             self._ramp = Ramp(inputs.length, self._goal(inputs), DURATION, speed)
             self._rested = 0.0
         if self._ramp.done:
@@ -91,7 +84,7 @@ class Calibrating(ActivityControl):
         Up to GOALS random goals are tried, until a step towards one of them ends in a holdable
         posture. If none does, the step whose end misses the least holding torque is chosen.
         """
-        robot, mae, theta = self._robot, inputs.mae, inputs.theta
+        robot, mae, theta = self._setup.robot, inputs.mae, inputs.theta
         tension = inputs.motor_tension
         limits = robot.tension.bias, gentle_limit(robot)
         best, best_tension, least_missing = theta, tension, np.inf

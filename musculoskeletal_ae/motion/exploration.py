@@ -13,11 +13,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.settings import Setup
 from musculoskeletal_ae.motion.activities import ActivityControl, Command, Inputs
 from musculoskeletal_ae.motion.methods import FIRST, Goal
 from musculoskeletal_ae.motion.ramps import LengthRamps
 from musculoskeletal_ae.presets.registry import preset_named
-from musculoskeletal_ae.robot.robot import Robot
 
 
 class Exploration:
@@ -26,18 +26,14 @@ class Exploration:
     A new iterator does not repeat the sequence: it continues the sequence at a new posture.
     """
 
-    def __init__(self, robot: Robot, seed: int, preset: str = 'default') -> None:
-        """Prepare to draw the random steps of a preset for `robot`, with the random seed `seed`."""
-        self._rng = np.random.default_rng([seed, 0xE8])
-        self.use(robot, preset)
-
-    def use(self, robot: Robot, preset: str) -> None:
-        """Use another preset, or a robot with other isolated muscles, for the next steps."""
-        self._robot, self._draw = robot, preset_named(preset).exploration()
+    def __init__(self, setup: Setup, seed: int) -> None:
+        """Prepare to draw the random steps of a preset, with the random seed `seed`."""
+        self._setup, self._rng = setup, np.random.default_rng([seed, 0xE8])
 
     def __iter__(self) -> Iterator[Goal]:
         while True:
-            yield from self._draw(self._robot, self._rng)
+            draw = preset_named(self._setup.settings.preset).exploration()
+            yield from draw(self._setup.robot, self._rng)
 
 
 class Exploring(ActivityControl):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Feedback: corrects the estimated posture error, and at rest reduces needless tension.
 
-`MotionFeedback` works while the arm moves and settles, `RestFeedback` afterwards. Both shift the
-desired posture (`Shift`), which acts in two ways (`tension_plan.TensionPlan`):
+The feedback has one law while the arm moves and settles, and another one afterwards. Both shift
+the desired posture (`Shift`), which acts in two ways (`tension_plan.TensionPlan`):
 
     l = ①(θ + δ, T),   −Gᵀ T = τ + k u,   k = SUPPORT σ/CORRECTION
 
@@ -22,9 +22,9 @@ from typing import NamedTuple
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.settings import Setup
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.activities import Inputs
-from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
 #: plan again if a tension limit has changed by more than this [N], and a planned tension is nearer
@@ -83,8 +83,18 @@ def depends_on_limit(tension: Array, before: Array, limit: Array) -> bool:
     return bool(np.count_nonzero(depends & (np.abs(limit - before) > REPLAN)))
 
 
-class RestFeedback:
-    """Slowly corrects the posture and reduces needless tension while the arm rests.
+class Feedback:
+    """Corrects the posture, and reduces needless tension while the arm rests.
+
+    While the arm moves along a trajectory and settles (`in_motion`), the shift of the desired
+    posture follows from the error e of the estimated posture:
+
+        δ = u = k_p e + c,   dc/dt = k_i e,   |c| ≤ CORRECTION
+
+    The integral c persists from one motion to the next. While the limiter holds a muscle back, no
+    entry of c grows, so that c does not wind up.
+
+    While the arm rests (`at_rest`), δ is c, which begins at the last shift of the motion:
 
         dc/dt = gain (θ_target − θ_estimated),   |c| ≤ CORRECTION
         du/dt = gain (c − u)                     where the support helps
@@ -124,44 +134,56 @@ class RestFeedback:
         relief: r [m], (M,).
     """
 
-    def __init__(self, robot: Robot) -> None:
-        self._robot = robot
+    def __init__(self, setup: Setup) -> None:
+        self._setup = setup
         #: errors of each joint that are not corrected [rad], (D,)
-        self._dead_band: Array = np.full(robot.joint_count, DEADBAND)
+        self._dead_band: Array = np.full(setup.robot.joint_count, DEADBAND)
         self.reset()
-        self.moving()
-
-    def use(self, robot: Robot) -> None:
-        """Use another robot description.
-
-        `robot` must already describe isolated muscles as muscles without tension.
-        """
-        self._robot = robot
+        #: times since the arm moved, and since T* was computed [s]
+        self._rested = self._unsolved = 0.0
 
     def use_network(self, mae: Mae) -> None:
         """Use the standard deviations of the estimate that a network knows."""
-        variance = np.zeros(self._robot.joint_count)
+        variance = np.zeros(self._setup.robot.joint_count)
         if mae.covariance is not None:
             variance = np.diag(mae.covariance)
         self._dead_band = np.maximum(DEADBAND, np.sqrt(variance))
 
     def reset(self) -> None:
         """Reset c, u and r to zero."""
-        self.correction: Array = np.zeros(self._robot.joint_count)
-        self.supported: Array = np.zeros(self._robot.joint_count)
-        self.relief: Array = np.zeros(self._robot.muscle_count)
-
-    def moving(self) -> None:
-        """Record that the arm moves, which interrupts the integration until it has settled."""
-        self._rested = self._unsolved = 0.0
+        self.correction: Array = np.zeros(self._setup.robot.joint_count)
+        self.supported: Array = np.zeros(self._setup.robot.joint_count)
+        self.relief: Array = np.zeros(self._setup.robot.muscle_count)
 
     @property
     def shift(self) -> Shift:
         """The present shift of the held posture."""
         return Shift(self.correction, self.supported)
 
-    def step(self, error: Array, jacobian: Array, inputs: Inputs, gain: float) -> bool:
-        """Integrate the errors since the last step if the arm rests; return whether this was done.
+    def in_motion(self, error: Array, is_held_back: bool, dt: float) -> Shift:
+        """Return the shift of the desired posture while the arm moves and settles.
+
+        Args:
+            error: Posture error, desired − estimated θ [rad], (D,).
+            is_held_back: Whether the limiter holds a muscle back (`Follower._is_held_back`).
+            dt: Time since the last call [s].
+        """
+        change = INTEGRAL * dt * error
+        if is_held_back:
+            change = np.where(change * self.correction >= 0.0, 0.0, change)
+        self.correction = np.clip(self.correction + change, -CORRECTION, CORRECTION)
+        # Bound the shift as well, so that a suddenly wrong estimate cannot move the arm far.
+        shift = self.correction + PROPORTIONAL * error
+        self.supported = np.clip(shift, -CORRECTION, CORRECTION)
+        self._rested = self._unsolved = 0.0
+        return Shift(self.supported, self.supported)
+
+    def come_to_rest(self) -> None:
+        """Continue at rest from the last shift of the motion."""
+        self.correction = self.supported
+
+    def at_rest(self, error: Array, jacobian: Array, inputs: Inputs, gain: float) -> bool:
+        """Integrate the errors since the last step once the arm has settled; return whether it has.
 
         Args:
             error: Posture error θ_target − θ_estimated [rad], (D,).
@@ -178,8 +200,8 @@ class RestFeedback:
         correction = self.correction + gain * dt * beyond
         self.correction = np.clip(correction, -CORRECTION, CORRECTION)
         self._unsolved += dt
-        if self._unsolved >= RELIEF_INTERVAL and self._robot.tension_source.is_known:
-            actuation, bias = self._robot.actuation, self._robot.tension.bias
+        if self._unsolved >= RELIEF_INTERVAL and self._setup.robot.tension_source.is_known:
+            actuation, bias = self._setup.robot.actuation, self._setup.robot.tension.bias
             lowest, largest = actuation.kept_tension, actuation.largest_relief
             change = gain * self._unsolved
             share = change / actuation.tension_per_length(inputs.motor_tension)
@@ -193,41 +215,3 @@ class RestFeedback:
             needless = np.where(motor > least, motor - least, np.minimum(bone - least, 0.0))
             self.relief = np.clip(self.relief + share * needless, -largest, largest)
         return True
-
-
-class MotionFeedback:
-    """Corrects the estimated posture error e while the arm moves along a trajectory and settles.
-
-    The shift is δ = u = k_p e + c, with dc/dt = k_i e and the gains k_p and k_i. The integral c is
-    stored in the rest feedback (`RestFeedback.correction`) and therefore persists from one motion
-    to the next. While the limiter holds a muscle back, no entry of c grows, so that c does not wind
-    up.
-    """
-
-    def __init__(self, rest: RestFeedback) -> None:
-        self._rest = rest
-        #: present shift of the desired posture [rad], (D,)
-        self._shift: Array = np.zeros_like(rest.correction)
-
-    def step(self, error: Array, is_held_back: bool, dt: float) -> Shift:
-        """Return the shift of the desired posture.
-
-        Args:
-            error: Posture error, desired − estimated θ [rad], (D,).
-            is_held_back: Whether the limiter holds a muscle back (`Follower._is_held_back`).
-            dt: Time since the last call [s].
-        """
-        rest = self._rest
-        change = INTEGRAL * dt * error
-        if is_held_back:
-            change = np.where(change * rest.correction >= 0.0, 0.0, change)
-        rest.correction = np.clip(rest.correction + change, -CORRECTION, CORRECTION)
-        rest.moving()
-        # Bound the shift as well, so that a suddenly wrong estimate cannot move the arm far.
-        shift = rest.correction + PROPORTIONAL * error
-        self._shift = np.clip(shift, -CORRECTION, CORRECTION)
-        return Shift(self._shift, self._shift)
-
-    def continue_at_rest(self) -> None:
-        """Let the rest feedback continue from the present shift."""
-        self._rest.correction = self._rest.supported = self._shift

@@ -27,7 +27,7 @@ K_stiff λ dl/dt are 0.
 
 A trajectory that is too fast for the muscle modules is slowed as a whole before it starts
 (`slowness`). The follower also holds the end of the trajectory. The rest feedback
-(`feedback.RestFeedback`) then continues from δ, and the plan changes only with it.
+(`feedback.Feedback`) then continues from δ, and the plan changes only with it.
 
 Where no tension is known, T is `Actuation.assumed_tension` in every posture, as in the samples from
 which the network was learned (doc/explanation/method.md).
@@ -42,16 +42,15 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import Setup
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.activities import LENGTH, ActivityControl, Command, Inputs
-from musculoskeletal_ae.motion.feedback import MotionFeedback, RestFeedback, Shift
+from musculoskeletal_ae.motion.feedback import Feedback, Shift
 from musculoskeletal_ae.motion.progress import Progress
 from musculoskeletal_ae.motion.ramps import Ramp
 from musculoskeletal_ae.motion.tension_plan import TensionPlan
 from musculoskeletal_ae.motion.trajectory import Trajectory
 from musculoskeletal_ae.motion.winches import Winches
-from musculoskeletal_ae.robot.robot import Robot
 
 #: gain of the rest feedback, which reduces posture error and needless tension at rest [1/s]
 FEEDBACK_GAIN = 0.5
@@ -72,30 +71,18 @@ class Follower(ActivityControl):
         progress: Time, setpoint and error along the trajectories.
         plan: The planned tensions.
         winches: Measures the lag λ of the muscle modules.
-        feedback: The feedback at rest.
+        feedback: Corrects the posture.
     """
 
-    def __init__(self, robot: Robot, settings: Settings) -> None:
-        self._robot, self._settings = robot, settings
-        self.progress, self.plan = Progress(robot), TensionPlan(robot, settings)
-        self.winches, self.feedback = Winches(robot), RestFeedback(robot)
-        self._motion_feedback = MotionFeedback(self.feedback)
+    def __init__(self, setup: Setup) -> None:
+        self._setup = setup
+        self.progress, self.plan = Progress(setup), TensionPlan(setup)
+        self.winches, self.feedback = Winches(setup), Feedback(setup)
         #: l_target at rest without the relief r [m], (M,); None while the arm moves or settles
         self._held: Array | None = None
         #: ramp that reduces the difference between the last command and the present plan to 0
         self._blend: Ramp | None = None
         self._desired: Array | None = None  # the last desired command [m], (M,)
-
-    def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings from the next step on.
-
-        `robot` must already describe isolated muscles as muscles without tension.
-        """
-        self._robot, self._settings = robot, settings
-        self.progress.use(robot)
-        self.plan.use(robot, settings)
-        self.winches.use(robot)
-        self.feedback.use(robot)
 
     def use_network(self, mae: Mae) -> None:
         """Use another network; the command changes without a jump."""
@@ -127,7 +114,7 @@ class Follower(ActivityControl):
         """
         if self._held is not None and self.progress.trajectory is not None:
             self.progress.return_to_end()
-            self.feedback.relief = np.zeros(self._robot.muscle_count)
+            self.feedback.relief = np.zeros(self._setup.robot.muscle_count)
         self._held = self._blend = None
 
     def _leave_rest(self) -> None:
@@ -188,9 +175,11 @@ class Follower(ActivityControl):
             length = self._moving(progress.trajectory, inputs)
         else:
             length = self._resting(inputs)
-        length = np.where(self._robot.used, length, sent)
+        length = np.where(self._setup.robot.used, length, sent)
         if self._blend is None:
-            rate_limit = float(self._robot.actuation.fastest(self._settings.rate_limit).min())
+            rate_limit = float(
+                self._setup.robot.actuation.fastest(self._setup.settings.rate_limit).min()
+            )
             self._blend = Ramp(sent - length, np.zeros_like(length), BLENDING, rate_limit)
         self._desired = length + self._blend.step(dt)
         return Command(LENGTH, self._desired.copy())
@@ -199,7 +188,7 @@ class Follower(ActivityControl):
         """Return the length command [m], (M,), during the motion and while the arm settles."""
         error = self.progress.error
         error = np.zeros_like(error) if self.plan.is_stiff else error
-        shift = self._motion_feedback.step(error, self._is_held_back(inputs), inputs.dt)
+        shift = self.feedback.in_motion(error, self._is_held_back(inputs), inputs.dt)
         return self._plan(trajectory, shift, self.winches.lag, inputs)
 
     def _plan(self, trajectory: Trajectory, shift: Shift, lag: float, inputs: Inputs) -> Array:
@@ -216,11 +205,11 @@ class Follower(ActivityControl):
     def _is_held_back(self, inputs: Inputs) -> bool:
         """Return whether the limiter did not let a muscle wind in as far as desired.
 
-        The result makes `MotionFeedback` stop integrating. With isolated muscles, the result is
+        The result makes the feedback stop integrating. With isolated muscles, the result is
         always False: some of the remaining muscles are then often at their limit, but without the
         integration, the arm would sag.
         """
-        if self._desired is None or not self._robot.used.all():
+        if self._desired is None or not self._setup.robot.used.all():
             return False
         return bool((inputs.length - self._desired > HELD_BACK).any())
 
@@ -229,9 +218,9 @@ class Follower(ActivityControl):
         feedback, plan, trajectory = self.feedback, self.plan, self.progress.trajectory
         assert trajectory is not None
         if is_new := self._held is None:
-            self._motion_feedback.continue_at_rest()
+            feedback.come_to_rest()
         before, gain = feedback.shift, 0.0 if plan.is_stiff else FEEDBACK_GAIN
-        feedback.step(self.progress.error, plan.jacobian, inputs, gain)
+        feedback.at_rest(self.progress.error, plan.jacobian, inputs, gain)
         if is_new or not np.array_equal(before, feedback.shift):
             self._held = self._plan(trajectory, feedback.shift, 0.0, inputs)
         assert self._held is not None

@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import Setup
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.messages.message_reading import TrajectoryPoints
@@ -26,7 +26,6 @@ from musculoskeletal_ae.motion.hand import Hand
 from musculoskeletal_ae.motion.slowness import exertion_slowness, slowness
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
 from musculoskeletal_ae.report import distinct
-from musculoskeletal_ae.robot.robot import Robot
 
 #: Refuse a point that exceeds a joint limit by more than this [rad]; clip any other point to the
 #: limit. The points of a replayed motion are estimated postures, and the estimate of an arm that is
@@ -41,23 +40,15 @@ SAME = 1e-6  # treat two poses as equal below this relative difference
 class Planner:
     """Plans trajectories with the network in use."""
 
-    def __init__(self, robot: Robot, settings: Settings) -> None:
-        self._hand = Hand(robot)
+    def __init__(self, setup: Setup) -> None:
+        self._setup, self._hand = setup, Hand(setup.robot)
         #: the last pose, whether its orientation counts, and the trajectory to it
         self._last_pose: tuple[pin.SE3, bool, Trajectory] | None = None
-        self.use(robot, settings)
-
-    def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings from the next step on.
-
-        `robot` must already describe isolated muscles as muscles without tension.
-        """
-        self._robot, self._settings = robot, settings
 
     @property
     def takes_nearest(self) -> bool:
         """Whether the arm goes to the nearest holdable posture if the target is not holdable."""
-        return self._settings.unreachable == 'nearest'
+        return self._setup.settings.unreachable == 'nearest'
 
     def to_posture(
         self, mae: Mae, start: Setpoint, theta: Array, duration: float, lag: float
@@ -82,10 +73,12 @@ class Planner:
         Raises:
             MessageError: If the motion is refused.
         """
-        path = np.vstack([start.theta, holdable_paths.way(self._robot, mae, start.theta, theta)])
+        path = np.vstack(
+            [start.theta, holdable_paths.way(self._setup.robot, mae, start.theta, theta)]
+        )
         path, problem = self._passable(mae, path, self.takes_nearest)
         planned = self._within_limits(mae, Trajectory.to(start, path[1:], duration))
-        slower = exertion_slowness(self._robot, mae, planned, lag)
+        slower = exertion_slowness(self._setup.robot, mae, planned, lag)
         if slower > 1.0:
             planned = self._within_limits(mae, planned.scaled(slower))
         return planned, problem
@@ -109,7 +102,7 @@ class Planner:
         planned = self._slowed(mae, Trajectory.through(start, points, passed))
         self.reachable(mae, start.theta, planned.end, nearest=False)
         self._passable(mae, planned.path[1], nearest=False)
-        slower = exertion_slowness(self._robot, mae, planned, lag)
+        slower = exertion_slowness(self._setup.robot, mae, planned, lag)
         # Slowing changes the path of a trajectory that starts in motion. If the slowed trajectory
         # would leave the joint limits, keep the faster one, from which the arm may then deviate.
         with suppress(MessageError):
@@ -118,7 +111,7 @@ class Planner:
 
     def to_rest(self, start: Setpoint) -> Trajectory:
         """Plan to come to rest within `trajectory.STOPPING` seconds from the setpoint `start`."""
-        return Trajectory.stopping(start, self._robot)
+        return Trajectory.stopping(start, self._setup.robot)
 
     def to_pose(
         self, mae: Mae, start: Setpoint, pose: pin.SE3, whole: bool, now: float
@@ -187,7 +180,7 @@ class Planner:
         Raises:
             MessageError: If θ is not holdable and `nearest` is false.
         """
-        robot = self._robot
+        robot = self._setup.robot
         if robot.used.all():
             return theta, ''
         held, problem = holdable_paths.nearest_held(robot, mae, start, theta)
@@ -218,7 +211,7 @@ class Planner:
         Raises:
             MessageError: If it is only a part, and `nearest` is false.
         """
-        robot = self._robot
+        robot = self._setup.robot
         if robot.used.all():
             return path, ''
         part, missing = holdable_paths.passable(robot, mae, path)
@@ -232,7 +225,7 @@ class Planner:
 
     @property
     def _because_of_isolation(self) -> str:
-        robot = self._robot
+        robot = self._setup.robot
         verb = 'are' if len(robot.isolated) > 1 else 'is'
         return f'because {robot.names(robot.isolated)} {verb} isolated'
 
@@ -242,7 +235,7 @@ class Planner:
         Raises:
             MessageError: If a point exceeds the joint limits by more than `TOLERANCE`.
         """
-        robot = self._robot
+        robot = self._setup.robot
         low, high = robot.lower[points.joints], robot.upper[points.joints]
         beyond = (points.position < low - TOLERANCE) | (points.position > high + TOLERANCE)
         if not beyond.any():
@@ -264,8 +257,8 @@ class Planner:
             MessageError: If the slowed trajectory leaves the joint limits. This can happen because
                 slowing changes the path of a trajectory that starts in motion.
         """
-        slower = planned.scaled(slowness(self._robot, mae, planned, self._settings))
-        slower.check(self._robot)
+        slower = planned.scaled(slowness(self._setup.robot, mae, planned, self._setup.settings))
+        slower.check(self._setup.robot)
         return slower
 
     def _within_limits(self, mae: Mae, planned: Trajectory) -> Trajectory:
@@ -277,4 +270,4 @@ class Planner:
         try:
             return self._slowed(mae, planned)
         except MessageError:
-            return self._slowed(mae, planned.after_rest(self._robot))
+            return self._slowed(mae, planned.after_rest(self._setup.robot))

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.settings import Setup
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
-from musculoskeletal_ae.robot.robot import Robot
 
 #: a new motion of an arm with isolated muscles starts from the estimated posture instead of the
 #: setpoint if a joint is further than this away from it [rad]: the arm has fallen
@@ -28,17 +28,13 @@ class Progress:
         error: Posture error, desired − estimated θ [rad], (D,).
     """
 
-    def __init__(self, robot: Robot) -> None:
-        self._robot = robot
+    def __init__(self, setup: Setup) -> None:
+        self._setup, joints = setup, setup.robot.joint_count
         self.trajectory: Trajectory | None = None
         self.next: tuple[Trajectory, float] | None = None
         self.time = self.over = 0.0
-        self.desired = Setpoint.resting(np.zeros(robot.joint_count))
-        self.error: Array = np.zeros(robot.joint_count)
-
-    def use(self, robot: Robot) -> None:
-        """Use another robot description, which also states the isolated muscles."""
-        self._robot = robot
+        self.desired = Setpoint.resting(np.zeros(joints))
+        self.error: Array = np.zeros(joints)
 
     def begin(self, trajectory: Trajectory, time: float = 0.0) -> None:
         """Replace all trajectories by a trajectory that began `time` [s] ago."""
@@ -89,7 +85,7 @@ class Progress:
     @property
     def has_fallen(self) -> bool:
         """Whether an arm with isolated muscles is far away from its setpoint."""
-        return not self._robot.used.all() and bool((np.abs(self.error) > FALLEN).any())
+        return not self._setup.robot.used.all() and bool((np.abs(self.error) > FALLEN).any())
 
     @property
     def latest(self) -> Trajectory | None:

@@ -18,12 +18,11 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import Setup
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.activities import LENGTH, ActivityControl, Command, Inputs
 from musculoskeletal_ae.motion.feedback import depends_on_limit
 from musculoskeletal_ae.motion.methods import FIRST, SECOND, Goal, Solution
-from musculoskeletal_ae.robot.robot import Robot
 
 # Ramp the command during this fraction of a movement's duration. In the remaining time, the arm
 # comes to rest and provides a rest sample.
@@ -62,8 +61,8 @@ class LengthRamps:
         solution: Solution of the present goal, or None.
     """
 
-    def __init__(self, robot: Robot, settings: Settings) -> None:
-        self.use(robot, settings)
+    def __init__(self, setup: Setup) -> None:
+        self._setup, robot = setup, setup.robot
         self._goals: list[Goal] = []
         self._goal: Goal | None = None  # present goal, which is approached or held
         self._remaining = 0.0  # time until the next goal begins [s]
@@ -72,13 +71,6 @@ class LengthRamps:
         self._tension: Array = robot.tension.bias  # T_const or T_current of the goal [N], (M,)
         self._limit: Array = robot.tension.limit  # tension limit of the present plan [N], (M,)
         self.solution: Solution | None = None
-
-    def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings from the next step on.
-
-        `robot` must already describe isolated muscles as muscles without tension.
-        """
-        self._robot, self._settings = robot, settings
 
     @property
     def missing_torque(self) -> Array | None:
@@ -108,7 +100,7 @@ class LengthRamps:
         """Solve the present goal again, for example with another network, and ramp to it."""
         if self._goal is None or self._ramp is None or self._goals:
             return
-        duration = self._settings.second_duration
+        duration = self._setup.settings.second_duration
         self._goals = [self._goal._replace(duration=duration, tension=self._tension)]
         if self._ramp.done:
             self._remaining = 0.0
@@ -132,20 +124,21 @@ class LengthRamps:
         return Command(LENGTH, self._command.copy())
 
     def _begin(self, goal: Goal, inputs: Inputs) -> None:
-        actuation = self._robot.actuation
         self._tension = inputs.motor_tension if goal.tension is None else goal.tension
-        if goal.method == SECOND and not actuation.knows_tension:
+        if goal.method == SECOND and not self._setup.robot.tension_source.is_known:
             goal = goal._replace(method=FIRST)
         self._goal, self._limit = goal, inputs.limit
         self.solution = None  # there is no solution if the next line raises an exception
         self.solution = self._solve(goal, inputs.mae, self._tension)
-        length = np.where(self._robot.used, self.solution.length, self._command)
-        rate_limit = float(self._robot.actuation.fastest(self._settings.rate_limit).min())
+        length = np.where(self._setup.robot.used, self.solution.length, self._command)
+        rate_limit = float(
+            self._setup.robot.actuation.fastest(self._setup.settings.rate_limit).min()
+        )
         self._ramp = Ramp(self._command, length, RAMP_SHARE * goal.duration, rate_limit)
         self._remaining = max(goal.duration, self._ramp.duration)
 
     def _solve(self, goal: Goal, mae: Mae, tension: Array) -> Solution:
-        robot, method = self._robot, self._settings.length_methods[goal.method]
+        robot, method = self._setup.robot, self._setup.settings.length_methods[goal.method]
         if method.takes_tension:
             tension = np.minimum(tension, self._limit)
         torque = robot.kinematics.holding_torque(goal.theta) + goal.effort
@@ -155,15 +148,10 @@ class LengthRamps:
 class RampedTarget(ActivityControl):
     """The activity of moving to a target and holding it by a length method."""
 
-    def __init__(self, ramps: LengthRamps, robot: Robot, settings: Settings) -> None:
-        self.ramps = ramps
+    def __init__(self, ramps: LengthRamps, setup: Setup) -> None:
+        self.ramps, self._setup = ramps, setup
         #: target posture θ [rad] and additional torque [N·m], (D,) each
         self._target: tuple[Array, Array] | None = None
-        self.use(robot, settings)
-
-    def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings from the next step on."""
-        self._robot, self._settings = robot, settings
 
     def set_target(self, theta: Array, effort: Array) -> None:
         """Set the target: a posture [rad], and a torque [N·m] besides gravity compensation.
@@ -196,12 +184,12 @@ class RampedTarget(ActivityControl):
         return self.ramps.missing_torque
 
     def _goals(self) -> list[Goal]:
-        chosen = self._settings
+        chosen = self._setup.settings
         method = chosen.length_methods.get(chosen.method)
         if self._target is None or method is None:
             return []
         # T_const of method `first` is T_bias.
-        first = Goal(FIRST, *self._target, chosen.first_duration, self._robot.tension.bias)
+        first = Goal(FIRST, *self._target, chosen.first_duration, self._setup.robot.tension.bias)
         if chosen.method == FIRST:
             return [first]
         if method.follows_first:

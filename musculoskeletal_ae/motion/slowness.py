@@ -71,7 +71,7 @@ def exertion_slowness(robot: Robot, mae: Mae, trajectory: Trajectory, lag: float
     """
     time, theta = trajectory.path
     is_still = (theta == theta[0]).all()
-    if not robot.actuation.knows_tension or is_still:
+    if not robot.tension_source.is_known or is_still:
         return 1.0
     factors, used = (SLOWER, 1.0) if robot.used.all() else (SLOWER_ISOLATED, USED)
     limits, bias, lag = PathLimits(robot, mae, used), robot.tension.bias, max(lag, LEAST_LAG)

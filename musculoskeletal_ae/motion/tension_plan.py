@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import Settings, Setup
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.activities import msc_compensation
 from musculoskeletal_ae.motion.feedback import (
@@ -43,19 +43,15 @@ class Stiffening:
     changes towards them at a limited rate.
     """
 
-    def __init__(self, robot: Robot, settings: Settings) -> None:
-        self.use(robot, settings)
+    def __init__(self, setup: Setup) -> None:
+        self._setup = setup
         self.reset()
-
-    def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings from the next step on."""
-        self._robot, self._settings = robot, settings
 
     def reset(self) -> None:
         """Discard the present solution; the next step computes a new one."""
         self.solution: Solution | None = None  # the solution that T_K approaches
         #: present tensions T_K [N], (M,), which approach `solution`
-        self._near: Array = self._robot.tension.bias
+        self._near: Array = self._setup.robot.tension.bias
         self._solved = 0.0  # time since the solution was computed [s]
 
     def step(
@@ -66,7 +62,7 @@ class Stiffening:
         The rate of T_K is limited. Trajectories may use the fraction SHARE of the rate limit of the
         lengths, and T_K may use half of the remaining fraction.
         """
-        robot, settings, solution = self._robot, self._settings, self.solution
+        robot, settings, solution = self._setup.robot, self._setup.settings, self.solution
         self._solved += dt
         if solution is None or self._solved >= AHEAD:
             at, self._solved = trajectory.sample(time + AHEAD), 0.0
@@ -98,8 +94,8 @@ class TensionPlan:
         jacobian: Muscle Jacobian G at the last setpoint [m/rad], (M, D).
     """
 
-    def __init__(self, robot: Robot, settings: Settings) -> None:
-        self._robot, self._settings = robot, settings
+    def __init__(self, setup: Setup) -> None:
+        self._setup, robot = setup, setup.robot
         self.effort: Array = np.zeros(robot.joint_count)
         self.jacobian: Array = np.zeros((robot.muscle_count, robot.joint_count))
         #: torque k by which tensions support each radian of a shift [N·m/rad], (D,)
@@ -107,32 +103,27 @@ class TensionPlan:
         self._limit: Array = robot.tension.limit  # tension limit of the present plan [N], (M,)
         #: friction coefficient μ of each tendon, (M,)
         self._friction: Array = np.full(robot.muscle_count, FRICTION)
-        self._stiffening = Stiffening(robot, settings)
+        self._stiffening = Stiffening(setup)
         self.reset()
-
-    def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings from the next step on."""
-        self._robot, self._settings = robot, settings
-        self._stiffening.use(robot, settings)
 
     def use_network(self, mae: Mae) -> None:
         """Use the tendon friction and the residual torque that a network has learned."""
         self._support = largest_support(mae) / CORRECTION
-        self._friction = tendon_friction(self._robot, mae)
+        self._friction = tendon_friction(self._setup.robot, mae)
 
     def reset(self) -> None:
         """Discard the plan: all muscles are at T_bias again, and no sliding direction is known."""
-        self.bone_tension: Array = self._robot.tension.bias.copy()
+        self.bone_tension: Array = self._setup.robot.tension.bias.copy()
         self.motor_tension: Array = self.bone_tension
-        self.missing_torque: Array = np.zeros(self._robot.joint_count)
+        self.missing_torque: Array = np.zeros(self._setup.robot.joint_count)
         #: sliding state s of each tendon: 1 after winding in, −1 after paying out, (M,)
-        self._sliding: Array = np.zeros(self._robot.muscle_count)
+        self._sliding: Array = np.zeros(self._setup.robot.muscle_count)
         self._stiffening.reset()
 
     @property
     def is_stiff(self) -> bool:
         """Whether the method is `stiffness`, which uses no feedback."""
-        return self._settings.method == 'stiffness'
+        return self._setup.settings.method == 'stiffness'
 
     @property
     def solution(self) -> Solution | None:
@@ -167,7 +158,7 @@ class TensionPlan:
             limit: Highest motor-side tension that may be planned [N], (M,).
             dt: Time since the last setpoint [s].
         """
-        robot = self._robot
+        robot = self._setup.robot
         at = trajectory.sample(time + 0.5 * dt)
         self.jacobian = jacobian = mae.muscle_jacobian(at.theta, self.bone_tension)
         speed = jacobian @ at.velocity
@@ -179,7 +170,7 @@ class TensionPlan:
         near: Array | float = 0.0
         if self.is_stiff:
             near = self._stiffening.step(mae, trajectory, time, self.effort, limit, dt)
-        if actuation.knows_tension:
+        if robot.tension_source.is_known:
             limits = np.minimum(low, limit) / loss, limit / loss
             stops = supporting_stops(robot, at.theta, at.velocity, self.effort)
             supporting = torque + self._support * shift.torque
@@ -199,7 +190,7 @@ class TensionPlan:
         The arm rests at the posture `theta` [rad], (D,).
         """
         length = mae.lengths(theta, self.bone_tension)
-        return length + msc_compensation(self._robot, self.motor_tension)
+        return length + msc_compensation(self._setup.robot, self.motor_tension)
 
 
 def plan_at_rest(robot: Robot, mae: Mae, theta: Array) -> TensionPlan:
@@ -208,7 +199,7 @@ def plan_at_rest(robot: Robot, mae: Mae, theta: Array) -> TensionPlan:
     Its `length(mae, theta)` is the length command. The arm has not moved before, so that tendon
     friction does not count.
     """
-    plan, none = TensionPlan(robot, Settings()), np.zeros(robot.joint_count)
+    plan, none = TensionPlan(Setup(robot, Settings())), np.zeros(robot.joint_count)
     trajectory = Trajectory.to(Setpoint.resting(theta), theta, 1.0)
     for _ in range(SOLVES):
         plan.step(trajectory, 0.0, Shift(none, none), 0.0, mae, robot.tension.limit, 0.0)

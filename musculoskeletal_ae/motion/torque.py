@@ -6,10 +6,9 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import Setup
 from musculoskeletal_ae.motion.activities import TENSION, ActivityControl, Command, Inputs
 from musculoskeletal_ae.robot.joint_stops import supporting_stops
-from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.robot.tension import least_tension
 
 # Gains of the method `tension`; K_p holds the arm near its target, and K_d damps its motion.
@@ -38,20 +37,13 @@ class TorqueControl(ActivityControl):
     and θ is the low-pass-filtered estimate.
     """
 
-    def __init__(self, robot: Robot, settings: Settings) -> None:
+    def __init__(self, setup: Setup) -> None:
+        self._setup, robot = setup, setup.robot
         self._missing_torque: Array = np.zeros(robot.joint_count)
         #: target posture θ [rad] and additional torque [N·m], (D,) each
         self._target: tuple[Array, Array] | None = None
         self._command: Array = robot.tension.bias  # last tension command [N], (M,)
         self._smooth: Array | None = None  # low-pass-filtered θ [rad], (D,)
-        self.use(robot, settings)
-
-    def use(self, robot: Robot, settings: Settings) -> None:
-        """Use another robot description and other settings from the next step on.
-
-        `robot` must already describe isolated muscles as muscles without tension.
-        """
-        self._robot, self._settings = robot, settings
 
     def set_target(self, theta: Array, effort: Array) -> None:
         """Set the target: a posture [rad], and a torque [N·m] besides gravity compensation.
@@ -62,7 +54,7 @@ class TorqueControl(ActivityControl):
 
     def enter(self, inputs: Inputs) -> None:
         """Enter the activity, starting from the present tensions."""
-        self._command = np.maximum(inputs.tension, self._robot.tension.bias)
+        self._command = np.maximum(inputs.tension, self._setup.robot.tension.bias)
         self._smooth = None
 
     def step(self, inputs: Inputs) -> Command | None:
@@ -85,7 +77,7 @@ class TorqueControl(ActivityControl):
         return self._missing_torque
 
     def _command_towards(self, target: Array, effort: Array, inputs: Inputs) -> Command:
-        robot, dt = self._robot, inputs.dt
+        robot, dt = self._setup.robot, inputs.dt
         before = inputs.theta if self._smooth is None else self._smooth
         self._smooth = smooth = before + dt / (dt + SMOOTHING) * (inputs.theta - before)
         velocity = (inputs.theta - smooth) / SMOOTHING
@@ -102,7 +94,7 @@ class TorqueControl(ActivityControl):
         # Scale the changes of all tensions by the same factor. If the old and the new tensions hold
         # the arm, all tensions in between then hold it as well.
         change = tension - self._command
-        actuation, rate_limit = robot.actuation, self._settings.rate_limit
+        actuation, rate_limit = robot.actuation, self._setup.settings.rate_limit
         rates = actuation.tension_per_length(self._command) * actuation.fastest(rate_limit)
         fastest = rates * dt
         share = float((fastest / np.maximum(fastest, np.maximum(np.abs(change), 1e-9))).min())
@@ -111,7 +103,7 @@ class TorqueControl(ActivityControl):
 
     def _stops(self, theta: Array, target: Array, effort: Array) -> Array | None:
         """Return the stops that support joints, (S, D): those at which θ and the target are."""
-        return supporting_stops(self._robot, np.stack([theta, target]), effort=effort)
+        return supporting_stops(self._setup.robot, np.stack([theta, target]), effort=effort)
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
         """Return the torque [N·m], (D,), that pulls θ towards `target` and damps the velocity."""
@@ -133,8 +125,8 @@ class GravityCompensation(TorqueControl):
     within the joint limits.
     """
 
-    def __init__(self, robot: Robot, settings: Settings) -> None:
-        super().__init__(robot, settings)
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(setup)
         self.held: Array | None = None  # θ_held, at which the spring holds the arm [rad], (D,)
         self._theta: Array | None = None  # the last posture [rad], (D,)
 
@@ -157,7 +149,7 @@ class GravityCompensation(TorqueControl):
         """Return no stops: the muscles carry the arm, so that a hand can lead it off a stop."""
 
     def _feedback(self, theta: Array, velocity: Array, target: Array) -> Array:
-        low, high = self._robot.lower, self._robot.upper
+        low, high = self._setup.robot.lower, self._setup.robot.upper
         held = target if self.held is None else np.clip(self.held, theta - BAND, theta + BAND)
         self.held = np.clip(held, low, high)
         wall = np.clip(theta, low + WALL_AT, high - WALL_AT) - theta

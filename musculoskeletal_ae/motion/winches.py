@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.settings import Setup
 from musculoskeletal_ae.motion.activities import msc_compensation
-from musculoskeletal_ae.robot.robot import Robot
 
 #: measure the lag only at muscles that move faster than this [m/s], because noise hides it in slow
 #: ones
@@ -30,17 +30,15 @@ class Winches:
     all muscles for which the equation holds and whose speed exceeds WINDING, except isolated ones.
     """
 
-    def __init__(self, robot: Robot) -> None:
-        self._robot = robot
+    def __init__(self, setup: Setup) -> None:
+        self._setup = setup
         self._products, self._squares = 0.0, LAGS
         self._since = self._last = 0.0
         self._delay = 0.0  # delay of the last muscle_states message on its way here [s]
         self._length: Array | None = None
-        self._speed: Array = np.zeros(robot.muscle_count)  # speed of each muscle, dl/dt [m/s], (M,)
-
-    def use(self, robot: Robot) -> None:
-        """Use another robot description; its isolated muscles are ignored."""
-        self._robot = robot
+        self._speed: Array = np.zeros(
+            setup.robot.muscle_count
+        )  # speed of each muscle, dl/dt [m/s], (M,)
 
     @property
     def lag(self) -> float:
@@ -76,9 +74,9 @@ class Winches:
         if before is None:
             return
         self._speed = speed = (length - before) / since
-        lacking = length - command + msc_compensation(self._robot, tension)
-        is_usable = (np.abs(speed) > WINDING) & self._robot.used
-        is_usable &= self._robot.actuation.is_pulling(length, command)
+        lacking = length - command + msc_compensation(self._setup.robot, tension)
+        is_usable = (np.abs(speed) > WINDING) & self._setup.robot.used
+        is_usable &= self._setup.robot.actuation.is_pulling(length, command)
         self._products -= float(lacking[is_usable] @ speed[is_usable])
         self._squares += float(speed[is_usable] @ speed[is_usable])
 

@@ -21,6 +21,7 @@ from std_msgs.msg import Float64MultiArray, String
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from musculoskeletal_ae.awake_clock import PAUSE
 from musculoskeletal_ae.bags.topics import topics_with
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.control import controller_status
@@ -288,9 +289,14 @@ class ControllerNode(Shell):
 
     def _step(self) -> None:
         self.overdue.reset()
-        command = self.core.step(time.monotonic(), self.now())
+        begun = time.monotonic()
+        command = self.core.step(begun, self.now())
         # Publish the mode first, so that no command of a moving arm follows a mode `stopped`.
         self._publish_mode()
+        if time.monotonic() - begun > PAUSE:
+            # The process was suspended meanwhile, and the arm may have moved. The next step, which
+            # notices the pause as well, computes a new command from the new posture.
+            command = None
         if command is not None:
             value, offset = command.value, self.body.offsets.offset
             value = value + offset if command.kind == LENGTH else value
@@ -336,7 +342,7 @@ class ControllerNode(Shell):
         """Yield the conditions of the core, and one if a latched stop could not be saved."""
         yield from super().conditions()
         if problem := self.memory.problem:
-            yield ConditionKind.STOP_NOT_KEPT.condition(problem)
+            yield ConditionKind.STATE_NOT_SAVED.condition(problem, ['controller'])
 
     def status(self) -> Report:
         """Return what the controller does; log stops and joint stiffness when they change."""

@@ -73,17 +73,15 @@ class EstimatorNode(Shell):
         self.needed.add('muscle_states')
         if not self.get_parameter('use_sim_time').value:  # simulated time may be slow
             self.needed.expect_rate('muscle_states', self.rate)
-        self.posture: tuple[float, ...] = ()  # value of the parameter zero_posture
-        self.muscles_to_isolate: tuple[int, ...] = ()  # value of the parameter isolate_muscles
-        self.parameters.follow('zero_posture', self._on_posture)
+        self.parameters.follow('on_anomaly', self._on_anomaly)
+        self.parameters.follow('zero_posture', partial(stated_theta, self.robot))
         if self.parameter('zero_at_start'):
             self.core.distrust_lengths(Evidence.NOT_CALIBRATED)
         elif found is not None and not found.offsets.known:
             self.core.distrust_lengths(Evidence.RESTARTED, found.offsets.offset)
-        self.parameters.follow('isolate_muscles', self._on_isolate_muscles)
-        self.core.isolate([*self.muscles_to_isolate, *(() if found is None else found.isolated)])
+        self.parameters.follow('isolate_muscles', self.robot.muscle_indices)
+        self.core.isolate([*self._muscles_to_isolate, *(() if found is None else found.isolated)])
         self.candidates.subscribe()
-        self.parameters.follow('on_anomaly', self._on_anomaly)
         self.follow_muscle_messages(self._on_muscles)
         self.follow_posture('joint_states', self._on_joints, some=True)
         self._publish_body()
@@ -117,34 +115,31 @@ class EstimatorNode(Shell):
         self.candidates.publish(mae)
         # The length calibration needs a network, so it begins with the first one.
         if Evidence.NOT_CALIBRATED in self.core.trust.evidence:
-            self.core.calibrate_lengths(self.posture)
+            self.core.calibrate_lengths(self.parameter('zero_posture'))
             self._publish_body()
 
-    def _on_posture(self, posture: tuple[float, ...]) -> None:
-        stated_theta(self.robot, posture)  # raises if the posture is not legal
-        self.posture = posture
-
-    def _on_isolate_muscles(self, names: tuple[str, ...]) -> None:
-        self.muscles_to_isolate = tuple(self.robot.muscle_indices(names))
+    @property
+    def _muscles_to_isolate(self) -> tuple[int, ...]:
+        return tuple(self.robot.muscle_indices(self.parameter('isolate_muscles')))
 
     def _on_anomaly(self, response: str) -> None:
         self.core.suspects.isolates = response == 'isolate'
 
     def _calibrate(self, request: Trigger.Request) -> str:
-        self.core.calibrate_lengths(self.posture)
+        self.core.calibrate_lengths(self.parameter('zero_posture'))
         self._reset(request)
-        if self.posture:
+        if self.parameter('zero_posture'):
             doing = 'hold the arm still in zero_posture'
         else:
             doing = 'call controller/explore, unless the arm is already exploring'
         return f'calibrating length offsets: {doing}; /diagnostics shows the progress'
 
     def _isolate_more(self, request: Trigger.Request) -> str:
-        if not self.muscles_to_isolate:
+        if not self._muscles_to_isolate:
             raise MusculoskeletalError(
                 '`isolate_muscles` names no muscle; set that parameter first'
             )
-        wanted = {*self.core.body.isolated, *self.muscles_to_isolate}
+        wanted = {*self.core.body.isolated, *self._muscles_to_isolate}
         self.core.reset(wanted)  # called before isolating, because a reset restores a suspect
         self.core.isolate(wanted)
         self._reset(request)
@@ -152,7 +147,7 @@ class EstimatorNode(Shell):
 
     def _restore(self, _: Trigger.Request) -> str:
         isolated = self.core.body.isolated
-        restored = self.muscles_to_isolate or isolated  # all muscles if the parameter names none
+        restored = self._muscles_to_isolate or isolated  # all muscles if the parameter names none
         self.core.restore(restored)
         self.core.networks.declare_repaired(restored, time.monotonic())
         self._publish_body()
@@ -267,7 +262,7 @@ class EstimatorNode(Shell):
         """Yield the conditions of the core, and one if the body state could not be saved."""
         yield from super().conditions()
         if problem := self.memory.problem:
-            yield ConditionKind.OFFSETS_NOT_SAVED.condition(problem)
+            yield ConditionKind.STATE_NOT_SAVED.condition(problem, ['estimator'])
 
     def _publish_joint_trust(self) -> None:
         trust, before = self.core.joint_trust, self.published_trust

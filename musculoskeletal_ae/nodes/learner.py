@@ -52,12 +52,9 @@ class LearnerNode(Shell):
             trainer=TrainerProcess,
             directory=self.state_directory(),
         )
-        self.publisher = self.create_publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
-        self.sources.watch('mae_checkpoint')
         core = self.core
         self._begin()
-        self.muscles_to_relearn: tuple[int, ...] = ()  # value of the parameter relearn_muscles
-        self.parameters.follow('relearn_muscles', self._on_relearn_muscles)
+        self.parameters.follow('relearn_muscles', self.robot.muscle_indices)
         # `replace` replaces what was learned, which cannot be undone. Therefore `load_checkpoint`
         # checks the value before any parameter of a request is set.
         self.parameters.on_change('checkpoint', core.replace, self.load_checkpoint)
@@ -77,6 +74,9 @@ class LearnerNode(Shell):
         self._decisions = self.checkpoint_queue(ACCEPTED, self._use_accepted)
         self.listen(UInt8MultiArray, ACCEPTED, self._decisions.propose, LATCHED)
         self.listen(KeyValue, REJECTED, self._use_rejected, LATCHED)
+        # The graph shows this publisher when the node is ready to report.
+        self.publisher = self.create_publisher(UInt8MultiArray, 'mae_checkpoint', LATCHED)
+        self.sources.watch('mae_checkpoint')
         self.create_timer(POLL_PERIOD, self._poll, clock=STEADY)
 
     # -- parameters -----------------------------------------------------------------------------
@@ -94,9 +94,6 @@ class LearnerNode(Shell):
                 mae = self.load_checkpoint(self.parameter('checkpoint'))
             if mae is not None:
                 self.core.begin(mae)
-
-    def _on_relearn_muscles(self, names: tuple[str, ...]) -> None:
-        self.muscles_to_relearn = tuple(self.robot.muscle_indices(names))
 
     # -- messages -------------------------------------------------------------------------------
 
@@ -131,13 +128,13 @@ class LearnerNode(Shell):
         return 'learning' if request.data else 'stopped; samples and network are kept'
 
     def _relearn(self, _: Trigger.Request) -> str:
-        if not self.muscles_to_relearn:
+        muscles = tuple(self.robot.muscle_indices(self.parameter('relearn_muscles')))
+        if not muscles:
             raise MusculoskeletalError(
                 '`relearn_muscles` names no muscle; set that parameter first'
             )
-        self.core.relearn(self.muscles_to_relearn)
-        names = self.robot.names(self.muscles_to_relearn)
-        return f'relearning: {names}; other muscles are unchanged'
+        self.core.relearn(muscles)
+        return f'relearning: {self.robot.names(muscles)}; other muscles are unchanged'
 
     def _poll(self) -> None:
         data = self.core.poll(self.now())

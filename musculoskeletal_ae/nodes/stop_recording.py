@@ -25,7 +25,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 
 SECONDS = 10.0  # let a recording begin this long before the stop [s]
 MOST = 50_000  # keep at most this many messages, the newest ones
-MOST_BYTES = 32 << 20  # keep messages of at most this total size [bytes]
+MOST_BYTES = 16 << 20  # keep messages of at most this total size [bytes]
 LARGEST_MESSAGE = 4 << 20  # leave out a larger message [bytes]; a typical network has half a MB
 FILE = 'cause.txt'  # file in the bag's directory with the cause of the stop; written last
 #: count the directories whose names match this pattern as recordings, of which the oldest ones are

@@ -12,9 +12,10 @@ checkpoint, and a muscle is reported when A exceeds the threshold in five consec
 import math
 
 from musculoskeletal_ae.arrays import Array
-from musculoskeletal_ae.estimation.detectors.residual_distance import NORM, ResidualDistance
+from musculoskeletal_ae.estimation.detectors.residual_distance import ResidualDistance
 from musculoskeletal_ae.estimation.finding import Observation
 from musculoskeletal_ae.mae.mae import Mae
+from musculoskeletal_ae.mae.residuals import NORM
 from musculoskeletal_ae.mae.units import Mask, State
 
 

@@ -18,7 +18,6 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.robot.muscle_file import POSITION, STIFFNESS
-from musculoskeletal_ae.robot.tension_source import TensionSource
 
 if TYPE_CHECKING:
     from musculoskeletal_ae.robot.robot import Robot
@@ -55,7 +54,6 @@ class Actuation(ABC):
     """How the muscle modules of one arm turn commands into tensions, and what they measure.
 
     Attributes:
-        source: Source of the tensions.
         speed: Largest speed of each module [m/s], (M,); infinite if it is not known.
         follows_tensions: Whether the modules accept tension commands as well as length commands.
     """
@@ -67,7 +65,6 @@ class Actuation(ABC):
         description = robot.description
         self._robot, self._whole = robot, description.tension
         self._stiffness, self._stated_release = description.stiffness, description.release
-        self.source: TensionSource = description.tension_source
         self.speed: Array = description.speed
 
     @property
@@ -75,11 +72,6 @@ class Actuation(ABC):
         return self._robot.tension.bias
 
     # -- tensions that are known -----------------------------------------------------------------
-
-    @property
-    def knows_tension(self) -> bool:
-        """Whether the modules measure tensions or motor currents."""
-        return self.source.is_known
 
     @property
     def assumed_tension(self) -> Array:
@@ -92,20 +84,23 @@ class Actuation(ABC):
 
     def known_tension(self, measured: Array) -> Array:
         """Return measured tensions [N], (..., M), or assumed tensions if none are measured."""
-        if self.knows_tension:
+        if self._robot.tension_source.is_known:
             return measured
         return np.full_like(measured, self.assumed_tension)
 
     # -- commands and tensions -------------------------------------------------------------------
 
-    @abstractmethod
     def choose(self, by_stiffness: Choice, by_position: Choice) -> Choice:
         """Return `by_stiffness` under stiffness control, `by_position` under position control."""
+        return by_stiffness if self.follows_tensions else by_position
 
     @property
-    @abstractmethod
     def kept_tension(self) -> Array:
-        """Tension that the modules maintain even if no command winds in the tendon [N], (M,)."""
+        """Tension that the modules maintain even if no command winds in the tendon [N], (M,).
+
+        It is T_bias under stiffness control. Position control maintains no tension.
+        """
+        return self.choose(self._bias, np.zeros_like(self._bias))
 
     @abstractmethod
     def demanded(self, length: Array, command: Array) -> Array | None:
@@ -149,16 +144,20 @@ class Actuation(ABC):
             LENGTH and target lengths [m], or TENSION and target tensions [N], (M,).
         """
 
-    @abstractmethod
     def unchanging_length(self, length: Array, tension: Array) -> Array:
         """Return the length command that does not change lengths and tensions [m], (M,).
+
+        Position-controlled modules hold their lengths. Where the present tension is below T_bias, a
+        command under stiffness control demands T_bias.
 
         Args:
             length: Present lengths [m], (M,).
             tension: Present tensions [N], (M,).
         """
+        if not self.follows_tensions:
+            return length.copy()
+        return self.length_for(length, tension, np.maximum(tension, self._bias))
 
-    @abstractmethod
     def present_tension(self, length: Array, command: Array, tension: Array) -> Array:
         """Return the tension command that can replace a length command without a jump [N], (M,).
 
@@ -167,8 +166,9 @@ class Actuation(ABC):
             command: Target lengths of the length command [m], (M,).
             tension: Measured tensions [N], (M,).
         """
+        demand = self.demanded(length, command)
+        return np.maximum(tension, self._bias) if demand is None else demand
 
-    @abstractmethod
     def is_pulling(self, length: Array, command: Array) -> Bools:
         """Return which modules follow their target length instead of maintaining T_bias, (M,).
 
@@ -176,17 +176,24 @@ class Actuation(ABC):
             length: Measured lengths [m], (M,).
             command: Target lengths [m], (M,).
         """
+        pulling: Bools = length > command
+        return self.choose(pulling, np.ones_like(pulling))
 
-    @abstractmethod
     def tension_of_lag(self, lag: float, speed: Array) -> Array:
         """Return by how much the tension of a muscle that is paid out exceeds T_bias [N], (M,).
 
-        The tension is higher because the module lags behind its command.
+        A module under stiffness control that pays out at a speed lags behind its command by the
+        length `lag` times speed. The control stiffness converts this length into a tension.
+        Position-controlled drives pay out without tension.
 
         Args:
             lag: Time by which the modules lag behind their commands [s].
             speed: Speed at which the modules pay out [m/s], (M,); not negative.
         """
+        if not self.follows_tensions:
+            return np.zeros_like(speed)
+        tension: Array = self._stiffness * lag * speed
+        return tension
 
     def fastest(self, rate_limit: float) -> Array:
         """Return the rate limit of each length command [m/s], (M,).
@@ -198,9 +205,9 @@ class Actuation(ABC):
     # -- limits ----------------------------------------------------------------------------------
 
     @property
-    @abstractmethod
     def largest_relief(self) -> float:
         """Largest length by which rest feedback pays out a muscle that is too tense [m]."""
+        return self.choose(RELIEF, SLACK)
 
     @abstractmethod
     def depth(self, tension: Array, rate: Array, limit: Array) -> Array:
@@ -223,22 +230,32 @@ class Actuation(ABC):
             limit: Tension limits [N], (M,).
         """
 
-    @abstractmethod
     def usable_lead(self, lead: Array | float) -> Array | float:
         """Return by how much a command to a lagging module may exceed `depth` [m].
+
+        Under stiffness control, it is the whole lead, because a module stops winding in at the
+        demanded tension. A position-controlled module would follow a leading command even if the
+        arm were blocked.
 
         Args:
             lead: Lag of each module behind its command while it winds in [m], scalar or (M,).
         """
+        return self.choose(lead, 0.0)
 
-    @abstractmethod
     def recovered(self, shortest: Array, dt: float) -> Array:
         """Return the shortest permitted commands after a tension exceeded its limit [m], (M,).
+
+        Under stiffness control, this is no restriction (−∞), because the modules regulate the
+        tension by themselves. With position control, the commands decrease by 10 mm/s: paying out
+        reverses the friction of the tendon, so the tension falls by far more than the elastic
+        elements explain. If the module wound in again at full speed, the tension would exceed its
+        limit again before the next reading arrives.
 
         Args:
             shortest: Shortest lengths that were permitted at the last call [m], (M,).
             dt: Time since the last call [s].
         """
+        return self.choose(np.full_like(shortest, -np.inf), shortest - RECOVERY * dt)
 
     @property
     def release(self) -> Array:
@@ -278,28 +295,19 @@ class Actuation(ABC):
             tension: Measured tension [N].
         """
 
-    @abstractmethod
     def winding_depth(self, muscle: int) -> float:
         """Return the length [m] by which `muscle` may be wound in while it is verified.
 
-        The limit applies whatever the sensors of the suspect muscle read.
+        The limit applies whatever the sensors of the suspect muscle read. It is DEPTH under
+        stiffness control, and `release` with position control.
         """
+        return DEPTH if self.follows_tensions else float(self.release[muscle])
 
 
 class StiffnessControl(Actuation):
     """Modules under muscle stiffness control, which maintain T_bias by themselves."""
 
     follows_tensions = True
-    largest_relief = RELIEF
-
-    def choose(self, by_stiffness: Choice, by_position: Choice) -> Choice:  # noqa: ARG002
-        """Return `by_stiffness`, the value for modules under muscle stiffness control."""
-        return by_stiffness
-
-    @property
-    def kept_tension(self) -> Array:
-        """Tension bias of each module [N], (M,), which muscle stiffness control maintains."""
-        return self._bias
 
     def demanded(self, length: Array, command: Array) -> Array:
         """Return the tensions that a length command demands [N], (M,).
@@ -330,34 +338,6 @@ class StiffnessControl(Actuation):
         """Return a tension command of `wanted` [N], (M,), because these modules follow tensions."""
         return TENSION, wanted
 
-    def unchanging_length(self, length: Array, tension: Array) -> Array:
-        """Return the length command that demands the present tension [m], (M,).
-
-        Where the present tension is below T_bias, the command demands T_bias.
-        """
-        return self.length_for(length, tension, np.maximum(tension, self._bias))
-
-    def present_tension(self, length: Array, command: Array, tension: Array) -> Array:  # noqa: ARG002
-        """Return the tensions that the length command demands [N], (M,)."""
-        return self.demanded(length, command)
-
-    def is_pulling(self, length: Array, command: Array) -> Bools:
-        """Return which muscles are longer than commanded, (M,); these demand more than T_bias.
-
-        Measured and commanded lengths are in [m], (M,) each.
-        """
-        pulling: Bools = length > command
-        return pulling
-
-    def tension_of_lag(self, lag: float, speed: Array) -> Array:
-        """Return by how much the tension of a muscle that is paid out exceeds T_bias [N], (M,).
-
-        A module that pays out at a speed lags behind its command by the length `lag` times speed.
-        The control stiffness converts this length into a tension.
-        """
-        tension: Array = self._stiffness * lag * speed
-        return tension
-
     def depth(self, tension: Array, rate: Array, limit: Array) -> Array:  # noqa: ARG002
         """Return by how much [m] a command is shorter than l if it demands `limit`, (M,)."""
         return self.largest_depth(limit)
@@ -366,14 +346,6 @@ class StiffnessControl(Actuation):
         """Return the largest `depth` [m] for any T and dT/dt, (M,)."""
         depth: Array = (limit - self._bias) / self._stiffness
         return depth
-
-    def usable_lead(self, lead: Array | float) -> Array | float:
-        """Return the whole lead [m], because a module stops winding in at the demanded tension."""
-        return lead
-
-    def recovered(self, shortest: Array, dt: float) -> Array:  # noqa: ARG002
-        """Return −∞ (no restriction), because the modules regulate the tension by themselves."""
-        return np.full_like(shortest, -np.inf)
 
     def released(
         self, last: Array, start: Array, length: Array, tension: Array, longest: Array,  # noqa: ARG002
@@ -398,25 +370,11 @@ class StiffnessControl(Actuation):
         measured = tension - self._whole.bias[muscle]
         return float(max(measured, self._stiffness[muscle] * (length - command)))
 
-    def winding_depth(self, muscle: int) -> float:  # noqa: ARG002
-        """Return the length by which any suspect may be wound in [m]: DEPTH, 15 mm."""
-        return DEPTH
-
 
 class PositionControl(Actuation):
     """Position-controlled modules, which maintain no tension by themselves."""
 
     follows_tensions = False
-    largest_relief = SLACK
-
-    def choose(self, by_stiffness: Choice, by_position: Choice) -> Choice:  # noqa: ARG002
-        """Return `by_position`, the value for position-controlled modules."""
-        return by_position
-
-    @property
-    def kept_tension(self) -> Array:
-        """0 N for each module, (M,), because position control maintains no tension."""
-        return np.zeros_like(self._bias)
 
     def demanded(self, length: Array, command: Array) -> None:  # noqa: ARG002
         """Return None, because a position demands no particular tension."""
@@ -443,22 +401,6 @@ class PositionControl(Actuation):
         goal = measured + ADMITTANCE * (wanted - measured)
         return LENGTH, self.length_for(length, measured, goal)
 
-    def unchanging_length(self, length: Array, tension: Array) -> Array:  # noqa: ARG002
-        """Return the present lengths [m], (M,), which position-controlled modules hold."""
-        return length.copy()
-
-    def present_tension(self, length: Array, command: Array, tension: Array) -> Array:  # noqa: ARG002
-        """Return the measured tensions [N], (M,), or T_bias where they are lower."""
-        return np.maximum(tension, self._bias)
-
-    def is_pulling(self, length: Array, command: Array) -> Bools:  # noqa: ARG002
-        """Return True for every module, (M,), because each follows its target length."""
-        return np.ones(np.shape(length), dtype=bool)
-
-    def tension_of_lag(self, lag: float, speed: Array) -> Array:  # noqa: ARG002
-        """Return 0 N for each module, (M,): position-controlled drives pay out without tension."""
-        return np.zeros_like(speed)
-
     def depth(self, tension: Array, rate: Array, limit: Array) -> Array:
         """Return by how much a command may be shorter than the measured length [m], (M,).
 
@@ -467,7 +409,7 @@ class PositionControl(Actuation):
         the value is negative: the elongation by which the muscle has to be paid out. If no tension
         is measured, the value is `release`.
         """
-        if not self.knows_tension:
+        if not self._robot.tension_source.is_known:
             return self.release
         elongation = self._robot.elongation
         depth = elongation(limit) - elongation(tension)
@@ -477,19 +419,6 @@ class PositionControl(Actuation):
     def largest_depth(self, limit: Array) -> Array:  # noqa: ARG002
         """Return `release` [m], (M,): the value of `depth` where no tension is known."""
         return self.release
-
-    def usable_lead(self, lead: Array | float) -> Array | float:  # noqa: ARG002
-        """Return 0 m: the module would follow a leading command even if the arm were blocked."""
-        return 0.0
-
-    def recovered(self, shortest: Array, dt: float) -> Array:
-        """Return the shortest permitted length commands [m], (M,), which decrease by 10 mm/s.
-
-        Paying out reverses the friction of the tendon, so the tension falls by far more than the
-        elastic elements explain. If the module wound in again at full speed, the tension would
-        exceed its limit again before the next reading arrives.
-        """
-        return shortest - RECOVERY * dt
 
     def released(
         self, last: Array, start: Array, length: Array, tension: Array, longest: Array,
@@ -503,7 +432,7 @@ class PositionControl(Actuation):
         """
         robot, bias = self._robot, self._whole.bias
         end = start + self.release
-        if is_fresh and self.knows_tension:
+        if is_fresh and self._robot.tension_source.is_known:
             excess = robot.elongation(tension) - robot.elongation(bias)
             measured = length + np.maximum(excess, 0.0)
             # Where the tension does not exceed T_bias, the module keeps its last command.
@@ -515,13 +444,6 @@ class PositionControl(Actuation):
     def rise(self, muscle: int, length: float, command: float, tension: float) -> float:  # noqa: ARG002
         """Return by how much the measured tension of the muscle exceeds T_bias [N]."""
         return float(tension - self._whole.bias[muscle])
-
-    def winding_depth(self, muscle: int) -> float:
-        """Return the length by which a suspect may be wound in [m].
-
-        It is as long as `release`, which by default changes the tension between T_bias and T_limit.
-        """
-        return float(self.release[muscle])
 
 
 ACTUATIONS: dict[str, type[Actuation]] = {STIFFNESS: StiffnessControl, POSITION: PositionControl}

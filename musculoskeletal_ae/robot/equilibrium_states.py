@@ -49,14 +49,16 @@ SCATTER = 0.03
 SMALL = 1e-9  # divide torques by at least this [N·m]
 
 
-class Equilibrium(NamedTuple):
-    """N equilibria, and how tensions and postures change near them."""
+class Equilibria(NamedTuple):
+    """N postures, in equilibrium or near it, and how tensions and postures change there."""
 
     theta: Array  # joint angles θ [rad], (N, D)
     tension: Array  # tensions T [N], (N, M)
     jacobian: Array  # muscle Jacobian G [m/rad], (N, M, D)
-    stiffness: Array  # stiffness k of each muscle [N/m]; 0 at constant tension, (N, M)
+    stiffness: Array  # stiffness k = ∂T/∂l of each muscle [N/m]; 0 at constant tension, (N, M)
+    bend: Array  # stiffness due to tensions, Σ T ∂²l/∂θ² [N·m/rad], (N, D, D)
     by_torque: Array  # change of θ per torque, ∂θ/∂τ [rad/(N·m)]; 0 at a stop, (N, D, D)
+    is_stable: Bools  # whether each posture is stable, (N,)
 
 
 def has_followers(robot: Robot) -> bool:
@@ -105,20 +107,21 @@ def equilibrium_states(
     if not len(found.theta):
         return None
     rows = rng.integers(len(found.theta), size=count)
-    theta, tension, jacobian, stiffness, by_torque = (part[rows] for part in found)
+    now = Equilibria._make(part[rows] for part in found)
+    tension, jacobian = now.tension, now.jacobian
     muscular = np.abs(jacobian * tension[..., None]).sum(axis=1)
     wound = VARIATION * tension * rng.standard_normal(tension.shape)  # change of T at constant θ
     change = SCATTER * muscular * rng.standard_normal(muscular.shape)
     change -= np.einsum('nmd,nm->nd', jacobian, wound)
-    turned = np.einsum('nij,nj->ni', by_torque, change)
-    tension = tension + wound + stiffness * np.einsum('nmd,nd->nm', jacobian, turned)
-    theta = np.clip(theta + turned, robot.lower, robot.upper)
+    turned = np.einsum('nij,nj->ni', now.by_torque, change)
+    tension = tension + wound + now.stiffness * np.einsum('nmd,nd->nm', jacobian, turned)
+    theta = np.clip(now.theta + turned, robot.lower, robot.upper)
     return theta, np.maximum(tension, 0.0)
 
 
 def settled_states(
     robot: Robot, theta: Array, tension: Array, stiffness: Array | float = 0.0
-) -> Equilibrium:
+) -> Equilibria:
     """Return the equilibria to which the robot moves.
 
     Args:
@@ -153,8 +156,7 @@ def settled_states(
         theta[moving] = np.clip(theta[moving] + change, robot.lower, robot.upper)
     torque, now = _linearised(robot, theta, law, None)
     is_found = now.is_stable & (np.abs(torque) <= enough).all(axis=1)
-    parts = theta, now.tension, now.jacobian, now.stiffness, now.by_torque
-    return Equilibrium(*(part[is_found] for part in parts))
+    return Equilibria._make(part[is_found] for part in now)
 
 
 class _Law(NamedTuple):
@@ -165,20 +167,9 @@ class _Law(NamedTuple):
     stiffness: Array  # stiffness k of each muscle [N/m], (N, M)
 
 
-class _Linearised(NamedTuple):
-    """Equations linearised at N postures, from which the next step is computed."""
-
-    tension: Array  # tensions T [N], (N, M)
-    jacobian: Array  # muscle Jacobian G [m/rad], (N, M, D)
-    stiffness: Array  # derivative ∂T/∂l [N/m], (N, M)
-    bend: Array  # stiffness due to tensions, Σ T ∂²l/∂θ² [N·m/rad], (N, D, D)
-    by_torque: Array  # change of θ per torque, ∂θ/∂τ [rad/(N·m)]; 0 at a stop, (N, D, D)
-    is_stable: Bools  # whether each posture is stable, (N,)
-
-
 def _linearised(
     robot: Robot, theta: Array, law: _Law, bend: Array | None
-) -> tuple[Array, _Linearised]:
+) -> tuple[Array, Equilibria]:
     """Return the torque that is not balanced [N·m], 0 at a stop, (N, D), and its derivatives.
 
     Args:
@@ -208,5 +199,5 @@ def _linearised(
     by_torque = vectors / np.maximum(size, least)[:, None, :] @ vectors.swapaxes(1, 2)
     by_torque = np.where(is_fixed, 0.0, by_torque)
     is_stable: Bools = (values > -least).all(axis=1)
-    now = _Linearised(tension, jacobian, stiffness, bend, by_torque, is_stable)
+    now = Equilibria(theta, tension, jacobian, stiffness, bend, by_torque, is_stable)
     return np.where(is_held, 0.0, torque), now

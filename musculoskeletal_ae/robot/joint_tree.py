@@ -48,12 +48,10 @@ MOST_TERMS = 17
 
 
 class Coupling(NamedTuple):
-    """A joint that follows another: q = offset + ratio · θ_master + Σ higher_k · θ_masterᵏ⁺²."""
+    """A joint that follows another: q = Σ terms_k · θ_masterᵏ."""
 
     master: str  # after `resolved`, a joint that is not coupled itself
-    ratio: float
-    offset: float  # position of the joint where its master is at 0 [rad or m]
-    higher: tuple[float, ...] = ()  # coefficients of the second and all higher powers
+    terms: tuple[float, ...]  # coefficients of all powers, at least two, the constant first
 
     @classmethod
     def of_terms(cls, master: str, terms: Sequence[float]) -> Coupling:
@@ -61,12 +59,7 @@ class Coupling(NamedTuple):
         offset, ratio, *higher = [*map(float, terms), 0.0, 0.0][: max(2, len(terms))]
         while higher and higher[-1] == 0.0:
             higher.pop()
-        return cls(master, ratio, offset, tuple(higher))
-
-    @property
-    def terms(self) -> tuple[float, ...]:
-        """The coefficients of all powers, the constant first."""
-        return self.offset, self.ratio, *self.higher
+        return cls(master, (offset, ratio, *higher))
 
     def value(self, master: Array | float) -> Array:
         """Return the position q of the joint [rad] or [m] for the position of its master."""
@@ -74,9 +67,10 @@ class Coupling(NamedTuple):
 
     def __str__(self) -> str:
         """Return the right side of the equation, such as '0.5 · elbow +0.1'."""
-        powers = [f'{c:+g} · {self.master}^{k}' for k, c in enumerate(self.higher, 2) if c]
-        offset = [f'{self.offset:+g}'] if self.offset else []
-        return ' '.join([f'{self.ratio:g} · {self.master}', *powers, *offset])
+        offset, ratio, *higher = self.terms
+        powers = [f'{c:+g} · {self.master}^{k}' for k, c in enumerate(higher, 2) if c]
+        constant = [f'{offset:+g}'] if offset else []
+        return ' '.join([f'{ratio:g} · {self.master}', *powers, *constant])
 
 
 def resolved(couplings: Mapping[str, Coupling]) -> dict[str, Coupling]:

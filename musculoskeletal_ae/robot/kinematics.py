@@ -93,7 +93,7 @@ class Kinematics:
         kept, still = [*joints, *followers], pin.neutral(full_model)
         for name, coupling in couplings.items():
             if name not in followers:
-                still[full_model.joints[full_model.getJointId(name)].idx_q] = coupling.offset
+                still[full_model.joints[full_model.getJointId(name)].idx_q] = coupling.terms[0]
         locked = [full_model.getJointId(name) for name in full_model.names[1:] if name not in kept]
         self.model = reduced(full_model, locked, still)
         self.data = self.model.createData()

@@ -121,7 +121,7 @@ def read_mimics(root: ET.Element) -> dict[str, Coupling]:
         mimic = joint.find('mimic')
         if mimic is not None and joint.get('type') != 'fixed':
             ratio, offset = (float(mimic.get(*d)) for d in (('multiplier', '1'), ('offset', '0')))
-            mimics[joint.get('name', '')] = Coupling(mimic.get('joint', ''), ratio, offset)
+            mimics[joint.get('name', '')] = Coupling(mimic.get('joint', ''), (offset, ratio))
     return mimics
 
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 
 from rclpy.node import Node
@@ -36,9 +35,8 @@ class NeededTopics:
         """
         self._node, self._full_name, self._reception = node, full_name, reception
         self._topics: list[str] = []
-        #: rates that the topics should have [Hz], by topic
-        self._expected_rates = dict[str, float]()
-        self._slow_reports = Counter[str]()  # successive reports with a low rate, by topic
+        self._expected: tuple[str, float] | None = None  # a topic, and its expected rate [Hz]
+        self._slow_reports = 0  # successive reports with a lower rate of this topic
         self._waiting = ''  # the missing topics that were logged last, '' if none is missing
 
     def __contains__(self, topic: object) -> bool:
@@ -49,21 +47,22 @@ class NeededTopics:
         self._topics += topics
 
     def expect_rate(self, topic: str, rate: float) -> None:
-        """Expect a rate [Hz] of a topic, and warn while its rate is below SLOW times `rate`."""
-        self._expected_rates[topic] = rate
+        """Expect a rate [Hz] of one topic, and warn while its rate is below SLOW times `rate`."""
+        self._expected = topic, rate
 
     def remove(self, topic: str) -> None:
         """Remove a topic, which is then no longer reported as missing, silent or slow."""
         self._topics = [other for other in self._topics if other != topic]
 
     def check_rates(self) -> None:
-        """Check the newest rates against the expected ones; log which topics are missing.
+        """Check the newest rate against the expected one; log which topics are missing.
 
         Call this once for each periodic report. A topic without any message is silent, not slow.
         """
-        for topic, expected in self._expected_rates.items():
-            is_slow = 0.0 < self._reception.arrivals[topic].rate < SLOW * expected
-            self._slow_reports[topic] = self._slow_reports[topic] + 1 if is_slow else 0
+        if self._expected is not None:
+            topic, rate = self._expected
+            is_slow = 0.0 < self._reception.arrivals[topic].rate < SLOW * rate
+            self._slow_reports = self._slow_reports + 1 if is_slow else 0
         self._log_missing()
 
     def conditions(self) -> Iterator[Condition]:
@@ -91,11 +90,11 @@ class NeededTopics:
                 detail = self._missing_text(topic)
                 kind = ConditionKind.MISSING_TOPIC
                 yield kind.condition(detail, [topic], level=level, steps=steps)
-        for topic, expected in self._expected_rates.items():
-            if self._slow_reports[topic] >= SLOW_REPORTS:
-                rate = self._reception.arrivals[topic].rate
-                detail = f'{topic} come at {rate:.0f} Hz instead of {expected:g} Hz'
-                yield ConditionKind.SLOW_TOPIC.condition(with_load(detail), [topic])
+        if self._expected is not None and self._slow_reports >= SLOW_REPORTS:
+            topic, expected = self._expected
+            rate = self._reception.arrivals[topic].rate
+            detail = f'{topic} come at {rate:.0f} Hz instead of {expected:g} Hz'
+            yield ConditionKind.SLOW_TOPIC.condition(with_load(detail), [topic])
 
     def _remedy(self, topic: str) -> tuple[Step, ...]:
         """Return the step that ends the silence of a topic; none if another node reports it.

@@ -33,7 +33,7 @@ from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.bags.storage import LONGEST_PAUSE
 from musculoskeletal_ae.bags.timed_messages import TimedMessages
 from musculoskeletal_ae.bags.topics import ALL, DEFAULT, DIAGNOSTICS, latched_topics, select
-from musculoskeletal_ae.conditions import ConditionKind
+from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
 from musculoskeletal_ae.messages.reception import Reception
 from musculoskeletal_ae.options import Parser, names, not_negative, number, positive
@@ -262,17 +262,17 @@ class Replay(Node):
     def _report(self, now: float) -> Report:
         """Return the status during playback; `now` is the time of the steady clock [s]."""
         state = PAUSED if self._timeline.paused else PLAYING
-        report = Report(state, {'position': self._position(), 'state': state})
+        conditions = list[Condition]()
         if state == PAUSED:
-            report = report.with_conditions([ConditionKind.REPLAY_STANDS.condition(PAUSED)])
+            conditions.append(ConditionKind.REPLAY_STANDS.condition(PAUSED))
         # Only lockstep delays playback for long, so report slow playback only in lockstep.
         before, self._reported = self._reported, (now, self._done())
         speed = (self._reported[1] - before[1]) / max(now - before[0], 1e-3)
         is_slow = 0.0 < speed < SLOW * self._rate and before[0] > self._seek_time
-        if state == PAUSED or self._lockstep is None or not is_slow:
-            return report
-        detail = f'at {speed / self._rate:.0%} of the wanted speed, because it waits for nodes'
-        return report.with_conditions([ConditionKind.REPLAY_SLOW.condition(with_load(detail))])
+        if state == PLAYING and self._lockstep is not None and is_slow:
+            detail = f'at {speed / self._rate:.0%} of the wanted speed, because it waits for nodes'
+            conditions.append(ConditionKind.REPLAY_SLOW.condition(with_load(detail)))
+        return Report(state, {'position': self._position(), 'state': state}, tuple(conditions))
 
     def _tick(self) -> None:
         """Publish the recorded time on /clock, if enabled and due.

@@ -156,7 +156,6 @@ class LengthJumps:
         displaced: Indices of the muscles whose lengths have jumped since their last length
             calibration; these lengths are not reliable.
         newest: Indices of the muscles whose new level was accepted with the last message.
-        count: Number of jumps whose new level was accepted, since the start.
         is_unseen: Whether the last of these jumps was during a pause of the messages
             (`Change.is_unseen`).
     """
@@ -165,7 +164,7 @@ class LengthJumps:
         self._robot = robot
         self.displaced: frozenset[int] = frozenset()
         self.newest: tuple[int, ...] = ()
-        self.count, self.is_unseen = 0, False
+        self.is_unseen = False
         self.reset()
 
     def reset(self) -> None:
@@ -214,7 +213,6 @@ class LengthJumps:
         self.newest = muscles
         if muscles:
             self.displaced |= set(muscles)
-            self.count += 1
             self.is_unseen = self._was_unseen
 
     def follow(self, length: Array, used: Bools, now: float, delay: float = 0.0) -> bool:

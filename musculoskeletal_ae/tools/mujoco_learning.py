@@ -39,13 +39,12 @@ from musculoskeletal_ae.learning.recordings import complete
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.training import train_on
+from musculoskeletal_ae.options import chain_of
 from musculoskeletal_ae.progress_bar import ProgressBar
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.model_training import train_on_model
 
 HELD_OUT = 60.0  # measure the error on a held-out motion of this duration [s]
-#: options of `train --mujoco` that are passed on to `import_robot`
-CHAIN = 'joints', 'muscles', 'without', 'base', 'end'
 
 
 class Learned(NamedTuple):
@@ -150,7 +149,7 @@ def _imported(args: Namespace, folder: Path) -> Robot:
                 f'{args.mujoco}: the muscles cannot hold the arm, so nothing was trained'
             )
 
-    chain = {name: getattr(args, name) for name in CHAIN}
+    chain = chain_of(args)
     imported = convert.import_robot(args.mujoco, folder, check, **chain)
     for note in imported.notes:
         print(note)

@@ -4,7 +4,7 @@
 import argparse
 from pathlib import Path
 
-from musculoskeletal_ae.options import Parser, exit_status, positive
+from musculoskeletal_ae.options import Parser, chain_of, exit_status, positive
 from musculoskeletal_ae.process_signals import import_heavy
 from musculoskeletal_ae.robot.directories import shipped_robots
 
@@ -94,7 +94,7 @@ def main(argv: list[str] | None = None) -> int:
                 '--mujoco learns from an emulated arm; remove --from-bag, --from-csv and --plot'
             )
         work = 'mujoco_learning'
-    elif any(getattr(args, name) for name in ('joints', 'muscles', 'without', 'base', 'end')):
+    elif any(chain_of(args).values()):
         parser.error('--joints, --muscles, --without, --base and --end need --mujoco')
     return exit_status(
         lambda: import_heavy(f'musculoskeletal_ae.tools.{work}').train(args), out=args.out

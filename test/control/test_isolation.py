@@ -12,7 +12,7 @@ from readings import reading
 from robots import write_robot
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.control.settings import METHODS, Settings
+from musculoskeletal_ae.control.settings import METHODS, Settings, Setup
 from musculoskeletal_ae.control.stop_commands import LARGEST_RISE, PAYING_OUT
 from musculoskeletal_ae.emulator.faults import SPEED_LIMIT
 from musculoskeletal_ae.exceptions import InfeasibleError, MessageError
@@ -404,7 +404,7 @@ def test_a_motion_is_slow_enough_for_the_torque_of_the_muscles(lost, limit, dura
         fast = fast.scaled(slowness(robot, mae, fast, settings))
         if lack(fast) > 0.3:
             hard += 1
-            planner = Planner(robot, settings)
+            planner = Planner(Setup(robot, settings))
             plans = [
                 planner.to_posture(mae, rest, goal, duration, lag)[0],
                 planner.through(mae, rest, fast.points, 0.0, lag),

@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 
 from musculoskeletal_ae.arrays import median_of_rows
 from musculoskeletal_ae.control.limiter import CommandLimiter
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import Settings, Setup
 from musculoskeletal_ae.motion.activities import LENGTH, TENSION, Command, unchanging
 from musculoskeletal_ae.robot.model_errors import LARGEST
 from musculoskeletal_ae.robot.robot import Robot
@@ -39,7 +39,7 @@ def vectors(low, high):
     st.floats(0.001, 1.0),
 )
 def test_lengths_keep_the_rate_limit_except_to_relieve_a_muscle_that_pulls_too_hard(commands, rate):
-    limiter, before = CommandLimiter(ROBOT, Settings(rate_limit=rate)), None
+    limiter, before = CommandLimiter(Setup(ROBOT, Settings(rate_limit=rate))), None
     for desired, length, limit in commands:
         pull = np.full(COUNT, BIAS)
         if before is not None:  # tensions follow from the last command by muscle stiffness control
@@ -64,7 +64,7 @@ def test_the_lead_of_a_winding_muscle_demands_more_only_while_its_tension_is_bel
     limit = ROBOT.tension.limit
 
     def demanded(tension, lead):
-        limiter, now = CommandLimiter(ROBOT, Settings(rate_limit=1.0)), sample(0.0, tension)
+        limiter, now = CommandLimiter(Setup(ROBOT, Settings(rate_limit=1.0))), sample(0.0, tension)
         for _ in range(10):  # long enough for the rate limit
             sent = limiter.limit(desired, now, LIMIT, DT, lead).value
         return BIAS + ROBOT.stiffness * -sent
@@ -75,14 +75,14 @@ def test_the_lead_of_a_winding_muscle_demands_more_only_while_its_tension_is_bel
 
 
 def test_the_tension_of_a_restored_muscle_rises_at_the_rate_limit():
-    limiter, now = CommandLimiter(ROBOT, Settings()), sample(0.0, BIAS)
-    wanted = Command(TENSION, np.full(COUNT, 2.0 * BIAS))
+    setup, now = Setup(ROBOT, Settings()), sample(0.0, BIAS)
+    limiter, wanted = CommandLimiter(setup), Command(TENSION, np.full(COUNT, 2.0 * BIAS))
     limiter.limit(wanted, now, LIMIT, DT)
-    limiter.use(ROBOT.without([0]), Settings())
+    setup.robot = ROBOT.without([0])
     for _ in range(30):
         before = limiter.limit(Command(TENSION, np.zeros(COUNT)), now, LIMIT, DT).value
     assert before[0] < BIAS
-    limiter.use(ROBOT, Settings())
+    setup.robot = ROBOT
     largest = limiter.largest_change(TENSION, DT)
     for _ in range(30):
         sent = limiter.limit(wanted, now, LIMIT, DT).value
@@ -92,7 +92,7 @@ def test_the_tension_of_a_restored_muscle_rises_at_the_rate_limit():
 
 
 def test_wrong_lengths_without_a_matching_tension_pay_out_at_the_rate_limit():
-    limiter, now = CommandLimiter(ROBOT, Settings()), sample(0.0, BIAS)
+    limiter, now = CommandLimiter(Setup(ROBOT, Settings())), sample(0.0, BIAS)
     held = unchanging(ROBOT, LENGTH, now)
     before = limiter.limit(held, now, LIMIT, DT).value
     for _ in range(5):
@@ -102,7 +102,7 @@ def test_wrong_lengths_without_a_matching_tension_pay_out_at_the_rate_limit():
 
 
 def test_a_wrong_length_sensor_pays_out_to_the_longest_length_of_the_muscle_at_most():
-    limiter = CommandLimiter(ROBOT, Settings())
+    limiter = CommandLimiter(Setup(ROBOT, Settings()))
     for _ in range(10):
         held = unchanging(ROBOT, LENGTH, sample(0.0, BIAS))
         sent = limiter.limit(held, sample(5.0, BIAS), LIMIT, DT).value
@@ -114,7 +114,7 @@ def test_a_wrong_length_sensor_pays_out_to_the_longest_length_of_the_muscle_at_m
 @given(st.lists(st.tuples(vectors(-100.0, 900.0), vectors(BIAS, MAX)), max_size=6))
 def test_tensions_stay_within_bias_and_limit_and_rise_no_faster_than_the_lengths_would(commands):
     settings = Settings()
-    limiter, before = CommandLimiter(ROBOT, settings), np.full(COUNT, BIAS)
+    limiter, before = CommandLimiter(Setup(ROBOT, settings)), np.full(COUNT, BIAS)
     for desired, limit in commands:
         sent = limiter.limit(Command(TENSION, desired), sample(0.0, BIAS), limit, DT).value
         assert (sent >= BIAS).all()
@@ -130,7 +130,11 @@ def test_tensions_stay_within_bias_and_limit_and_rise_no_faster_than_the_lengths
     )
 )
 def test_across_changes_between_lengths_and_tensions_no_demand_and_no_length_makes_a_step(wanted):
-    limiter, rate, now = CommandLimiter(ROBOT, Settings()), Settings().rate_limit, sample(0.0, BIAS)
+    limiter, rate, now = (
+        CommandLimiter(Setup(ROBOT, Settings())),
+        Settings().rate_limit,
+        sample(0.0, BIAS),
+    )
     demand, last_length, elapsed = np.full(COUNT, BIAS), None, 0.0
     for by_length, length, tension in wanted:
         desired = Command(LENGTH, length) if by_length else Command(TENSION, tension)
@@ -145,7 +149,7 @@ def test_across_changes_between_lengths_and_tensions_no_demand_and_no_length_mak
 
 
 def test_a_length_after_a_pause_between_tensions_is_near_the_last_published_length():
-    limiter, settings, now = CommandLimiter(ROBOT, Settings()), Settings(), sample(0.0, BIAS)
+    limiter, settings, now = CommandLimiter(Setup(ROBOT, Settings())), Settings(), sample(0.0, BIAS)
     for _ in range(300):  # slack
         last = limiter.limit(Command(LENGTH, np.full(COUNT, 0.1)), now, LIMIT, DT).value
     limiter.limit(Command(TENSION, ROBOT.tension.bias), now, LIMIT, DT)
@@ -156,7 +160,7 @@ def test_a_length_after_a_pause_between_tensions_is_near_the_last_published_leng
 
 @pytest.mark.parametrize('kind', [LENGTH, TENSION])
 def test_a_command_that_is_not_finite_is_not_published_and_the_last_one_stays(kind):
-    limiter, now = CommandLimiter(ROBOT, Settings()), sample(0.0, BIAS)
+    limiter, now = CommandLimiter(Setup(ROBOT, Settings())), sample(0.0, BIAS)
     good = limiter.limit(unchanging(ROBOT, kind, now), now, LIMIT, DT)
     bad = good.value.copy()
     bad[2] = np.nan

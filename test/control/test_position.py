@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from readings import reading
 
 from musculoskeletal_ae.control.limiter import CommandLimiter
-from musculoskeletal_ae.control.settings import METHODS, Settings
+from musculoskeletal_ae.control.settings import METHODS, Settings, Setup
 from musculoskeletal_ae.control.stop_commands import PAYING_OUT, SafeStop
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
@@ -50,7 +50,7 @@ def pull_in_this_posture(length, tension, command):
 @given(st.lists(st.tuples(vectors(-1.0, 1.0), vectors(0.0, 260.0)), min_size=1, max_size=5),
        vectors(60.0, 190.0))  # fmt: skip
 def test_no_command_stretches_a_muscle_beyond_the_limit_even_if_no_joint_gives_way(messages, limit):
-    limiter, length = CommandLimiter(ROBOT, Settings(rate_limit=1.0)), np.zeros(COUNT)
+    limiter, length = CommandLimiter(Setup(ROBOT, Settings(rate_limit=1.0))), np.zeros(COUNT)
     for desired, tension in messages:
         now = sample(length, tension, ROBOT)
         before = limiter.last(LENGTH, now).value
@@ -67,7 +67,11 @@ def test_no_command_stretches_a_muscle_beyond_the_limit_even_if_no_joint_gives_w
 
 
 def test_a_muscle_at_its_limit_does_not_oscillate_although_friction_and_delay_hide_its_tension():
-    limiter, friction, stiffness = CommandLimiter(ROBOT, Settings()), 0.35, 0.25 * LIMIT / 0.001
+    limiter, friction, stiffness = (
+        CommandLimiter(Setup(ROBOT, Settings())),
+        0.35,
+        0.25 * LIMIT / 0.001,
+    )
     length, sliding, readings, tensions = np.zeros(COUNT), np.ones(COUNT), [], []
     for n in range(400):
         end = np.maximum(0.1 * LIMIT - stiffness * length, 0.0)
@@ -88,7 +92,7 @@ def test_a_muscle_at_its_limit_does_not_oscillate_although_friction_and_delay_hi
 def test_a_rising_tension_is_extrapolated_by_the_times_at_which_its_messages_were_sent():
     commands = []
     for delay in (0.0, 0.009):  # the second message arrives on time, or just before the third
-        limiter = CommandLimiter(ROBOT, Settings())
+        limiter = CommandLimiter(Setup(ROBOT, Settings()))
         for n, late in enumerate((0.0, delay, 0.0)):
             now = sample(0.0, 100.0 + 0.5 * n, ROBOT)
             now = replace(now, time=n * DT + late, delay=late)
@@ -99,7 +103,7 @@ def test_a_rising_tension_is_extrapolated_by_the_times_at_which_its_messages_wer
 
 def test_a_motor_current_that_reads_too_little_does_not_lead_to_too_much_tension():
     robot = Robot(with_modules(ROBOT.description, 'position', 'current'))
-    stream, limiter = MuscleStream(robot), CommandLimiter(robot, Settings())
+    stream, limiter = MuscleStream(robot), CommandLimiter(Setup(robot, Settings()))
     length, tension, highest = np.zeros(COUNT), np.full(COUNT, BIAS), 0.0
     for n in range(400):
         read = 0.75 * tension - 0.05 * LIMIT
@@ -114,7 +118,7 @@ def test_a_motor_current_that_reads_too_little_does_not_lead_to_too_much_tension
 
 
 def test_a_desired_tension_becomes_a_length_command_towards_it():
-    limiter, now = CommandLimiter(ROBOT, Settings()), sample(0.0, 50.0, ROBOT)
+    limiter, now = CommandLimiter(Setup(ROBOT, Settings())), sample(0.0, 50.0, ROBOT)
     sent = limiter.limit(Command(TENSION, np.full(COUNT, 80.0)), now, LIMIT, DT)
     assert sent.kind == LENGTH
     assert (sent.value < 0.0).all()
@@ -124,9 +128,9 @@ def test_a_desired_tension_becomes_a_length_command_towards_it():
 
 
 def stopped(now, steps, suspect=None, settings=None):
-    limiter = CommandLimiter(ROBOT, settings or Settings(hold_time=0.0))
+    limiter = CommandLimiter(Setup(ROBOT, settings or Settings(hold_time=0.0)))
     limiter.limit(Command(LENGTH, np.zeros(COUNT)), sample(0.0, BIAS, ROBOT), LIMIT, DT)
-    stop, sent = SafeStop(ROBOT, settings or Settings(hold_time=0.0), limiter), []
+    stop, sent = SafeStop(Setup(ROBOT, settings or Settings(hold_time=0.0)), limiter), []
     for step in range(steps):
         message = now(step, limiter.command.value)
         is_fresh = message is not None
@@ -152,7 +156,7 @@ def test_a_stop_holds_and_then_pays_out_until_the_measured_tension_is_the_bias()
 
 def test_without_fresh_readings_a_stop_pays_out_the_stated_length():
     sent = stopped(lambda *_: None, 200)
-    longest = CommandLimiter(ROBOT, Settings()).longest
+    longest = CommandLimiter(Setup(ROBOT, Settings())).longest
     np.testing.assert_allclose(sent[-1], np.minimum(ROBOT.actuation.release, longest))
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from control_bench import sample
 
 from musculoskeletal_ae.control.limiter import CommandLimiter
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import Settings, Setup
 from musculoskeletal_ae.control.stop_commands import SafeStop
 from musculoskeletal_ae.motion.activities import LENGTH, TENSION, Command
 from musculoskeletal_ae.robot.robot import Robot
@@ -17,9 +17,9 @@ DT = 0.01
 
 def stopped(last, settings, now, steps, is_fresh=True):
     """Return the commands (N, M) of the `steps` steps of a stop that follows the command `last`."""
-    limiter = CommandLimiter(ROBOT, settings)
+    limiter = CommandLimiter(Setup(ROBOT, settings))
     limiter.command = last
-    stop, sent = SafeStop(ROBOT, settings, limiter), []
+    stop, sent = SafeStop(Setup(ROBOT, settings), limiter), []
     for _ in range(steps):
         desired = stop.step(now, DT, is_fresh, suspect=None)
         sent.append(limiter.limit(desired, now, ROBOT.tension.max, DT).value)

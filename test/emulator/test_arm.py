@@ -127,7 +127,7 @@ def test_a_ruptured_muscle_has_no_tension_and_winds_in_at_the_speed_limit(robot,
     arm = make_arm(robot, 2, reality)
     command = to_mid_range(robot, 80.0)
     drive(arm, command, 2.0)
-    arm.set_ruptured([robot.muscles[1]])
+    arm.set_faults([f'rupture:{robot.muscles[1]}'])
     before = arm._muscle.length[1]
     drive(arm, command, 0.1)
     assert arm.sense().muscles.tension[1] == 0.0
@@ -136,7 +136,7 @@ def test_a_ruptured_muscle_has_no_tension_and_winds_in_at_the_speed_limit(robot,
     limit = arm.sense().muscles.length[1]
     drive(arm, command, 0.5)
     assert arm.sense().muscles.length[1] == pytest.approx(limit, abs=1e-3)
-    arm.set_ruptured([])
+    arm.set_faults([])
     drive(arm, command, 3.0)
     assert arm.sense().muscles.tension[1] > 0.5 * robot.tension.bias[1]
 
@@ -197,8 +197,6 @@ def test_reset_brings_the_arm_back_to_rest(robot, reality):
     arm = make_arm(robot, 3, reality)
     start = arm.theta
     drive(arm, to_mid_range(robot, 80.0), 2.0)
-    arm.set_ruptured([robot.muscles[0]])
-    arm.step(0.5)
     arm.reset()
     np.testing.assert_array_equal(arm.theta, start)
     assert arm.sense().muscles.tension.min() > 0.5 * robot.tension.bias[0]

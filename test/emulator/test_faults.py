@@ -116,7 +116,7 @@ def test_a_fault_of_one_joint_sensor_leaves_the_others(arm, robot):
 
 
 def hold(arm, robot, lines, seconds=1.5, tension=80.0):
-    arm.faults.set(lines)
+    arm.set_faults(lines)
     command = to_mid_range(robot, tension)
     for _ in range(round(seconds / 0.01)):
         arm.command_length(command)
@@ -255,7 +255,6 @@ def test_an_illegal_fault_is_refused_with_the_legal_ones(line, arm):
 @pytest.mark.parametrize('name', KINDS)
 def test_every_kind_of_fault_can_be_set_by_name_and_repaired(name, arm, robot):
     assert read_fault(name, robot).kind == name
-    arm.faults.set([name])
     hold(arm, robot, [name], 0.2)
     hold(arm, robot, [], 0.5)
     assert arm.faults.deliver(arm.sense(), 100.0)
@@ -269,8 +268,7 @@ def test_an_arm_mounted_upside_down_falls_upwards_and_its_accelerometer_shows_it
     for lines in ([], ['mount_y:3.1416'], []):
         arm = make_arm(robot, 1, reality)
         arm.set_faults(['mount_x'])
-        arm.set_faults(lines)
-        arm.set_ruptured(robot.muscles)
+        arm.set_faults([*lines, 'rupture'])
         arm.step(2.0)
         fallen.append(robot.kinematics.end_effector_pose(arm.theta).translation[2])
         readings.append(arm.accelerometer('torso')[2])

@@ -106,14 +106,3 @@ def test_modules_that_follow_lengths_take_the_command_that_the_refusal_names(rob
         arm.command_tension(robot.tension.bias)
     named = re.search('publish muscle_(length)_command', str(refused.value))[1]
     getattr(arm, f'command_{named}')(arm.sense().muscles.length)
-
-
-def test_as_many_length_offsets_are_accepted_as_the_refusal_says(robot):
-    arm = make_arm(robot)
-    for number in (0, 1):
-        check_remedy(
-            arm.set_length_offset,
-            [0.0, 0.0],
-            r'legal: (\d+) or (\d+) numbers',
-            [lambda match, number=number: [0.01] * int(match[number + 1])],
-        )

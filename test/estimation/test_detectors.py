@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE, IN_A_ROW, NORM
+from musculoskeletal_ae.estimation.detectors.residual_distance import DISTANCE, IN_A_ROW
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME, SLACK_LENGTH
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.experiments.detection import observe
+from musculoskeletal_ae.mae.residuals import NORM
 from musculoskeletal_ae.mae.units import State
 
 DT = 0.01

@@ -10,7 +10,7 @@ from exact_mae import rest_readings
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.detectors.module_following import FAULTY, PositionFollowing
 from musculoskeletal_ae.estimation.detectors.slack_tendon import DEAD_TIME, StretchedTendon
-from musculoskeletal_ae.estimation.suspect_verification import Outcome, PositionLaw, Verification
+from musculoskeletal_ae.estimation.suspect_verification import Outcome, Verification
 from musculoskeletal_ae.experiments.detection import observe
 from musculoskeletal_ae.robot.description import with_modules
 from musculoskeletal_ae.robot.robot import Robot
@@ -142,7 +142,7 @@ def verdict(tension, length, slack):
         length: Computes the measured length [m] from the commanded length [m] and noise.
         slack: Additional length of the tendon at first, relative to a taut one [m].
     """
-    watched = Verification(MUSCLE, PositionLaw(BIAS[MUSCLE], elongation))
+    watched = Verification(MUSCLE, BIAS[MUSCLE], elongation=elongation)
     for n, (shake, stir) in enumerate(NOISE):
         command = -min(max(0.0, (n - 150) * 0.0002), 0.028)
         pull, wound = tension(-command, shake), length(command, stir)

@@ -31,8 +31,8 @@ class Fake:
     def set_payload(self, mass):
         self.done.append((self.time, mass))
 
-    def set_ruptured(self, names):
-        self.done.append((self.time, tuple(names)))
+    def set_faults(self, lines):
+        self.done.append((self.time, tuple(line.removeprefix('rupture:') for line in lines)))
 
     def follow(self, script, duration):
         for tick in range(round(duration / 0.01)):

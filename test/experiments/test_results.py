@@ -191,8 +191,7 @@ def test_if_initial_training_fails_every_part_reports_it(monkeypatch, tmp_path, 
     assert 'no tension at all' in (tmp_path / 'report.html').read_text('utf-8')
 
 
-def test_a_network_is_read_whole_while_another_individual_brings_it(arm26, tmp_path, monkeypatch):
-    monkeypatch.setattr(online_learning, 'measure', lambda *_: None)
+def test_a_network_is_read_whole_while_another_individual_brings_it(arm26, tmp_path):
     study = Study(arm26, 'default', (0, 1), 1.0, True, tmp_path)
     for preset in PRESETS:
         study.network_file(preset, None).write_text('first')

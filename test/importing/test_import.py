@@ -49,7 +49,7 @@ def test_a_mujoco_model_keeps_its_lengths(mjcf, tmp_path):
     assert result.robot.joints == ('swing', 'lift', 'elbow')
     assert max(result.comparison.lengths.values()) < 1e-6
     assert len(result.robot.routes.wrapping) == 4
-    assert result.robot.description.couplings['curl'].ratio == pytest.approx(0.5)
+    assert result.robot.description.couplings['curl'].terms[1] == pytest.approx(0.5)
     assert result.robot.tension.limit[0] == pytest.approx(180.0)
     assert 'dropped: tendon none: it is a fixed tendon, which has no route' in result.notes
     assert 'dropped: actuator not: it does not act on a tendon' in result.notes
@@ -495,7 +495,7 @@ def test_a_urdf_becomes_a_skeleton_and_its_mimic_a_coupling(tmp_path, capsys):
     assert 'wrist = -0.5 · shoulder +0.1' in capsys.readouterr().out
     robot = Robot.load(tmp_path / 'out')
     assert robot.joints == ('shoulder',)
-    assert robot.description.couplings['wrist'] == ('shoulder', -0.5, 0.1, ())
+    assert robot.description.couplings['wrist'] == ('shoulder', (0.1, -0.5))
     assert robot.muscles == ('muscle_of_shoulder', 'muscle_of_wrist')
     put(tmp_path, 'arm.urdf', bodies.URDF.format(mimic='<mimic joint="moon"/>'))
     with pytest.raises(SourceError, match="a joint mimics 'moon', but there is no such joint"):

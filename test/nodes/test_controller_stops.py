@@ -2,6 +2,7 @@
 """Every stop cause on a real graph, and how the arm resumes."""
 
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from controlled_arm import IMPATIENT, PATIENT, ControlledArm
 from std_msgs.msg import String
 from std_srvs.srv import SetBool, Trigger
 
+from musculoskeletal_ae.awake_clock import PAUSE
 from musculoskeletal_ae.bags.reader import Bag
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.nodes.controller import ControllerNode
@@ -108,6 +110,24 @@ def test_a_lost_driver_stops_the_arm_and_a_new_one_lets_it_resume(moving):
     arm.graph.wait(lambda: reset(arm).success, 'the reset')
     arm.target(HERE)
     arm.goes_to(HERE)
+
+
+def test_a_command_from_before_a_pause_of_the_process_is_not_published(moving, monkeypatch):
+    arm = moving()
+    core, before, stale = arm.controller.core, arm.count(), []
+    step = core.step
+
+    def suspended_step(*args):
+        command = step(*args)
+        if stale or command is None:
+            return command
+        time.sleep(1.2 * PAUSE)
+        stale.append(command.value + 1e-4)  # no other command has these values
+        return command._replace(value=stale[0])
+
+    monkeypatch.setattr(core, 'step', suspended_step)
+    arm.graph.wait(lambda: stale and arm.count() > before + 30, 'commands after the pause')
+    assert not (arm.sent()[before:] == stale[0]).all(axis=1).any()
 
 
 def test_after_a_killed_controller_or_a_stop_a_new_controller_waits_for_a_reset(moving):

@@ -113,9 +113,10 @@ def test_an_empty_list_at_the_start_is_an_empty_list(graph, kind, name, tmp_path
 
 def test_an_arm_of_one_joint_may_stand_at_0_to_find_its_zeros(graph, tmp_path):
     robot = str(write_robot(tmp_path, joints=['swing']))
-    assert graph.host(EstimatorNode, robot=robot).posture == ()
+    assert graph.host(EstimatorNode, robot=robot).parameter('zero_posture') == ()
     graph.end(graph.hosted[0])
-    assert graph.host(EstimatorNode, robot=robot, zero_posture=[0.0]).posture == (0.0,)
+    node = graph.host(EstimatorNode, robot=robot, zero_posture=[0.0])
+    assert node.parameter('zero_posture') == (0.0,)
 
 
 @pytest.mark.parametrize(
@@ -123,8 +124,8 @@ def test_an_arm_of_one_joint_may_stand_at_0_to_find_its_zeros(graph, tmp_path):
     [
         (
             EstimatorNode,
-            {'zero_posture': [0.0, -1.0], 'isolate_muscles': ['tail']},
-            lambda node: node.posture,
+            {'on_anomaly': 'isolate', 'isolate_muscles': ['tail']},
+            lambda node: node.core.suspects.isolates,
         ),
         # Setting `checkpoint` would replace the network in use, which may have learned much.
         (

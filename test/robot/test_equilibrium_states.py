@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from robots import write_robot
 
+from musculoskeletal_ae.control.settings import Settings, Setup
 from musculoskeletal_ae.importing.convert import import_robot
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.mae.training import rest_states
@@ -41,7 +42,7 @@ def test_one_tendon_of_two_sprung_joints_determines_where_they_settle(finger):
 
 
 def test_the_finger_explores_postures_in_which_it_can_rest(finger):
-    steps = [*islice(Exploration(finger, 1), 90)]
+    steps = [*islice(Exploration(Setup(finger, Settings()), 1), 90)]
     theta, tension = (np.array(part) for part in zip(*((s.theta, s.tension) for s in steps[1::3])))
     settled = settled_states(finger, theta, tension)
     assert len(settled.theta) == len(theta)

@@ -92,12 +92,8 @@ CHANGE_YOUNG = Largest(0.06, 0.028)
 #: with such a network, tolerate this difference g between measured and computed lengths while the
 #: usual difference is not known
 GAP_YOUNG = Largest(0.08, 0.045)
-#: with a network whose detector is calibrated, tolerate this change Δ of the difference between
-#: measured and computed lengths
-CHANGE_LEARNED = Largest(0.035, 0.016)
-#: with a network whose detector is calibrated, tolerate this difference g between measured and
-#: computed lengths while the usual difference is not known
-GAP_LEARNED = Largest(0.035, 0.016)
+#: with a network whose detector is calibrated, tolerate this change Δ, and also this difference g
+LEARNED = Largest(0.035, 0.016)
 #: Store a healthy message at this interval [s]. The stored messages show the usual difference
 #: between measured and computed lengths.
 HEALTHY_SPACING = 1.0
@@ -205,7 +201,7 @@ class LengthDisagreement(Detector):
         """Return the change of each length difference since the arm was healthy, with its limits.
 
         For a muscle without enough healthy messages, such as one that was isolated for a minute,
-        the healthy difference is assumed to be 0, and the limits are GAP_YOUNG or GAP_LEARNED.
+        the healthy difference is assumed to be 0, and the limits are GAP_YOUNG or LEARNED.
 
         Args:
             gap: Measured minus computed lengths [m], (M,).
@@ -215,7 +211,7 @@ class LengthDisagreement(Detector):
         """
         assert self._mae is not None
         is_learned = self._mae.is_calibrated
-        limits = (CHANGE_LEARNED, GAP_LEARNED) if is_learned else (CHANGE_YOUNG, GAP_YOUNG)
+        limits = (LEARNED, LEARNED) if is_learned else (CHANGE_YOUNG, GAP_YOUNG)
         single, together = (np.where(self._has_usual, *pair) for pair in zip(*limits, strict=True))
         return gap - self._usual, Largest(single, together)
 

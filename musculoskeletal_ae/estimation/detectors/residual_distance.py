@@ -41,7 +41,6 @@ from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import slack_tension
 
 DISTANCE = 'distance'  # name under which a checkpoint stores the threshold of the distance d
-NORM = 'norm'  # name under which a checkpoint stores the threshold of the anomaly score A
 
 #: name a further muscle besides the suspect if d without that muscle is below the threshold, and at
 #: most this multiple of d without the suspect
