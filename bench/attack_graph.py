@@ -562,7 +562,9 @@ class Attack:
             self.spin(rng.choice((0.01, 0.05)))
         self.end_strangers()
         if any(topic.endswith(OBEYED) for topic, _ in topics):
-            self.pulled.append((begin, time.time() + 1.0))
+            # The modules keep the last command until a controller, which may have been killed,
+            # commands them again.
+            self.pulled.append((begin, time.time() + 5.0))
 
 
 #: topics whose messages the emulated arm obeys, whichever node publishes them

@@ -454,8 +454,12 @@ class Shell(Node):
         self.awake.tick(time.monotonic())
         self.sources.watch(CLOCK)  # `use_sim_time` may be set at any time
         self.sources.look()
+        self._look_for_twins()
         self.on_intruders(self.intruders)
-        self._report_changes()
+        if self._reports_of_twins is None:
+            self._report_changes()
+        else:  # two nodes of one name know each other by their reports, so report often
+            self._report()
 
     def _look_for_twins(self) -> None:
         """Read the reports of other nodes while the graph has several nodes of this node's name.
@@ -572,7 +576,6 @@ class Shell(Node):
     def _report_periodically(self) -> None:
         self._reception.measure_rates()
         self.needed.check_rates()
-        self._look_for_twins()
         self._report()
 
     def _report_changes(self) -> None:
