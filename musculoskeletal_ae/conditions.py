@@ -33,7 +33,7 @@ class Clears(Enum):
     #: afterwards, once the arm has been released, only by a reset
     CONDITION = 'if the condition clears within `hold_time`'
     VERIFICATION = 'when a verification of the suspect muscle ends'
-    RESET = '–'
+    RESET = '–'  # no earlier end
 
 
 class Stop(NamedTuple):
@@ -82,7 +82,7 @@ class Declaration(NamedTuple):
     #: length offsets that become unreliable by a finding; None if there are none
     revokes: Revokes | None = None
     #: whether the muscle of a finding is damaged: a reset is refused until its readings fit again
-    #: (`repair_check`), and its length may be another one after the repair
+    #: (`repair_check`), and its length may have another offset after the repair
     is_damage: bool = False
 
 

@@ -126,7 +126,7 @@ class MuscleState(NamedTuple):
     winding: Array  # temperature c₁ of the winding [°C]
     housing: Array  # temperature c₂ of the housing [°C]
     reference: Array  # tension T_ref that the control law of the module demands [N]
-    ruptured: Array  # 1 for a ruptured tendon, which `Faults` sets
+    ruptured: Array  # 1 for a ruptured tendon; `Faults` owns this array and alone changes it
 
 
 @njit(cache=True)

@@ -268,7 +268,7 @@ class Verification:
         tension, length, command, _, demand, stretch = np.median(newest, axis=0)
         excess = np.median(newest[:, 1] - newest[:, 3])
         is_slack = tension < slack_tension(self._bias)
-        # A healthy tendon has tension if it is stretched that far.
+        # A healthy tendon that is stretched further than this has tension.
         is_stretched = stretch > STRETCHED * self._elongation(self._bias)
         may_wait = self._watched < LONGEST_WINDING and self._time < LONGEST
         if is_slack and not is_stretched and may_wait:

@@ -23,7 +23,7 @@ KEPT_SHARE = 0.5
 
 
 def held_ranges(robot: Robot) -> list[tuple[str, float, float]]:
-    """Return each joint that needs other limits, with the ends of the held part [rad or m]."""
+    """Return joints that need narrower limits: name, lower and upper limit [rad or m]."""
     sprung = robot.kinematics.elasticity.is_sprung
     if not sprung.any():
         return []

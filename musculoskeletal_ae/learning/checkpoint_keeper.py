@@ -32,14 +32,14 @@ from musculoskeletal_ae.robot.robot import Robot
 
 
 class Packed(NamedTuple):
-    """A network, also as the content of a checkpoint."""
+    """A network, and the bytes of the checkpoint that contains it."""
 
     mae: Mae
     data: bytes
 
     @classmethod
     def of(cls, mae: Mae) -> Packed:
-        """Pack a network."""
+        """Serialize a network."""
         return cls(mae, checkpoint.to_bytes(mae))
 
 
@@ -64,7 +64,7 @@ class CheckpointKeeper:
             StateError: If the directory cannot be used.
         """
         self.published = 0
-        self._newest: Packed | None = None  # the newest network, decided on or not
+        self._newest: Packed | None = None  # the newest network, accepted or not
         self._is_published = True  # whether `_newest` was published
         self.rejected, self.last_rejected = 0, ''
         self._saved: Packed | None = None  # the network to save: the last accepted one
@@ -78,7 +78,7 @@ class CheckpointKeeper:
 
     @property
     def mae(self) -> Mae | None:
-        """The newest network, whether the estimator has decided on it or not; None before it."""
+        """The newest network, accepted by the estimator or not; None before the first."""
         return None if self._newest is None else self._newest.mae
 
     @property

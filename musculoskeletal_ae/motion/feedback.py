@@ -179,7 +179,7 @@ class Feedback:
         return Shift(self.supported, self.supported)
 
     def come_to_rest(self) -> None:
-        """Continue at rest from the last shift of the motion."""
+        """Begin the feedback at rest with the shift that the desired posture had last in motion."""
         self.correction = self.supported
 
     def at_rest(self, error: Array, jacobian: Array, inputs: Inputs, gain: float) -> bool:

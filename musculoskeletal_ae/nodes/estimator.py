@@ -243,7 +243,8 @@ class EstimatorNode(Shell):
     def _publish_body(self) -> None:
         """Publish the body state if it has changed, and act on the change."""
         body, before, suspects = self.core.body, self.body, self.core.suspects
-        self.memory.note(body)
+        if body is not before or self.memory.problem:  # repeat an attempt to save that has failed
+            self.memory.note(body)
         if body is before:
             return
         self.body = body

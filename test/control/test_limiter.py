@@ -130,11 +130,8 @@ def test_tensions_stay_within_bias_and_limit_and_rise_no_faster_than_the_lengths
     )
 )
 def test_across_changes_between_lengths_and_tensions_no_demand_and_no_length_makes_a_step(wanted):
-    limiter, rate, now = (
-        CommandLimiter(Setup(ROBOT, Settings())),
-        Settings().rate_limit,
-        sample(0.0, BIAS),
-    )
+    setup, now = Setup(ROBOT, Settings()), sample(0.0, BIAS)
+    limiter, rate = CommandLimiter(setup), setup.settings.rate_limit
     demand, last_length, elapsed = np.full(COUNT, BIAS), None, 0.0
     for by_length, length, tension in wanted:
         desired = Command(LENGTH, length) if by_length else Command(TENSION, tension)

@@ -67,11 +67,8 @@ def test_no_command_stretches_a_muscle_beyond_the_limit_even_if_no_joint_gives_w
 
 
 def test_a_muscle_at_its_limit_does_not_oscillate_although_friction_and_delay_hide_its_tension():
-    limiter, friction, stiffness = (
-        CommandLimiter(Setup(ROBOT, Settings())),
-        0.35,
-        0.25 * LIMIT / 0.001,
-    )
+    limiter = CommandLimiter(Setup(ROBOT, Settings()))
+    friction, stiffness = 0.35, 0.25 * LIMIT / 0.001
     length, sliding, readings, tensions = np.zeros(COUNT), np.ones(COUNT), [], []
     for n in range(400):
         end = np.maximum(0.1 * LIMIT - stiffness * length, 0.0)

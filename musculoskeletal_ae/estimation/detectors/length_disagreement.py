@@ -92,7 +92,8 @@ CHANGE_YOUNG = Largest(0.06, 0.028)
 #: with such a network, tolerate this difference g between measured and computed lengths while the
 #: usual difference is not known
 GAP_YOUNG = Largest(0.08, 0.045)
-#: with a network whose detector is calibrated, tolerate this change Δ, and also this difference g
+#: with a network whose detector is calibrated, tolerate this change Δ, and this difference g while
+#: the usual difference is not known
 LEARNED = Largest(0.035, 0.016)
 #: Store a healthy message at this interval [s]. The stored messages show the usual difference
 #: between measured and computed lengths.
