@@ -195,7 +195,10 @@ def main(argv: list[str]) -> int:
         '--reality', default=KIN, help='emulator model: kin, foreign or an MJCF file'
     )
     parser.add_argument(
-        '--methods', type=names, default=METHODS, help='control methods to compare, or - for none'
+        '--methods',
+        type=names,
+        default=tuple(METHODS),
+        help='control methods to compare, or - for none',
     )
     parser.add_argument(
         '--seconds', type=positive, default=EXPLORED, help='time of exploration [s]'

@@ -58,6 +58,8 @@ def inputs(mae, theta, limit, robot=ROBOT, dt=DT, tension=None):
         length=unchanging(robot, LENGTH, now).value,
         tension=tension,
         limit=limit,
+        target=None,
+        effort=np.zeros(robot.joint_count),
         dt=dt,
     )
 

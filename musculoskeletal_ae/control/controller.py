@@ -185,7 +185,7 @@ class Controller:
         self._jumped_at = math.inf  # time of the last jump of lengths [s]; ∞ before the first one
         #: number of messages after which the filtered muscle states are newer than the last pause
         self._awaited_samples = 0
-        if self.settings.method == 'float':
+        if self.settings.control_method.is_guided:
             self.supervisor.on_request(Activity.GRAVITY_COMPENSATION)
 
     # -- settings and messages ------------------------------------------------------------------
@@ -214,11 +214,11 @@ class Controller:
         is_stiffer = settings.desired_stiffness(units) != before.desired_stiffness(units)
         self.setup.settings = settings
         is_other = (settings.method, settings.preset) != (before.method, before.preset)
-        if settings.method == 'float':
+        if settings.control_method.is_guided:
             self._request(Activity.GRAVITY_COMPENSATION)
         elif is_other and not self.supervisor.explores:
             self._hold()
-        if settings.method == 'stiffness' and is_stiffer.any():
+        if settings.control_method.sets_stiffness and is_stiffer.any():
             self.activities.follower.plan_anew()
 
     def use(self, mae: Mae) -> None:
@@ -441,7 +441,7 @@ class Controller:
             if self.supervisor.is_latched:
                 return f'stopped: {condition.text}'
             return f'paused: {condition.text}: try again when the pause has ended'
-        if wanted and self.settings.method == 'float':
+        if wanted and self.settings.control_method.is_guided:
             return GUIDED
         if wanted and not (self.robot.tension_source.is_known or self.stream.body.offsets.known):
             return (
@@ -651,6 +651,8 @@ class Controller:
             length=self.limiter.last(LENGTH, sample).value,
             tension=self.limiter.last(TENSION, sample).value,
             limit=np.minimum(self.watchdog.heat.planned, self.robot.tension.limit),
+            target=self.target_state.theta,
+            effort=self.target_state.effort,
             dt=dt,
         )
 
@@ -696,15 +698,11 @@ class Controller:
 
     def _hold(self) -> None:
         """Move to the target with the present method, starting from the present tensions."""
-        state = self.target_state
-        by_torque = self.settings.method == 'tension'
-        holding = Activity.TORQUE if by_torque else Activity.HOLDING
-        activity = Activity.IDLE if state.theta is None else holding
+        has_target = self.target_state.theta is not None
         self.activities.leave()
-        if state.theta is not None:
-            self.activities.torque.set_target(state.theta, state.effort)
-            self.activities.ramped_target.set_target(state.theta, state.effort)
-        self.supervisor.on_request(activity)
+        self.supervisor.on_request(
+            self.settings.control_method.activity if has_target else Activity.IDLE
+        )
 
     def _approach(self, duration: float) -> None:
         """Start a trajectory of `duration` [s] to the target, along `Planner.to_posture`'s path."""
@@ -716,7 +714,7 @@ class Controller:
         if problem:
             state.theta = trajectory.end
             state.unreachable_reason = f'{problem}; the arm goes as far as it can'
-        self._begin(trajectory, 0.0, state.effort)
+        self._begin(trajectory)
 
     def _follow(
         self, trajectory: Trajectory, unreachable_reason: str = '', delay: float = 0.0
@@ -724,15 +722,14 @@ class Controller:
         """Follow a requested trajectory after `delay` [s]; its end becomes the target."""
         nothing = np.zeros(self.robot.joint_count)
         self.target_state = Target(nothing, trajectory.end, (), unreachable_reason)
-        self._begin(trajectory, delay, nothing)
+        self._begin(trajectory, delay)
 
-    def _begin(self, trajectory: Trajectory, delay: float, effort: Array) -> None:
+    def _begin(self, trajectory: Trajectory, delay: float = 0.0) -> None:
         follower = self.activities.follower
         if follower.progress.trajectory is None and delay > 0.0:
             start, _ = self._ready()
             follower.follow(self.planner.to_rest(start))
         follower.follow(trajectory, delay)
-        follower.exert(effort)
         self.supervisor.on_request(Activity.MOVING)
 
     @property
@@ -771,5 +768,5 @@ class Controller:
         return Setpoint.resting(inside), self.mae
 
     def _refuse_gravity_compensation(self) -> None:
-        if self.settings.method == 'float':
+        if self.settings.control_method.is_guided:
             raise MessageError('method float', GUIDED)

@@ -129,7 +129,7 @@ def _target(core: Controller) -> Iterator[Condition]:
     target, robot, kind = core.target_state, core.robot, ConditionKind
     if target.clamped:
         yield kind.TARGET_CLAMPED.condition(', '.join(target.clamped), target.clamped)
-    if target.effort.any() and core.settings.method in ('geometric', 'first', 'second'):
+    if target.effort.any() and not core.settings.control_method.uses_effort:
         yield kind.EFFORT_IGNORED.condition(f'method `{core.settings.method}` does not use it')
     follower = core.activities.follower
     if core.is_following and follower.progress.is_moving and (slow := slowed(follower)):
@@ -226,7 +226,8 @@ def _learned(core: Controller) -> str:
 
 def _add_stiffness(core: Controller, values: dict[str, str]) -> None:
     solution = core.activities.follower.plan.solution
-    if core.settings.method != 'stiffness' or solution is None or solution.stiffness is None:
+    is_stiff = core.settings.control_method.sets_stiffness
+    if not is_stiff or solution is None or solution.stiffness is None:
         return
     expected, *reachable = solution.stiffness
     robot = core.robot

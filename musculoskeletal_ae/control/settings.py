@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.control.supervisor import Activity
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.messages.arrival import INTERRUPTION
 from musculoskeletal_ae.parameters import PRESET, naming_parameter, parameters_of, settable
@@ -22,9 +23,45 @@ if TYPE_CHECKING:
     from musculoskeletal_ae.robot.robot import Robot
 
 UNREACHABLE = ('refuse', 'nearest')  # legal values of the setting `unreachable`
-METHODS = ('geometric', 'first', 'second', 'proposed', 'tension', 'stiffness', 'float')
-BY_TENSION = ('tension', 'float')  # methods that command tensions; all others command lengths
 MOST_STIFFNESS = 1000.0  # refuse a larger desired stiffness of a revolute joint [N·m/rad]
+
+
+@dataclass(frozen=True)
+class ControlMethod:
+    """How a control method differs from others, apart from how it computes commands.
+
+    Attributes:
+        activity: What the arm does at its target.
+        uses_effort: Whether the arm exerts the effort of a target.
+        sets_stiffness: Whether tensions are chosen for the setting `joint_stiffness`.
+    """
+
+    activity: Activity = Activity.HOLDING
+    uses_effort: bool = True
+    sets_stiffness: bool = False
+
+    @property
+    def commands_tension(self) -> bool:
+        """Whether the method commands tensions; all others command lengths."""
+        return self.activity in (Activity.TORQUE, Activity.GRAVITY_COMPENSATION)
+
+    @property
+    def is_guided(self) -> bool:
+        """Whether a hand guides the arm, so that it follows no target."""
+        return self.activity is Activity.GRAVITY_COMPENSATION
+
+
+#: all control methods, by the value of the setting `method`
+METHODS = {
+    'geometric': ControlMethod(uses_effort=False),
+    'first': ControlMethod(uses_effort=False),
+    'second': ControlMethod(uses_effort=False),
+    'proposed': ControlMethod(),
+    'tension': ControlMethod(activity=Activity.TORQUE),
+    'stiffness': ControlMethod(sets_stiffness=True),
+    'float': ControlMethod(activity=Activity.GRAVITY_COMPENSATION),
+}
+BY_LENGTH = tuple(name for name, method in METHODS.items() if not method.commands_tension)
 
 
 def _most_stiffness(radian: float) -> float:
@@ -43,7 +80,7 @@ class Settings:
     """Settings of control; `Controller.configure` applies changed settings."""
 
     method: str = settable(
-        'proposed', 'control method, which computes commands from targets', legal=METHODS
+        'proposed', 'control method, which computes commands from targets', legal=tuple(METHODS)
     )
     preset: str = replace(PRESET, settable=True).field()
     joint_stiffness: tuple[float, ...] = settable(
@@ -151,12 +188,11 @@ class Settings:
 
     def _check_method(self, robot: Robot) -> None:
         """Check that the robot's muscle modules measure the tensions that the method needs."""
-        if robot.tension_source.is_current and self.method in BY_TENSION:
-            legal = tuple(method for method in METHODS if method not in BY_TENSION)
+        if robot.tension_source.is_current and self.control_method.commands_tension:
             raise MusculoskeletalError(
                 f'{self.method!r} requires measured tensions, but tension_source in '
                 'muscles.yaml is `current`: the friction of a resting drive hides the force of a '
-                f'hand; legal: {", ".join(legal)}'
+                f'hand; legal: {", ".join(BY_LENGTH)}'
             )
         if robot.tension_source.is_known:
             return
@@ -166,6 +202,11 @@ class Settings:
                 f'{self.method!r} requires tensions, but tension_source in muscles.yaml is '
                 f'`none`; legal with preset {self.preset!r}: {", ".join(legal)}'
             )
+
+    @property
+    def control_method(self) -> ControlMethod:
+        """How the chosen method differs from others."""
+        return METHODS[self.method]
 
     @property
     def length_methods(self) -> Mapping[str, LengthMethod]:
@@ -178,7 +219,7 @@ class Settings:
 
         All other methods ramp the lengths (`LengthRamps`) or command tensions (`TorqueControl`).
         """
-        return self.method not in (*BY_TENSION, *self.length_methods)
+        return self.method in BY_LENGTH and self.method not in self.length_methods
 
 
 @dataclass

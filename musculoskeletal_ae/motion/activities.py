@@ -42,6 +42,8 @@ class Inputs(NamedTuple):
     length: Array  # last length command, or a command that keeps the present tensions [m], (M,)
     tension: Array  # last tension command, or a command that keeps the present tensions [N], (M,)
     limit: Array  # highest tension that may be planned [N], (M,)
+    target: Array | None  # the requested posture [rad], (D,); None if there is none
+    effort: Array  # requested torque in addition to gravity compensation [N·m], (D,)
     dt: float  # time since the last command [s]
 
 

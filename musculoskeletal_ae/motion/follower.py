@@ -100,12 +100,6 @@ class Follower(ActivityControl):
             self.progress.begin(trajectory)
             self._leave_rest()
 
-    def exert(self, effort: Array) -> None:
-        """Exert a torque [N·m], (D,), in addition to inverse dynamics, until the next call."""
-        if (effort != self.plan.effort).any():
-            self.plan.effort = effort
-            self.plan_anew()
-
     def plan_anew(self) -> None:
         """Plan again, with a smooth transition from the last command to the new plan.
 
@@ -166,7 +160,7 @@ class Follower(ActivityControl):
             self.winches.forget()
         if progress.advance(dt):
             self._leave_rest()
-        if self.plan.adopt_limit(inputs.limit):
+        if self.plan.adopt(inputs.limit, inputs.effort):
             self.plan_anew()
         if self._held is None:
             progress.update_desired()

@@ -150,28 +150,18 @@ class RampedTarget(ActivityControl):
 
     def __init__(self, ramps: LengthRamps, setup: Setup) -> None:
         self.ramps, self._setup = ramps, setup
-        #: target posture θ [rad] and additional torque [N·m], (D,) each
-        self._target: tuple[Array, Array] | None = None
-
-    def set_target(self, theta: Array, effort: Array) -> None:
-        """Set the target: a posture [rad], and a torque [N·m] besides gravity compensation.
-
-        Both arrays have the shape (D,).
-        """
-        self._target = theta, effort
-        self.ramps.pursue(self._goals())
 
     def enter(self, inputs: Inputs) -> None:
         """Enter the activity, starting from the present tensions."""
         self.ramps.start_from(inputs.length)
-        self.ramps.pursue(self._goals())
+        self.ramps.pursue(self._goals(inputs))
 
     def step(self, inputs: Inputs) -> Command | None:
         """Advance by one control step and return the next length command."""
         return self.ramps.step(inputs)
 
     def leave(self) -> None:
-        """Leave the activity; the target is kept for the next time."""
+        """Leave the activity."""
 
     @property
     def has_arrived(self) -> bool:
@@ -183,15 +173,16 @@ class RampedTarget(ActivityControl):
         """Torque [N·m], (D,), that the muscles cannot exert at the present goal."""
         return self.ramps.missing_torque
 
-    def _goals(self) -> list[Goal]:
-        chosen = self._setup.settings
+    def _goals(self, inputs: Inputs) -> list[Goal]:
+        chosen, theta, effort = self._setup.settings, inputs.target, inputs.effort
         method = chosen.length_methods.get(chosen.method)
-        if self._target is None or method is None:
+        if theta is None or method is None:
             return []
         # T_const of method `first` is T_bias.
-        first = Goal(FIRST, *self._target, chosen.first_duration, self._setup.robot.tension.bias)
+        bias = self._setup.robot.tension.bias
+        first = Goal(FIRST, theta, effort, chosen.first_duration, bias)
         if chosen.method == FIRST:
             return [first]
         if method.follows_first:
-            return [first, Goal(chosen.method, *self._target, chosen.second_duration)]
-        return [Goal(chosen.method, *self._target, chosen.first_duration)]
+            return [first, Goal(chosen.method, theta, effort, chosen.second_duration)]
+        return [Goal(chosen.method, theta, effort, chosen.first_duration)]

@@ -123,18 +123,25 @@ class TensionPlan:
     @property
     def is_stiff(self) -> bool:
         """Whether the method is `stiffness`, which uses no feedback."""
-        return self._setup.settings.method == 'stiffness'
+        return self._setup.settings.control_method.sets_stiffness
 
     @property
     def solution(self) -> Solution | None:
         """The last solution of the method `stiffness`; None if there is none."""
         return self._stiffening.solution
 
-    def adopt_limit(self, limit: Array) -> bool:
-        """Return whether a tension limit [N], (M,), requires a new plan; adopt the limit if so."""
+    def adopt(self, limit: Array, effort: Array) -> bool:
+        """Adopt a tension limit and an effort; return whether they require a new plan.
+
+        Args:
+            limit: Highest motor-side tension that may be planned [N], (M,).
+            effort: Torque in addition to inverse dynamics [N·m], (D,).
+        """
         is_other = depends_on_limit(self.motor_tension, self._limit, limit)
         if is_other:
             self._limit = limit
+        is_other = is_other or bool((effort != self.effort).any())
+        self.effort = effort
         return is_other
 
     def step(

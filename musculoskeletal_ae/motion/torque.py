@@ -40,17 +40,8 @@ class TorqueControl(ActivityControl):
     def __init__(self, setup: Setup) -> None:
         self._setup, robot = setup, setup.robot
         self._missing_torque: Array = np.zeros(robot.joint_count)
-        #: target posture θ [rad] and additional torque [N·m], (D,) each
-        self._target: tuple[Array, Array] | None = None
         self._command: Array = robot.tension.bias  # last tension command [N], (M,)
         self._smooth: Array | None = None  # low-pass-filtered θ [rad], (D,)
-
-    def set_target(self, theta: Array, effort: Array) -> None:
-        """Set the target: a posture [rad], and a torque [N·m] besides gravity compensation.
-
-        Both arrays have the shape (D,).
-        """
-        self._target = theta, effort
 
     def enter(self, inputs: Inputs) -> None:
         """Enter the activity, starting from the present tensions."""
@@ -59,12 +50,12 @@ class TorqueControl(ActivityControl):
 
     def step(self, inputs: Inputs) -> Command | None:
         """Advance by one control step; return the tension command, or None without a target."""
-        if self._target is None:
+        if inputs.target is None:
             return None
-        return self._command_towards(*self._target, inputs)
+        return self._command_towards(inputs.target, inputs.effort, inputs)
 
     def leave(self) -> None:
-        """Leave the activity; the target is kept for the next time."""
+        """Leave the activity."""
 
     @property
     def has_arrived(self) -> bool:

@@ -26,7 +26,7 @@ from musculoskeletal_ae.bags.topics import topics_with
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.control import controller_status
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
+from musculoskeletal_ae.control.settings import BY_LENGTH, Settings
 from musculoskeletal_ae.control.stop_memory import BEFORE, StopMemory
 from musculoskeletal_ae.estimation.suspect_verification import LONGEST
 from musculoskeletal_ae.exceptions import MusculoskeletalError, printable
@@ -135,16 +135,17 @@ class ControllerNode(Shell):
         settings = Settings(**{name: self.parameter(name) for name in parameters_of(Settings)})
         settings.check_fit(self.robot)
         with naming_parameter('method'):
-            self._check_driver(settings.method)
+            self._check_driver(settings)
         return settings
 
-    def _check_driver(self, method: str) -> None:
-        """Check that the driver or the motors can follow the commands of a method."""
-        if method in BY_TENSION and self.motors.command_topic:
-            legal = ', '.join(method for method in METHODS if method not in BY_TENSION)
+    def _check_driver(self, settings: Settings) -> None:
+        """Check that the driver or the motors can follow the commands of the method."""
+        method = settings.control_method
+        legal = ', '.join(BY_LENGTH)
+        if method.commands_tension and self.motors.command_topic:
             problem = (
-                f'{method!r} commands tensions, but the motors on {self.motors.command_topic} '
-                'follow lengths only'
+                f'{settings.method!r} commands tensions, but the motors on '
+                f'{self.motors.command_topic} follow lengths only'
             )
             raise MusculoskeletalError(f'{problem}; legal: {legal}')
         followed = {
@@ -153,13 +154,12 @@ class ControllerNode(Shell):
         }
         # Position-controlled modules need no tension commands, because the limiter turns tensions
         # into lengths.
-        by_tension = method in BY_TENSION and self.robot.actuation.follows_tensions
+        by_tension = method.commands_tension and self.robot.actuation.follows_tensions
         if by_tension and followed[LENGTH] and not followed[TENSION]:
             # Refuse the method, because a driver that gets no commands pays the muscles out.
-            legal = ', '.join(method for method in METHODS if method not in BY_TENSION)
             problem = (
-                f'{method!r} commands tensions, but the driver subscribes to muscle_length_command '
-                'only'
+                f'{settings.method!r} commands tensions, but the driver subscribes to '
+                'muscle_length_command only'
             )
             raise MusculoskeletalError(
                 f'{problem}; legal: {legal}; or let the driver subscribe to muscle_tension_command'

@@ -132,7 +132,7 @@ class Arm(RuleBasedStateMachine):
         if self.core.reset(self.now) is None:
             self.has_stopped = False
 
-    @rule(method=st.sampled_from(METHODS), preset=st.sampled_from(['default', 'paper']))
+    @rule(method=st.sampled_from(list(METHODS)), preset=st.sampled_from(['default', 'paper']))
     def configure(self, method, preset):
         self.core.configure(replace(self.core.settings, method=method, preset=preset))
 

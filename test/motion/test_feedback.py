@@ -55,6 +55,8 @@ def step(feedback, robot, error, tension, gain=GAIN, motor=None, dt=DT):
         length=nothing,
         tension=nothing,
         limit=limit,
+        target=None,
+        effort=nothing,
         dt=dt,
     )
     return feedback.at_rest(error, jacobian(robot), inputs, gain)

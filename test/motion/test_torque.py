@@ -28,9 +28,10 @@ DT = 0.01
 
 
 def settled(control, target=THETA, effort=None, theta=THETA, limit=LIMIT):
-    control.set_target(target, np.zeros(5) if effort is None else effort)
+    effort = np.zeros(5) if effort is None else effort
+    wanted = inputs(MAE, theta, limit, ROBOT)._replace(target=target, effort=effort)
     for _ in range(50):
-        command = control.step(inputs(MAE, theta, limit, ROBOT))
+        command = control.step(wanted)
     return command.value
 
 
@@ -57,15 +58,14 @@ def test_the_position_gain_exerts_torque_towards_the_target():
 def test_a_prismatic_joint_is_held_as_by_a_pinion(control, tmp_path):
     robot = Robot.load(write_robot(tmp_path, slider=True))
     mae, middle = ExactMae(robot), 0.5 * (robot.lower + robot.upper)
-    limit, nothing = robot.tension.limit, np.zeros(robot.joint_count)
 
     def torque(theta):
         held = control(Setup(robot, Settings()))
-        held.set_target(middle, nothing)
-        held.enter(inputs(mae, middle, limit, robot))
-        held.step(inputs(mae, middle, limit, robot))
+        there, here = (inputs(mae, each, robot.tension.limit, robot) for each in (middle, theta))
+        held.enter(there)
+        held.step(there._replace(target=middle))
         for _ in range(300):
-            tension = held.step(inputs(mae, theta, limit, robot)).value
+            tension = held.step(here._replace(target=middle)).value
         return -mae.muscle_jacobian(theta, tension).T @ tension
 
     theta = middle - robot.units.to_theta(np.array([0.02, 0.02, 0.02, 0.0012]))
@@ -78,10 +78,10 @@ def test_a_prismatic_joint_is_held_as_by_a_pinion(control, tmp_path):
 def test_tensions_change_no_faster_than_the_rate_limit_allows():
     control = TorqueControl(Setup(ROBOT, Settings(rate_limit=0.05)))
     before = np.full(ROBOT.muscle_count, 150.0)
-    control.set_target(THETA, np.zeros(5))
     control.enter(inputs(MAE, THETA, LIMIT, ROBOT, tension=before))
     for _ in range(50):
-        tension = control.step(inputs(MAE, THETA, LIMIT, ROBOT)).value
+        now = inputs(MAE, THETA, LIMIT, ROBOT)._replace(target=THETA)
+        tension = control.step(now).value
         assert np.abs(tension - before).max() <= ROBOT.stiffness[0] * 0.05 * DT + 1e-9
         before = tension
 

@@ -10,7 +10,7 @@ from readings import reading
 from robots import read_muscles, write_muscles, write_robot
 
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.settings import BY_TENSION, METHODS, Settings
+from musculoskeletal_ae.control.settings import METHODS, Settings
 from musculoskeletal_ae.driver.listening import Listening
 from musculoskeletal_ae.emulator.reality import make_arm
 from musculoskeletal_ae.exceptions import MusculoskeletalError, RobotDescriptionError
@@ -114,7 +114,7 @@ def test_an_emulated_drive_reads_more_current_while_it_winds_in(reality):
 @pytest.mark.parametrize('method', METHODS)
 def test_methods_that_regulate_tension_are_refused_for_motor_currents(method):
     settings = Settings(method=method)
-    if method not in BY_TENSION:
+    if not METHODS[method].commands_tension:
         Controller(ROBOT, settings)
         return
     with pytest.raises(MusculoskeletalError, match=r'friction of a resting drive .* legal: geom'):
