@@ -276,15 +276,6 @@ class Lab:
                 continue
             if output is not None:
                 self._estimates.append(output.state.theta)
-                if core.body.offsets.known:
-                    sample = output.sample
-                    core.networks.message(
-                        sample.tension_read,
-                        sample.length,
-                        sample.sliding,
-                        received,
-                        core.measured,
-                    )
             self.publish()
 
     def publish(self) -> None:
@@ -292,13 +283,11 @@ class Lab:
         core = self.estimator
         if (trust := core.joint_trust) is not self._published_trust:
             self._published_trust = trust
-            core.networks.messages.clear()
             self._to_learner.append(lambda: self.learner.use_joint_trust(trust))
         if core.body is not self._published_body:
             body = self._published_body = core.body
             self._to_controller.append(lambda: self.controller.use_body(body))
             self._to_learner.append(lambda: self.learner.use_body(body))
-            core.networks.follow(body, self.now)
 
     def _connect_networks(self) -> None:
         """Let controller and learner hear the estimator's decisions on networks."""

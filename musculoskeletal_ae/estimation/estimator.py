@@ -112,6 +112,7 @@ class Estimator:
         load: The newest external load; None as in `Output`.
         stepped_at: Time on the steady clock at which the last message was accepted while there was
             a network [s].
+        received_at: Time on the steady clock of the last message, even if it was rejected [s].
     """
 
     def __init__(self, robot: Robot, preset: str = 'default', first_generation: int = 1) -> None:
@@ -140,7 +141,7 @@ class Estimator:
         self.sample: MuscleSample | None = None
         self.output: Output | None = None
         self.measured: Array | None = None
-        self.stepped_at = -math.inf
+        self.stepped_at = self.received_at = -math.inf
         self.load: Contact | None = None
         #: times since the health of the body was last checked [s]: between receptions, of which
         #: each message adds at most LONGEST_STEP, and between publications
@@ -151,6 +152,7 @@ class Estimator:
         self.joint_check = JointSensorTrust(robot)
         #: usable readings of the joint sensors [rad] and their times [s], (2, D); NaN if unknown
         self._readings = np.full((2, robot.joint_count), np.nan)
+        self.networks.follow(self.body, self.received_at)
 
     @property
     def cause(self) -> str:
@@ -387,6 +389,7 @@ class Estimator:
         Raises:
             RejectionError: If the message cannot be used.
         """
+        self.received_at = now
         try:
             sample = self.stream.take(message, time, now, delay)
         except RejectionError as error:
@@ -485,6 +488,10 @@ class Estimator:
         detected, contact = False, None
         if sample.jumped or not 0.0 < self._unchecked_sent < SPACING:
             detected, contact = self._check(sample, estimated, readings, now), self.load
+        if self.body.offsets.known:
+            self.networks.message(
+                sample.tension_read, sample.length, sample.sliding, now, self.measured
+            )
         self.output = Output(sample, estimated.state, estimated.anomaly, detected, contact)
         return self.output
 
@@ -520,8 +527,10 @@ class Estimator:
         if detected:
             self.joint_check.drop_newest()
         elif known and self.suspects.finding is None:
-            load = 0.0 if self.load is None else self.load.distance
+            load, trust = 0.0 if self.load is None else self.load.distance, self.joint_trust
             self.joint_check.step(observation, readings, now, load)
+            if self.joint_trust is not trust:
+                self.networks.messages.clear()  # the readings so far may be wrong
         return detected
 
     # -- findings, verification and calibration -------------------------------------------------
@@ -549,6 +558,7 @@ class Estimator:
         if body != before:
             self.body = replace(body, generation=before.generation + 1)
             self.stream.use_body(self.body)
+            self.networks.follow(self.body, self.received_at)
 
     def _measured_theta(self, readings: Array) -> Array | None:
         """Return the readings [rad], (D,), if they show the posture of all joints, else None.

@@ -220,22 +220,17 @@ def learn(
         if isolated != estimator.body.isolated:
             learner.use_body(learner.body.with_isolated(isolated))
             estimator.isolate(isolated)
-            networks.follow(estimator.body, at)
-            networks.messages.clear()
         if learner.mae is not newest:
             _decide(estimator, learner.mae, at)
             newest = learner.mae
         reading = MuscleReadings(length=length, tension=tension)
         learner.joints(at, theta)
+        estimator.joints(theta, at)
         with suppress(RejectionError):  # the learner counts it
-            output = estimator.take(reading, at, at)
-            assert output is not None
-            sample = output.sample
-            networks.message(sample.tension_read, sample.length, sample.sliding, at, theta)
+            estimator.take(reading, at, at)
         finding = estimator.suspects.finding
         if finding is not None and not stop:
             learner.use_body(learner.body.with_anomaly(Anomaly.FOUND, finding.muscle))
-            networks.follow(estimator.body, at)
             stop = (
                 f'learning stopped {at:.1f} s after the start: an anomaly begins there '
                 f'({learner.robot.muscles[finding.muscle]}: {finding.kind.identifier})'

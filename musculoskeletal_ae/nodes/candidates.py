@@ -31,7 +31,6 @@ from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.nodes.checkpoint_queue import ACCEPTED, CANDIDATES, REJECTED
 from musculoskeletal_ae.nodes.shell import Shell
 from musculoskeletal_ae.ros.message_building import LATCHED, bytes_message
-from musculoskeletal_ae.signals.body_state import BodyState
 
 
 class Candidates:
@@ -61,18 +60,9 @@ class Candidates:
         node.parameters.follow('checkpoint', self._use_file, self._read)
         node.listen(UInt8MultiArray, CANDIDATES, self.queue.propose, LATCHED)
 
-    def follow(self, body: BodyState) -> None:
-        """Follow a change of the body state, and reject waiting candidates if an anomaly begins."""
-        in_use, waiting = self._networks.mae, None
-        begins = body.has_anomaly and not self._networks.body.has_anomaly
-        if begins and in_use is not None:
-            waiting = self.queue.give_up()
-        proven = self._networks.follow(body, time.monotonic())
-        if proven is not None and in_use is not None:
-            self._node.get_logger().warning(
-                f'checkpoint version {in_use.version}: an anomaly was detected soon after it was '
-                f'accepted; returned to checkpoint version {proven.version}'
-            )
+    def give_up(self) -> None:
+        """Reject the waiting candidates, because an anomaly begins, unless no network is in use."""
+        waiting = None if self._networks.mae is None else self.queue.give_up()
         if waiting is not None:
             with suppress(CheckpointError):  # an unfit checkpoint has no version
                 mae = checkpoint.from_bytes(bytes(waiting.data), self._node.robot)

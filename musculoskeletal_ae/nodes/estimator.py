@@ -200,7 +200,7 @@ class EstimatorNode(Shell):
         if self.mirror is not None and self.core.body.offsets.known and sample is not None:
             self._publish_mirror(sample, clock.to_msg())
         if output is not None:
-            self._publish(output, clock.to_msg(), now)
+            self._publish(output, clock.to_msg())
 
     def _on_marker(self, message: PoseStamped) -> None:
         theta = self.core.posture_of_marker(read_pose(message, self.root_frame))
@@ -211,12 +211,8 @@ class EstimatorNode(Shell):
 
     # -- publishing -----------------------------------------------------------------------------
 
-    def _publish(self, output: Output, stamp: Any, now: float) -> None:
-        state, sample = output.state, output.sample
-        if self.core.body.offsets.known:
-            self.core.networks.message(
-                sample.tension_read, sample.length, sample.sliding, now, self.core.measured
-            )
+    def _publish(self, output: Output, stamp: Any) -> None:
+        state = output.state
         self.joints.publish(posture_message(self.robot.units, state.theta, stamp))
         known = None if self.core.mae is None else self.core.mae.covariance
         if known is not None and is_heard(self.covariance):
@@ -255,7 +251,8 @@ class EstimatorNode(Shell):
         if body.has_anomaly and not before.has_anomaly:
             text = f'anomaly detected: {self.core.cause}; {self.core.advice}'
             self.get_logger().warning(text)
-        self.candidates.follow(body)
+        if body.has_anomaly and not before.has_anomaly:
+            self.candidates.give_up()
         if body.has_anomaly != before.has_anomaly:
             self._report()  # at once, because the report names the suspect
 
@@ -274,7 +271,6 @@ class EstimatorNode(Shell):
         rows[-1] = self.robot.units.to_position(trust.deviation)
         self.trust.publish(array_message(rows, 'quantity', 'joint'))
         if before is not None:
-            self.core.networks.messages.clear()  # the readings so far may be wrong
             names = ', '.join(self.robot.joints[joint] for joint in trust.unused)
             self.get_logger().warning(f'joint sensors that are not used: {names or "none"}')
             self._report()

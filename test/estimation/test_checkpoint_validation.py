@@ -169,12 +169,13 @@ def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back(trained)
     gate, old, new = CheckpointValidator(ROBOT), trained['default'], trained['paper']
     gate.take(old, 0.0)
     gate.take(new, 100.0)
-    assert gate.follow(FAULTY, 100.0 + 0.6 * PROOF) is old
+    gate.follow(FAULTY, 100.0 + 0.6 * PROOF)
     assert gate.mae is old
-    assert gate.follow(FAULTY, 108.0) is None
-    assert gate.follow(HEALTHY, 120.0) is None
+    gate.follow(FAULTY, 108.0)
+    gate.follow(HEALTHY, 120.0)
+    assert gate.mae is old
     gate.take(new, 130.0)
-    assert gate.follow(FAULTY, 130.0 + 1.1 * PROOF) is None
+    gate.follow(FAULTY, 130.0 + 1.1 * PROOF)
     assert gate.mae is new
 
 
@@ -217,7 +218,8 @@ def test_many_unproven_networks_leave_the_first_one_to_roll_back_to(trained):
     gate.take(first, 0.0)
     for _ in range(3 * MOST_USED):  # without messages between them, no network is proven
         gate.take(trained['default'], 0.0)
-    assert gate.follow(FAULTY, 0.0) is first
+    gate.follow(FAULTY, 0.0)
+    assert gate.mae is first
 
 
 def send_messages_of_the_model(gate, measures):
@@ -299,8 +301,8 @@ def test_decisions_are_told_and_an_anomaly_rejects_the_network_accepted_shortly_
     deque(gate.propose(replace(first, version=2), lambda: 20.0))
     with pytest.raises(GateError):
         deque(gate.propose(replace(_turned(first, 3.0), version=3), lambda: 21.0))
-    proven = gate.follow(FAULTY, 22.0)
-    assert proven.version == 1
+    gate.follow(FAULTY, 22.0)
+    assert gate.mae.version == 1
     assert used == [1, 2, 1]
     assert [each[:2] for each in told] == [
         ('accepted', 1),

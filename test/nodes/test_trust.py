@@ -95,7 +95,7 @@ def test_an_anomaly_rejects_a_network_that_is_being_validated(arm, trained):
     first, candidates = estimator.core.complete_mae, estimator.candidates
     arm.graph.send_network(checkpoint.to_bytes(replace(trained['paper'], version=67)))
     arm.graph.wait(lambda: candidates.queue.is_busy, 'the validation')
-    candidates.follow(estimator.core.body.with_anomaly(Anomaly.FOUND, 0))
+    candidates.give_up()
     arm.graph.wait(lambda: decisions, 'the decision')
     assert decisions[-1].key == '67'
     assert 'anomaly' in decisions[-1].value
@@ -125,7 +125,7 @@ def test_an_anomaly_soon_after_a_new_network_brings_the_proven_one_back_in_all_n
     arm.graph.wait(is_used, 'the new network')
     decisions = arm.graph.listen(KeyValue, 'rejected_checkpoint', LATCHED)
     body = arm.estimator.core.body
-    arm.estimator.candidates.follow(body.with_anomaly(Anomaly.FOUND, 0))
+    arm.estimator.core.networks.follow(body.with_anomaly(Anomaly.FOUND, 0), time.monotonic())
     arm.graph.wait(
         lambda: decisions and 'soon after' in decisions[-1].value, 'the rejection of the new one'
     )

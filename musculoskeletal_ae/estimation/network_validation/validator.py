@@ -132,35 +132,32 @@ class CheckpointValidator:
         self.check(mae, is_chosen=True)
         self._accept(mae, now, unsuitable_because=self._weakness(mae))
 
-    def follow(self, body: BodyState, now: float) -> Mae | None:
+    def follow(self, body: BodyState, now: float) -> None:
         """Follow a change of the body state.
 
-        New length offsets make the stored messages useless. If an anomaly begins, a network that
-        was accepted shortly before may be its cause; it is rejected, and the newest network that
-        was in use for 10 s (PROOF) without an anomaly is used again, or the oldest one if none was.
-
-        Returns:
-            The proven network that is used again; None if the network in use does not change.
+        Other length offsets or isolated muscles make the stored messages useless. If an anomaly
+        begins, a network that was accepted shortly before may be its cause; it is rejected, and the
+        newest network that was in use for 10 s (PROOF) without an anomaly is used again, or the
+        oldest one if none was.
         """
         before, self.body = self.body, body
-        if body.offsets != before.offsets:
+        if body.offsets != before.offsets or body.isolated != before.isolated:
             self.messages.clear()
         if body.has_anomaly == before.has_anomaly:
-            return None
+            return
         if not body.has_anomaly:
             self.messages.clear()  # they may describe the arm as it was before a repair
-            return None
+            return
         self.messages.drop_after(now - DETECTION_DELAY)
         doubtful = self.mae
         while len(self._used) > 1 and now - self._used[-1][0] < PROOF:
             del self._used[-1]
         proven = self.mae
         if proven is doubtful or proven is None or doubtful is None:
-            return None
+            return
         self.unsuitable_because = ''
         self.accepted(self._use(proven))
         self.rejected(doubtful, 'an anomaly was detected soon after this network was accepted')
-        return proven
 
     def _accept(self, mae: Mae, now: float, unsuitable_because: str = '') -> None:
         try:
