@@ -27,9 +27,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import Condition, ConditionKind
 from musculoskeletal_ae.estimation import estimator_status
 from musculoskeletal_ae.estimation.contact import Contact, ContactEstimator
-from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
 from musculoskeletal_ae.estimation.estimate import Estimate, estimate
-from musculoskeletal_ae.estimation.finding import Finding, Observation
+from musculoskeletal_ae.estimation.finding import Finding, Observation, jump_finding
 from musculoskeletal_ae.estimation.further_loss import needed_muscles
 from musculoskeletal_ae.estimation.health import HealthMonitor
 from musculoskeletal_ae.estimation.healthy_torque import HealthyTorque
@@ -432,7 +431,8 @@ class Estimator:
 
     def _use_sample(self, sample: MuscleSample, now: float) -> Output | None:
         self._rejected.note('', now)
-        self._handle(self.health.read(sample.newest, self.body.used, now), now)
+        read = sample.newest.replace(length=sample.length_read)
+        self._handle(self.health.read(read, self.body.used, now), now)
         if sample.jumped:
             self._handle_jump(sample.jumped, now)
         before, self.sample = self.sample, sample
@@ -577,7 +577,7 @@ class Estimator:
         return np.where(now - time < JOINTS_AGE, theta, np.nan)
 
     def _handle_jump(self, jumped: tuple[int, ...], now: float) -> None:
-        """Respond to a jump of lengths in three cases in which the detector `LengthJump` does not.
+        """Respond to a jump of lengths in three cases in which `HealthMonitor.step` does not.
 
         During a length calibration, the calibration starts again. Without a network, the jump is
         latched as a finding. While other offsets are not known, those of the lengths that have
@@ -588,9 +588,9 @@ class Estimator:
             self._note(Evidence.CALIBRATING, jumped)
             self._begin(self._new_calibration(self.calibration.posture, 'a length jumped'))
         elif self.mae is None and self.body.offsets.known:
-            self._handle(finding_of(jumped), now)
+            self._handle(jump_finding(jumped), now)
         elif not self.body.offsets.known:
-            self._note(finding_of(jumped).kind, jumped)
+            self._note(jump_finding(jumped).kind, jumped)
 
     def _check_suspect(self, isolating: Iterable[int] = (), checks_lengths: bool = True) -> None:
         """Check that suspect muscles are repaired, unless they are among the muscles `isolating`.

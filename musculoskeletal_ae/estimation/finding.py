@@ -5,11 +5,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from musculoskeletal_ae.arrays import Array, Bools
+from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import ConditionKind, Revokes
 from musculoskeletal_ae.estimation.estimate import Estimate
 from musculoskeletal_ae.mae.mae import Mae
-from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 #: discard messages that arrived within this time before a fault was detected [s], because the fault
@@ -53,6 +52,19 @@ class Finding:
         return self.kind.revokes is Revokes.ONE
 
 
+def jump_finding(jumped: tuple[int, ...]) -> Finding:
+    """Return the finding for one or several muscles whose lengths have jumped, and stay there.
+
+    `signals/length_jumps.py` rejects messages with a jump. If the new lengths persist, messages are
+    accepted again, and the first sample names these muscles (`MuscleSample.jumped`).
+    """
+    if len(jumped) == 1:
+        return Finding(jumped[0], ConditionKind.LENGTH_JUMP, 'its length jumped')
+    others = '1 other length' if len(jumped) == 2 else f'{len(jumped) - 1} other lengths'
+    evidence = f'its length and {others} jumped'
+    return Finding(jumped[0], ConditionKind.LENGTHS_JUMPED, evidence)
+
+
 @dataclass(frozen=True, eq=False)
 class Observation:
     """One message as the input of the detectors.
@@ -80,8 +92,8 @@ class Observation:
 class Detector:
     """Base class of the detectors, each of which looks for one sign of a fault.
 
-    `SuspectHandling` latches their findings. A new detector overrides `step` or `read`, and other
-    methods as needed. To use a new detector, add it to the list in `HealthMonitor`.
+    `SuspectHandling` latches their findings. A new detector overrides `step`, and other methods as
+    needed. To use a new detector, add it to the list in `HealthMonitor`.
     """
 
     def use(self, mae: Mae) -> None:
@@ -89,21 +101,6 @@ class Detector:
 
     def reset(self) -> None:
         """Reset the detector, for example after a jump of the clock or a reset by the user."""
-
-    def read(
-        self,
-        readings: MuscleReadings,  # noqa: ARG002
-        usable: Bools,  # noqa: ARG002
-        now: float,  # noqa: ARG002
-    ) -> Finding | None:
-        """Check the raw readings of a message, even of a rejected one; return a finding or None.
-
-        Args:
-            readings: The raw readings.
-            usable: Whether each muscle is used, (M,).
-            now: Time of the message on a steady clock [s].
-        """
-        return None
 
     def step(self, observation: Observation) -> Finding | None:  # noqa: ARG002
         """Check a message for which the network has made an estimate; return a finding or None."""

@@ -8,11 +8,10 @@ The estimator, offline learning (`train --from-bag`) and the experiments use the
 from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.estimation.detectors.frozen_sensor import FrozenSensor
 from musculoskeletal_ae.estimation.detectors.length_disagreement import LengthDisagreement
-from musculoskeletal_ae.estimation.detectors.length_jump import LengthJump
 from musculoskeletal_ae.estimation.detectors.missing_values import MissingValues
 from musculoskeletal_ae.estimation.detectors.saturated_sensor import SaturatedSensor
 from musculoskeletal_ae.estimation.detectors.thermal_drift import ThermalDrift
-from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
+from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation, jump_finding
 from musculoskeletal_ae.estimation.lengths.exchange import ExchangeCheck
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.presets.registry import preset_named
@@ -43,9 +42,8 @@ class HealthMonitor:
         self.joints = LengthDisagreement(robot)
         self.heat = Heat(robot)
         self._exchange = ExchangeCheck(robot)
+        self._missing = MissingValues(robot)
         self._detectors: list[Detector] = [
-            LengthJump(),
-            MissingValues(robot),
             *by_physics,
             self.residual,
             self.joints,
@@ -66,19 +64,24 @@ class HealthMonitor:
             detector.reset()
 
     def read(self, readings: MuscleReadings, usable: Bools, now: float) -> Finding | None:
-        """Check the raw readings of a message, even of a rejected one; return the first finding.
+        """Check the readings of a message, even of a rejected one; return a finding or None.
 
-        `Detector.read` describes the arguments. Without a finding, the result is None.
+        Args:
+            readings: The readings, with lengths as the sensors measured them.
+            usable: Whether each muscle is used, (M,).
+            now: Time of the message on a steady clock [s].
         """
         self._exchange.read(readings, now)
-        findings = [detector.read(readings, usable, now) for detector in self._detectors]
-        return next(filter(None, findings), None)
+        return self._missing.step(readings, usable, now)
 
     def step(self, observation: Observation) -> Finding | None:
         """Check a message for which there is an estimate; return the first finding or None.
 
-        If a fault of the driver explains the finding (`exchange`), it is reported instead.
+        A jump of lengths takes precedence. If a fault of the driver explains the finding
+        (`exchange`), it is reported instead.
         """
         findings = [detector.step(observation) for detector in self._detectors]
+        if (jumped := observation.sample.jumped) and observation.lengths_known:
+            findings.insert(0, jump_finding(jumped))
         self._exchange.note(observation)
         return self._exchange.explain(next(filter(None, findings), None), observation)

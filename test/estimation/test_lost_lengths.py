@@ -36,6 +36,7 @@ class MovingArm:
         self.tense = np.ones(robot.muscle_count)  # 0 for a tendon without tension
         self.order = np.arange(robot.muscle_count)  # muscle that each column of the readings shows
         self.sign = np.ones(robot.muscle_count)  # of each column of lengths
+        self.misread = 0.0  # added to the readings of the tensions [N]
         self.posture = None  # θ of an arm that stands still [rad], or None
 
     def go(self, seconds, sensors=True):
@@ -52,7 +53,7 @@ class MovingArm:
             if sensors:
                 self.core.joints(theta + self.joint_off, self.time)
             length = length * self.sign
-            states = np.array([length, tension, np.full_like(length, 25.0)])
+            states = np.array([length, tension + self.misread, np.full_like(length, 25.0)])
             with suppress(RejectionError):
                 self.core.take(reading(states[:, self.order]), self.time, self.time)
 
@@ -233,10 +234,17 @@ def test_exchanged_muscles_are_named_instead_of_lost_offsets(robot, calibrated, 
     assert arm.offsets.revoked
 
 
-@pytest.mark.parametrize('is_exchange', [True, False])
-def test_a_driver_that_returns_with_another_order_or_sign_is_named(robot, mae, is_exchange):
+@pytest.mark.parametrize(
+    ('is_exchange', 'offset'), [(True, 0.0), (False, 0.0), (True, 0.1), (False, 0.03)]
+)
+def test_a_driver_that_returns_with_another_order_or_sign_is_named(robot, mae, is_exchange, offset):
     arm = MovingArm(robot, mae)
     arm.posture = robot.lower + 0.2 * (robot.upper - robot.lower)
+    arm.off[:] = offset
+    if offset:
+        arm.core.calibrate_lengths(tuple(arm.posture))
+        arm.go(5.0, sensors=False)
+        assert arm.offsets.known and arm.kind is None
     arm.go(2.0, sensors=False)
     length = arm.core.sample.length_read
     longest = int(np.abs(length).argmax())
@@ -246,6 +254,9 @@ def test_a_driver_that_returns_with_another_order_or_sign_is_named(robot, mae, i
         arm.order[[longest, other]] = other, longest
     else:
         arm.sign[longest] = -1.0
+    arm.misread = 1e4 if offset else 0.0  # with offsets, the first message is also unusable
+    arm.go(DT, sensors=False)
+    arm.misread = 0.0
     arm.go(2.0, sensors=False)
     assert arm.kind is ConditionKind.MUSCLES_EXCHANGED, arm.core.cause
     assert robot.muscles[longest] in arm.core.cause

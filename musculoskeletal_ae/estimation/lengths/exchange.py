@@ -27,8 +27,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.conditions import ConditionKind
-from musculoskeletal_ae.estimation.detectors.length_jump import finding_of
-from musculoskeletal_ae.estimation.finding import Finding, Observation
+from musculoskeletal_ae.estimation.finding import Finding, Observation, jump_finding
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import anomaly, residuals
 from musculoskeletal_ae.robot.robot import Robot
@@ -173,7 +172,7 @@ class ExchangeCheck:
         has_changed = np.abs(after - before) > DISCONTINUOUS
         has_changed[list(self._mae.isolated)] = False
         changed = tuple(np.flatnonzero(has_changed).tolist())
-        return finding_of(changed) if len(changed) > 1 else None
+        return jump_finding(changed) if len(changed) > 1 else None
 
     def _judge_silence(self) -> WiringJudgement | None:
         """Judge which order and signs make the lengths continue over the last pause of messages.
