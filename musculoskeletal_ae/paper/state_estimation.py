@@ -17,6 +17,7 @@ from musculoskeletal_ae.estimation.finding import Observation
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.residuals import NORM
 from musculoskeletal_ae.mae.units import Mask, State
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 
 def estimate(mae: Mae, tension: Array, length: Array) -> State:
@@ -41,6 +42,6 @@ class AnomalyNorm(ResidualDistance):
         )
         return math.sqrt(tension @ tension) + math.sqrt(length @ length)
 
-    def limit(self, theta: Array, tension: Array) -> float:  # noqa: ARG002
+    def limit(self, theta: Array, sample: MuscleSample) -> float:  # noqa: ARG002
         """Return the threshold of the anomaly score A for every state; ∞ if there is none."""
         return self.threshold

@@ -20,7 +20,6 @@ from musculoskeletal_ae.estimation.network_validation.message_errors import FLOO
 from musculoskeletal_ae.estimation.network_validation.posture_check import LIMITS
 from musculoskeletal_ae.estimation.network_validation.validator import (
     DETECTION_DELAY,
-    MOST_USED,
     PROOF,
     CheckpointValidator,
 )
@@ -216,7 +215,7 @@ def test_only_the_network_in_use_needs_no_decision(trained):
 def test_many_unproven_networks_leave_the_first_one_to_roll_back_to(trained):
     gate, first = CheckpointValidator(ROBOT), trained['paper']
     gate.take(first, 0.0)
-    for _ in range(3 * MOST_USED):  # without messages between them, no network is proven
+    for _ in range(60):  # without messages between them, no network is proven
         gate.take(trained['default'], 0.0)
     gate.follow(FAULTY, 0.0)
     assert gate.mae is first

@@ -13,7 +13,7 @@ from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.residuals import TouchStatistics
 from musculoskeletal_ae.signals.body_state import Anomaly
 
-REASON = 'l by ①, brachialis: relative error 3 from the geometric model, limit 1.7'
+REASON = 'l by ①, brachialis: error 3 relative to the spread, from the geometric model, limit 1.7'
 
 
 class ScriptedTrainer(Trainer):

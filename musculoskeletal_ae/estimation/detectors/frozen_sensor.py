@@ -30,7 +30,7 @@ class FrozenSensor(Detector):
     """
 
     def __init__(self, robot: Robot) -> None:
-        self._robot = self._complete_robot = robot
+        self._robot = robot
         self._mae: Mae | None = None
         self._last: Array | None = None  # last readings of length and tension, (2, M)
         #: time for which the readings of length and tension have not changed [s]
@@ -45,7 +45,7 @@ class FrozenSensor(Detector):
 
     def use(self, mae: Mae) -> None:
         """Use another network to predict lengths; its isolated muscles are ignored."""
-        self._mae, self._robot = mae, self._complete_robot.without(mae.isolated)
+        self._mae = mae
         self._stop_observing()
 
     def reset(self) -> None:
@@ -66,7 +66,7 @@ class FrozenSensor(Detector):
         if not robot.tension_source.is_known:  # an unknown tension does not count as frozen
             is_same[1] = 0.0
         slack = slack_tension(robot.tension.bias)
-        is_near_bias = np.abs(tension - robot.tension.bias) <= slack
+        is_near_bias = (np.abs(tension - robot.tension.bias) <= slack) & sample.usable
         # Messages with the present value are counted only when the reading changes again. Otherwise
         # a frozen sensor would look like one that never had noise.
         same, changed, now = self._near_bias
@@ -83,17 +83,17 @@ class FrozenSensor(Detector):
         by_length, by_tension = self._unchanged_time
         has_noise = (same + changed >= ENOUGH) & (changed > NOISY * (same + changed))
         time = np.maximum(by_length, by_tension * (~is_near_bias | has_noise))
-        time = time * (robot.used & (tension > slack))
+        time = time * (sample.usable & (tension > slack))
         muscle = int(time.argmax())
         if time[muscle] < FROZEN_TIME or not observation.lengths_known:
             self._stop_observing()
             return None
-        isolated = tuple(sorted((*robot.isolated, muscle)))
+        isolated = tuple(sorted((*mae.isolated, muscle)))
         if self._reduced_mae is None or self._reduced_mae.isolated != isolated:
             self._stop_observing()
             self._reduced_mae = mae.without(isolated)
         theta = self._reduced_mae.estimate(sample.bone_tension, sample.length).theta
-        pull = np.minimum(sample.bone_tension, robot.tension.limit)
+        pull = np.minimum(sample.bone_tension, robot.tension.limit) * sample.usable
         predicted = float(self._reduced_mae.lengths(theta, pull)[muscle])
         self._shortest = min(predicted, self._shortest)
         self._longest = max(predicted, self._longest)

@@ -38,7 +38,6 @@ import numpy as np
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.estimation.finding import Detector, Finding, Observation
-from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import slack_tension
 
@@ -74,16 +73,12 @@ class ModuleFollowing(Detector):
     """Reports a module whose tension does not follow the tension that its command demands."""
 
     def __init__(self, robot: Robot) -> None:
-        self._robot = self._complete_robot = robot
+        self._robot = robot
         self.reset()
-
-    def use(self, mae: Mae) -> None:
-        """Use another network: monitor the muscles that are not isolated in it."""
-        self._robot = self._complete_robot.without(mae.isolated)
 
     def reset(self) -> None:
         """Reset the detector: discard all evidence."""
-        count = self._complete_robot.muscle_count
+        count = self._robot.muscle_count
         self._evidence: Array = np.zeros(count)  # time of evidence [s]
         self._length: Array | None = None  # length in the previous message [m]
         self._difference: Array | None = None  # smoothed difference from the command [N or m]
@@ -108,7 +103,7 @@ class ModuleFollowing(Detector):
         correcting = np.maximum(np.sign(self._difference) * self._speed, 0.0)
         growth = self._growth(observation, np.abs(self._difference), correcting)
         is_full = correcting > FULL_SPEED * self._robot.actuation.speed
-        growth = np.where(is_full | ~self._robot.used, -1.0, np.clip(growth, -1.0, 1.0))
+        growth = np.where(is_full | ~observation.sample.usable, -1.0, np.clip(growth, -1.0, 1.0))
         self._evidence = np.maximum(self._evidence + growth * dt, 0.0)
         if self._evidence.max() < FAULTY:
             return None
@@ -130,7 +125,7 @@ class ModuleFollowing(Detector):
 
     def _reference(self, demand: Array) -> Array:
         """Return the demanded tension T_ref [N], (M,): that of a command, but at most T_max."""
-        return np.minimum(demand, self._complete_robot.tension.max)
+        return np.minimum(demand, self._robot.tension.max)
 
     def _growth(self, observation: Observation, away: Array, correcting: Array) -> Array:
         """Return the growth of the evidence against each module [s/s], (M,).
@@ -143,7 +138,7 @@ class ModuleFollowing(Detector):
             correcting: Speed of each winch in the direction that reduces the difference [m/s].
         """
         assert observation.demand is not None
-        limit, demand = self._complete_robot.tension.limit, self._reference(observation.demand)
+        limit, demand = self._robot.tension.limit, self._reference(observation.demand)
         excess = away - limit * correcting / CORRECTING
         allowed = ALLOWED * limit + ALLOWED_SHARE * demand
         # Slack tendons, which even a slow winch may take up, are left to `slack_tendon.py`.
@@ -176,7 +171,7 @@ class PositionFollowing(ModuleFollowing):
 
     def _growth(self, observation: Observation, away: Array, correcting: Array) -> Array:
         excess = away - LAG * correcting - BEHIND
-        tension, most = observation.sample.motor_tension, self._complete_robot.tension.max
+        tension, most = observation.sample.motor_tension, self._robot.tension.max
         growth: Array = np.where(tension > FULL * most, -1.0, excess / CLEARLY_BEHIND)
         return growth
 

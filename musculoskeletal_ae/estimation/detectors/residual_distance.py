@@ -39,6 +39,7 @@ from musculoskeletal_ae.mae.residuals import AnomalyStatistics, residuals
 from musculoskeletal_ae.report import distinct
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.limits import slack_tension
+from musculoskeletal_ae.signals.muscle_stream import MuscleSample
 
 DISTANCE = 'distance'  # name under which a checkpoint stores the threshold of the distance d
 
@@ -81,7 +82,7 @@ class ResidualDistance(Detector):
             slack: The detector that knows which slack tendons are being wound in; meanwhile,
                 messages are ignored. With None, no message is ignored.
         """
-        self._robot = self._complete_robot = robot
+        self._robot = robot
         self._slack = slack
         self._mae: Mae | None = None
         self._statistics: AnomalyStatistics | None = None
@@ -101,17 +102,12 @@ class ResidualDistance(Detector):
             self._whiten: Array = np.linalg.inv(np.linalg.cholesky(statistics.covariance))
             self._spread = np.sqrt(np.diag(statistics.covariance))
         self._mae, self._statistics, self.threshold = mae, statistics, np.inf
-        self._robot = self._complete_robot.without(mae.isolated)
         if statistics is not None and statistics.calibrated:
             self.threshold = statistics.thresholds.get(self.threshold_name, np.inf)
 
     def reset(self) -> None:
         """Reset the detector: discard the count of messages above the threshold."""
         self._beyond = 0
-
-    def forget_reading(self) -> None:
-        """Forget the last reading, for example when the length offsets change."""
-        self.reading = None
 
     def step(self, observation: Observation) -> Finding | None:
         """Update `reading`; report the suspect after five consecutive messages above the threshold.
@@ -128,7 +124,7 @@ class ResidualDistance(Detector):
             share = centred / self._spread
         square = share * share
         score = square[:muscle_count] + square[muscle_count:]
-        is_slack = self._robot.used & (tension < slack_tension(self._robot.tension.bias))
+        is_slack = sample.usable & (tension < slack_tension(self._robot.tension.bias))
         slack_count = int(np.count_nonzero(is_slack))
         waits = False
         if slack_count:
@@ -147,7 +143,7 @@ class ResidualDistance(Detector):
         # in use.
         is_first = evidence and self._beyond == IN_A_ROW
         if is_first and self.is_calibrated and slack_count != 1:
-            candidates = is_slack if slack_count else self._robot.used
+            candidates = is_slack if slack_count else sample.usable
             suspect, *others = self._suspects(sample.bone_tension, sample.length, candidates)
             if others:
                 names = ' or '.join(self._robot.muscles[muscle] for muscle in others)
@@ -173,15 +169,17 @@ class ResidualDistance(Detector):
         share = (postures - theta) / (self._robot.upper - self._robot.lower)
         return float(np.sqrt(np.square(share).sum(axis=1).min())) / NEAR
 
-    def limit(self, theta: Array, tension: Array) -> float:
+    def limit(self, theta: Array, sample: MuscleSample) -> float:
         """Return the threshold of the statistic in a posture; ∞ if it is not calibrated.
 
         Args:
             theta: Joint angles [rad], (D,).
-            tension: Tensions [N], (M,).
+            sample: The readings.
         """
-        used = self._robot.used
-        highest = float((tension[used] / self._robot.tension.limit[used]).max(initial=0.0))
+        used = sample.usable
+        highest = float(
+            (sample.motor_tension[used] / self._robot.tension.limit[used]).max(initial=0.0)
+        )
         factor = np.clip(max(self.unfamiliarity(theta), highest), 1.0, WIDEST)
         return self.threshold * float(factor)
 
@@ -205,8 +203,7 @@ class ResidualDistance(Detector):
         limit, where = self.threshold, ''
         value = self.statistic(observation, distance)
         if value > limit and not has_slack:
-            theta, tension = observation.estimate.state.theta, observation.sample.motor_tension
-            wider = self.limit(theta, tension)
+            wider = self.limit(observation.estimate.state.theta, observation.sample)
             if wider > limit:
                 limit = wider
                 where = ' (raised for an unfamiliar posture or a tension above tension.limit)'
@@ -231,7 +228,7 @@ class ResidualDistance(Detector):
         assert self._mae is not None
         distance = np.full(len(candidates), np.inf)
         for muscle in np.flatnonzero(candidates).tolist():
-            reduced = self._mae.without((*self._robot.isolated, muscle))
+            reduced = self._mae.without((*self._mae.isolated, muscle))
             assert reduced.anomaly is not None
             state = reduced.estimate(bone_tension, length)
             error = residuals(state, bone_tension, length, reduced.isolated)

@@ -62,7 +62,7 @@ class SlackTendon(Detector):
     """
 
     def __init__(self, robot: Robot) -> None:
-        self._robot = self._complete_robot = robot
+        self._robot = robot
         muscle_count = robot.muscle_count
         self._slack_time: Array = np.zeros(muscle_count)  # time without tension [s]
         #: time without tension and without winding in [s]
@@ -71,11 +71,6 @@ class SlackTendon(Detector):
         self._taut_excess: Array = np.zeros(muscle_count)
         self._wound_length: Array = np.zeros(muscle_count)  # length when last wound in [m]
         self.is_winding_in: Bools = np.zeros(muscle_count, dtype=bool)
-
-    def use(self, mae: Mae) -> None:
-        """Use another network, and monitor the muscles that are not isolated in it."""
-        self._mae = mae
-        self._robot = self._complete_robot.without(mae.isolated)
 
     def reset(self) -> None:
         """Reset the detector: measure anew how long tendons have been slack."""
@@ -94,7 +89,7 @@ class SlackTendon(Detector):
             self.is_winding_in[:] = False
             return None
         bias = self._robot.tension.bias
-        is_slack = (tension < slack_tension(demand)) & (demand >= bias) & self._robot.used
+        is_slack = (tension < slack_tension(demand)) & (demand >= bias) & sample.usable
         if not (np.count_nonzero(is_slack) or np.count_nonzero(self._slack_time)):
             self.is_winding_in[:] = False
             return None
@@ -130,8 +125,9 @@ class SlackTendon(Detector):
             return observation.demand
         bias, theta = self._robot.tension.bias, observation.estimate.state.theta
         is_implausible = share_outside(self._robot, theta).max() > LIMITS.estimate_outside
-        is_slack = observation.sample.motor_tension < slack_tension(bias)
-        if not is_implausible or is_slack[self._robot.used].all():
+        sample = observation.sample
+        is_slack = sample.motor_tension < slack_tension(bias)
+        if not is_implausible or is_slack[sample.usable].all():
             return None
         return np.full(len(is_slack), bias)
 
@@ -156,9 +152,8 @@ class StretchedTendon(SlackTendon):
         self._taut_predictions = dict[int, tuple[MuscleSample, Bools, Prediction]]()
 
     def use(self, mae: Mae) -> None:
-        """Use another network: monitor the muscles that are not isolated in it."""
-        super().use(mae)
-        self._errors = LengthErrors(self._complete_robot, mae)
+        """Use another network to predict lengths."""
+        self._errors = LengthErrors(self._robot, mae)
         self._taut_predictions.clear()
 
     def reset(self) -> None:
@@ -174,7 +169,7 @@ class StretchedTendon(SlackTendon):
 
         The result is None if there is no such muscle.
         """
-        sample, used = observation.sample, self._robot.used
+        sample, used = observation.sample, observation.sample.usable
         lowest = self._slack_tension
         is_slack = (sample.motor_tension < lowest) & used
         self._recent.append(sample)
@@ -196,7 +191,7 @@ class StretchedTendon(SlackTendon):
     @property
     def _slack_tension(self) -> Array:
         """Tension below which each tendon is regarded as slack [N], (M,): SLACK_SHARE · T_bias."""
-        return slack_tension(self._complete_robot.tension.bias)
+        return slack_tension(self._robot.tension.bias)
 
     def _is_stretched(self, sample: MuscleSample, is_slack: Bools, start: Array) -> Bools:
         """Return which slack tendons are so short that a healthy tendon would have tension, (M,).
@@ -207,7 +202,7 @@ class StretchedTendon(SlackTendon):
             start: Initial values of the joint angles, which are fitted to the lengths of the
                 muscles with tension [rad], (D,).
         """
-        used = self._robot.used & ~is_slack
+        used = sample.usable & ~is_slack
         tension = np.where(is_slack, self._slack_tension, sample.bone_tension)
         now = self._errors.predict(sample.length, tension, sample.tension_spread, used, start)
         is_stretched = np.zeros(len(is_slack), dtype=bool)

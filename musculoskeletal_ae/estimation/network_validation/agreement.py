@@ -20,12 +20,12 @@ computes. The names in capitals are constants of this file.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from collections.abc import Iterable
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Ints
+from musculoskeletal_ae.estimation.network_validation.comparison import Comparison
 from musculoskeletal_ae.estimation.network_validation.posture_check import PostureCheck
 from musculoskeletal_ae.estimation.network_validation.recent_messages import LEAST, RecentMessages
 from musculoskeletal_ae.mae.mae import Mae
@@ -59,29 +59,8 @@ SHAPE_MOVED = 0.3
 #: the same limit as SHAPE_MOVED, but while an initial network is in use
 SHAPE_MOVED_INITIAL = 0.42
 
-BY_SENSORS = 'joint sensors'  # text for users if joint sensors are the reference
-BY_NETWORK = 'the network in use'  # text for users if the network in use is the reference
-
-
-class Agreement(NamedTuple):
-    """How much one quantity of a candidate network differs from its reference."""
-
-    name: str  # name of the quantity for users, such as 'θ'
-    owners: tuple[str, ...]  # joint or muscle of each error
-    #: error of each joint [rad or m] or muscle [m], or the relative error of all lengths
-    error: Array
-    limit: Array  # largest permitted value of each error
-    source: str  # what the candidate is compared with: BY_SENSORS or BY_NETWORK
-
-    def faults(self) -> Iterator[str]:
-        """Yield a text for users on the error that exceeds its limit most; nothing if none does."""
-        excess = self.error / self.limit
-        if not excess.max() <= 1.0:
-            worst = int(excess.argmax())
-            yield (
-                f'{self.name}, {self.owners[worst]}: differs by {self.error[worst]:.2g} from '
-                f'{self.source}, limit {self.limit[worst]:.3g}'
-            )
+BY_SENSORS = 'from joint sensors'  # text for users if joint sensors are the reference
+BY_NETWORK = 'from the network in use'  # text for users if the network in use is the reference
 
 
 class AgreementCheck:
@@ -107,7 +86,7 @@ class AgreementCheck:
         self._in_use, self._isolated = in_use, tuple(isolated)
         self._has_learned = in_use.covariance is not None
 
-    def comparisons(self, mae: Mae) -> list[Agreement]:
+    def comparisons(self, mae: Mae) -> list[Comparison]:
         """Return comparisons of a candidate with joint sensors, or else with the network in use.
 
         There is one for each quantity: angles, lengths and, if needed, the change of lengths.
@@ -134,8 +113,9 @@ class AgreementCheck:
             return None
         measured = self._messages.theta[rows]
         error, in_use = (_median(theta[rows] - measured) for theta in (new, old))
-        worst = int((error / np.fmax(ANGLE_CLEAR, ANGLE_WORSE * in_use)).argmax())
-        if not error[worst] > max(ANGLE_CLEAR, ANGLE_WORSE * in_use[worst]):
+        limit = np.fmax(ANGLE_CLEAR, ANGLE_WORSE * in_use)
+        worst = self._angles(error, limit, BY_SENSORS).worst
+        if worst is None:
             return ''
         unit = self._robot.units[worst]
         return (
@@ -153,7 +133,7 @@ class AgreementCheck:
         old = self._in_use.estimate(*self._messages.readings(self._in_use)).theta
         return new, old, np.flatnonzero(np.isfinite(self._messages.theta).all(axis=1))
 
-    def _with_network(self, mae: Mae, new: Array, old: Array, tension: Array) -> list[Agreement]:
+    def _with_network(self, mae: Mae, new: Array, old: Array, tension: Array) -> list[Comparison]:
         """Compare a candidate with the network in use.
 
         Args:
@@ -172,7 +152,7 @@ class AgreementCheck:
             self._shape(mae),
         ]
 
-    def _with_sensors(self, mae: Mae, new: Array, old: Array, rows: Ints) -> list[Agreement]:
+    def _with_sensors(self, mae: Mae, new: Array, old: Array, rows: Ints) -> list[Comparison]:
         """Compare a candidate and the network in use with joint sensors.
 
         Args:
@@ -199,14 +179,14 @@ class AgreementCheck:
             comparisons.append(self._shape(mae))
         return comparisons
 
-    def _angles(self, error: Array, limit: Array, source: str) -> Agreement:
+    def _angles(self, error: Array, limit: Array, source: str) -> Comparison:
         outside = self._robot.units.to_position
-        return Agreement('θ', self._robot.joints, outside(error), outside(limit), source)
+        return Comparison('θ', self._robot.joints, outside(error), outside(limit), source)
 
-    def _lengths(self, error: Array, limit: Array, source: str) -> Agreement:
-        return Agreement('l by ① at θ', self._robot.muscles, error, limit, source)
+    def _lengths(self, error: Array, limit: Array, source: str) -> Comparison:
+        return Comparison('l by ① at θ', self._robot.muscles, error, limit, source)
 
-    def _shape(self, mae: Mae) -> Agreement:
+    def _shape(self, mae: Mae) -> Comparison:
         """Compare the network `mae` with the network in use by how lengths change with posture.
 
         Both networks compute the muscle lengths at the same fixed states.
@@ -217,7 +197,9 @@ class AgreementCheck:
         difference = np.linalg.norm((new - old).std(axis=0)) / np.linalg.norm(old.std(axis=0))
         limit = SHAPE_MOVED if self._has_learned else SHAPE_MOVED_INITIAL
         error = np.array([difference])
-        return Agreement('change of l by ①', ('all muscles',), error, np.array([limit]), BY_NETWORK)
+        return Comparison(
+            'change of l by ①', ('all muscles',), error, np.array([limit]), BY_NETWORK
+        )
 
     def _length_error(self, mae: Mae, theta: Array, tension: Array, length: Array) -> Array:
         """Return the median error of the lengths that a network computes at known postures.

@@ -7,11 +7,12 @@ computes the lengths at these joint angles (third error). The median error of ea
 messages must be below WORSE times that of the network in use, or below FLOOR.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.estimation.network_validation.comparison import Comparison
 from musculoskeletal_ae.estimation.network_validation.recent_messages import RecentMessages
 from musculoskeletal_ae.mae.mae import Mae
 
@@ -49,15 +50,27 @@ def message_errors(mae: Mae, messages: RecentMessages, isolated: Iterable[int]) 
     return errors
 
 
+def comparisons(
+    errors: dict[str, Array], in_use: dict[str, Array], muscles: tuple[str, ...]
+) -> list[Comparison]:
+    """Return comparisons of the errors of a candidate with those of the network in use.
+
+    Args:
+        errors: Errors of the candidate.
+        in_use: Errors of the network in use.
+        muscles: Names of the muscles.
+    """
+    return [
+        _compared(name, muscles, error, FLOOR[name], in_use[name]) for name, error in errors.items()
+    ]
+
+
 def worse_length(
     errors: dict[str, Array], in_use: dict[str, Array], muscles: tuple[str, ...]
 ) -> str:
     """Return a text on the muscle whose length a network explains clearly worse than another.
 
-    Args:
-        errors: Errors of the network.
-        in_use: Errors of the network in use.
-        muscles: Names of the muscles.
+    The arguments are those of `comparisons`.
 
     Returns:
         The muscle with both errors; '' if no error is above CLEAR and WORSE times that of the
@@ -65,8 +78,8 @@ def worse_length(
     """
     name = 'l by ① at θ of ②'
     error, before = errors[name], in_use[name]
-    worst = int((error / np.fmax(CLEAR, WORSE * before)).argmax())
-    if not error[worst] > max(CLEAR, WORSE * before[worst]):
+    worst = _compared(name, muscles, error, CLEAR, before).worst
+    if worst is None:
         return ''
     return (
         f'its error of the length of {muscles[worst]} is {1e3 * error[worst]:.0f} mm, that of the '
@@ -74,22 +87,9 @@ def worse_length(
     )
 
 
-def faults(
-    errors: dict[str, Array], in_use: dict[str, Array], muscles: tuple[str, ...]
-) -> Iterator[str]:
-    """Yield a text for each kind of error that exceeds its limit, on the worst muscle.
-
-    Args:
-        errors: Errors of the candidate.
-        in_use: Errors of the network in use.
-        muscles: Names of the muscles.
-    """
-    for name, error in errors.items():
-        limit = np.fmax(FLOOR[name], WORSE * in_use[name])
-        excess = error / limit
-        if not excess.max() <= 1.0:
-            worst = int(excess.argmax())
-            yield (
-                f'{name}, {muscles[worst]}: error {error[worst]:.3g} on recent messages, '
-                f'limit {limit[worst]:.3g}'
-            )
+def _compared(
+    name: str, muscles: tuple[str, ...], error: Array, least: float, before: Array
+) -> Comparison:
+    """Compare errors with `least` and with WORSE times the errors before, whichever is larger."""
+    limit = np.fmax(least, WORSE * before)
+    return Comparison(name, muscles, error, limit, 'on recent messages')

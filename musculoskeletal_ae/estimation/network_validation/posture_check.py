@@ -35,6 +35,7 @@ from functools import cached_property
 import numpy as np
 
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.estimation.network_validation.comparison import Comparison
 from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.mae.units import Mask
 from musculoskeletal_ae.robot.equilibrium_states import equilibrium_states, has_followers
@@ -105,17 +106,11 @@ class PostureCheck:
             limit = np.full(len(error), LIMITS[name])
             if name.startswith('θ') and not error.max() <= LIMITS[name]:
                 limit = np.maximum(limit, self._undetermined)
-            excess = error / limit
-            if not excess.max() <= 1.0:
-                worst = int(excess.argmax())
-                owner = 'all muscles'
-                if name != SCALE:
-                    owner = (self._robot.joints if 'θ' in name else self._robot.muscles)[worst]
-                source = 'the geometric model' if name.endswith('①') else 'the lengths of ①'
-                yield (
-                    f'{name}, {owner}: relative error {error[worst]:.2g} from {source}, '
-                    f'limit {limit[worst]:.3g}'
-                )
+            owners = self._robot.joints if 'θ' in name else self._robot.muscles
+            owners = ('all muscles',) if name == SCALE else owners
+            source = 'the geometric model' if name.endswith('①') else 'the lengths of ①'
+            reference = f'relative to the spread, from {source}'
+            yield from Comparison(name, owners, error, limit, reference).faults()
 
     def errors(self, mae: Mae) -> Iterator[tuple[str, Array] | None]:
         """Yield the name of each error in LIMITS with its values, one for each joint or muscle.

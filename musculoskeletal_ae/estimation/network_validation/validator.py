@@ -41,7 +41,8 @@ from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.design.route_jumps import jump_warning
 from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.estimation.network_validation import detector_check, message_errors
-from musculoskeletal_ae.estimation.network_validation.agreement import Agreement, AgreementCheck
+from musculoskeletal_ae.estimation.network_validation.agreement import AgreementCheck
+from musculoskeletal_ae.estimation.network_validation.comparison import Comparison
 from musculoskeletal_ae.estimation.network_validation.posture_check import PostureCheck
 from musculoskeletal_ae.estimation.network_validation.recent_messages import RecentMessages
 from musculoskeletal_ae.exceptions import CheckpointError, GateError
@@ -52,7 +53,6 @@ from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
 #: after an anomaly, return to a network that had been in use for at least this long without an
 #: anomaly [s]
 PROOF = 10.0
-MOST_USED = 20  # keep at most this many networks to which the estimator can return
 RELEARNING_TIME = 600.0  # expect that a muscle may be relearned for this long after its repair [s]
 
 
@@ -268,14 +268,12 @@ class CheckpointValidator:
         self._used.append((now, mae))
         while len(self._used) > 1 and now - self._used[1][0] >= PROOF:
             del self._used[0]
-        if len(self._used) > MOST_USED:
-            del self._used[1]  # the oldest network has proven itself longest, so it stays
 
     def message_errors(self, mae: Mae) -> dict[str, Array]:
         """Return the errors of a network on the recent messages; {} if these are too few."""
         return message_errors.message_errors(mae, self.messages, self.body.isolated)
 
-    def agreement(self, mae: Mae) -> list[Agreement]:
+    def agreement(self, mae: Mae) -> list[Comparison]:
         """Compare a network with joint sensors or, without them, with the network in use.
 
         Return [] if no network is in use.
@@ -311,10 +309,11 @@ class CheckpointValidator:
             errors = self.message_errors(mae)
             in_use = self.message_errors(self.mae.without(self.body.isolated))
             yield None
-            yield from message_errors.faults(errors, in_use, self._robot.muscles)
+            compared = message_errors.comparisons(errors, in_use, self._robot.muscles)
             if not is_chosen:
-                for comparison in self.agreement(mae):
-                    yield from comparison.faults()
+                compared += self.agreement(mae)
+            for comparison in compared:
+                yield from comparison.faults()
             yield None
         yield from detector_check.faults(mae, self.messages, self.body.isolated)
 
