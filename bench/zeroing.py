@@ -69,6 +69,7 @@ class Loop:
         now, read, estimator, control = self.time, self.arm.sense(), self.estimator, self.controller
         if joints:
             estimator.joints(read.theta, now)
+        had_anomaly = estimator.body.has_anomaly
         estimate = estimator.take(read.muscles, now, now)
         zeros = estimator.body.offsets
         if zeros != self._zeros:
@@ -77,7 +78,7 @@ class Loop:
         if estimate is not None:
             control.take(read.muscles, now)
             control.estimated(estimate.state.theta, now)
-            if estimate.detected:
+            if estimator.body.has_anomaly and not had_anomaly:
                 self.alarms += 1
                 with suppress(MusculoskeletalError):  # refused while the suspect is implausible
                     estimator.reset()

@@ -19,7 +19,6 @@ verification has ended the anomaly, unless another stop cause needs a reset.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -67,9 +66,6 @@ RESTORE = 'call estimator/restore to use isolated muscles again'
 GUIDED = (
     'with method `float`, the arm is guided by hand; set the parameter `method` to another method'
 )
-#: stop the arm if the lengths have jumped and the estimator has not revoked the length offsets
-#: within this time [s]
-REACTION_TIME = 1.0
 #: after a length calibration has begun, wait this long for its first estimate before the estimate
 #: counts as stale [s]; if messages arrive at 10 Hz, a calibration needs 3.5 s
 FIRST_ESTIMATE = 5.0
@@ -182,7 +178,6 @@ class Controller:
         self.resting_load = RestingLoad(robot)
         self.sent_at = 0.0  # time of the last publication [s]; set by the caller
         self._estimate_problem = Persistence()
-        self._jumped_at = math.inf  # time of the last jump of lengths [s]; ∞ before the first one
         #: number of messages after which the filtered muscle states are newer than the last pause
         self._awaited_samples = 0
         if self.settings.control_method.is_guided:
@@ -258,8 +253,6 @@ class Controller:
 
     def _use_sample(self, sample: MuscleSample, now: float) -> None:
         self.sample, self.rejected = sample, None
-        if sample.jumped:
-            self._jumped_at = now
         self.watchdog.take_sample(sample, now)
         # Messages that had waited during a pause show how the arm was before it.
         if self._awaited_samples and sample.delay <= PAUSE:
@@ -491,30 +484,20 @@ class Controller:
             present.append(ConditionKind.ANOMALY.condition())
         if detail := self.stream.implausible(now):
             present.append(ConditionKind.IMPLAUSIBLE_MUSCLE_STATES.condition(detail))
-        if detail := self._revoked_lengths(now):
+        if detail := self._revoked_lengths():
             present.append(ConditionKind.LENGTH_OFFSETS_REVOKED.condition(detail))
         if detail := self._estimate_problem.lasting(now):
             present.append(ConditionKind.IMPLAUSIBLE_ESTIMATE.condition(detail))
         return sorted(present, key=lambda condition: ORDER[condition.identifier])
 
-    def _revoked_lengths(self, now: float) -> str:
-        """Return why the lengths are unreliable, or ''.
-
-        Normally the estimator revokes the offsets. The controller does so only if the estimator
-        does not react to a jump, for example because the estimator was just restarting. During an
-        anomaly, the arm is stopped, and the estimator decides whether a jump is due to a repair.
-        """
-        stream = self.stream
-        if muscles := stream.body.offsets.revoked:
-            names = '' if len(muscles) == self.robot.muscle_count else self.robot.names(muscles)
-            of_muscles = f' of {names}' if names else ''
-            return f'the estimator has revoked the length offsets{of_muscles}'
-        if stream.body.has_anomaly:
+    def _revoked_lengths(self) -> str:
+        """Return which length offsets the estimator has revoked, or ''."""
+        muscles = self.stream.body.offsets.revoked
+        if not muscles:
             return ''
-        is_ignored = stream.has_jumped and now - self._jumped_at > REACTION_TIME
-        if is_ignored and stream.body.offsets.known:
-            return f'the lengths of {self.robot.names(sorted(stream.jumps.displaced))} have jumped'
-        return ''
+        names = '' if len(muscles) == self.robot.muscle_count else self.robot.names(muscles)
+        of_muscles = f' of {names}' if names else ''
+        return f'the estimator has revoked the length offsets{of_muscles}'
 
     def step(self, now: float, time: float | None = None) -> Command | None:
         """Advance all parts to `now`, and return the command to publish; None to publish nothing.

@@ -49,7 +49,7 @@ from musculoskeletal_ae.remedy_steps import Step, sentence
 from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.inverse_kinematics import posture_of_marker
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import BodyState, LengthOffsets
+from musculoskeletal_ae.signals.body_state import Anomaly, BodyState, LengthOffsets
 from musculoskeletal_ae.signals.joint_stream import JointStream
 from musculoskeletal_ae.signals.joint_trust_message import JointTrust
 from musculoskeletal_ae.signals.limits import Persistence
@@ -67,7 +67,6 @@ class Output(NamedTuple):
         sample: The checked readings of the message.
         state: Joint angles, tensions and lengths that the network estimates from the readings.
         anomaly: Anomaly score A: the size of the network's residual, in scaled units.
-        detected: Whether this message made a detector report a fault, which was then latched.
         contact: External load; None while the length offsets are unknown, on a robot whose tensions
             are unknown, and for a message that follows the last checked one within 6 ms (SPACING).
     """
@@ -75,7 +74,6 @@ class Output(NamedTuple):
     sample: MuscleSample
     state: State
     anomaly: float
-    detected: bool
     contact: Contact | None = None
 
 
@@ -260,7 +258,6 @@ class Estimator:
         self.calibration = calibration
         unknown = LengthOffsets.unknown(self.robot.muscle_count)
         self._note(Evidence.CALIBRATING, self.calibration.muscles, unknown)
-        self.health.residual.forget_reading()
         self.output = self.load = None
         self.contact.reset()
 
@@ -279,11 +276,9 @@ class Estimator:
                 length of the suspect muscle show that it is not repaired. Nothing changes then.
         """
         calibration = self._new_calibration(posture)
-        self._check_suspect(checks_lengths=False)
+        self._refuse_unrepaired(self._suspected(), 'zero')
         self._begin(calibration)
         self._accept_body()
-        self.health.joints.forget()
-        self.joint_check.forget()
 
     def commanded(
         self, now: float, length: Array | None = None, tension: Array | None = None
@@ -327,17 +322,14 @@ class Estimator:
                 still contradict the rest of the arm (`repair_check`). No muscle is restored then.
         """
         restored = [muscle for muscle in self.body.isolated if muscle in set(muscles)]
-        verification = self.suspects.verification
-        if verification is not None and verification.muscle in restored:
+        verified = self.body.verified
+        if verified is not None and verified in restored:
             raise MusculoskeletalError(
-                f'{self.robot.muscles[verification.muscle]} is being verified; this ends by itself '
+                f'{self.robot.muscles[verified]} is being verified; this ends by itself '
                 f'within {LONGEST:g} s; wait until then, and call estimator/restore again if the '
                 'muscle is still isolated'
             )
-        if problems := list(filter(None, map(self._repair_problem, restored))):
-            again = 'then call estimator/restore again'
-            raise MusculoskeletalError(f'{"; ".join(problems)}; {again}')
-        self._confirm(restored)
+        self._refuse_unrepaired(restored, 'restore')
         if self.calibration is not None:  # the lengths of these muscles were not checked meanwhile
             self._note(Evidence.CALIBRATING, restored)
         self.isolate(muscle for muscle in self.body.isolated if muscle not in restored)
@@ -346,23 +338,24 @@ class Estimator:
         """Reset the anomaly, and consider the body healthy in its present state.
 
         Args:
-            isolating: Muscles (indices) that the caller isolates next; they need not be healthy.
+            isolating: Muscles (indices) that are isolated in addition; they need not be healthy.
 
         Raises:
             MusculoskeletalError: If the readings of the suspect muscle still contradict the rest of
                 the arm (`repair_check`), or if length offsets were revoked, which only a length
                 calibration ends. The anomaly then stays.
         """
-        self._check_suspect(tuple(isolating))
+        isolating = tuple(isolating)
+        self._refuse_unrepaired(self._suspected(isolating), 'reset')
         if self.body.offsets.revoked:
             raise MusculoskeletalError(f'{self.cause}; {self.advice}')
-        self._accept_body()
+        self._accept_body(isolating)
 
-    def _accept_body(self) -> None:
+    def _accept_body(self, isolating: tuple[int, ...] = ()) -> None:
         """Consider the body healthy in its present state, and clear a finding."""
         self.health.heat.accept(*range(self.robot.muscle_count))
         self.mounting.reset()
-        self._clear(self.suspects.clear(self.body.isolated))
+        self.isolate([*self.suspects.clear(self.body.isolated), *isolating])
 
     def clock_jumped_back(self) -> None:
         """Discard earlier messages after the clock jumped back; a latched finding stays."""
@@ -485,19 +478,20 @@ class Estimator:
         self.measured = self._measured_theta(readings)
         self._unchecked += dt
         self._unchecked_sent += sent_apart
-        detected, contact = False, None
+        contact = None
         if sample.jumped or not 0.0 < self._unchecked_sent < SPACING:
-            detected, contact = self._check(sample, estimated, readings, now), self.load
+            self._check(sample, estimated, readings, now)
+            contact = self.load
         if self.body.offsets.known:
             self.networks.message(
                 sample.tension_read, sample.length, sample.sliding, now, self.measured
             )
-        self.output = Output(sample, estimated.state, estimated.anomaly, detected, contact)
+        self.output = Output(sample, estimated.state, estimated.anomaly, contact)
         return self.output
 
     def _check(
         self, sample: MuscleSample, estimated: Estimate, readings: Array, now: float
-    ) -> bool:
+    ) -> None:
         """Check the health of the body, and estimate its external load (`load`).
 
         Args:
@@ -505,9 +499,6 @@ class Estimator:
             estimated: The network's estimate.
             readings: Fresh readings of the joint sensors [rad], (D,); NaN where there are none.
             now: Time on the steady clock [s].
-
-        Returns:
-            Whether a detector has found a fault, and the anomaly has been latched.
         """
         dt, sent_apart = min(self._unchecked, LONGEST_STEP), self._unchecked_sent
         self._unchecked = self._unchecked_sent = 0.0
@@ -515,7 +506,7 @@ class Estimator:
         demand = self._commands.demand(self.robot, sample, now)
         command = self._commands.length(sample, now)
         observation = Observation(sample, estimated, demand, dt, known, self.measured, command)
-        detected = self._handle(self.health.step(observation), now)
+        self._handle(self.health.step(observation), now)
         self.load = None
         if known and self.robot.tension_source.is_known:
             pull = sample.bone_tension * self.body.used
@@ -524,14 +515,11 @@ class Estimator:
                 torque = self.load.torque
                 self.healthy_torque.step(torque, self.contact.velocity, sent_apart)
                 self.mounting.step(estimated.state.theta, pull, torque, dt)
-        if detected:
-            self.joint_check.drop_newest()
-        elif known and self.suspects.finding is None:
+        if known and self.suspects.finding is None:
             load, trust = 0.0 if self.load is None else self.load.distance, self.joint_trust
             self.joint_check.step(observation, readings, now, load)
             if self.joint_trust is not trust:
                 self.networks.messages.clear()  # the readings so far may be wrong
-        return detected
 
     # -- findings, verification and calibration -------------------------------------------------
 
@@ -549,16 +537,29 @@ class Estimator:
             self._update_body(offsets=self.trust.offsets)
 
     def _update_body(self, **changes: Any) -> None:
-        """Change attributes of the body state, and take its anomaly from `suspects`.
+        """Change attributes of the body state, and follow the finding of `suspects`.
 
-        If the body state then differs from the previous one, its generation increases by one.
+        If the body state then differs from the previous one, its generation increases by one, and
+        all parts follow it.
         """
-        suspects, before = self.suspects, self.body
-        body = replace(before, anomaly=suspects.anomaly, suspect=suspects.suspect, **changes)
-        if body != before:
-            self.body = replace(body, generation=before.generation + 1)
-            self.stream.use_body(self.body)
-            self.networks.follow(self.body, self.received_at)
+        finding, before = self.suspects.finding, self.body
+        if finding is not None:
+            is_verified = self.suspects.verification is not None
+            changes['anomaly'] = Anomaly.VERIFYING if is_verified else Anomaly.FOUND
+            changes['suspect'] = finding.muscle
+        elif before.has_anomaly:
+            changes['anomaly'] = Anomaly.ENDED
+        body = replace(before, **changes)
+        if body == before:
+            return
+        self.body = replace(body, generation=before.generation + 1)
+        self.stream.use_body(self.body)
+        self.networks.follow(self.body, self.received_at)
+        if body.has_anomaly and not before.has_anomaly:
+            self.joint_check.drop_newest()
+        if (body.offsets.offset != before.offsets.offset).any():
+            self.health.forget()
+            self.joint_check.forget()
 
     def _measured_theta(self, readings: Array) -> Array | None:
         """Return the readings [rad], (D,), if they show the posture of all joints, else None.
@@ -592,40 +593,31 @@ class Estimator:
         elif not self.body.offsets.known:
             self._note(jump_finding(jumped).kind, jumped)
 
-    def _check_suspect(self, isolating: Iterable[int] = (), checks_lengths: bool = True) -> None:
-        """Check that suspect muscles are repaired, unless they are among the muscles `isolating`.
+    def _suspected(self, isolating: tuple[int, ...] = ()) -> list[int]:
+        """Return the muscles (indices) that must be repaired before the anomaly may end.
 
-        Then confirm the length offset of each suspect whose length has jumped since the finding.
+        There are none if the suspect muscle is among the muscles `isolating`.
+        """
+        finding = self.suspects.finding
+        if finding is None or not finding.kind.is_damage or finding.muscle in isolating:
+            return []
+        return [muscle for muscle in finding.muscles if muscle not in isolating]
 
-        Args:
-            isolating: Muscles (indices) that the caller isolates next; they need not be repaired.
-            checks_lengths: Whether the lengths must fit the posture.
+    def _refuse_unrepaired(self, muscles: Iterable[int], service: str) -> None:
+        """Refuse a service if the readings of these muscles contradict the rest of the arm.
+
+        A length calibration (service `zero`) does not require that the lengths fit.
 
         Raises:
-            MusculoskeletalError: If the readings of a suspect still contradict the rest of the arm;
-                the text says what to repair.
+            MusculoskeletalError: The text says what to repair.
         """
-        suspected = self.suspects.finding
-        if suspected is None or not suspected.kind.is_damage or suspected.muscle in isolating:
+        if (check := self._repair_check) is None:
             return
-        used = [muscle for muscle in suspected.muscles if muscle not in isolating]
-        problems = [self._repair_problem(muscle, checks_lengths) for muscle in used]
-        if problems := list(filter(None, problems)):
-            again = f'call estimator/{"reset" if checks_lengths else "zero"} again'
-            raise MusculoskeletalError(f'{"; ".join(problems)}; then {again}')
-        self._confirm(used)
-
-    def _confirm(self, muscles: Iterable[int]) -> None:
-        """Confirm the length offsets of repaired muscles whose lengths changed in the repair."""
-        moved = [muscle for muscle in muscles if self.trust.evidence[muscle] is Evidence.MOVED]
-        self._note(Evidence.CONFIRMED, moved)
-
-    def _repair_problem(self, muscle: int, checks_lengths: bool = True) -> str:
-        """Return why a muscle must not be used yet, or '' if it may be used."""
-        check = self._repair_check
-        if check is None:
-            return ''
-        return (check if checks_lengths else check._replace(limit=math.inf)).problem(muscle)
+        problem = check.defect if service == 'zero' else check.problem
+        if problems := list(filter(None, map(problem, muscles))):
+            raise MusculoskeletalError(
+                f'{"; ".join(problems)}; then call estimator/{service} again'
+            )
 
     @property
     def _repair_check(self) -> RepairCheck | None:
@@ -640,37 +632,32 @@ class Estimator:
         jumping, theta = self.stream.jumping, self.measured
         return RepairCheck(self.robot, mae, sample, body.isolated, theta, demand, jumping, limit)
 
-    def _handle(self, finding: Finding | None, now: float) -> bool:
+    def _handle(self, finding: Finding | None, now: float) -> None:
         """Latch a finding and isolate its muscle, as its kind and the settings require.
 
         A finding that makes a single length unreliable also revokes the offset of this length. A
-        finding that makes several lengths unreliable revokes all offsets.
-
-        Returns:
-            Whether this finding has just been latched; False if `finding` is None, or if an earlier
-            finding is latched already.
+        finding that makes several lengths unreliable revokes all offsets. A wrong length that the
+        repair of a suspect explains is only noted.
         """
         if finding is None:
-            return False
-        before = self.suspects.finding
-        is_repair = self.suspects.explains(finding)
+            return
+        if self.suspects.explains(finding):
+            self._note(Evidence.MOVED, [finding.muscle])
+            self.health.reset()  # evidence from before the repair is no longer valid
+            return
         isolated = self.suspects.take(finding, self.body.isolated, now)
         if set(isolated) != set(self.body.isolated):
             self.isolate(isolated)
         self._update_body()
-        if is_repair:
-            self._note(Evidence.MOVED, [finding.muscle])
-            self.health.reset()  # evidence from before the repair is no longer valid
-            return False
         if finding.kind.revokes is not None and finding.muscle not in self.body.isolated:
             self._note(finding.kind, [finding.muscle] if finding.is_of_one_length else None)
-        return before is None and self.suspects.finding is not None
 
     def _verify(self, sample: MuscleSample, estimate: Estimate, dt: float, now: float) -> None:
-        verification, mae = self.suspects.verification, self.mae
+        verification, muscle, mae = self.suspects.verification, self.suspects.verified, self.mae
         assert verification is not None
+        assert muscle is not None
         assert mae is not None
-        muscle, command = verification.muscle, self._commands.newest_length(now)
+        command = self._commands.newest_length(now)
         pull = np.clip(sample.bone_tension, 0.0, self.robot.tension.limit)
         tension = self.robot.tension_source.known(sample.motor_tension)
         verdict = verification.step(
@@ -682,13 +669,7 @@ class Estimator:
         )
         if verdict is not None:
             self.health.heat.accept(muscle)
-            self._clear(self.suspects.conclude(verdict, self.body.isolated, now))
-
-    def _clear(self, isolated: tuple[int, ...]) -> None:
-        if isolated != self.body.isolated:
-            self.isolate(isolated)
-        self._update_body()
-        self.health.reset()
+            self.isolate(self.suspects.conclude(verdict, self.body.isolated, now))
 
     def _calibrate(
         self, calibration: LengthCalibration, sample: MuscleSample, dt: float, now: float

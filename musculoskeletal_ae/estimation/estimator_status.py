@@ -86,9 +86,7 @@ def _isolated(core: Estimator) -> Iterator[Condition]:
 
     A further condition names the remaining muscles that the estimate needs.
     """
-    verification = core.suspects.verification
-    verified = None if verification is None else verification.muscle
-    isolated = [muscle for muscle in core.body.isolated if muscle != verified]
+    isolated = [muscle for muscle in core.body.isolated if muscle != core.body.verified]
     for muscle in isolated:
         name, fault = core.robot.muscles[muscle], core.suspects.faults.get(muscle)
         detail = name if fault is None else f'{name} ({fault})'
@@ -191,7 +189,7 @@ def _residuals(core: Estimator) -> dict[str, str]:
         'suspect muscle': core.robot.muscles[suspect],
     }
     if residual.is_calibrated:
-        limit = residual.limit(output.state.theta, output.sample.motor_tension)
+        limit = residual.limit(output.state.theta, output.sample)
         values[f'{residual.symbol} limit'] = f'{limit:.3g}'
     return values
 

@@ -63,6 +63,11 @@ class HealthMonitor:
         for detector in self._detectors:
             detector.reset()
 
+    def forget(self) -> None:
+        """Forget what was observed with other length offsets."""
+        self.joints.forget()
+        self._exchange.forget()
+
     def read(self, readings: MuscleReadings, usable: Bools, now: float) -> Finding | None:
         """Check the readings of a message, even of a rejected one; return a finding or None.
 

@@ -47,7 +47,6 @@ from musculoskeletal_ae.estimation.suspect_verification import (
     VerificationVerdict,
 )
 from musculoskeletal_ae.robot.robot import Robot
-from musculoskeletal_ae.signals.body_state import Anomaly
 
 #: verify no further suspect, and wait for a user, if this many suspects were verified as healthy
 #: within WITHIN: there must be a fault that a verification does not reveal
@@ -66,9 +65,7 @@ class SuspectHandling:
     Attributes:
         isolates: Whether suspects are isolated and verified, as with `on_anomaly: isolate`.
         finding: The latched finding, or None.
-        suspect: Index of the muscle that the newest latched finding names, also after its end; None
-            before the first.
-        verification: The running verification of the suspect, or None.
+        verification: The running verification of the muscle that the finding names, or None.
         last_verdict: Index of the last verified suspect, or of a muscle isolated without a
             verification, and its verdict; None before the first.
         faults: Verdicts on the isolated muscles that turned out to be faulty, by index.
@@ -78,20 +75,17 @@ class SuspectHandling:
         self._robot = robot
         self.isolates = False
         self.finding: Finding | None = None
-        self.suspect: int | None = None
         self.verification: Verification | None = None
         self.last_verdict: tuple[int, VerificationVerdict] | None = None
         self.faults: dict[int, VerificationVerdict] = {}
         self._acquitted: list[float] = []  # times at which suspects were verified as healthy [s]
 
     @property
-    def anomaly(self) -> Anomaly:
-        """State of the newest finding: none, found, being verified, or ended."""
-        if self.suspect is None:
-            return Anomaly.NONE
-        if self.finding is None:
-            return Anomaly.ENDED
-        return Anomaly.FOUND if self.verification is None else Anomaly.VERIFYING
+    def verified(self) -> int | None:
+        """Index of the muscle that is being verified; None if there is none."""
+        if self.finding is None or self.verification is None:
+            return None
+        return self.finding.muscle
 
     @property
     def cause(self) -> str:
@@ -126,14 +120,12 @@ class SuspectHandling:
             return (*isolated, muscle)
         if finding.kind.reaction is FindingReaction.ISOLATE_ONLY:
             return isolated
-        if self.explains(finding):
-            return isolated
         if self.finding is not None:
             if finding.kind.revokes is not None and self.finding.kind.revokes is None:
                 isolated = self.clear(isolated)  # the earlier finding is based on wrong lengths
-                self.finding, self.suspect = finding, muscle
+                self.finding = finding
             return isolated
-        self.finding, self.suspect = finding, muscle
+        self.finding = finding
         recent = [time for time in self._acquitted if now - time < WITHIN]
         may_isolate = self.isolates and finding.kind.reaction is FindingReaction.ISOLATE
         if not may_isolate or len(recent) >= ACQUITTALS:
@@ -157,9 +149,9 @@ class SuspectHandling:
         elastic = robot.series_elastic.of(muscle)
         at_zero = robot.routes.length_at_zero[muscle]
         return robot.actuation.choose(
-            Verification(muscle, bias, stiffness=float(robot.stiffness[muscle])),
+            Verification(bias, stiffness=float(robot.stiffness[muscle])),
             Verification(
-                muscle, bias, elongation=lambda tension: float(elastic.elongation(at_zero, tension))
+                bias, elongation=lambda tension: float(elastic.elongation(at_zero, tension))
             ),
         )
 
@@ -170,12 +162,13 @@ class SuspectHandling:
 
         A healthy suspect is restored, a faulty one stays isolated.
         """
-        assert self.verification is not None
-        self.last_verdict = self.verification.muscle, verdict
+        assert self.finding is not None
+        muscle = self.finding.muscle
+        self.last_verdict = muscle, verdict
         if verdict.outcome is Outcome.HEALTHY:
             self._acquitted.append(now)
         else:
-            self.faults[self.verification.muscle] = verdict
+            self.faults[muscle] = verdict
             self.verification = None  # so that `clear` leaves the suspect isolated
         return self.clear(isolated)
 
@@ -184,9 +177,9 @@ class SuspectHandling:
 
         A suspect that is being verified is restored, because a reset declares it healthy.
         """
-        suspect = None if self.verification is None else self.verification.muscle
+        verified = self.verified
         self.finding = self.verification = None
-        return tuple(muscle for muscle in isolated if muscle != suspect)
+        return tuple(muscle for muscle in isolated if muscle != verified)
 
     def on_isolated(self, isolated: Iterable[int]) -> None:
         """Discard the verdicts on muscles that are no longer isolated, and stop verifying them.
@@ -195,5 +188,5 @@ class SuspectHandling:
         """
         isolated = tuple(isolated)
         self.faults = {m: verdict for m, verdict in self.faults.items() if m in isolated}
-        if self.verification is not None and self.verification.muscle not in isolated:
+        if self.verified not in isolated:
             self.verification = None

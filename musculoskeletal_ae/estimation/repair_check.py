@@ -50,7 +50,11 @@ class RepairCheck(NamedTuple):
 
     def problem(self, muscle: int) -> str:
         """Return why a muscle must not be used yet, as a text for users; '' if it may be used."""
-        robot, sample, demand, limit = self.robot, self.sample, self.demand, self.limit
+        return self.defect(muscle) or self._length_problem(muscle)
+
+    def defect(self, muscle: int) -> str:
+        """Return a problem that is not a wrong length, as a text for users; '' if there is none."""
+        robot, sample, demand = self.robot, self.sample, self.demand
         name, tension = robot.muscles[muscle], float(sample.motor_tension[muscle])
         if muscle in self.jumping:
             return f'the length of {name} has just jumped; wait for {LIMITS.settled:g} s'
@@ -60,7 +64,10 @@ class RepairCheck(NamedTuple):
         demanded = 0.0 if demand is None else float(demand[muscle])
         if demanded >= bias and tension < slack_tension(demanded):
             return f'{name} has no tension although the command demands tension; repair it'
-        error = self._length_error(muscle)
+        return ''
+
+    def _length_problem(self, muscle: int) -> str:
+        name, limit, error = self.robot.muscles[muscle], self.limit, self._length_error(muscle)
         may_be_slack = self._is_slack(muscle) and error > 0.0
         if abs(error) <= limit or may_be_slack:
             return ''

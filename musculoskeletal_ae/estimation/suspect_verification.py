@@ -147,7 +147,6 @@ class Verification:
 
     def __init__(
         self,
-        muscle: int,
         bias: float,
         stiffness: float = math.nan,
         elongation: Callable[[float], float] | None = None,
@@ -155,13 +154,12 @@ class Verification:
         """Start the verification.
 
         Args:
-            muscle: Index of the suspect.
             bias: Tension bias [N].
             stiffness: Control stiffness [N/m] of a module under muscle stiffness control.
             elongation: For a position-controlled module, a function that returns the elongation L_e
                 of the series elastic element [m] at a tension [N]; otherwise None.
         """
-        self.muscle, self._bias = muscle, bias
+        self._bias = bias
         self._stiffness, self._elongation = stiffness, elongation
         self._reference = 0.0  # x_0 − L_e(T_0) [m]
         self._scale = min(1.0, bias / USUAL_BIAS)

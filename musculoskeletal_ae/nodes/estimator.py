@@ -125,24 +125,24 @@ class EstimatorNode(Shell):
     def _on_anomaly(self, response: str) -> None:
         self.core.suspects.isolates = response == 'isolate'
 
-    def _calibrate(self, request: Trigger.Request) -> str:
+    def _calibrate(self, _: Trigger.Request) -> str:
         self.core.calibrate_lengths(self.parameter('zero_posture'))
-        self._reset(request)
+        self._publish_body()
+        self._report()
         if self.parameter('zero_posture'):
             doing = 'hold the arm still in zero_posture'
         else:
             doing = 'call controller/explore, unless the arm is already exploring'
         return f'calibrating length offsets: {doing}; /diagnostics shows the progress'
 
-    def _isolate_more(self, request: Trigger.Request) -> str:
+    def _isolate_more(self, _: Trigger.Request) -> str:
         if not self._muscles_to_isolate:
             raise MusculoskeletalError(
                 '`isolate_muscles` names no muscle; set that parameter first'
             )
-        wanted = {*self.core.body.isolated, *self._muscles_to_isolate}
-        self.core.reset(wanted)  # called before isolating, because a reset restores a suspect
-        self.core.isolate(wanted)
-        self._reset(request)
+        self.core.reset({*self.core.body.isolated, *self._muscles_to_isolate})
+        self._publish_body()
+        self._report()
         return self._isolated
 
     def _restore(self, _: Trigger.Request) -> str:

@@ -125,7 +125,7 @@ class MuscleStream:
 
     Attributes:
         body: Length offsets and isolated muscles.
-        jumps: The jumps of lengths, and the muscles that they have displaced.
+        jumps: The jumps of lengths.
     """
 
     def __init__(self, robot: Robot, body: BodyState | None = None, window: int = 1) -> None:
@@ -168,25 +168,14 @@ class MuscleStream:
 
     def use_body(self, body: BodyState) -> None:
         """Use the length offsets and isolated muscles of another body state from now on."""
-        has_new_offsets = body.offsets != self.body.offsets
-        is_calibrated = has_new_offsets and not body.offsets.revoked
-        if has_new_offsets:  # the change of lengths is not a motion
+        if body.offsets != self.body.offsets:  # the change of lengths is not a motion
             self._direction = FrictionDirection()
-        self.jumps.use_body(body, is_calibrated)
         self.body = body
 
     @property
     def jumping(self) -> tuple[int, ...]:
         """Indices of the muscles whose lengths have jumped to a level not yet accepted."""
         return self.jumps.jumping(self.body.used)
-
-    @property
-    def has_jumped(self) -> bool:
-        """Whether a length has jumped since the last length calibration.
-
-        A jump during a pause of the messages does not count, because the arm may have moved.
-        """
-        return bool(self.jumps.displaced) and not self.jumps.is_unseen
 
     def implausible(self, now: float) -> str:
         """Return why messages have been implausible for longer than a glitch, or ''."""
@@ -284,7 +273,7 @@ class MuscleStream:
         if problem is not None:
             self._follow(read, now, self._delay)
             return problem
-        problem = self.jumps.step(read.length, read.tension, used, now, self._delay)
+        problem = self.jumps.step(read.length, used, now, self._delay)
         # While the length offsets are unknown, lengths are unreliable in any case, so that a jump
         # is no reason to reject the message.
         return problem if known else None

@@ -31,7 +31,7 @@ def verdict(tension, length, likely=0.0):
         length: Computes the measured length [m] from the number of the message and noise.
         likely: Length that the other muscles predict for the suspect [m].
     """
-    watched = Verification(0, BIAS, STIFFNESS)
+    watched = Verification(BIAS, STIFFNESS)
     for n, (shake, stir) in enumerate(NOISE):
         command = -min(max(0.0, (n - 150) * 0.0002), 0.003)
         demand = BIAS + max(0.0, -STIFFNESS * command)
@@ -72,7 +72,7 @@ def test_verification_recognises_the_fault_by_the_response_to_winding_in(
 
 
 def test_a_suspect_that_is_not_wound_in_stays_isolated():
-    watched = Verification(0, BIAS, STIFFNESS)
+    watched = Verification(BIAS, STIFFNESS)
     answers = [watched.step(0.0, 0.0, None, 0.0, DT) for _ in range(round(PATIENCE / DT) + 5)]
     assert answers[-1].outcome is Outcome.NOT_WOUND_IN
     assert not any(answers[: round(PATIENCE / DT) - 5])
@@ -320,7 +320,7 @@ def test_a_muscle_whose_length_jumps_is_isolated_as_a_suspect_if_suspects_are_is
 @pytest.mark.parametrize('scale', [1.0, 0.1])
 def test_a_jam_is_recognised_in_a_weak_muscle_as_in_a_strong_one(scale):
     # The tension of the jammed muscle stays at T_bias, although three times T_bias is demanded.
-    watched = Verification(0, scale * BIAS, scale * STIFFNESS)
+    watched = Verification(scale * BIAS, scale * STIFFNESS)
     for n, (shake, stir) in enumerate(NOISE):
         command = -min(max(0.0, (n - 150) * 0.0004), 0.006)
         result = watched.step(scale * (BIAS + shake), stir, command, 0.0, DT)

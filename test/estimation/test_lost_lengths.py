@@ -380,11 +380,7 @@ def test_the_repair_of_a_suspect_keeps_the_offsets(ruptured):
     ruptured.go(3.0, sensors=ruptured.has_sensors)
     assert ruptured.kind is None
     assert ruptured.offsets.known
-    assert_array_equal(ruptured.offsets.offset, before.offset)
-    # The larger deviation tells the other nodes that the estimator has confirmed the length.
-    grown = ruptured.offsets.deviation > before.deviation
-    assert np.flatnonzero(grown).tolist() == [2]
-    assert not ruptured.core.stream.jumps.displaced
+    assert ruptured.offsets is before
 
 
 @pytest.mark.parametrize('jump', [SEVERAL, 0.1 * np.eye(6)[4]])

@@ -142,7 +142,7 @@ def verdict(tension, length, slack):
         length: Computes the measured length [m] from the commanded length [m] and noise.
         slack: Additional length of the tendon at first, relative to a taut one [m].
     """
-    watched = Verification(MUSCLE, BIAS[MUSCLE], elongation=elongation)
+    watched = Verification(BIAS[MUSCLE], elongation=elongation)
     for n, (shake, stir) in enumerate(NOISE):
         command = -min(max(0.0, (n - 150) * 0.0002), 0.028)
         pull, wound = tension(-command, shake), length(command, stir)

@@ -65,8 +65,6 @@ def test_only_a_jump_of_the_suspect_alone_is_explained_by_its_repair(suspects, k
     suspects.take(finding, (), 0.0)
     is_repair = jump == Finding(1, ConditionKind.LENGTH_JUMP, '')
     assert suspects.explains(jump) == is_repair
-    suspects.take(jump, (), 1.0)
-    assert suspects.finding is (finding if is_repair else jump)
 
 
 def test_a_repair_of_a_muscle_that_may_be_faulty_instead_explains_its_jump_as_well(suspects):

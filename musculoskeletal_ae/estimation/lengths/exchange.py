@@ -87,7 +87,6 @@ class ExchangeCheck:
         self._mae: Mae | None = None
         #: bone-side tensions, and lengths as read, of recent messages
         self._messages: deque[tuple[Array, Array]] = deque(maxlen=USUAL_COUNT)
-        self._offset: Array = np.zeros(robot.muscle_count)  # length offsets of these messages [m]
         self._since = 0.0  # time since a message was last kept [s]
         #: time [s] and lengths as read [m], (M,), of the newest message, accepted or not
         self._newest: tuple[float, Array] | None = None
@@ -98,6 +97,10 @@ class ExchangeCheck:
     def use(self, mae: Mae) -> None:
         """Use another network; its isolated muscles are ignored."""
         self._mae = mae
+
+    def forget(self) -> None:
+        """Forget the messages, because the length offsets have changed."""
+        self._messages.clear()
 
     def read(self, readings: MuscleReadings, now: float) -> None:
         """Read the raw lengths of a message, accepted or not, to notice a pause of the driver.
@@ -119,11 +122,8 @@ class ExchangeCheck:
         if self._since < SPACING - 1e-9:
             return
         self._since = 0.0
-        sample, offset = observation.sample, _offset(observation)
-        if not observation.lengths_known or not np.allclose(offset, self._offset, atol=1e-9):
-            self._messages.clear()
-            self._offset = offset
         if observation.lengths_known:
+            sample = observation.sample
             self._messages.append((sample.bone_tension, sample.length_read))
 
     def explain(self, finding: Finding | None, observation: Observation) -> Finding | None:

@@ -2,14 +2,14 @@
 """Decides, for all nodes, which length offsets may be trusted.
 
 Detectors, the length calibration, the joint sensors, the check of a repaired muscle and a restart
-provide evidence. `TRANSITIONS` states which trust follows from each of them. A finding revokes
+provide evidence. The newest evidence on an offset decides whether it is trusted. A finding revokes
 offsets if the declaration of its kind says so (`conditions.py`). The estimator publishes the result
 on `body_state`, and all other nodes follow it.
 
     start ── ASSUMED ───────────────────► KNOWN ── a finding that revokes offsets ──► REVOKED
     start ── NOT_CALIBRATED, RESTARTED ─► UNKNOWN ── CALIBRATED ─► KNOWN
     any ──── CALIBRATING ───────────────► UNKNOWN, for the muscles that are calibrated
-    KNOWN ── MOVED, then CONFIRMED ─────► KNOWN
+    KNOWN ── MOVED ─────────────────────► KNOWN, but the next calibration determines it anew
 
 The estimator itself knows that it has restarted, because it saves its offsets (`body_memory`).
 """
@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from enum import Enum
-from typing import NamedTuple
 
 import numpy as np
 
@@ -26,10 +25,8 @@ from musculoskeletal_ae.arrays import Bools
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.signals.body_state import LengthOffsets, Trust
 
-#: Add this standard deviation to an offset that is confirmed after a repair [m], because the repair
-#: may have changed it slightly. The next calibration determines an offset anew if its standard
-#: deviation is at least this.
-CONFIRMED = 0.01
+#: determine an offset anew in the next calibration if its standard deviation is at least this [m]
+PRECISE = 0.01
 
 
 class Evidence(Enum):
@@ -40,32 +37,11 @@ class Evidence(Enum):
     RESTARTED = 'not calibrated since the estimator was restarted'
     CALIBRATING = 'being calibrated'
     CALIBRATED = 'calibrated'
-    MOVED = 'changed while the muscle was repaired; not checked yet'
-    CONFIRMED = 'checked after the repair of the muscle'
+    MOVED = 'changed while the muscle was repaired'
 
 
-class Transition(NamedTuple):
-    """How evidence changes the trust in the offset of a muscle."""
-
-    before: frozenset[Trust]  # apply the evidence only if the present trust is one of these
-    after: Trust  # the trust that follows from it
-
-
-_ANY, _UNKNOWN = frozenset(Trust), frozenset({Trust.UNKNOWN})
-_KNOWN = frozenset({Trust.KNOWN})
-
-#: change the trust in an offset in this way by each kind of evidence; ASSUMED is missing, because
-#: it is the evidence at the start and is never taken later
-TRANSITIONS = {
-    Evidence.NOT_CALIBRATED: Transition(_ANY, Trust.UNKNOWN),
-    Evidence.RESTARTED: Transition(_ANY, Trust.UNKNOWN),
-    Evidence.CALIBRATING: Transition(_ANY, Trust.UNKNOWN),
-    Evidence.CALIBRATED: Transition(_UNKNOWN, Trust.KNOWN),
-    Evidence.MOVED: Transition(_KNOWN, Trust.KNOWN),
-    Evidence.CONFIRMED: Transition(_KNOWN, Trust.KNOWN),
-}
-#: revoke known offsets after a finding whose kind revokes length offsets
-REVOCATION = Transition(_KNOWN, Trust.REVOKED)
+#: evidence after which an offset is unknown until a calibration has found it
+UNSURE = frozenset({Evidence.NOT_CALIBRATED, Evidence.RESTARTED, Evidence.CALIBRATING})
 
 
 class LengthTrust:
@@ -99,22 +75,20 @@ class LengthTrust:
             muscles: Indices of the muscles that it concerns; None for all muscles.
             found: Offsets and standard deviations that replace the present ones; None to keep them.
         """
-        previous = self.offsets
-        transition = REVOCATION if isinstance(evidence, ConditionKind) else TRANSITIONS[evidence]
-        candidates = range(len(self.evidence)) if muscles is None else muscles
-        concerned = [m for m in candidates if previous.trust[m] in transition.before]
+        previous, is_finding = self.offsets, isinstance(evidence, ConditionKind)
+        concerned = list(range(len(self.evidence)) if muscles is None else muscles)
+        if is_finding or evidence is Evidence.MOVED:  # these concern known offsets only
+            concerned = [m for m in concerned if previous.trust[m] == Trust.KNOWN]
         for muscle in concerned:
             self.evidence[muscle] = evidence
         rows = previous.rows.copy()
         if found is not None:
             rows[:2, concerned] = found.rows[:2, concerned]
-        if evidence is Evidence.CONFIRMED:
-            rows[1, concerned] = np.hypot(rows[1, concerned], CONFIRMED)
-        rows[2, concerned] = transition.after
+        trust = Trust.UNKNOWN if evidence in UNSURE else Trust.KNOWN
+        rows[2, concerned] = Trust.REVOKED if is_finding else trust
         if (rows == previous.rows).all():
             return False
-        offset, deviation, trust = rows
-        self.offsets = LengthOffsets(offset, deviation, trust.astype(int))
+        self.offsets = LengthOffsets(rows[0], rows[1], rows[2].astype(int))
         return True
 
     @property
@@ -124,7 +98,7 @@ class LengthTrust:
         They are known and precise, and their muscle has not been repaired since.
         """
         is_moved = np.array([evidence is Evidence.MOVED for evidence in self.evidence])
-        is_precise = self.offsets.deviation < CONFIRMED
+        is_precise = self.offsets.deviation < PRECISE
         return (self.offsets.trust == Trust.KNOWN) & is_precise & ~is_moved
 
     @property
