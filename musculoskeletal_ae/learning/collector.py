@@ -108,11 +108,6 @@ class SampleCollector:
         return False
 
     @property
-    def has_just_jumped(self) -> bool:
-        """Whether the last message was the first one accepted after a jump of lengths."""
-        return bool(self._stream.jumps.newest)
-
-    @property
     def is_anomaly(self) -> bool:
         """Whether an anomaly is present."""
         return self._margin.is_anomaly

@@ -35,8 +35,7 @@ from musculoskeletal_ae.learning.checkpoint_keeper import CheckpointKeeper
 from musculoskeletal_ae.learning.collector import MARKER, NONE, SENSOR, SampleCollector
 from musculoskeletal_ae.learning.detector_calibration import Reservoir, uncalibrated
 from musculoskeletal_ae.learning.learner_status import learner_conditions, learner_report
-from musculoskeletal_ae.learning.sample_history import HELD_TIME, JointHistory, OffsetHistory
-from musculoskeletal_ae.learning.samples import SampleStore
+from musculoskeletal_ae.learning.samples import HELD_TIME, SampleStore
 from musculoskeletal_ae.learning.scheduler import LEAST_BLIND, STEPS, Update, UpdateScheduler
 from musculoskeletal_ae.learning.trainer import Trainer
 from musculoskeletal_ae.mae.mae import Mae
@@ -45,7 +44,6 @@ from musculoskeletal_ae.report import Report
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.signals.body_state import BodyState
 from musculoskeletal_ae.signals.joint_trust_message import JointTrust
-from musculoskeletal_ae.signals.limits import LIMITS
 from musculoskeletal_ae.signals.muscle_states import MuscleReadings
 from musculoskeletal_ae.signals.muscle_stream import MuscleSample, RejectionError
 from musculoskeletal_ae.signals.pairing import Paired
@@ -118,8 +116,8 @@ class Learner:
         )
         self.keeper = CheckpointKeeper(robot, samples, directory)
         saved = self.keeper.load()
-        self.offset_history = OffsetHistory(samples, self.body.offsets.offset)
-        self.joint_history = JointHistory(samples, robot.joint_count)
+        if not samples.held:  # otherwise, the offsets of the held samples were loaded with them
+            samples.offset = self.body.offsets.offset
         self._time = -math.inf  # time of the last message [s]
         if saved is not None:
             self._start(saved)
@@ -172,8 +170,6 @@ class Learner:
         self._learn_from(self.collector.take(time, message, delay), time)
 
     def _learn_from(self, paired: Paired[MuscleSample] | None, time: float) -> None:
-        if not 0.0 <= time - self._time <= LIMITS.pause or self.collector.has_just_jumped:
-            self.offset_history.interrupt()
         self._time = time
         if paired is None or not (self.enabled and self.body.offsets.known):
             return
@@ -181,18 +177,6 @@ class Learner:
             return
         for _ in self.collector.collect(paired, time):
             self._note_new_samples()
-
-    def _use_known_offsets(self) -> None:
-        """Use length offsets that the estimator has just declared known.
-
-        Samples that were taken under wrong offsets are dropped or corrected (`sample_history`).
-        """
-        before = self.offset_history.corrected
-        self.offset_history.use(self.body.offsets.offset)
-        if self.offset_history.corrected != before:
-            self.collector.healthy.clear()
-            self.scheduler.note_news()
-        self.keeper.store()
 
     def accept(self, sample: Sample) -> None:
         """Store and save a new sample, and schedule an update."""
@@ -229,18 +213,20 @@ class Learner:
         """Use another body state from now on.
 
         Isolated muscles are not learned. While the length offsets are unknown, or an anomaly is
-        present, learning pauses. Samples that were taken under wrong length offsets are dropped or
-        corrected (`sample_history`); all others are kept.
+        present, learning pauses. Samples that may have been taken under wrong length offsets are
+        held back, and later dropped or used again (`samples`); all others are kept.
         """
         before, offsets = self.body, body.offsets
         self.collector.use_body(body)
         if offsets != before.offsets:
             if offsets.revoked:
-                self.offset_history.revoke(self._time)
+                self.samples.hold(self._time)
                 self.collector.healthy.forget_newest(HELD_TIME)
                 self.keeper.store()  # also saves which samples are held back
             elif offsets.known:
-                self._use_known_offsets()
+                if dropped := self.samples.use_offset(offsets.offset):
+                    self.collector.rejected['wrong length offsets'] += dropped
+                self.keeper.store()
         if body.isolated != before.isolated:
             self.scheduler.note_news()
 
@@ -248,13 +234,14 @@ class Learner:
         """Use another trust in the joint sensors: learn nothing from sensors in doubt.
 
         Their angles since the beginning of the doubt are removed from the samples, and are put back
-        if the user confirms the sensors (`sample_history`).
+        if the user confirms the sensors (`samples`).
 
         Args:
             trust: The trust, with times on the clock of the messages.
         """
+        before = self.joint_trust
         self.collector.use_joint_trust(trust)
-        unused = self.joint_history.use(trust)
+        unused = self.samples.use_trust(before, trust)
         for joint in unused:
             self.collector.healthy.remove_angles(joint, self._time - trust.since[joint])
         if unused:

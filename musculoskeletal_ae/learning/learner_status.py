@@ -74,10 +74,6 @@ def _values(learner: Learner) -> dict[str, str]:
         'healthy time': f'{collector.healthy.time:.0f} s',
         **learner.trainer.values(),
     }
-    history = learner.offset_history
-    if history.dropped or history.corrected:
-        values['samples dropped with wrong length offsets'] = str(history.dropped)
-        values['samples corrected for wrong length offsets'] = str(history.corrected)
     if learner.isolated:
         values['isolated muscles'] = learner.robot.names(learner.isolated)
     values |= keeper.values()

@@ -7,6 +7,22 @@ not move (`rest`), the length offsets are known, and no anomaly is detected shor
 from every stored one by more than a threshold (paper, §III-C). When the store is full, it drops the
 older of the two samples that are nearest to each other. The remaining samples then cover all
 postures and tensions so far, and the newest sample always stays.
+
+The estimator finds a fault some time after it has begun. The samples of this time are therefore
+treated as doubtful when the finding arrives. All older samples stay as they are.
+
+**Length offsets.** A finding may revoke the offsets, because lengths have jumped or disagree with
+the joint sensors. The samples of the last seconds are held back until the next length calibration:
+
+    same offsets         the finding was false, so the samples are used again
+    other offsets        the samples are dropped, because it is unknown which of them are wrong
+
+**Joint sensors.** If the estimator doubts a sensor, the samples since the beginning of the doubt
+(`signals/joint_trust_message.py`) lose the angle of this joint. They keep tensions, lengths and the
+other angles. What happens next depends on the estimator:
+
+    trusted again        the sensor was false in the meantime, so these angles stay unknown
+    confirmed by user    the doubt was wrong, so the samples get their angles back
 """
 
 from __future__ import annotations
@@ -20,6 +36,7 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array, Bools
 from musculoskeletal_ae.body_model.observations import NOTHING, Observations, Sample
+from musculoskeletal_ae.signals.joint_trust_message import JointTrust, SensorTrust
 
 CAPACITY = 400  # keep at most this many samples by default, and drop the most similar ones
 #: Estimate tendon creep once the number of accepted samples exceeds this share of the capacity, and
@@ -30,6 +47,11 @@ CREEP_SHARE = 0.5
 MOMENT_ARM = 0.04
 JOINT_DISTANCE = 0.05  # keep a sample if an angle differs from every stored one by more [rad]
 TENSION_DISTANCE = 10.0  # keep a sample if a tension differs from every stored one by more [N]
+#: conclude that length offsets have changed only if two calibrations differ by more than this [m]
+CALIBRATION_SPREAD = 0.008
+#: hold back samples taken up to this long before length offsets were revoked [s], because the
+#: offsets may already have been wrong
+HELD_TIME = 5.0
 
 
 class StoredSample(NamedTuple):
@@ -49,7 +71,7 @@ class SampleStore:
         stored: The samples from which the learner learns, the oldest first.
         accepted: Number of samples ever accepted.
         held: Samples that are held back because their length offsets are in doubt.
-        held_offset: These length offsets [m], (M,).
+        offset: Length offsets under which the newest samples were taken [m], (M,).
     """
 
     def __init__(self, capacity: int = CAPACITY) -> None:
@@ -57,7 +79,9 @@ class SampleStore:
         self.capacity, self.accepted = capacity, 0
         self.stored: list[StoredSample] = []
         self.held: list[StoredSample] = []
-        self.held_offset: Array = NOTHING
+        self.offset: Array = NOTHING
+        #: angles that were removed [rad], by number of the sample, for each unused joint
+        self._removed: dict[int, dict[int, float]] = {}
 
     def __len__(self) -> int:
         return len(self.stored)
@@ -105,29 +129,49 @@ class SampleStore:
         for each in (*self.stored[: len(self.stored) - newest], *self.held):
             each.known[muscle] = False
 
-    def hold(self, since: float, now: float, offset: Array) -> None:
-        """Hold back the samples of some time until it is known whether they are correct.
+    def hold(self, now: float) -> None:
+        """Hold back the samples of the last `HELD_TIME`, because offsets were revoked at `now` [s].
 
-        Args:
-            since: Beginning of this time [s].
-            now: End of this time [s].
-            offset: Length offsets under which they were taken [m], (M,).
+        `use_offset` later puts them back or drops them.
         """
+        since = now - HELD_TIME
         self.held += [each for each in self.stored if since <= each.time <= now]
         self.stored = [each for each in self.stored if not since <= each.time <= now]
-        self.held_offset = offset
 
-    def put_back_held(self) -> None:
-        """Put back the held samples at their original positions."""
-        self.stored = sorted([*self.stored, *self.held], key=attrgetter('number'))
-        self.held = []
+    def use_offset(self, offset: Array) -> int:
+        """Use known length offsets [m] (M,) from now on; return the number of dropped samples.
 
-    def drop_held(self) -> int:
-        """Drop the held samples; return their number."""
-        count, self.held = len(self.held), []
-        return count
+        If they equal the previous offsets, samples that were held back are put back at their
+        original positions. Otherwise they are dropped.
+        """
+        # The previous offset is NaN for a muscle that was added at a restart.
+        change = np.nan_to_num(np.abs(offset - self.offset)).max()
+        held, self.held, self.offset = self.held, [], offset
+        if change > CALIBRATION_SPREAD:
+            return len(held)
+        self.stored = sorted([*self.stored, *held], key=attrgetter('number'))
+        return 0
 
-    def remove_angles(self, joint: int, since: float) -> dict[int, float]:
+    def use_trust(self, before: JointTrust, trust: JointTrust) -> tuple[int, ...]:
+        """Use another trust in the joint sensors: remove angles, or put them back.
+
+        Args:
+            before: The previous trust.
+            trust: The trust from now on, with times on the clock of the samples.
+
+        Returns:
+            Indices of the joints whose sensors are not used from now on.
+        """
+        unused = tuple(j for j in trust.unused if before.is_used[j])
+        for j in unused:
+            self._removed[j] = self._remove_angles(j, trust.since[j])
+        for j in [j for j in self._removed if trust.is_used[j]]:
+            removed = self._removed.pop(j)
+            if trust.trust[j] is SensorTrust.CONFIRMED and before.trust[j] is SensorTrust.DOUBTED:
+                self._set_angles(j, removed)
+        return unused
+
+    def _remove_angles(self, joint: int, since: float) -> dict[int, float]:
         """Remove θ of a joint from the samples accepted at `since` [s] or later.
 
         Returns:
@@ -139,10 +183,10 @@ class SampleStore:
             if each.time >= since
         }
         removed = {number: angle for number, angle in recent.items() if np.isfinite(angle)}
-        self.set_angles(joint, dict.fromkeys(removed, np.nan))
+        self._set_angles(joint, dict.fromkeys(removed, np.nan))
         return removed
 
-    def set_angles(self, joint: int, angles: Mapping[int, float]) -> None:
+    def _set_angles(self, joint: int, angles: Mapping[int, float]) -> None:
         """Set θ of a joint [rad] in some samples, by number."""
         for place, each in enumerate(self.stored):
             if each.number in angles:
@@ -150,26 +194,10 @@ class SampleStore:
                 theta[joint] = angles[each.number]
                 self.stored[place] = each._replace(sample=each.sample._replace(theta=theta))
 
-    def lengthen(self, by: Array, first: int) -> int:
-        """Add `by` [m] (M,) to the lengths of all samples with number `first` or above.
-
-        Lengths of muscles that were isolated in a sample are not changed.
-
-        Returns:
-            The number of changed samples.
-        """
-        count = 0
-        for place, each in enumerate(self.stored):
-            if each.number >= first:
-                used = ~np.isin(np.arange(len(by)), each.sample.isolated)
-                longer = each.sample._replace(length=each.sample.length + by * used)
-                self.stored[place] = each._replace(sample=longer)
-                count += 1
-        return count
-
     def clear(self) -> None:
-        """Clear all samples."""
+        """Clear all samples, after which their numbers begin at 1 again."""
         self.stored, self.held, self.accepted = [], [], 0
+        self._removed.clear()
 
     def observations(self) -> Observations:
         """Return all samples as arrays, except those that are held back."""

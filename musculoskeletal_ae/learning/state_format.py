@@ -66,7 +66,7 @@ def collect(robot: Robot, samples: SampleStore, network: bytes | None) -> SavedS
         robot.tension_source.kind,
         tuple(map(_saved, samples.stored)),
         tuple(map(_saved, samples.held)),
-        tuple(samples.held_offset.tolist()) if samples.held else (),
+        tuple(samples.offset.tolist()) if samples.held else (),
         samples.accepted,
         network,
     )
@@ -162,8 +162,8 @@ def restore_samples(state: SavedState, robot: Robot, samples: SampleStore) -> No
         samples.add(stored.sample, stored.known, stored.number)
     samples.held = [_restored(saved, state, robot) for saved in state.held]
     if samples.held:
-        samples.held_offset = np.full(robot.muscle_count, np.nan)
-        samples.held_offset[list(robot.muscle_indices(state.muscles))] = state.held_offset
+        samples.offset = np.full(robot.muscle_count, np.nan)
+        samples.offset[list(robot.muscle_indices(state.muscles))] = state.held_offset
     samples.accepted = max(samples.accepted, state.accepted)
 
 

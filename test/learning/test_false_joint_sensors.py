@@ -4,7 +4,6 @@
 import numpy as np
 import pytest
 
-from musculoskeletal_ae.learning.sample_history import JointHistory
 from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.joint_trust_message import JointTrust, SensorTrust
 
@@ -13,14 +12,26 @@ def trust(elbow, since=np.nan):
     return JointTrust((SensorTrust.TRUSTED, elbow), np.array([np.nan, since]), np.zeros(2))
 
 
+class Taught:
+    """A store with ten samples, and the newest trust in the joint sensors."""
+
+    def __init__(self, stage):
+        self.samples, self.trust = SampleStore(), JointTrust.full(2)
+        self.add(stage)
+
+    def add(self, stage):
+        for now in range(1, 11):
+            self.samples.add(stage.sample(), time=float(now))
+
+    def use(self, trust):
+        before, self.trust = self.trust, trust
+        return self.samples.use_trust(before, trust)
+
+
 @pytest.fixture
 def taught(stage):
-    """Return ten samples, taken in ten seconds, and their history."""
-    samples = SampleStore()
-    history = JointHistory(samples, 2)
-    for now in range(1, 11):
-        samples.add(stage.sample(), time=float(now))
-    return samples, history
+    """Return ten samples, taken in ten seconds while all sensors were trusted."""
+    return Taught(stage)
 
 
 def elbows(samples):
@@ -28,32 +39,41 @@ def elbows(samples):
 
 
 def test_readings_of_the_doubtful_time_are_given_up_for_good_if_the_sensor_is_mended(taught):
-    samples, history = taught
+    samples = taught.samples
     before = elbows(samples)
-    assert history.use(trust(SensorTrust.DOUBTED, 6.0)) == (1,)
+    assert taught.use(trust(SensorTrust.DOUBTED, 6.0)) == (1,)
     for _ in range(2):
         assert (elbows(samples)[:5] == before[:5]).all()
         assert np.isnan(elbows(samples)[5:]).all()
         assert np.isfinite([sample.theta[0] for sample in samples.samples]).all()
-        history.use(trust(SensorTrust.TRUSTED, 6.0))
+        taught.use(trust(SensorTrust.TRUSTED, 6.0))
     assert np.isnan(elbows(samples)[5:]).all()
 
 
 def test_readings_of_the_doubtful_time_come_back_if_the_user_confirms_them(taught):
-    samples, history = taught
+    samples = taught.samples
     before = elbows(samples)
-    history.use(trust(SensorTrust.DOUBTED, 6.0))
-    history.use(trust(SensorTrust.CONFIRMED, 6.0))
+    taught.use(trust(SensorTrust.DOUBTED, 6.0))
+    taught.use(trust(SensorTrust.CONFIRMED, 6.0))
     assert (elbows(samples) == before).all()
 
 
 def test_readings_during_impossible_ones_are_given_up_even_if_the_sensor_was_confirmed(taught):
-    samples, history = taught
-    history.use(trust(SensorTrust.CONFIRMED, 2.0))
-    assert history.use(trust(SensorTrust.IMPOSSIBLE, 6.0)) == (1,)
-    history.use(trust(SensorTrust.CONFIRMED, 6.0))
+    samples = taught.samples
+    taught.use(trust(SensorTrust.CONFIRMED, 2.0))
+    assert taught.use(trust(SensorTrust.IMPOSSIBLE, 6.0)) == (1,)
+    taught.use(trust(SensorTrust.CONFIRMED, 6.0))
     assert np.isnan(elbows(samples)[5:]).all()
     assert np.isfinite(elbows(samples)[:5]).all()
+
+
+def test_angles_of_samples_that_were_cleared_meanwhile_do_not_come_back(taught, stage):
+    taught.use(trust(SensorTrust.DOUBTED, 6.0))
+    taught.samples.clear()
+    taught.add(stage)
+    before = elbows(taught.samples)
+    taught.use(trust(SensorTrust.CONFIRMED, 6.0))
+    assert (elbows(taught.samples) == before).all()
 
 
 def test_a_trust_survives_its_message():

@@ -9,8 +9,6 @@ import pytest
 from learning.test_learner import Arm, IdleTrainer
 from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.learning.learner import Learner
-from musculoskeletal_ae.learning.sample_history import OffsetHistory
-from musculoskeletal_ae.learning.samples import SampleStore
 from musculoskeletal_ae.signals.body_state import LengthOffsets, Trust
 
 OFF = 0.08 * np.array([1.0, 0.9, -0.8, -0.9, 0.9, -1.0])
@@ -124,33 +122,10 @@ def test_they_are_dropped_if_other_zeros_are_found(learner, arm):
     use(learner, OFF)
     np.testing.assert_array_equal(lengths(learner), [first][: 2 - held])
     arm.rest(POSTURE)
-    assert learner.report().values['samples dropped with wrong length offsets'] == str(held)
+    assert learner.report().values['not learned: wrong length offsets'] == str(held)
     assert learner.samples.accepted >= numbers
     for each in learner.samples.stored:
         assert each.number == 1 or each.number > numbers
-
-
-@pytest.mark.parametrize(('is_interrupted', 'corrected'), [(False, 6), (True, 2)])
-def test_samples_under_zeros_that_the_modules_cannot_have_had_are_corrected(
-    stage, is_interrupted, corrected
-):
-    store, wrong = SampleStore(), np.full(6, 0.09)
-    history = OffsetHistory(store, np.zeros(6))
-    true = [stage.sample() for _ in range(4)]
-    for sample in true[:2]:
-        store.add(sample)
-    history.use(wrong)
-    for sample in true[2:]:
-        store.add(sample._replace(length=sample.length - wrong))
-    if is_interrupted:  # after a power cycle, the true offsets may have changed
-        history.interrupt()
-    history.use(np.zeros(6))
-    # Two samples are corrected when the wrong offsets arrive. If the right ones follow without an
-    # interruption, all four samples are corrected, so there are six corrections.
-    assert history.corrected == corrected
-    if not is_interrupted:
-        for sample, expected in zip(store.samples, true, strict=True):
-            np.testing.assert_allclose(sample.length, expected.length)
 
 
 def test_nothing_is_learned_after_a_jump_of_lengths_until_a_calibration(learner, arm):
