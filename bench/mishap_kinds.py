@@ -43,9 +43,7 @@ NOT_FOLLOWING = frozenset({'module_not_following'})
 JAM = FAULTY | NOT_FOLLOWING | {'slack_tendon'}
 ONE_LENGTH = FAULTY | {'length_jump', 'length_disagrees'}
 SEVERAL_LENGTHS = frozenset({'lengths_jumped', 'lengths_disagree'})
-REVOKED = frozenset({
-    'length_offsets_revoked', 'lengths_not_learned', 'length_calibration_stuck',
-})  # fmt: skip
+REVOKED = frozenset({'length_offsets_revoked', 'length_calibration_stuck'})
 FROZEN = FAULTY | {'sensor_frozen'}
 MISSING = FAULTY | {'values_missing', 'implausible_muscle_states', 'readings_rejected'}
 TENSION_SENSOR = FAULTY | NOT_FOLLOWING | {

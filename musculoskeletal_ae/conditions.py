@@ -681,14 +681,6 @@ class ConditionKind(Enum):
         'sensor can have',
         (Step.CHECK_JOINT_SENSOR, Step.LEARN_AFRESH),
     )
-    LENGTHS_NOT_LEARNED = Declaration(
-        'lengths_not_learned',
-        'learner',
-        'error',
-        'lengths have jumped, and the estimator has not calibrated them again yet',
-        'nothing is learned, because lengths have jumped',
-        (Step.CALIBRATE_LENGTHS,),
-    )
     LEARNING_DISABLED = Declaration(
         'learning_disabled',
         'learner',

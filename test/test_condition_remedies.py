@@ -110,8 +110,6 @@ PLACES = {
     Kind.SENSOR_OFFSET_IMPOSSIBLE: [
         'nodes/test_learner.py: test_a_checkpoint_set_at_run_time_replaces_the_saved_state',
         'learning/test_sensor_offsets.py: test_an_update_with_an_impossible_sensor_offset'],
-    Kind.LENGTHS_NOT_LEARNED: [
-        'learning/test_wrong_offsets.py: test_nothing_is_learned_after_a_jump_of_lengths_until'],
     Kind.LEARNING_DISABLED: [
         'nodes/test_learner.py: test_an_anomaly_and_learner_enable_stop_learning'],
 }  # fmt: skip

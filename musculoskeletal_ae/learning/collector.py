@@ -100,14 +100,6 @@ class SampleCollector:
         return self._stream.body
 
     @property
-    def has_jumped(self) -> bool:
-        """Whether a length has jumped since the last length calibration.
-
-        A jump during a pause of the messages does not count, because the arm may have moved.
-        """
-        return False
-
-    @property
     def is_anomaly(self) -> bool:
         """Whether an anomaly is present."""
         return self._margin.is_anomaly

@@ -173,8 +173,6 @@ class Learner:
         self._time = time
         if paired is None or not (self.enabled and self.body.offsets.known):
             return
-        if self.collector.has_jumped:  # since the last calibration of the lengths
-            return
         for _ in self.collector.collect(paired, time):
             self._note_new_samples()
 
@@ -395,15 +393,6 @@ class Learner:
     def last_update(self) -> Update | None:
         """The last finished update; None before the first."""
         return self.scheduler.last_update
-
-    @property
-    def has_unsettled_jump(self) -> bool:
-        """Whether lengths have jumped, but the estimator has neither revoked them nor stopped.
-
-        Nothing is learned meanwhile.
-        """
-        has_jumped = self.collector.has_jumped and self.body.offsets.known
-        return has_jumped and not self.collector.is_anomaly
 
     @property
     def impossible_offsets(self) -> dict[str, str]:

@@ -41,8 +41,6 @@ def _failures(learner: Learner) -> Iterator[Condition]:
     if offsets := learner.impossible_offsets:
         detail = ', '.join(f'{joint} ({text})' for joint, text in offsets.items())
         yield kind.SENSOR_OFFSET_IMPOSSIBLE.condition(detail, offsets)
-    if learner.has_unsettled_jump:
-        yield kind.LENGTHS_NOT_LEARNED.condition()
 
 
 def _obstacles(learner: Learner) -> Iterator[Condition]:

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 from learning.test_learner import Arm, IdleTrainer
+from musculoskeletal_ae.bags.streams import Pairs
 from musculoskeletal_ae.estimation.finding import DETECTION_DELAY
 from musculoskeletal_ae.learning.learner import Learner
+from musculoskeletal_ae.learning.recordings import learn
 from musculoskeletal_ae.signals.body_state import LengthOffsets, Trust
 
 OFF = 0.08 * np.array([1.0, 0.9, -0.8, -0.9, 0.9, -1.0])
@@ -128,10 +130,16 @@ def test_they_are_dropped_if_other_zeros_are_found(learner, arm):
         assert each.number == 1 or each.number > numbers
 
 
-def test_nothing_is_learned_after_a_jump_of_lengths_until_a_calibration(learner, arm):
-    arm.off = OFF
-    arm.rest(4.0)
-    for _ in range(3):
-        arm.rest(POSTURE)
-    assert len(learner.samples) == 2
-    assert 'lengths have jumped' in learner.report().message
+def test_nothing_of_a_recording_is_learned_after_its_lengths_have_jumped(arm26, initial, stage):
+    sample, time = stage.sample(), 0.01 * np.arange(1200)
+    has_jumped = np.repeat([False, True], 600)[:, None]
+    recording = Pairs(
+        time,
+        np.tile(sample.theta, (len(time), 1)),
+        sample.length + OFF * has_jumped,
+        sample.tension + 20.0 * has_jumped,  # the rests after the jump would be new samples
+        np.zeros((len(time), 6), dtype=int),
+    )
+    learner = Learner(arm26, initial, trainer=IdleTrainer)
+    assert 'lengths_jumped' in learn(learner, recording)
+    np.testing.assert_allclose(lengths(learner), [sample.length])
