@@ -30,8 +30,6 @@ class Sample(NamedTuple):
     spread: Array = NOTHING
     #: direction of gravity in the frames of the tree's joints, (3J,); NaN or empty without an IMU
     gravity: Array = NOTHING
-    #: indices of the muscles that were isolated when the sample was taken
-    isolated: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

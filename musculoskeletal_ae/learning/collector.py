@@ -6,8 +6,8 @@
     gravity ─────────────────────────────────────┴► paired by time (`pairing`)
          ─► at rest (`rest`) ─► no anomaly near (`anomaly_margin`) ─► new (`samples`)
 
-Values of isolated muscles are replaced by 0 before messages are paired. A sample names the muscles
-that were isolated when it was taken.
+Values of isolated muscles are replaced by 0 before messages are paired. The store records which
+muscles a sample describes.
 """
 
 import math
@@ -192,7 +192,6 @@ class SampleCollector:
             message.sliding,
             self._spread,
             gravity,
-            self.body.isolated,
         )
         self._margin.pass_time(dt)
         rest = self._detector.step(reading, dt)
@@ -204,7 +203,8 @@ class SampleCollector:
             return []
         new = []
         for waited in self._margin.hold(dt, reading, rest):
-            self.healthy.step(waited.reading, waited.dt)
+            # No muscle has been isolated or restored since this message, as `use_body` resets.
+            self.healthy.step(waited.reading, waited.dt, self.body.isolated)
             if waited.rest is not None and self._is_new(waited.rest):
                 self.accept(waited.rest, now)
                 new.append(waited.rest)

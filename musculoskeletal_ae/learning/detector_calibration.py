@@ -93,7 +93,7 @@ class Reservoir:
         self._missing: frozenset[int] = frozenset()  # muscles that were isolated in some messages
         self._rests = SampleStore()
 
-    def step(self, reading: Sample, dt: float) -> None:
+    def step(self, reading: Sample, dt: float, isolated: Iterable[int] = ()) -> None:
         """Add a message to the selection with a probability that keeps the selection uniform.
 
         Only one message in 0.1 s (SPACING) is considered; all others are ignored.
@@ -101,13 +101,14 @@ class Reservoir:
         Args:
             reading: The message, with NaN for unmeasured θ.
             dt: Time since the previous message [s].
+            isolated: Indices of the muscles that are isolated, so that the message lacks them.
         """
         self._since += dt
         if self._since < SPACING - 1e-9:
             return
         self.time += min(self._since, 2.0 * SPACING)
         self._since = 0.0
-        self._missing |= frozenset(reading.isolated)
+        self._missing |= frozenset(isolated)
         self._offered += 1
         full = len(self._kept) == self._capacity
         place = int(self._rng.integers(self._offered)) if full else len(self._kept)

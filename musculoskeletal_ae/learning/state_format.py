@@ -24,8 +24,7 @@ Values = tuple[float, ...]  # an array of numbers, as it is saved
 class SavedSample(msgspec.Struct, frozen=True, array_like=True):
     """One `Sample` with its number and the muscles that it describes, as in `StoredSample`.
 
-    `isolated` are indices into the muscles of the saved state. `unused` is 0; states of earlier
-    versions have another number there.
+    In states of earlier versions, two more values follow, which are not read.
     """
 
     number: int
@@ -36,8 +35,6 @@ class SavedSample(msgspec.Struct, frozen=True, array_like=True):
     spread: Values
     gravity: Values
     known: tuple[bool, ...]
-    unused: int
-    isolated: tuple[int, ...]
 
 
 class SavedState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -73,22 +70,11 @@ def collect(robot: Robot, samples: SampleStore, network: bytes | None) -> SavedS
 
 
 def _saved(stored: StoredSample) -> SavedSample:
-    sample = stored.sample
     theta, tension, length, direction, spread, gravity = (
-        tuple(part.tolist()) for part in sample[:6]
+        tuple(part.tolist()) for part in stored.sample
     )
-    return SavedSample(
-        stored.number,
-        theta,
-        tension,
-        length,
-        direction,
-        spread,
-        gravity,
-        tuple(stored.known.tolist()),
-        0,
-        sample.isolated,
-    )
+    known = tuple(stored.known.tolist())
+    return SavedSample(stored.number, theta, tension, length, direction, spread, gravity, known)
 
 
 def to_bytes(state: SavedState) -> bytes:
@@ -148,7 +134,6 @@ def _fits(sample: SavedSample, robot: Robot, muscle_count: int) -> bool:
         and all(len(part) == muscle_count for part in of_muscles)
         and len(sample.spread) in (0, joint_count)
         and len(sample.gravity) in (0, gravity_size)
-        and all(0 <= muscle < muscle_count for muscle in sample.isolated)
     )
 
 
@@ -180,8 +165,7 @@ def _restored(saved: SavedSample, state: SavedState, robot: Robot) -> StoredSamp
     direction[places] = saved.direction
     known[places] = saved.known
     spread, gravity = np.array(saved.spread), np.array(saved.gravity)
-    isolated = tuple(sorted(places[muscle] for muscle in saved.isolated))
-    sample = Sample(theta, tension, length, direction, spread, gravity, isolated)
+    sample = Sample(theta, tension, length, direction, spread, gravity)
     return StoredSample(sample, known, saved.number)
 
 

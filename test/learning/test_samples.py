@@ -240,20 +240,21 @@ def test_the_direction_of_friction_is_unknown_after_a_gap_in_the_stream(messages
     assert (sample.direction == 0.0).all()
 
 
-def test_a_sample_names_the_muscles_that_were_isolated_when_it_was_taken(messages, arm26):
+def test_a_sample_describes_the_muscles_that_were_not_isolated_when_it_was_taken(messages, arm26):
     theta, _, _ = middle(arm26)
     collector = messages.collector
+    stored = collector.samples.stored
     (healthy,) = messages.rest(theta, 2.0 + DETECTION_DELAY)
-    assert healthy.isolated == ()
+    assert stored[-1].sample is healthy and stored[-1].known.all()
     body = collector.body.with_isolated([2])
     collector.use_body(body)
     (isolated,) = messages.rest(theta, 2.0 + DETECTION_DELAY, tension=80.0)
-    assert isolated.isolated == (2,)
+    assert np.flatnonzero(~stored[-1].known).tolist() == [2]
     assert isolated.length[2] == isolated.tension[2] == 0.0
     offsets = LengthOffsets(np.full(6, 0.003), np.zeros(6))
     body = body.with_isolated([]).with_offsets(offsets)
     collector.use_body(body)
     (moved,) = messages.rest(theta, 2.0 + DETECTION_DELAY, tension=100.0)
-    assert moved.isolated == ()
+    assert stored[-1].known.all()
     pull = np.full(6, 100.0)
     np.testing.assert_allclose(moved.length, arm26.muscle_lengths(theta, pull) - 0.003)

@@ -96,7 +96,7 @@ def test_samples_and_network_come_back_to_the_bit(tmp_path, arm26, initial):
     store = SampleStore()
     for sample in (
         plain,
-        plain._replace(spread=np.full(2, 0.02), gravity=gravity, isolated=(1, 4)),
+        plain._replace(spread=np.full(2, 0.02), gravity=gravity),
     ):
         store.add(sample)
     store.forget(1, newest=1)
@@ -244,10 +244,8 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
     network = initial_mae(small, 'default', steps=2)
     store = SampleStore()
     for _ in range(4):
-        theta, *parts, spread, gravity, _ = stage.sample()
-        measured = theta, *(part[kept] for part in parts), spread, gravity
-        # In the robot without the added muscle, this index is that of the muscle after it.
-        store.add(Sample(*measured, isolated=(added,)))
+        theta, *parts, spread, gravity = stage.sample()
+        store.add(Sample(theta, *(part[kept] for part in parts), spread, gravity))
     store.forget(0, newest=1)
     with closing(StateStore(tmp_path, small)) as state:
         state.save(store, checkpoint.to_bytes(network))
@@ -255,7 +253,6 @@ def test_a_robot_with_another_muscle_takes_the_samples_over(tmp_path, arm26, sta
         loaded = learner.samples
         assert numbers(loaded) == numbers(store)
         for one, other in zip(loaded.samples, store.samples, strict=True):
-            assert one.isolated == (added + 1,) and other.isolated == (added,)
             np.testing.assert_array_equal(one.theta, other.theta)
             np.testing.assert_array_equal(one.length[kept], other.length)
             np.testing.assert_array_equal(one.direction[kept], other.direction)
