@@ -34,21 +34,16 @@ class Waiting(NamedTuple):
 
 
 class AnomalyMargin:
-    """Holds messages back until `DETECTION_DELAY` has passed without an anomaly.
-
-    Attributes:
-        is_anomaly: Whether an anomaly is present.
-    """
+    """Holds messages back until `DETECTION_DELAY` has passed without an anomaly."""
 
     def __init__(self) -> None:
-        self.is_anomaly = False
         self._waiting: deque[Waiting] = deque(maxlen=MOST_WAITING)
         self._time = self._closed_until = 0.0
 
     @property
     def is_closed(self) -> bool:
-        """Whether messages are ignored: during an anomaly and shortly after it."""
-        return self.is_anomaly or self._time < self._closed_until
+        """Whether messages are ignored, because an anomaly has ended shortly before (`close`)."""
+        return self._time < self._closed_until
 
     def pass_time(self, dt: float) -> None:
         """Pass the time `dt` [s], until the next message."""
@@ -68,20 +63,12 @@ class AnomalyMargin:
             released.append(self._waiting.popleft())
         return released
 
-    def set_anomaly(self, is_anomaly: bool) -> int:
-        """Set whether an anomaly is present; return the number of rest samples it discards.
-
-        When an anomaly begins, all messages held back are discarded.
-        """
-        lost = 0
-        if is_anomaly and not self.is_anomaly:
-            lost = sum(waiting.rest is not None for waiting in self._waiting)
-            self._waiting.clear()
-        if self.is_anomaly and not is_anomaly:
-            self._closed_until = self._time + DETECTION_DELAY
-        self.is_anomaly = is_anomaly
+    def discard(self) -> int:
+        """Discard all messages that are held back; return the number of rest samples among them."""
+        lost = sum(waiting.rest is not None for waiting in self._waiting)
+        self._waiting.clear()
         return lost
 
-    def reset(self) -> None:
-        """Reset the margin: discard messages held back, for example after a clock jumped back."""
-        self._waiting.clear()
+    def close(self) -> None:
+        """Ignore messages for `DETECTION_DELAY` from now on, because an anomaly has ended."""
+        self._closed_until = self._time + DETECTION_DELAY

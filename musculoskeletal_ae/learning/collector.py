@@ -99,11 +99,6 @@ class SampleCollector:
         """The body state under which samples are taken."""
         return self._stream.body
 
-    @property
-    def is_anomaly(self) -> bool:
-        """Whether an anomaly is present."""
-        return self._margin.is_anomaly
-
     # -- messages -------------------------------------------------------------------------------
 
     def joints(self, time: float, theta: Array) -> None:
@@ -197,7 +192,7 @@ class SampleCollector:
         rest = self._detector.step(reading, dt)
         if rest is not None and np.isnan(rest.gravity).all():
             rest = rest._replace(gravity=NOTHING)
-        if self._margin.is_closed:
+        if self.body.has_anomaly or self._margin.is_closed:
             if rest is not None:
                 self.rejected['anomaly'] += 1
             return []
@@ -234,8 +229,10 @@ class SampleCollector:
         """
         before = self.body
         self._stream.use_body(body)
-        if lost := self._margin.set_anomaly(body.has_anomaly):
+        if body.has_anomaly and not before.has_anomaly and (lost := self._margin.discard()):
             self.rejected['anomaly'] += lost
+        if before.has_anomaly and not body.has_anomaly:
+            self._margin.close()
         if (body.offsets, body.isolated) != (before.offsets, before.isolated):
             self.healthy.use_isolated(body.isolated)
             self.reset()
@@ -250,4 +247,4 @@ class SampleCollector:
         self._joint_stream.reset()
         self._pairing.reset()
         self._detector.reset()
-        self._margin.reset()
+        self._margin.discard()

@@ -287,7 +287,7 @@ class Learner:
         if now < self._polled_at:  # this is the first poll, or the clock was set back
             self.collector.usable = Arrival(since=now)
         self._polled_at = now
-        is_learning = self.enabled and not self.collector.is_anomaly
+        is_learning = self.enabled and not self.body.has_anomaly
         if is_learning and self.trainer.ready and self.scheduler.is_due(now, len(self.samples)):
             data = self.samples, self.collector.healthy, self.isolated
             self.trainer.submit(self.scheduler.begin(now, *data, steps or self._steps))

@@ -51,9 +51,9 @@ def _obstacles(learner: Learner) -> Iterator[Condition]:
         yield kind.LEARNING_DISABLED.condition()
     if not offsets.known:
         yield kind.LEARNING_WAITS.condition('the length offsets are unknown')
-    if learner.collector.is_anomaly:
+    if learner.body.has_anomaly:
         yield kind.LEARNING_WAITS.condition('there is an anomaly')
-    can_learn = learner.enabled and offsets.known and not learner.collector.is_anomaly
+    can_learn = learner.enabled and offsets.known and not learner.body.has_anomaly
     if can_learn and learner.idle_time > LONGEST_IDLE:
         detail = f'no usable data for {learner.idle_time:.0f} s: {learner.collector.obstacle}'
         yield kind.NOTHING_TO_LEARN.condition(detail)

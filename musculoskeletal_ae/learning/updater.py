@@ -38,7 +38,7 @@ class Updater(ABC):
 
     def __init__(self, robot: Robot, mae: Mae, seed: int = 0) -> None:
         """Continue from a network; `seed` is the random seed."""
-        self._robot, self._origin, self._mae, self._seed = robot, mae, mae, seed
+        self._robot, self._mae, self._seed = robot, mae, seed
 
     @property
     def body(self) -> CalibratedBody | None:
@@ -64,14 +64,14 @@ class Updater(ABC):
         self, network: Network, preset: str, steps: int, job: Job, fit: FittedBody | None = None
     ) -> Mae:
         """Return the trained network as an `Mae` with its statistics and its training history."""
-        origin, samples = self._origin, len(job.observed)
+        before, samples = self._mae, len(job.observed)
         history = (
-            f'{origin.training.split(LEARNED)[0]}{LEARNED}'
+            f'{before.training.split(LEARNED)[0]}{LEARNED}'
             f'{samples} samples at rest, preset {preset}, {steps} steps'
         )
-        mae = to_mae(network, origin.joints, origin.muscles, origin.preset, history)
+        mae = to_mae(network, before.joints, before.muscles, before.preset, history)
         mae = mae.without(job.isolated)
-        before = self._mae.without(job.isolated)
+        before = before.without(job.isolated)
         before = before if job.statistics_hold else uncalibrated(before)
         if self.body is not None:
             touch = TouchStatistics(
