@@ -648,9 +648,7 @@ class Controller:
 
     def _stopped(self, present: list[Condition], dt: float) -> Command | None:
         """Return the command of an arm that the causes `present` stop, after a step of dt [s]."""
-        if not self.stopping.is_entered:
-            self.activities.leave()
-            self.stopping.enter()
+        self.activities.leave()
         if self.sample is None:
             return None
         # After an auto-recoverable cause has cleared, the arm waits to resume. This time does not

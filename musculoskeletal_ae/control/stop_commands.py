@@ -32,25 +32,14 @@ SPEED = 0.02  # wind a suspect in at this speed [m/s]
 
 
 class SafeStop:
-    """Commands a stopped arm.
-
-    Attributes:
-        is_entered: Whether the arm is in a stop.
-    """
+    """Commands a stopped arm."""
 
     def __init__(self, setup: Setup, limiter: CommandLimiter) -> None:
         self._setup, self._limiter = setup, limiter
-        self.is_entered = False
         self.leave()
-
-    def enter(self) -> None:
-        """Begin a stop, whose hold time starts now."""
-        self.leave()
-        self.is_entered = True
 
     def leave(self) -> None:
-        """End the stop, and forget its hold time and the lengths at which its release began."""
-        self.is_entered = False
+        """End the stop, and forget its duration and the lengths at which its release began."""
         self._held = 0.0  # duration of the stop [s]; excludes the time of waiting to resume
         self._wound_from: float | None = None  # suspect's command before it was wound in [m]
         self._released_from: Array | None = None  # lengths at the start of the release [m], (M,)
