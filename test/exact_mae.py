@@ -15,7 +15,7 @@ class ExactMae:
         self.robot = robot
         self.friction = np.zeros(robot.muscle_count)
         self.transmission = Transmission(self.friction)
-        self.preset = 'default'
+        self.preset, self.version = 'default', 0
         self.elasticity = self.touch = self.covariance = None
         self.offset = 0.0  # error of every length [m], by which tests tell networks apart
         self.fail: Exception | None = None

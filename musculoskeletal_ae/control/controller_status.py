@@ -61,6 +61,8 @@ def report(core: Controller, now: float) -> Report:
         'method': core.settings.method,
         'preset': core.settings.preset,
     }
+    if core.mae is not None:
+        values['checkpoint version'] = str(core.mae.version)
     if supervisor.condition is not None:
         values['stop cause'] = supervisor.condition.identifier
     _add_motion(core, values)

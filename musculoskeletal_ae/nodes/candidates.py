@@ -85,5 +85,4 @@ class Candidates:
 
     def publish(self, mae: Mae) -> None:
         """Publish a network that was accepted, so that all nodes use it."""
-        self._node.checkpoint_version = mae.version
         self._accepted.publish(bytes_message(checkpoint.to_bytes(mae)))

@@ -140,7 +140,6 @@ class Shell(Node):
         self._fault = '', -math.inf  # the last internal error, and its time [s]
         #: identifiers, levels and subjects of the conditions in the last report
         self._reported: frozenset[tuple[str, str, tuple[str, ...]]] = frozenset()
-        self.checkpoint_version: int | None = None  # version of the network in use
         self.needed = NeededTopics(self, self.full_name, self._reception)
         backward = JumpThreshold(
             min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True
@@ -317,35 +316,32 @@ class Shell(Node):
             unfit: Called with the reason if a network is unusable; the previous network stays in
                 use.
         """
-        has_accepted = False
+        arrival = self._reception.arrivals[ACCEPTED]
 
         def put_to_use(mae: Mae) -> None:
             try:
                 use(mae)
             except (np.linalg.LinAlgError, FloatingPointError) as error:
                 raise CheckpointError(f'the network cannot be evaluated ({error})') from error
-            self.checkpoint_version = mae.version
             self.needed.remove(ACCEPTED)
 
         def handle(message: UInt8MultiArray) -> Iterator[None]:
             mae = checkpoint.from_bytes(bytes(message.data), self.robot)
             yield
             put_to_use(mae)
-            nonlocal has_accepted
-            has_accepted = True
 
         def use_file(mae: Mae) -> None:
-            if has_accepted:
+            if arrival.was_used:
                 raise MusculoskeletalError(
                     'all nodes use the network of the estimator; set the parameter `checkpoint` of '
                     'the estimator instead'
                 )
             put_to_use(mae)
 
-        self.accepted = self.checkpoint_queue(ACCEPTED, handle, unfit)
+        accepted = self.checkpoint_queue(ACCEPTED, handle, unfit)
         self.needed.add(ACCEPTED)
         self.parameters.follow('checkpoint', use_file, self.load_checkpoint)
-        self.listen(UInt8MultiArray, ACCEPTED, self.accepted.propose, LATCHED)
+        self.listen(UInt8MultiArray, ACCEPTED, accepted.propose, LATCHED)
 
     def load_checkpoint(self, path: str) -> Mae | None:
         """Return the network in a file; None if the path is empty.
@@ -594,8 +590,6 @@ class Shell(Node):
         except Exception as error:  # noqa: BLE001 - the error has to be reported
             self.on_callback_error(TIMER, error)
             report = Report('', {}, (ConditionKind.INTERNAL_ERROR.condition(self._fault[0]),))
-        if self.checkpoint_version is not None:
-            report.values.setdefault('checkpoint version', str(self.checkpoint_version))
         self._reported = _signs(report.conditions)
         self._diagnostics.tell(report)
 

@@ -164,7 +164,10 @@ def test_the_simulator_waits_for_a_checkpoint_and_refuses_unfit_ones(graph, mae,
     for version in (41, 42):
         data = checkpoint.to_bytes(replace(mae, version=version))
         graph.send_network(data, 'accepted_checkpoint')
-        graph.wait(lambda version=version: sim.checkpoint_version == version, f'{version}')
+        graph.wait(
+            lambda version=version: sim.arm is not None and sim.arm.mae.version == version,
+            f'{version}',
+        )
     graph.next('sim/joint_states', 3)
     assert not graph.set_parameter('sim', 'checkpoint', '/nowhere')[0]
     # Once the estimator has published a network, it decides which network all nodes use.
