@@ -223,7 +223,7 @@ class Controller:
         robot = self.robot.with_elasticity(mae.elasticity)
         if robot is not self.robot:
             self.setup.robot = robot
-        self.activities.follower.use_network(mae)
+        self.activities.follower.plan_anew()
         self.resting_load.use(mae)
         if self.activities.entered is self.activities.ramped_target:
             self.activities.ramps.solve_again()

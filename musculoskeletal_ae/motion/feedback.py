@@ -83,6 +83,14 @@ def depends_on_limit(tension: Array, before: Array, limit: Array) -> bool:
     return bool(np.count_nonzero(depends & (np.abs(limit - before) > REPLAN)))
 
 
+def _dead_band(mae: Mae) -> Array | float:
+    """Return the errors [rad], (D,), below which the posture of a joint is not corrected."""
+    if mae.covariance is None:
+        return DEADBAND
+    dead_band: Array = np.maximum(DEADBAND, np.sqrt(np.diag(mae.covariance)))
+    return dead_band
+
+
 class Feedback:
     """Corrects the posture, and reduces needless tension while the arm rests.
 
@@ -136,18 +144,9 @@ class Feedback:
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
-        #: errors of each joint that are not corrected [rad], (D,)
-        self._dead_band: Array = np.full(setup.robot.joint_count, DEADBAND)
         self.reset()
         #: times since the arm moved, and since T* was computed [s]
         self._rested = self._unsolved = 0.0
-
-    def use_network(self, mae: Mae) -> None:
-        """Use the standard deviations of the estimate that a network knows."""
-        variance = np.zeros(self._setup.robot.joint_count)
-        if mae.covariance is not None:
-            variance = np.diag(mae.covariance)
-        self._dead_band = np.maximum(DEADBAND, np.sqrt(variance))
 
     def reset(self) -> None:
         """Reset c, u and r to zero."""
@@ -188,14 +187,14 @@ class Feedback:
         Args:
             error: Posture error θ_target − θ_estimated [rad], (D,).
             jacobian: Muscle Jacobian G at the target [m/rad], (M, D).
-            inputs: Tensions, their limit, and the time since the last step.
+            inputs: The network, tensions, their limit, and the time since the last step.
             gain: Integral gain [1/s]; 0 for no feedback.
         """
         dt, limit = inputs.dt, inputs.limit
         self._rested += dt
         if self._rested <= SETTLING or gain == 0.0:
             return False
-        is_off = np.abs(error) >= self._dead_band
+        is_off = np.abs(error) >= _dead_band(inputs.mae)
         beyond = np.where(is_off, error, 0.0)
         correction = self.correction + gain * dt * beyond
         self.correction = np.clip(correction, -CORRECTION, CORRECTION)

@@ -43,7 +43,6 @@ import numpy as np
 
 from musculoskeletal_ae.arrays import Array
 from musculoskeletal_ae.control.settings import Setup
-from musculoskeletal_ae.mae.mae import Mae
 from musculoskeletal_ae.motion.activities import LENGTH, ActivityControl, Command, Inputs
 from musculoskeletal_ae.motion.feedback import Feedback, Shift
 from musculoskeletal_ae.motion.progress import Progress
@@ -83,12 +82,6 @@ class Follower(ActivityControl):
         #: ramp that reduces the difference between the last command and the present plan to 0
         self._blend: Ramp | None = None
         self._desired: Array | None = None  # the last desired command [m], (M,)
-
-    def use_network(self, mae: Mae) -> None:
-        """Use another network; the command changes without a jump."""
-        self.plan.use_network(mae)
-        self.feedback.use_network(mae)
-        self.plan_anew()
 
     # -- requests -------------------------------------------------------------------------------
 

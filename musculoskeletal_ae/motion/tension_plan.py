@@ -21,7 +21,7 @@ from musculoskeletal_ae.motion.feedback import (
     depends_on_limit,
     largest_support,
 )
-from musculoskeletal_ae.motion.holdable_paths import FRICTION, tendon_friction
+from musculoskeletal_ae.motion.holdable_paths import tendon_friction
 from musculoskeletal_ae.motion.methods import SOLVES, Solution, stiffness_command
 from musculoskeletal_ae.motion.slowness import SHARE
 from musculoskeletal_ae.motion.trajectory import Setpoint, Trajectory
@@ -98,18 +98,9 @@ class TensionPlan:
         self._setup, robot = setup, setup.robot
         self.effort: Array = np.zeros(robot.joint_count)
         self.jacobian: Array = np.zeros((robot.muscle_count, robot.joint_count))
-        #: torque k by which tensions support each radian of a shift [N·m/rad], (D,)
-        self._support: Array | float = 0.0
         self._limit: Array = robot.tension.limit  # tension limit of the present plan [N], (M,)
-        #: friction coefficient μ of each tendon, (M,)
-        self._friction: Array = np.full(robot.muscle_count, FRICTION)
         self._stiffening = Stiffening(setup)
         self.reset()
-
-    def use_network(self, mae: Mae) -> None:
-        """Use the tendon friction and the residual torque that a network has learned."""
-        self._support = largest_support(mae) / CORRECTION
-        self._friction = tendon_friction(self._setup.robot, mae)
 
     def reset(self) -> None:
         """Discard the plan: all muscles are at T_bias again, and no sliding direction is known."""
@@ -173,14 +164,14 @@ class TensionPlan:
         torque = robot.kinematics.inverse_dynamics(*at) + self.effort
         actuation, low = robot.actuation, robot.tension.bias
         low = low + actuation.tension_of_lag(lag, np.maximum(speed, 0.0))
-        loss = np.exp(self._friction * self._sliding)
+        loss = np.exp(tendon_friction(robot, mae) * self._sliding)
         near: Array | float = 0.0
         if self.is_stiff:
             near = self._stiffening.step(mae, trajectory, time, self.effort, limit, dt)
         if robot.tension_source.is_known:
             limits = np.minimum(low, limit) / loss, limit / loss
             stops = supporting_stops(robot, at.theta, at.velocity, self.effort)
-            supporting = torque + self._support * shift.torque
+            supporting = torque + largest_support(mae) / CORRECTION * shift.torque
             tension, missing_torque = least_tension(jacobian, supporting, *limits, near, stops)
             if missing_torque.any():  # report only what is missing without the feedback
                 without_feedback = least_tension(jacobian, torque, *limits, near, stops)

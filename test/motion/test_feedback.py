@@ -43,11 +43,11 @@ def holding(robot, desired=0.0):
     return holding_tension(robot, 0.5 * (robot.lower + robot.upper), desired)
 
 
-def step(feedback, robot, error, tension, gain=GAIN, motor=None, dt=DT):
+def step(feedback, robot, error, tension, gain=GAIN, motor=None, dt=DT, mae=None):
     limit = np.full(robot.muscle_count, robot.tension.limit)
     nothing = np.zeros(robot.muscle_count)
     inputs = Inputs(
-        mae=None,
+        mae=mae or ExactMae(robot),
         sample=None,
         motor_tension=tension if motor is None else motor,
         bone_tension=tension,
@@ -136,9 +136,8 @@ def test_errors_below_the_standard_deviation_of_the_estimate_are_not_corrected(r
     feedback, mae = rested(robot), ExactMae(robot)
     deviation = np.array([3.0 * DEADBAND, 0.5 * DEADBAND])
     mae.covariance = np.diag(deviation**2)
-    feedback.use_network(mae)
     error = np.full(robot.joint_count, 2.0 * DEADBAND)
-    step(feedback, robot, error, holding(robot))
+    step(feedback, robot, error, holding(robot), mae=mae)
     assert feedback.correction == pytest.approx(GAIN * DT * error * [0.0, 1.0])
 
 
