@@ -74,9 +74,11 @@ class Bench:
     """A controller with healthy sensor data, unless a test changes them."""
 
     def __init__(self, mae=None, **chosen):
-        # The bench's arm does not move. With a `target_duration` of 0, lengths ramp to those of the
-        # target, which does not require a moving arm.
-        self.core = Controller(ROBOT, Settings(**{'target_duration': 0.0, **chosen}))
+        # The arm of the bench does not move by itself, so all its movements take equally long.
+        settings = Settings(**chosen)
+        if 'target_duration' not in chosen:
+            settings = replace(settings, target_duration=settings.first_duration)
+        self.core = Controller(ROBOT, settings)
         self.mae = mae or ExactMae(ROBOT)
         self.core.use(self.mae)
         self.now, self.dt = 100.0, DT

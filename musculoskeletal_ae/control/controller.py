@@ -363,7 +363,7 @@ class Controller:
             self._hold()  # the arm moves to the target as soon as it may move
             return
         try:
-            self._approach(self.settings.target_duration or self.settings.first_duration)
+            self._approach(self.settings.target_duration)
         except MessageError:
             self.target_state = state
             raise

@@ -142,8 +142,7 @@ class Settings:
     #: duration of the second movement of method `second`, and of that after a new checkpoint [s]
     second_duration: float = 2.0
     #: duration of a movement to a target with method `stiffness`, or with method `proposed` of
-    #: preset `default` [s]; extended if muscle modules or muscles are too weak; 0 for
-    #: first_duration
+    #: preset `default` [s]; extended if muscle modules or muscles are too weak
     target_duration: float = 1.2
 
     def __post_init__(self) -> None:

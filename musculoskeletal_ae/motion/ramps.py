@@ -64,11 +64,11 @@ class LengthRamps:
     def __init__(self, setup: Setup) -> None:
         self._setup, robot = setup, setup.robot
         self._goals: list[Goal] = []
-        self._goal: Goal | None = None  # present goal, which is approached or held
+        #: present goal, which is approached or held, with the tension that it uses
+        self._goal: Goal | None = None
         self._remaining = 0.0  # time until the next goal begins [s]
         self._ramp: Ramp | None = None
         self._command: Array = np.zeros(robot.muscle_count)
-        self._tension: Array = robot.tension.bias  # T_const or T_current of the goal [N], (M,)
         self._limit: Array = robot.tension.limit  # tension limit of the present plan [N], (M,)
         self.solution: Solution | None = None
 
@@ -101,7 +101,7 @@ class LengthRamps:
         if self._goal is None or self._ramp is None or self._goals:
             return
         duration = self._setup.settings.second_duration
-        self._goals = [self._goal._replace(duration=duration, tension=self._tension)]
+        self._goals = [self._goal._replace(duration=duration)]
         if self._ramp.done:
             self._remaining = 0.0
 
@@ -124,12 +124,13 @@ class LengthRamps:
         return Command(LENGTH, self._command.copy())
 
     def _begin(self, goal: Goal, inputs: Inputs) -> None:
-        self._tension = inputs.motor_tension if goal.tension is None else goal.tension
+        if goal.tension is None:
+            goal = goal._replace(tension=inputs.motor_tension)
         if goal.method == SECOND and not self._setup.robot.tension_source.is_known:
             goal = goal._replace(method=FIRST)
         self._goal, self._limit = goal, inputs.limit
         self.solution = None  # there is no solution if the next line raises an exception
-        self.solution = self._solve(goal, inputs.mae, self._tension)
+        self.solution = self._solve(goal, inputs.mae)
         length = np.where(self._setup.robot.used, self.solution.length, self._command)
         rate_limit = float(
             self._setup.robot.actuation.fastest(self._setup.settings.rate_limit).min()
@@ -137,8 +138,10 @@ class LengthRamps:
         self._ramp = Ramp(self._command, length, RAMP_SHARE * goal.duration, rate_limit)
         self._remaining = max(goal.duration, self._ramp.duration)
 
-    def _solve(self, goal: Goal, mae: Mae, tension: Array) -> Solution:
+    def _solve(self, goal: Goal, mae: Mae) -> Solution:
         robot, method = self._setup.robot, self._setup.settings.length_methods[goal.method]
+        tension = goal.tension
+        assert tension is not None
         if method.takes_tension:
             tension = np.minimum(tension, self._limit)
         torque = robot.kinematics.holding_torque(goal.theta) + goal.effort

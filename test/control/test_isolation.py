@@ -61,7 +61,7 @@ NOT_THERE = next(theta for theta in POSTURES if not held(theta))
 @pytest.mark.parametrize(
     ('method', 'duration'),
     [
-        *((method, 0.0) for method in METHODS),
+        *((method, 0.5) for method in METHODS),
         ('proposed', 1.0),
         pytest.param('stiffness', 1.0, marks=pytest.mark.thorough),
     ],
