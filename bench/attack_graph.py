@@ -44,6 +44,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from bench.processes import end_processes, memory
 from musculoskeletal_ae.arrays import Array
+from musculoskeletal_ae.conditions import KINDS as CONDITION_KINDS
 from musculoskeletal_ae.emulator.faults import KINDS, read_fault
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.nodes.declared_parameters import PARAMETERS
@@ -174,6 +175,16 @@ class Attack:
         self._services: dict[str, str] = {}
         self._looked = self._judged = 0.0
         self._listen()
+
+    @property
+    def has_detected(self) -> bool:
+        """Whether the estimator reports an anomaly."""
+        return any(
+            (kind := CONDITION_KINDS.get(each.condition.identifier)) is not None
+            and kind.reaction is not None
+            and each.condition.level == 'error'
+            for each in self.situation.conditions()
+        )
 
     def __enter__(self) -> Attack:
         for name in NODES:

@@ -286,9 +286,7 @@ def deny_an_anomaly(scene: Scene) -> None:
     muscle = attack.robot.muscles[scene.rng.randrange(attack.robot.muscle_count)]
     scene.set('hardware_emulator', 'faults', [f'rupture:{muscle}'])
     with scene.wrong():
-        attack.wait(
-            lambda: attack.situation.detected, 'a rupture is detected', f'rupture of {muscle}'
-        )
+        attack.wait(lambda: attack.has_detected, 'a rupture is detected', f'rupture of {muscle}')
         scene.publish('body_state', *_denials(scene), qos=LATCHED)
         attack.call(Trigger, 'controller/reset')
         attack.call(SetBool, 'controller/explore', SetBool.Request(data=True))
@@ -301,7 +299,7 @@ def deny_and_go(scene: Scene) -> None:
     scene.set('hardware_emulator', 'faults', [f'rupture:{attack.robot.muscles[0]}'])
     with scene.wrong():
         attack.wait(
-            lambda: attack.situation.detected,
+            lambda: attack.has_detected,
             'a rupture is detected',
             'rupture of the first muscle',
         )
@@ -445,7 +443,7 @@ def stop_a_verification(scene: Scene) -> None:
     scene.set('hardware_emulator', 'faults', [f'rupture:{attack.robot.muscles[1]}'])
     with scene.wrong():
         attack.wait(
-            lambda: attack.situation.detected,
+            lambda: attack.has_detected,
             'a rupture is detected',
             'rupture of the second muscle',
         )

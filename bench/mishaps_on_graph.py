@@ -109,7 +109,7 @@ def stopped_verification(scene: Scene) -> Callable[[], object]:
     attack = scene.attack
     scene.set('estimator', 'on_anomaly', 'isolate')
     scene.set('hardware_emulator', 'faults', [f'rupture:{attack.robot.muscles[1]}'])
-    attack.wait(lambda: attack.situation.detected, 'a rupture is detected', 'second muscle')
+    attack.wait(lambda: attack.has_detected, 'a rupture is detected', 'second muscle')
     attack.call(Trigger, 'controller/stop')
     return lambda: scene.set('estimator', 'on_anomaly', 'stop')
 

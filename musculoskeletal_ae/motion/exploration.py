@@ -42,7 +42,6 @@ class Exploring(ActivityControl):
     def __init__(self, exploration: Exploration, ramps: LengthRamps) -> None:
         self.stream, self.ramps = exploration, ramps
         self._steps: Iterator[Goal] | None = None
-        self._theta: Array | None = None  # present target [rad], (D,)
 
     def enter(self, inputs: Inputs) -> None:
         """Begin the exploration, or continue it after a pause, from the present tensions."""
@@ -58,24 +57,15 @@ class Exploring(ActivityControl):
         assert self._steps is not None
         if self.ramps.is_over_after(inputs.dt):
             goal = next(self._steps)
-            self._theta = goal.theta
             # All other methods use the present tension.
             self.ramps.pursue([goal if goal.method == FIRST else goal._replace(tension=None)])
         return self.ramps.step(inputs)
 
     def leave(self) -> None:
         """Leave the exploration; the next exploration starts with another posture."""
-        self._steps = self._theta = None
+        self._steps = None
 
     @property
     def missing_torque(self) -> Array | None:
         """Torque [N·m], (D,), that the muscles cannot exert at the present goal."""
         return self.ramps.missing_torque
-
-    @property
-    def theta(self) -> Array | None:
-        """The posture to which the arm moves [rad], (D,); None before the first step.
-
-        This is not a target of the user, and does not replace `Controller.target_state`.
-        """
-        return self._theta

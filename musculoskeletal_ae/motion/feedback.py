@@ -181,8 +181,8 @@ class Feedback:
         """Begin the feedback at rest with the shift that the desired posture had last in motion."""
         self.correction = self.supported
 
-    def at_rest(self, error: Array, jacobian: Array, inputs: Inputs, gain: float) -> bool:
-        """Integrate the errors since the last step once the arm has settled; return whether it has.
+    def at_rest(self, error: Array, jacobian: Array, inputs: Inputs, gain: float) -> None:
+        """Integrate the errors since the last step once the arm has settled.
 
         Args:
             error: Posture error θ_target − θ_estimated [rad], (D,).
@@ -193,7 +193,7 @@ class Feedback:
         dt, limit = inputs.dt, inputs.limit
         self._rested += dt
         if self._rested <= SETTLING or gain == 0.0:
-            return False
+            return
         is_off = np.abs(error) >= _dead_band(inputs.mae)
         beyond = np.where(is_off, error, 0.0)
         correction = self.correction + gain * dt * beyond
@@ -213,4 +213,3 @@ class Feedback:
             motor = np.clip(inputs.motor_tension, lowest, limit)
             needless = np.where(motor > least, motor - least, np.minimum(bone - least, 0.0))
             self.relief = np.clip(self.relief + share * needless, -largest, largest)
-        return True

@@ -56,11 +56,6 @@ class CheckpointQueue:
         self._timer: Any = node.create_timer(STEP_PERIOD, self._step, clock=clock)
         self._timer.cancel()
 
-    @property
-    def is_busy(self) -> bool:
-        """Whether a checkpoint is being processed or waits to be processed."""
-        return self._steps is not None or self._next is not None
-
     def propose(self, message: UInt8MultiArray) -> None:
         """Process a checkpoint as soon as the present one has been processed.
 

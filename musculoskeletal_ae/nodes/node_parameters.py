@@ -41,11 +41,6 @@ class NodeParameters:
             self.value(key)  # raises if the value is not legal
         node.add_on_set_parameters_callback(self._set)
 
-    @property
-    def followed(self) -> frozenset[str]:
-        """Names of the parameters that have a setter."""
-        return frozenset(self._setters)
-
     def value(self, name: str) -> Any:
         """Return the checked value of a parameter; a list becomes a tuple without empty names.
 

@@ -242,16 +242,6 @@ class Situation:
         return tuple(name for names in found for name in names)
 
     @property
-    def detected(self) -> bool:
-        """Whether the estimator has detected an anomaly."""
-        return any(
-            (kind := KINDS.get(each.condition.identifier)) is not None
-            and kind.reaction is not None
-            and each.condition.level == 'error'
-            for each in self.conditions()
-        )
-
-    @property
     def doing(self) -> str:
         """Activity of the controller, or why the arm stands still; '' without a controller."""
         controller = self._reports.get('controller')

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The whole controller without an arm: the test provides sensor data and time."""
 
+from itertools import islice
+
 import numpy as np
 import pytest
 from control_bench import DT, OTHER, REST, ROBOT, Bench, settled, values
@@ -11,10 +13,11 @@ from readings import reading
 
 from musculoskeletal_ae.conditions import ConditionKind
 from musculoskeletal_ae.control.controller import Controller
-from musculoskeletal_ae.control.settings import METHODS, Settings
+from musculoskeletal_ae.control.settings import METHODS, Settings, Setup
 from musculoskeletal_ae.exceptions import MessageError, MusculoskeletalError
 from musculoskeletal_ae.motion import follower
 from musculoskeletal_ae.motion.activities import LENGTH, TENSION
+from musculoskeletal_ae.motion.exploration import Exploration
 from musculoskeletal_ae.motion.feedback import REPLAN
 from musculoskeletal_ae.robot.robot import Robot
 
@@ -230,22 +233,17 @@ def test_exploration_started_again_continues_its_stream_of_postures():
         bench.core.explore(True)
         bench.core.explore(True)  # a second request does not restart the exploration
         bench.step(5)
-        observed.append(bench.core.activities.exploring.theta)
+        observed.append(bench.core.activities.ramps.solution.length)
         bench.core.explore(False)
         bench.step(5)
-    assert len({tuple(theta) for theta in observed}) == 3
+    assert len({tuple(length) for length in observed}) == 3
 
 
 @pytest.mark.parametrize(('preset', 'sends'), [('default', True), ('paper', False)])
 def test_the_preset_decides_whether_exploration_takes_joints_to_their_limits(preset, sends):
-    bench, at_limit = Bench(preset=preset), False
-    for _ in range(30):
-        bench.core.explore(True)
-        bench.step(2)
-        theta = bench.core.activities.exploring.theta
-        at_limit |= bool(((theta == ROBOT.lower) | (theta == ROBOT.upper)).any())
-        bench.core.explore(False)
-    assert at_limit == sends
+    goals = islice(Exploration(Setup(ROBOT, Settings(preset=preset)), 0), 30)
+    at_limit = [(goal.theta == ROBOT.lower) | (goal.theta == ROBOT.upper) for goal in goals]
+    assert np.any(at_limit) == sends
 
 
 def test_a_subset_of_joints_waits_until_the_posture_of_the_others_is_known():
@@ -262,7 +260,7 @@ def test_a_target_of_one_joint_ends_exploring_and_leaves_the_others_where_they_a
     for ends in (lambda: None, lambda: bench.core.explore(False), bench.stop):
         bench.core.explore(True)
         bench.step(5)
-        assert (bench.core.activities.exploring.theta != bench.theta).any()
+        assert bench.core.supervisor.explores
         ends()
         bench.core.target({ROBOT.joints[0]: (0.1, 0.0)})
         np.testing.assert_allclose(bench.core.target_state.theta, [0.1, REST[1]])

@@ -94,12 +94,10 @@ def test_an_anomaly_rejects_a_network_that_is_being_validated(arm, trained):
     decisions = arm.graph.listen(KeyValue, 'rejected_checkpoint', LATCHED)
     first, candidates = estimator.core.complete_mae, estimator.candidates
     arm.graph.send_network(checkpoint.to_bytes(replace(trained['paper'], version=67)))
-    arm.graph.wait(lambda: candidates.queue.is_busy, 'the validation')
-    candidates.give_up()
-    arm.graph.wait(lambda: decisions, 'the decision')
+    # The network is validated in many steps; do not let all of them pass.
+    arm.graph.wait(lambda: candidates.give_up() or decisions, 'the decision')
     assert decisions[-1].key == '67'
     assert 'anomaly' in decisions[-1].value
-    assert not candidates.queue.is_busy
     assert estimator.core.complete_mae is first
 
 
