@@ -102,6 +102,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from musculoskeletal_ae.ros.executor import make_executor
 from musculoskeletal_ae.robot.robot import Robot
+from musculoskeletal_ae.signals.muscle_states import QUANTITIES
 name, robot, rate, at, out, hears = sys.argv[1:]
 robot = Robot.load(robot)
 def kind(topic):
