@@ -102,15 +102,14 @@ def lengths_of_cardsflow(file: Path, source: Source) -> Callable[[dict[str, Arra
     return lengths
 
 
-def compared(file: Path, robot: Robot, comparison: Comparison | None) -> Comparison | None:
-    """Compare the muscle lengths of a robot imported from a cardsflow.xml with those by MuJoCo.
+def compared(file: Path, robot: Robot, source: Source) -> Comparison | None:
+    """Compare the muscle lengths of a robot with those of its source.
 
-    For other files, and without a model.urdf beside the file, return `comparison` unchanged.
+    For a cardsflow.xml with a model.urdf beside it, MuJoCo computes the lengths of the source.
     """
-    if file.name != 'cardsflow.xml' or not file.with_name('model.urdf').exists():
-        return comparison
-    source = read_source(file)
-    source.lengths = lengths_of_cardsflow(file, source)
+    if file.name == 'cardsflow.xml' and file.with_name('model.urdf').exists():
+        source = read_source(file)
+        source.lengths = lengths_of_cardsflow(file, source)
     return compare(source, robot)
 
 
@@ -118,8 +117,8 @@ def row(file: Path, out: Path) -> list[str]:
     """Import one file, and return the row of the table that describes the result."""
     name = f'{file.parent.name}/{file.name}'
     try:
-        robot, notes, comparison = import_robot(file, out)
-        comparison = compared(file, robot, comparison)
+        robot, source = import_robot(file, out)
+        comparison = compared(file, robot, source)
     except MusculoskeletalError as error:
         return [name, str(error)[-160:]]
     parts = comparison if comparison and comparison.lengths else ({'': np.nan},) * 3
@@ -129,7 +128,7 @@ def row(file: Path, out: Path) -> list[str]:
     check = check_verdict(check_robot(robot, 100)).removeprefix('check_robot: ')
     wraps = len(set(robot.routes.muscle[robot.routes.wrapping].tolist()))
     counts = (robot.joint_count, robot.muscle_count, wraps)
-    return [name, *map(str, counts), *errors, f'{check} ({len(set(notes))} notes)']
+    return [name, *map(str, counts), *errors, f'{check} ({len(set(source.notes))} notes)']
 
 
 def main(argv: list[str]) -> None:

@@ -265,14 +265,6 @@ def experiment_rows(
     begun = time.perf_counter()
     share = 1.0
 
-    def check(robot: Robot) -> None:
-        nonlocal share
-        found = prospects(robot)
-        share = found.share
-        if found.is_pointless:
-            seconds = time.perf_counter() - begun
-            raise MusculoskeletalError(f'after {seconds:.1f} s: {" ".join(found.lines())}')
-
     def measure_training() -> dict[str, float]:
         start = time.process_time()
         online_learning.train_initial(study, study.preset)
@@ -284,7 +276,12 @@ def experiment_rows(
         robot = Robot.load(directory)
     else:
         shutil.rmtree(directory, ignore_errors=True)
-        robot = import_robot(file, directory, check, joints=joints).robot
+        robot = import_robot(file, directory, joints=joints).robot
+        found = prospects(robot)
+        share = found.share
+        if found.is_pointless:
+            seconds = time.perf_counter() - begun
+            raise MusculoskeletalError(f'after {seconds:.1f} s: {" ".join(found.lines())}')
     study = Individuals(
         robot, 'default', args.seeds, args.minutes, quick=not args.whole, folder=folder,
         reality=str(directory / 'model.xml'),

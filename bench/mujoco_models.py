@@ -55,6 +55,7 @@ from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.exporting.exported_mjcf import export_into
 from musculoskeletal_ae.figures import save_figure
 from musculoskeletal_ae.importing.convert import import_robot
+from musculoskeletal_ae.importing.source import compare
 from musculoskeletal_ae.mae import checkpoint
 from musculoskeletal_ae.mae.initial_training import initial_mae
 from musculoskeletal_ae.options import Parser, names
@@ -119,10 +120,6 @@ MODELS = (
 )
 
 
-class EnoughError(Exception):
-    """The prospects are known, and nothing else is wanted."""
-
-
 def measured(model: Model, file: Path, folder: Path, args: Namespace) -> dict[str, Any]:
     """Import a model, let an individual of it learn, export what it learned; return the numbers."""
     begun, result = time.process_time(), dict[str, Any]()
@@ -130,18 +127,17 @@ def measured(model: Model, file: Path, folder: Path, args: Namespace) -> dict[st
     def seconds() -> float:
         return time.process_time() - begun
 
-    def check(robot: Robot) -> None:
+    robot_folder = folder / 'robot'
+    try:
+        robot, source = import_robot(file, robot_folder, joints=model.joints)
         found = prospects(robot)
         result.update(joints=robot.joint_count, muscles=robot.muscle_count, known=seconds())
         result.update(held=held_text(found))
         if found.is_pointless:
             raise MusculoskeletalError(' '.join(found.lines()[:-1]))
         if args.prospects:
-            raise EnoughError
-
-    robot_folder = folder / 'robot'
-    try:
-        robot = import_robot(file, robot_folder, check, joints=model.joints).robot
+            return result
+        compare(source, robot)  # `train --mujoco` prints it, so its time counts
         preset = preset_named('default')
         steps = preset.initial_steps(robot) // (1 if args.whole else QUICK)
         initial = initial_mae(robot, preset.name, args.seeds[0], steps=steps)
@@ -160,8 +156,6 @@ def measured(model: Model, file: Path, folder: Path, args: Namespace) -> dict[st
                 result['whole'] = seconds()
         exported = folder / 'exported' / file.name, folder / 'exported_robot'
         again = import_robot(*exported, joints=model.joints).robot
-    except EnoughError:
-        return result
     except MusculoskeletalError as error:
         # The prospects do not name the file; the paths in other errors are those of this machine.
         text = str(error).replace(f'{file}: ', '').replace(f'{folder}/', '')

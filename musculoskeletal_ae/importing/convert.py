@@ -4,7 +4,6 @@
 import re
 from argparse import Namespace
 from collections import Counter
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
@@ -46,13 +45,12 @@ READERS = {
 
 
 class Imported(NamedTuple):
-    """An imported robot, with notes on the import and a comparison with its source."""
+    """An imported robot, with the source from which it was made."""
 
     robot: Robot
-    #: notes on everything that the import chose, dropped, held fixed, renamed or approximated
-    notes: tuple[str, ...]
-    #: comparison with the source's own engine; None if no engine computes the source's lengths
-    comparison: Comparison | None
+    #: its notes state everything that the import chose, dropped, held fixed, renamed or
+    #: approximated; `compare` compares the robot with it
+    source: Source
 
 
 def read_source(file: Path) -> Source:
@@ -90,16 +88,12 @@ def read_source(file: Path) -> Source:
     return source
 
 
-def import_robot(
-    file: Path, out: Path, loaded: Callable[[Robot], None] = lambda _: None, **chain: Any
-) -> Imported:
+def import_robot(file: Path, out: Path, **chain: Any) -> Imported:
     """Import a file as a robot directory.
 
     Args:
         file: Path of the file to import.
         out: A new or empty directory.
-        loaded: Function that is called with the new robot before the slow comparison with the
-            source.
         chain: Options of `cut`.
 
     Raises:
@@ -122,14 +116,15 @@ def import_robot(
                 source.reduce_range(joint, low, high)
             write(source, out)
             robot = Robot.load(out)
-    loaded(robot)
-    return Imported(robot, tuple(source.notes), compare(source, robot))
+    return Imported(robot, source)
 
 
 def run(args: Namespace) -> int:
     """Run an import, print the report, and return the exit status."""
-    robot, notes, comparison = import_robot(args.file, args.out, show_prospects, **chain_of(args))
-    for note, count in Counter(notes).items():
+    robot, source = import_robot(args.file, args.out, **chain_of(args))
+    print(*prospects(robot).lines(), sep='\n', flush=True)
+    comparison = compare(source, robot)  # slow: what makes the robot useless is printed before
+    for note, count in Counter(source.notes).items():
         print(note + (f' ({count} times)' if count > 1 else ''))
     for note in robot.description.notes:
         print(note)
@@ -143,12 +138,6 @@ def run(args: Namespace) -> int:
     print(f'{args.out}: {robot.joint_count} joints, {robot.muscle_count} muscles')
     print(check_verdict(check_robot(robot)))
     return 0
-
-
-def show_prospects(robot: Robot) -> None:
-    """Print how well a robot will probably learn and move (`design/prospects.py`)."""
-    for line in prospects(robot).lines():
-        print(line, flush=True)
 
 
 def length_verdict(comparison: Comparison | None) -> str:

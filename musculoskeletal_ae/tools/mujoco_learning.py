@@ -32,7 +32,7 @@ from musculoskeletal_ae.experiments.recording import (
 )
 from musculoskeletal_ae.exporting.exported_mjcf import export_into
 from musculoskeletal_ae.importing import convert
-from musculoskeletal_ae.importing.source import listed
+from musculoskeletal_ae.importing.source import compare, listed
 from musculoskeletal_ae.learning.convergence import MOST_UPDATES
 from musculoskeletal_ae.learning.learner import Learner
 from musculoskeletal_ae.learning.recordings import complete
@@ -140,21 +140,17 @@ def learn(robot: Robot, initial: Mae, model: Path, seed: int, minutes: float) ->
 
 def _imported(args: Namespace, folder: Path) -> Robot:
     """Import the file, and print the report; refuse a robot that cannot explore."""
-
-    def check(robot: Robot) -> None:
-        found = prospects(robot)
-        print(*found.lines(), sep='\n', flush=True)
-        if found.is_pointless:
-            raise MusculoskeletalError(
-                f'{args.mujoco}: the muscles cannot hold the arm, so nothing was trained'
-            )
-
-    chain = chain_of(args)
-    imported = convert.import_robot(args.mujoco, folder, check, **chain)
-    for note in imported.notes:
+    robot, source = convert.import_robot(args.mujoco, folder, **chain_of(args))
+    found = prospects(robot)
+    print(*found.lines(), sep='\n', flush=True)
+    if found.is_pointless:
+        raise MusculoskeletalError(
+            f'{args.mujoco}: the muscles cannot hold the arm, so nothing was trained'
+        )
+    for note in source.notes:
         print(note)
-    print(convert.length_verdict(imported.comparison), flush=True)
-    return imported.robot
+    print(convert.length_verdict(compare(source, robot)), flush=True)
+    return robot
 
 
 def _shown(loop: ClosedLoop, learner: Learner, duration: float) -> Iterator[tuple[Array, ...]]:

@@ -17,7 +17,7 @@ from musculoskeletal_ae.design.checks import check_robot
 from musculoskeletal_ae.exceptions import MusculoskeletalError
 from musculoskeletal_ae.importing import convert
 from musculoskeletal_ae.importing.convert import import_robot, read_source
-from musculoskeletal_ae.importing.source import SourceError, cut, urdf
+from musculoskeletal_ae.importing.source import SourceError, compare, cut, urdf
 from musculoskeletal_ae.robot.description import TENSION_DEFAULT
 from musculoskeletal_ae.robot.robot import Robot
 from musculoskeletal_ae.tools.import_robot import main
@@ -31,6 +31,10 @@ def put(directory, name, text):
     directory.mkdir(exist_ok=True)
     (directory / name).write_text(text, encoding='utf-8')
     return directory / name
+
+
+def comparison_of(imported):
+    return compare(imported.source, imported.robot)
 
 
 @pytest.fixture
@@ -47,20 +51,20 @@ def cardsflow(tmp_path):
 def test_a_mujoco_model_keeps_its_lengths(mjcf, tmp_path):
     result = import_robot(mjcf, tmp_path / 'out')
     assert result.robot.joints == ('swing', 'lift', 'elbow')
-    assert max(result.comparison.lengths.values()) < 1e-6
+    assert max(comparison_of(result).lengths.values()) < 1e-6
     assert len(result.robot.routes.wrapping) == 4
     assert result.robot.description.couplings['curl'].terms[1] == pytest.approx(0.5)
     assert result.robot.tension.limit[0] == pytest.approx(180.0)
-    assert 'dropped: tendon none: it is a fixed tendon, which has no route' in result.notes
-    assert 'dropped: actuator not: it does not act on a tendon' in result.notes
+    assert 'dropped: tendon none: it is a fixed tendon, which has no route' in result.source.notes
+    assert 'dropped: actuator not: it does not act on a tendon' in result.source.notes
 
 
 def test_the_example_model_imports_exactly_and_is_sound(tmp_path):
     result = import_robot(EXAMPLE, tmp_path / 'out')
     assert result.robot.joints == ('shoulder', 'elbow')
     assert len(result.robot.muscles) == 4
-    assert not [note for note in result.notes if note.startswith('dropped')]
-    lengths, _, flips = result.comparison
+    assert not [note for note in result.source.notes if note.startswith('dropped')]
+    lengths, _, flips = comparison_of(result)
     assert max(lengths.values()) < 1e-6
     assert not any(flips.values())
     check = check_robot(result.robot)
@@ -84,7 +88,7 @@ CURVE = '0.1 0.5 0.1 -0.05 0.02'
 def test_all_quantities_that_mujoco_uses_are_imported(mjcf, tmp_path, old, new):
     assert old in mjcf.read_text()
     mjcf.write_text(mjcf.read_text().replace(old, new))
-    lengths, arms, flips = import_robot(mjcf, tmp_path / 'out').comparison
+    lengths, arms, flips = comparison_of(import_robot(mjcf, tmp_path / 'out'))
     assert max(lengths.values()) < 1e-6
     assert max(arms.values()) < 1e-5
     assert not any(flips.values())
@@ -103,8 +107,8 @@ def test_a_point_on_the_rim_of_a_wrapped_object_counts_as_outside_it(mjcf, tmp_p
     mjcf.write_text(text)
     result = import_robot(mjcf, tmp_path / 'out')
     site = 'muscle bend: a site on the rim of an object on lower counts as outside the object'
-    assert f'chosen: {site}; in MuJoCo, rounding errors decide this' in result.notes
-    assert max(result.comparison.lengths.values()) < 1e-6
+    assert f'chosen: {site}; in MuJoCo, rounding errors decide this' in result.source.notes
+    assert max(comparison_of(result).lengths.values()) < 1e-6
     m, robot = result.robot.muscles.index('bend'), result.robot
     theta = np.zeros((400, 3))
     theta[:, 2] = np.linspace(robot.lower[2], robot.upper[2], 400)
@@ -127,7 +131,7 @@ def test_the_hand_is_the_tip_of_the_last_geometry_or_a_site(mjcf, tmp_path, caps
     theta = np.array([0.2, 0.0, -0.5])
     pose, tip = (result.robot.kinematics.link_pose(theta, n) for n in ('finger', 'finger_tip'))
     np.testing.assert_allclose(pose.actInv(tip.translation), [0.0, 0.0, -0.06], atol=1e-9)
-    (chosen,) = [note for note in result.notes if 'end effector' in note]
+    (chosen,) = [note for note in result.source.notes if 'end effector' in note]
     assert chosen.startswith(
         'chosen: end effector finger_tip (choose another with --end; others: finger, f2, hole, f1)'
     )
@@ -149,7 +153,7 @@ def test_the_end_effector_is_the_tip_of_the_chain_whatever_its_name(mjcf, tmp_pa
     more = f'{inner}{tip}</body></body>{beside}<site name="hole"'
     mjcf.write_text(mjcf.read_text().replace('<site name="hole"', more))
     out = tmp_path / 'out'
-    notes = import_robot(mjcf, out).notes
+    notes = import_robot(mjcf, out).source.notes
     assert any(note.startswith(f'chosen: end effector {names[1]} ') for note in notes)
     assert f'\nend_effector: {names[1]}\n' in (out / 'muscles.yaml').read_text()
     assert Robot.load(out).description.end_effector == names[1]
@@ -175,7 +179,7 @@ def test_only_actuators_that_pull_contribute_strength(mjcf, tmp_path, actuators,
     result = import_robot(mjcf, tmp_path / 'out')
     actual = result.robot.tension.limit[result.robot.muscles.index('out')]
     assert actual == pytest.approx(limit or TENSION_DEFAULT['limit'], rel=0.01)
-    assert any('it can only push' in note for note in result.notes) == (limit is None)
+    assert any('it can only push' in note for note in result.source.notes) == (limit is None)
 
 
 def test_a_limit_is_never_above_what_the_tendon_is_allowed_to_pull(mjcf, tmp_path):
@@ -183,7 +187,7 @@ def test_a_limit_is_never_above_what_the_tendon_is_allowed_to_pull(mjcf, tmp_pat
     mjcf.write_text(mjcf.read_text().replace('name="out"', ranged))
     result = import_robot(mjcf, tmp_path / 'out')
     assert result.robot.tension.limit[result.robot.muscles.index('out')] == pytest.approx(80.0)
-    assert 'only in model.xml: armature: tendon out' in result.notes
+    assert 'only in model.xml: armature: tendon out' in result.source.notes
 
 
 def test_muscles_have_the_tensions_that_the_model_asks_for_and_tendons_hardly_stretch(
@@ -200,12 +204,12 @@ def test_muscles_have_the_tensions_that_the_model_asks_for_and_tendons_hardly_st
     stretch = robot.series_elastic.elongation(robot.routes.length_at_zero, limit)
     assert np.all(stretch < 1.8e-5 * limit + 4e-4)
     for constant in ('tension.limit', 'series_elastic', 'stiffness'):
-        assert any(note.startswith(f'chosen: {constant}') for note in result.notes)
+        assert any(note.startswith(f'chosen: {constant}') for note in result.source.notes)
 
 
 def test_a_joint_that_a_spring_takes_past_its_muscles_keeps_the_range_that_they_can_hold(tmp_path):
     result = import_robot(put(tmp_path, 'snap.xml', bodies.SNAPPING), tmp_path / 'out')
-    note = [note for note in result.notes if note.startswith('chosen: limits of joint mcp')]
+    note = [note for note in result.source.notes if note.startswith('chosen: limits of joint mcp')]
     assert 'instead of 0 to 1.5' in note[0]
     assert result.robot.lower[0] == 0.0
     # At 0.927 rad, the flexor passes over the axis.
@@ -243,7 +247,7 @@ def test_forces_that_only_the_emulated_arm_has_are_reported(mjcf, tmp_path):
     mjcf.write_text(
         text.replace('name="out"', tendon).replace('name="upper"', 'name="upper" gravcomp="1"')
     )
-    notes = import_robot(mjcf, tmp_path / 'out').notes
+    notes = import_robot(mjcf, tmp_path / 'out').source.notes
     for effect in ('friction', 'armature'):
         assert f'only in model.xml: {effect}: joint elbow' in notes
     for effect in ('friction', 'limits'):
@@ -263,15 +267,15 @@ def test_names_that_clash_here_lose_nothing(mjcf, tmp_path):
     result = import_robot(mjcf, tmp_path / 'out')
     assert result.robot.muscles == ('a_b', 'a_b_', 'out', 'in', 'bend', 'stretch', 'curler')
     assert result.robot.joints == ('to_base', 'universe_', 'elbow')
-    assert 'renamed: tendon a b is a_b_ here' in result.notes
-    assert max(result.comparison.lengths.values()) < 1e-6
+    assert 'renamed: tendon a b is a_b_ here' in result.source.notes
+    assert max(comparison_of(result).lengths.values()) < 1e-6
 
 
 @pytest.mark.parametrize('turn', ['0', '3'])
 def test_a_side_site_on_the_axis_has_the_same_effect_as_in_mujoco(mjcf, tmp_path, turn):
     text = mjcf.read_text().replace('euler="1.57 0 0.1"', f'euler="0 0 {turn}"')
     mjcf.write_text(text.replace('pos="-0.06 0 -0.3"', 'pos="0 0 -0.5"'))
-    assert max(import_robot(mjcf, tmp_path / 'out').comparison.lengths.values()) < 1e-6
+    assert max(comparison_of(import_robot(mjcf, tmp_path / 'out')).lengths.values()) < 1e-6
 
 
 COUPLED = '<joint joint1="curl" joint2="elbow"/><joint joint1="elbow" joint2="curl"/>'
@@ -298,7 +302,7 @@ COUPLED = '<joint joint1="curl" joint2="elbow"/><joint joint1="elbow" joint2="cu
 def test_what_differs_from_the_source_is_reported(mjcf, tmp_path, monkeypatch, old, new, expected):
     monkeypatch.chdir(tmp_path)
     mjcf.write_text(mjcf.read_text().replace(old, new, 1))
-    assert any(expected in note for note in import_robot(mjcf, tmp_path / 'out').notes)
+    assert any(expected in note for note in import_robot(mjcf, tmp_path / 'out').source.notes)
     assert not (tmp_path / 'MUJOCO_LOG.TXT').exists()
 
 
@@ -308,8 +312,8 @@ def test_cardsflow_points_are_measured_from_the_centre_of_mass(cardsflow, tmp_pa
     point = result.robot.description.routes[0][0]
     np.testing.assert_allclose(point.xyz, [0.05, 0.01, 0.2])
     # The source computes no lengths of muscles that wrap, so only the straight one is compared.
-    assert result.comparison.lengths == pytest.approx({'front': 0.0}, abs=1e-9)
-    assert any('muscle still: it moves no joint' in note for note in result.notes)
+    assert comparison_of(result).lengths == pytest.approx({'front': 0.0}, abs=1e-9)
+    assert any('muscle still: it moves no joint' in note for note in result.source.notes)
 
 
 def test_an_sdf_is_the_same_arm_as_its_urdf(cardsflow, tmp_path):
@@ -331,7 +335,7 @@ def test_cardsflow_muscles_with_the_same_name_are_distinguished(cardsflow, tmp_p
     cardsflow.write_text(bodies.CARDSFLOW.replace('"back"', '"front"'))
     result = import_robot(cardsflow, tmp_path / 'out')
     assert result.robot.muscles == ('front', 'front_')
-    assert 'renamed: muscle front is front_ here' in result.notes
+    assert 'renamed: muscle front is front_ here' in result.source.notes
 
 
 def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tmp_path):
@@ -339,14 +343,14 @@ def test_cardsflow_wraps_that_stand_between_no_points_are_left_out(cardsflow, tm
     text = bodies.CARDSFLOW.replace('<viaPoint type', f'{wrap}<viaPoint type')
     cardsflow.write_text(text.replace('</viaPoint></link></myo', f'</viaPoint>{wrap}</link></myo'))
     result = import_robot(cardsflow, tmp_path / 'out')
-    assert (result.robot.muscles, result.comparison) == (('front', 'back'), ({}, {}, {}))
+    assert (result.robot.muscles, comparison_of(result)) == (('front', 'back'), ({}, {}, {}))
     assert (
         'dropped: last wrap of the route of front, because no fixed point follows it'
-        in result.notes
+        in result.source.notes
     )
     assert (
         'dropped: SPHERICAL via point in the route of front, because no fixed point directly '
-        'precedes it' in result.notes
+        'precedes it' in result.source.notes
     )
     with pytest.raises(SourceError, match=r'no muscle remains; dropped: muscle still: .*joint$'):
         import_robot(cardsflow, tmp_path / 'none', without=('front', 'back'))
@@ -428,7 +432,7 @@ def test_a_limit_with_one_end_is_none_and_a_joint_of_the_root_link_is_reported(c
     put(tmp_path, 'model.sdf', text)
     result = import_robot(cardsflow, tmp_path / 'out')
     assert result.robot.lower == pytest.approx(-np.pi)
-    assert 'held fixed: joint t (revolute), which carries the root link' in result.notes
+    assert 'held fixed: joint t (revolute), which carries the root link' in result.source.notes
 
 
 LIMITS = 'shoulder: [0.3, -0.2, -0.7, 0.9]\nwrist: [[0.1, -0.1], [0.0, 0.2]]\nneck: [-1, 1]\n'
@@ -439,8 +443,8 @@ def test_cardsflow_limits_beside_the_model_are_read(cardsflow, tmp_path):
     result = import_robot(cardsflow, tmp_path / 'out')
     assert result.robot.lower == pytest.approx([-0.7, -0.1])
     assert result.robot.upper == pytest.approx([0.9, 0.2])
-    assert 'chosen: limits of joints from joint_limits.yaml: shoulder, wrist' in result.notes
-    assert 'dropped: limits of unknown joints in joint_limits.yaml: neck' in result.notes
+    assert 'chosen: limits of joints from joint_limits.yaml: shoulder, wrist' in result.source.notes
+    assert 'dropped: limits of unknown joints in joint_limits.yaml: neck' in result.source.notes
 
 
 @pytest.mark.parametrize(
@@ -455,7 +459,7 @@ def test_cardsflow_limits_that_are_none_are_refused(cardsflow, tmp_path, text):
 def test_missing_limits_are_named_with_the_remedy(cardsflow, tmp_path):
     text = (tmp_path / 'model.urdf').read_text().replace('lower="-1" upper="1"', '', 1)
     put(tmp_path, 'model.urdf', text)
-    notes = import_robot(cardsflow, tmp_path / 'out').notes
+    notes = import_robot(cardsflow, tmp_path / 'out').source.notes
     expected = (
         'chosen: joint shoulder: limits ±3.142, because the source has no range; give it a range in'
     )
@@ -528,7 +532,7 @@ def test_a_floating_base_is_held_and_named_unless_it_is_asked_for(mjcf, tmp_path
     mjcf.write_text(mjcf.read_text().replace(base, f'{base}{slide}'))
     result = import_robot(mjcf, tmp_path / 'held')
     assert result.robot.joints == ('swing', 'lift', 'elbow')
-    (note,) = [note for note in result.notes if 'root_z' in note]
+    (note,) = [note for note in result.source.notes if 'root_z' in note]
     assert re.match(r'held fixed: joint root_z at 0, because .* no muscle moves it', note)
     joints = 'root_z', 'swing', 'lift', 'elbow'
     assert import_robot(mjcf, tmp_path / 'kept', joints=joints).robot.joints == joints
@@ -546,8 +550,8 @@ def test_weight_pulls_in_the_same_direction_on_a_chain_that_was_cut_out(mjcf, tm
 def test_joints_that_are_left_out_stand_where_the_source_rests_them(mjcf, tmp_path):
     result = import_robot(mjcf, tmp_path / 'out', joints=['elbow'], muscles=['bend', 'stretch'])
     assert result.robot.joints == ('elbow',)
-    assert 'held fixed: joint swing at 0.2' in result.notes
-    assert max(result.comparison.lengths.values()) < 1e-6
+    assert 'held fixed: joint swing at 0.2' in result.source.notes
+    assert max(comparison_of(result).lengths.values()) < 1e-6
 
 
 @pytest.mark.parametrize(

@@ -110,7 +110,7 @@ def test_the_import_names_each_of_them_and_keeps_their_damping(imported):
     notes = ' '.join(imported.robot.description.notes)
     for name in ('return', 'strip', 'stop'):
         assert f'passive tendon {name} ' in notes
-    assert not [note for note in imported.notes if 'no actuator pulls it' in note]
+    assert not [note for note in imported.source.notes if 'no actuator pulls it' in note]
     damping = imported.robot.kinematics.elasticity.damping
     assert damping[0] > 0.01 + 20.0 * 0.003**2
     assert damping[1] == pytest.approx(0.01)
