@@ -58,13 +58,11 @@ class Pairs(NamedTuple):
 
 
 class Streams(NamedTuple):
-    """Sensor data and commands of one arm; missing topics are empty series."""
+    """Sensor data of one arm; missing topics are empty series."""
 
     joints: Series  # usable joint angles [rad], (N, D); NaN where a joint has no usable reading
     muscle_times: Array  # times of the readings of muscle modules since the bag's start [s], (N,)
     muscles: MuscleReadings  # the N readings, with corrected lengths and plausible temperatures
-    length_commands: Series  # target lengths of the muscle modules [m], (N, M)
-    tension_commands: Series  # target tensions of the muscle modules [N], (N, M)
     isolated: Series  # 1 for isolated muscles, else 0, (N, M)
     rejected: Counter[str]  # rejected messages by topic and reason
     ignored: Counter[str]  # unused parts of messages by topic and part
@@ -162,8 +160,6 @@ class _ArmStreams:
         self.by_topic = {
             'joint_states': _Stream((robot.joint_count,), self._posture),
             'muscle_states': _Stream((len(QUANTITIES), muscles), self._muscle_states),
-            'muscle_length_command': _Stream((muscles,), self._command),
-            'muscle_tension_command': _Stream((muscles,), self._command),
             'body_state': self._body,
             'isolated_muscles': self._isolated,
             'muscle_length_zeros': self._offsets,
@@ -204,9 +200,6 @@ class _ArmStreams:
             'used because muscles.yaml says tension_source: none; if they were measured, set '
             'tension_source: sensor'
         )
-
-    def _command(self, message: Any, _: Arrival) -> Array:
-        return read_array(message, 1, self._robot.muscle_count)
 
     def _body_rows(self, message: Any, _: Arrival) -> Array:
         body = BodyState.of_rows(read_array(message, ROWS, self._robot.muscle_count))
@@ -283,7 +276,7 @@ def read_streams(
     progress: Callable[[float], None] = lambda _: None,
     stop: int = LATEST,
 ) -> Streams:
-    """Read sensor data and commands of one arm.
+    """Read the sensor data of one arm.
 
     Muscle states pass through the same `MuscleStream` as on a robot, which rejects and counts
     implausible messages. Each length is corrected by the length offsets of the newest body state
@@ -324,7 +317,7 @@ def read_streams(
     optional = f'{recorded.get("joint_states")} as joint_states'
     _check_fit(bag, {key: each for key, each in used.items() if key != optional}, warnings)
     notes = tuple(filter(None, (messages.note, arm.tension_note)))
-    joints, states, lengths, tensions, *_ = (stream.series() for stream in arm.by_topic.values())
+    joints, states = (arm.by_topic[name].series() for name in ('joint_states', 'muscle_states'))
     is_known = np.array(arm.had_offsets, dtype=bool)
     if not is_known.all():
         reason = f'{labels["muscle_states"]}: length offsets unknown'
@@ -334,7 +327,7 @@ def read_streams(
     judged = judge_series(robot, joints.time, joints.values)
     is_usable, times_read = np.isfinite(judged.theta).any(axis=1), joints.time
     joints = Series(joints.time[is_usable], judged.theta[is_usable])
-    series = joints, states.time, readings, lengths, tensions, arm.isolated()
+    series = joints, states.time, readings, arm.isolated()
     false = times_read[~is_usable]
     return Streams(*series, reception.rejected, reception.ignored, notes, judged, false)
 

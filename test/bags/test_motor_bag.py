@@ -85,7 +85,6 @@ def test_motors_are_read_as_muscles_and_the_joints_beside_them_as_joints(
     assert_allclose(streams.muscles.length, arm.length)
     assert_allclose(streams.muscles.tension, arm.tension)
     assert np.isnan(streams.muscles.temperature).all()
-    assert_allclose(streams.length_commands.values, arm.length)
     assert not streams.rejected
     if topic.endswith('joint_states'):
         assert_allclose(streams.pairs().theta, arm.theta)
